@@ -1,0 +1,122 @@
+"""The pinhole camera: intrinsics in pixels and a rigid world-to-camera transform."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gs2d.errors import ShapeError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera in the OpenCV convention: x right, y down, z forward.
+
+    Pixel (i, j) (column i, row j) covers [i, i+1) x [j, j+1) and is centred at (i + 0.5, j + 0.5).
+    The principal point is general.
+
+    Attributes
+    ----------
+    width, height : int
+        Image size, px.
+    fx, fy, cx, cy : float
+        Focal lengths and principal point, px, in the corner-origin convention above.
+    T_cam_world : ndarray [4, 4] float64
+        x_cam = T_cam_world @ x_world (homogeneous).
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    T_cam_world: np.ndarray  # [4, 4]
+
+    def __post_init__(self) -> None:
+        T = np.asarray(self.T_cam_world, dtype=np.float64)
+        if T.shape != (4, 4):
+            raise ShapeError(f"T_cam_world must be [4, 4], got {list(T.shape)}")
+        if not (np.isfinite(T).all() and np.allclose(T[3], (0, 0, 0, 1), atol=1e-6)):
+            raise ShapeError("T_cam_world must be finite with last row (0, 0, 0, 1)")
+        if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
+            raise ShapeError(
+                f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
+                f"fx={self.fx}, fy={self.fy}"
+            )
+        object.__setattr__(self, "T_cam_world", T)
+
+    @property
+    def K(self) -> np.ndarray:
+        """Intrinsic matrix [3, 3], px."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """World-to-camera rotation [3, 3]."""
+        return np.asarray(self.T_cam_world[:3, :3])
+
+    @property
+    def center(self) -> np.ndarray:
+        """Camera centre in the world [3] wu."""
+        return np.asarray(-self.rotation.T @ self.T_cam_world[:3, 3])
+
+    @property
+    def forward(self) -> np.ndarray:
+        """Unit optical axis in the world [3]."""
+        return np.asarray(self.rotation[2])
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera with another image size (intrinsics scale with each axis)."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    def downscaled(self, factor: int) -> Camera:
+        """The camera of an image area-filtered by an integer factor; leftover rows and columns are cut.
+
+        Raises
+        ------
+        ShapeError
+            If nothing is left.
+        """
+        width, height = self.width // factor, self.height // factor
+        if factor < 1 or width < 1 or height < 1:
+            raise ShapeError(f"downscale must leave at least one pixel of {self.width}x{self.height}, got {factor}")
+        f = float(factor)
+        return replace(
+            self, width=width, height=height, fx=self.fx / f, fy=self.fy / f, cx=self.cx / f, cy=self.cy / f
+        )
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project world points.
+
+        Parameters
+        ----------
+        points : ndarray [P, 3] wu
+
+        Returns
+        -------
+        pixels : ndarray [P, 2] px
+        depth : ndarray [P] wu, along the optical axis (points behind the camera have depth <= 0)
+        """
+        x = points @ self.rotation.T + self.T_cam_world[:3, 3]
+        z = x[:, 2]
+        safe = np.where(np.abs(z) < 1e-12, 1e-12, z)
+        return np.stack([self.fx * x[:, 0] / safe + self.cx, self.fy * x[:, 1] / safe + self.cy], axis=1), z
+
+
+def look_at(
+    eye: np.ndarray, target: np.ndarray, up: np.ndarray, *, width: int, height: int, fx: float, fy: float | None = None
+) -> Camera:
+    """A camera at ``eye`` [3] that looks at ``target`` [3], ``up`` [3] towards the top of the image."""
+    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = -T[:3, :3] @ eye
+    return Camera(width, height, fx, fy if fy is not None else fx, width / 2, height / 2, T)

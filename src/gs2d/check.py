@@ -1,0 +1,55 @@
+"""Shape checks with named dimensions: the same name must mean the same size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gs2d.errors import ShapeError
+
+
+def check_shapes(arrays: Mapping[str, tuple[Any, str]]) -> dict[str, int]:
+    """Check arrays against shape patterns and return the size of each named dimension.
+
+    Parameters
+    ----------
+    arrays : mapping of name to (array, pattern)
+        Anything with a ``.shape``. A pattern is words: an integer must match exactly, a name must have the
+        same size wherever it occurs, ``_`` matches any size. ``"N 3"`` is [N, 3]; ``""`` is a scalar.
+
+    Returns
+    -------
+    dict of str to int
+        The size of each named dimension.
+
+    Raises
+    ------
+    ShapeError
+        Names the first array that does not fit, and the array that fixed the dimension.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> check_shapes({"means": (np.zeros((5, 3)), "N 3"), "quats": (np.zeros((5, 4)), "N 4")})
+    {'N': 5}
+    """
+    sizes: dict[str, int] = {}
+    fixed_by: dict[str, str] = {}
+    for name, (array, pattern) in arrays.items():
+        words = pattern.split()
+        shape = tuple(int(size) for size in array.shape)
+        fits = len(words) == len(shape)
+        for word, size in zip(words, shape, strict=False):
+            if word == "_":
+                continue
+            if word.lstrip("-").isdigit():
+                fits = fits and int(word) == size
+            elif word in sizes:
+                fits = fits and sizes[word] == size
+            elif fits:
+                sizes[word], fixed_by[word] = size, name
+        if not fits:
+            known = [f"{w}={sizes[w]} (from {fixed_by[w]})" for w in words if w in sizes and fixed_by[w] != name]
+            context = f" with {', '.join(known)}" if known else ""
+            raise ShapeError(f"{name} must be [{', '.join(words)}]{context}, got {list(shape)}")
+    return sizes

@@ -1,0 +1,1 @@
+"""Posed photographs: readers of every supported layout."""

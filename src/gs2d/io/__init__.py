@@ -1,0 +1,1 @@
+"""Files that gs2d writes: PLY, run folders."""

@@ -1,0 +1,1 @@
+"""Surfaces: sparse TSDF fusion and marching cubes."""

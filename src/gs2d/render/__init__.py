@@ -1,0 +1,1 @@
+"""Rasterizers: one contract, several backends."""

@@ -1,0 +1,82 @@
+"""What goes into and comes out of a rasterizer, whatever the backend."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """Every constant the rasterizer uses. The numbers in brackets are rules of the contract (render/api.py).
+
+    Attributes
+    ----------
+    near : float
+        wu. Splats whose centre is at or before it are culled; pairs with a smaller depth are skipped.
+    far : float
+        wu. Only maps depth for the distortion.
+    alpha_min, alpha_max : float
+        Pairs below alpha_min are skipped, above alpha_max clamped.
+    transmittance_min : float
+        A pixel stops before the splat that would bring its transmittance below this.
+    error_cutoff : float
+        Footprint of ``splat_errors``: rho <= error_cutoff^2.
+    lowpass_px : float
+        px. Standard deviation of the screen-space low-pass filter.
+    background : tuple of 3 floats
+        Colour behind everything, in [0, 1].
+    sh_degree : int
+        SH degree that is evaluated (coefficients above it are ignored and get zero gradient).
+    """
+
+    near: float = 0.2
+    far: float = 100.0
+    alpha_min: float = 1.0 / 255.0
+    alpha_max: float = 0.99
+    transmittance_min: float = 1e-4
+    error_cutoff: float = 3.0
+    lowpass_px: float = math.sqrt(2.0) / 2.0
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sh_degree: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class RenderOutput:
+    """Images and per-splat facts of one view.
+
+    Attributes
+    ----------
+    color : Tensor [H, W, 3]
+        sum w c + T_final background, not clamped above 1.
+    alpha : Tensor [H, W]
+        sum w = 1 - T_final.
+    normal : Tensor [H, W, 3]
+        sum w n, world frame, each n facing the camera; not normalised.
+    depth_mean : Tensor [H, W] wu
+        sum w z / alpha; 0 where nothing was hit.
+    depth_median : Tensor [H, W] wu
+        Depth of the last pair whose incoming transmittance exceeds 0.5; 0 where nothing was hit.
+    distortion : Tensor [H, W]
+        Sum over pairs i > j of w_i w_j (m_i - m_j)^2, m the mapped depth.
+    radii : Tensor [N] px
+        Half the longer side of each splat's screen box; 0 for splats that touch no pixel.
+    """
+
+    color: Tensor
+    alpha: Tensor
+    normal: Tensor
+    depth_mean: Tensor
+    depth_median: Tensor
+    distortion: Tensor
+    radii: Tensor
+
+    def depth(self, kind: str) -> Tensor:
+        """``depth_mean`` or ``depth_median`` by the name a recipe or protocol uses."""
+        if kind == "mean":
+            return self.depth_mean
+        if kind == "median":
+            return self.depth_median
+        raise ValueError(f"depth must be 'mean' or 'median', got {kind!r}")

@@ -1,0 +1,1 @@
+"""Training: state, rows, optimizer, densification, actions, loop."""
