@@ -1,0 +1,1 @@
+"""Seeded benchmarks: `python -m benchmarks.<name>`; results with machine and versions go to `benchmarks/results/`."""
