@@ -1,0 +1,61 @@
+# Each target does its own set-up in .venv, on any machine with Python >= 3.11 (and a C++ compiler for the native kernels).
+#   make demo      the main job on a small synthetic capture: runs/demo/report.html
+#   make test      ruff, mypy and the tests that take minutes, not hours
+#   make test-all  the slow tests too
+#   make lint      ruff and mypy
+#   make kernels   the native library into the source tree, for development with PYTHONPATH=src
+VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check -q
+# The first Python >= 3.11 found; `make PYTHON=/path/to/python` chooses another.
+PYTHON ?= $(shell for p in python3.14 python3.13 python3.12 python3.11 python3 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
+WORKERS ?= 2
+TEST_ARGS ?=
+
+SOURCES := $(shell find src CMakeLists.txt pyproject.toml README.md LICENSE -type f \
+	-not -path '*/__pycache__/*' -not -path 'src/gs2d/kernels/lib/*' 2>/dev/null)
+# One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts.
+TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
+
+.PHONY: demo test test-all lint kernels install clean
+
+demo: $(VENV)/installed
+	$(VENV)/bin/gs2d demo
+
+test: lint
+	$(TEST_ENV) $(PY) -m pytest -m "not slow" -n $(WORKERS) -q $(TEST_ARGS)
+
+test-all: lint
+	$(TEST_ENV) $(PY) -m pytest -n $(WORKERS) -q $(TEST_ARGS)
+
+lint: $(VENV)/installed
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy
+
+install: $(VENV)/installed
+
+kernels: $(VENV)/dependencies
+	$(VENV)/bin/cmake -S . -B build/dev -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(VENV)/bin/ninja \
+		-DCMAKE_BUILD_TYPE=Release
+	$(VENV)/bin/cmake --build build/dev
+	$(VENV)/bin/cmake --install build/dev --prefix src
+
+clean:
+	rm -rf build dist $(VENV)/installed
+
+# The wheel as users get it (not editable): the tests test what is shipped. --no-build-isolation uses the pinned tools.
+$(VENV)/installed: $(VENV)/dependencies $(SOURCES)
+	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP) install --no-deps --no-build-isolation --force-reinstall .
+	@touch $@
+
+$(VENV)/dependencies: constraints.txt pyproject.toml
+	@test -n "$(PYTHON)" || { echo "error: no Python >= 3.11 found; install one, or run make PYTHON=/path/to/python" >&2; exit 1; }
+	@test -x $(PY) || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "error: $(PYTHON) cannot make a virtual environment; on Debian: apt install python3-venv" >&2; exit 1; }
+	$(PIP) install -c constraints.txt scikit-build-core cmake ninja
+	$(PY) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+		print(*p["dependencies"], *p["optional-dependencies"]["dev"], sep="\n")' > $(VENV)/requirements.txt
+	$(PIP) install -c constraints.txt -r $(VENV)/requirements.txt
+	@touch $@
