@@ -1,0 +1,109 @@
+"""Rotations, neighbour distances, and what a set of cameras says about the size of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.errors import ShapeError
+
+__all__ = ["camera_extent", "focus_point", "nearest_distances", "quats_to_matrices"]
+
+
+def quats_to_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices of quaternions, which are normalised here.
+
+    Parameters
+    ----------
+    quats : Tensor [N, 4]
+        (w, x, y, z), any non-zero length. A zero quaternion gives NaN: the rasterizers cull it.
+
+    Returns
+    -------
+    Tensor [N, 3, 3]
+    """
+    check_shapes({"quats": (quats, "N 4")})
+    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
+    """Root mean square distance of each point to its k nearest others (initial scale of a splat).
+
+    Parameters
+    ----------
+    points : ndarray [P, 3] wu
+    k : int
+        Neighbours; fewer are used where the set holds fewer.
+
+    Returns
+    -------
+    ndarray [P] float64, wu. Coincident points give 0: the caller sets a floor.
+
+    Raises
+    ------
+    ShapeError
+        If there are fewer than two points, k is not positive, or a coordinate is not finite.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    check_shapes({"points": (points, "P 3")})
+    if len(points) < 2 or k < 1:
+        raise ShapeError(f"nearest_distances needs at least 2 points and k >= 1, got {len(points)} points and k={k}")
+    if not np.isfinite(points).all():
+        raise ShapeError("nearest_distances needs finite points, got NaN or infinity: drop those points")
+    k = min(k, len(points) - 1)
+    distances, _ = cKDTree(points).query(points, k=k + 1)  # the nearest is the point itself, or a twin of it
+    return np.asarray(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)))
+
+
+def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
+    """The point nearest to all optical axes in the least-squares sense.
+
+    Minimises the sum of squared distances to the lines ``center + t forward``. Where the axes leave it free (all
+    parallel, or one camera), the free part is that of the mean camera centre.
+
+    Returns
+    -------
+    ndarray [3] wu
+
+    Raises
+    ------
+    ShapeError
+        If there is no camera.
+    """
+    if not cameras:
+        raise ShapeError("focus_point needs at least one camera, got none")
+    centers = np.stack([camera.center for camera in cameras])  # [V, 3]
+    axes = np.stack([camera.forward for camera in cameras])
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3] onto the plane across each axis
+    origin = centers.mean(axis=0)
+    right = np.einsum("vij,vj->i", projectors, centers - origin)
+    offset = np.linalg.lstsq(projectors.sum(axis=0), right, rcond=1e-9)[0]
+    return np.asarray(origin + offset)
+
+
+def camera_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 x the largest distance of a camera centre from the mean centre, wu (official 2DGS scene extent).
+
+    0 for a single camera: the caller chooses what stands in for it.
+
+    Raises
+    ------
+    ShapeError
+        If there is no camera.
+    """
+    if not cameras:
+        raise ShapeError("camera_extent needs at least one camera, got none")
+    centers = np.stack([camera.center for camera in cameras])
+    return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())

@@ -1,0 +1,128 @@
+"""Real spherical harmonics up to degree 3: view-dependent colour of a splat (docs/math.md, "Colour")."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gs2d.check import check_shapes
+from gs2d.errors import ShapeError
+
+__all__ = ["MAX_DEGREE", "num_coefficients", "rgb_to_sh0", "sh_basis", "sh_degree_of", "sh_to_rgb"]
+
+MAX_DEGREE = 3
+
+# Normalisation constants of the real spherical harmonics (Condon-Shortley phase), as in 3DGS:
+C0 = 0.28209479177387814  # sqrt(1 / (4 pi))
+C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)  # sqrt(15 / 4pi), sqrt(5 / 16pi), sqrt(15 / 16pi)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+# sqrt(35 / 32pi), sqrt(105 / 4pi), sqrt(21 / 32pi), sqrt(7 / 16pi), sqrt(105 / 16pi)
+
+
+def num_coefficients(degree: int) -> int:
+    """K = (degree + 1)^2, the number of coefficients of all degrees up to ``degree``."""
+    return (degree + 1) ** 2
+
+
+def sh_degree_of(coefficients: int) -> int:
+    """The degree whose coefficients number K.
+
+    Raises
+    ------
+    ShapeError
+        If K is not 1, 4, 9 or 16.
+    """
+    for degree in range(MAX_DEGREE + 1):
+        if num_coefficients(degree) == coefficients:
+            return degree
+    raise ShapeError(
+        f"sh0 and shN must hold K = 1, 4, 9 or 16 SH coefficients (degree 0 to {MAX_DEGREE}), got {coefficients}"
+    )
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Values of the first K = (degree + 1)^2 basis functions.
+
+    Parameters
+    ----------
+    directions : Tensor [N, 3]
+        Unit vectors.
+    degree : int
+        0 to 3.
+
+    Returns
+    -------
+    Tensor [N, K]
+        Ordered by degree l, then by order m = -l .. l.
+
+    Raises
+    ------
+    ShapeError
+        If the shape or the degree is wrong.
+    """
+    check_shapes({"directions": (directions, "N 3")})
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ShapeError(f"SH degree must be 0 to {MAX_DEGREE}, got {degree}")
+    x, y, z = directions.unbind(1)  # [N] each
+    basis = [torch.full_like(x, C0)]
+    if degree >= 1:
+        basis += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        basis += [
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2 * z * z - x * x - y * y),
+            -C2[0] * x * z,
+            C2[2] * (x * x - y * y),
+        ]
+    if degree >= 3:
+        basis += [
+            -C3[0] * y * (3 * x * x - y * y),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4 * z * z - x * x - y * y),
+            C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -C3[2] * x * (4 * z * z - x * x - y * y),
+            C3[4] * z * (x * x - y * y),
+            -C3[0] * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(basis, dim=1)
+
+
+def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:
+    """Colour of N splats seen along N directions: SH + 0.5, clamped at 0 (not above 1).
+
+    Parameters
+    ----------
+    sh0 : Tensor [N, 1, 3]
+    shN : Tensor [N, K-1, 3]
+    directions : Tensor [N, 3]
+        Unit vectors from the camera to the splat.
+    degree : int
+        Degree that is evaluated; coefficients above it are ignored.
+
+    Returns
+    -------
+    Tensor [N, 3]
+        RGB; 0.5 where all coefficients are 0. A clamped channel has zero gradient.
+
+    Raises
+    ------
+    ShapeError
+        If the coefficients do not reach ``degree``.
+    """
+    check_shapes({"sh0": (sh0, "N 1 3"), "shN": (shN, "N _ 3"), "directions": (directions, "N 3")})
+    K = num_coefficients(degree)
+    if 1 + shN.shape[1] < K:
+        raise ShapeError(f"shN must hold at least {K - 1} coefficients for degree {degree}, got {shN.shape[1]}")
+    basis = sh_basis(directions, degree)  # [N, K]
+    rgb = basis[:, :1] * sh0[:, 0]
+    if degree > 0:
+        rgb = rgb + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, : K - 1])
+    return (rgb + 0.5).clamp(min=0.0)
+
+
+def rgb_to_sh0(rgb: Tensor) -> Tensor:
+    """The degree-0 coefficients [N, 1, 3] whose colour is ``rgb`` [N, 3] from every direction."""
+    check_shapes({"rgb": (rgb, "N 3")})
+    return ((rgb - 0.5) / C0)[:, None, :]
