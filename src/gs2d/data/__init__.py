@@ -1,1 +1,19 @@
 """Posed photographs: readers of every supported layout."""
+
+from __future__ import annotations
+
+from gs2d.data.cache import ImageCache, Picture
+from gs2d.data.load import DEFAULT_CACHE_BYTES, FORMATS, detect_format, load_scene
+from gs2d.data.scene import PointCloud, Scene, View
+
+__all__ = [
+    "DEFAULT_CACHE_BYTES",
+    "FORMATS",
+    "ImageCache",
+    "Picture",
+    "PointCloud",
+    "Scene",
+    "View",
+    "detect_format",
+    "load_scene",
+]

@@ -1,0 +1,81 @@
+"""A thread-safe cache of decoded pictures, bounded in bytes."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One decoded photograph with its masks; the arrays are read-only because they are shared.
+
+    Attributes
+    ----------
+    image : ndarray uint8 [H, W, 3 or 4]
+        sRGB, straight alpha in the fourth channel.
+    mask : ndarray bool [H, W] or None
+        False = ignore this pixel.
+    object_mask : ndarray bool [H, W] or None
+        True = the object.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray | None = None
+    object_mask: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for field in ("image", "mask", "object_mask"):
+            array = getattr(self, field)
+            if array is not None:
+                frozen = array.view()
+                frozen.setflags(write=False)
+                object.__setattr__(self, field, frozen)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return sum(array.nbytes for array in (self.image, self.mask, self.object_mask) if array is not None)
+
+
+class ImageCache:
+    """Least-recently-used pictures, at most ``max_bytes`` of them.
+
+    A picture larger than the bound is handed out and not kept. Decoding happens outside the lock: threads decode
+    different pictures at the same time; two threads that ask for the same one may both decode it.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = int(max_bytes)
+        self._pictures: OrderedDict[Hashable, Picture] = OrderedDict()
+        self._nbytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held now."""
+        return self._nbytes
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def get(self, key: Hashable, decode: Callable[[], Picture]) -> Picture:
+        """The picture of ``key``, decoded if it is not held."""
+        with self._lock:
+            held = self._pictures.get(key)
+            if held is not None:
+                self._pictures.move_to_end(key)
+                return held
+        picture = decode()
+        with self._lock:
+            if key not in self._pictures and picture.nbytes <= self.max_bytes:
+                self._pictures[key] = picture
+                self._nbytes += picture.nbytes
+                while self._nbytes > self.max_bytes:
+                    _, dropped = self._pictures.popitem(last=False)
+                    self._nbytes -= dropped.nbytes
+        return picture

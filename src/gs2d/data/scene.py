@@ -1,0 +1,193 @@
+"""A posed capture: views, sparse points and where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.data.cache import ImageCache, Picture
+from gs2d.errors import DataError
+from gs2d.images import composite
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One posed photograph, decoded when asked for.
+
+    Attributes
+    ----------
+    name : str
+        Unique in its scene: the file's path relative to the image folder, with ``/`` (``cam0/0001.jpg``).
+    camera : Camera
+        Pinhole, at the size that ``image()`` has (downscaling and undistortion are already in it).
+    decode : callable
+        Reads the picture from disk; called through the cache.
+    cache : ImageCache
+        Shared by all views of a scene.
+    path : Path or None
+        The photograph's file.
+    """
+
+    name: str
+    camera: Camera
+    decode: Callable[[], Picture] = field(repr=False)
+    cache: ImageCache = field(repr=False, default_factory=lambda: ImageCache(0))
+    path: Path | None = None
+
+    @classmethod
+    def from_arrays(
+        cls,
+        name: str,
+        camera: Camera,
+        image: np.ndarray,
+        mask: np.ndarray | None = None,
+        object_mask: np.ndarray | None = None,
+    ) -> View:
+        """A view of arrays in memory: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
+        picture = Picture(image, mask, object_mask)
+        return cls(name, camera, lambda: picture)
+
+    def image(self) -> np.ndarray:
+        """The photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
+
+        Raises
+        ------
+        DataError
+            The file does not decode, or is gone.
+        """
+        return self._picture().image
+
+    def mask(self) -> np.ndarray | None:
+        """Which pixels count, bool [H, W] (a fresh copy), or None if all do. False = ignore this pixel."""
+        mask = self._picture().mask
+        return None if mask is None else mask.copy()
+
+    def object_mask(self) -> np.ndarray | None:
+        """Where the object is, bool [H, W] (a fresh copy): a silhouette file (DTU), else alpha >= 0.5, else None.
+
+        Unlike ``mask`` it says nothing about which pixels to train on: the background of DTU is trained and then
+        left out of the surface.
+        """
+        picture = self._picture()
+        if picture.object_mask is not None:
+            return picture.object_mask.copy()
+        return picture.image[:, :, 3] >= 128 if picture.image.shape[2] == 4 else None
+
+    def alpha(self) -> np.ndarray | None:
+        """The alpha channel, float32 [H, W] in [0, 1], or None if the photograph has none."""
+        image = self._picture().image
+        return image[:, :, 3] * np.float32(1 / 255) if image.shape[2] == 4 else None
+
+    def target(self, background: Sequence[float] | np.ndarray) -> np.ndarray:
+        """What a rendering over ``background`` (3 floats in [0, 1]) should look like, float32 [H, W, 3] in [0, 1]."""
+        return composite(self._picture().image, background)
+
+    def _picture(self) -> Picture:
+        return self.cache.get(self, self._decode_checked)
+
+    def _decode_checked(self) -> Picture:
+        picture = self.decode()
+        expected = (self.camera.height, self.camera.width)
+        for what, array in (("image", picture.image), ("mask", picture.mask), ("object mask", picture.object_mask)):
+            if array is not None and array.shape[:2] != expected:
+                raise DataError(
+                    f"the {what} of view {self.name} must be {expected[1]}x{expected[0]} like its camera, "
+                    f"got {array.shape[1]}x{array.shape[0]}; did the file change since the scene was loaded?"
+                )
+        return picture
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Sparse points.
+
+    Attributes
+    ----------
+    points : ndarray [P, 3] float64 wu
+    colors : ndarray [P, 3] uint8 sRGB, or None
+    """
+
+    points: np.ndarray
+    colors: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shapes = {"points": (self.points, "P 3")}
+        if self.colors is not None:
+            shapes["colors"] = (self.colors, "P 3")
+        check_shapes(shapes)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A capture as it is on disk: never re-centred, never rescaled.
+
+    Attributes
+    ----------
+    name : str
+        The folder's name.
+    format : str
+        "blender", "nerfstudio", "dtu" or "colmap".
+    train, test : tuple of View
+        Sorted by name. ``test`` is empty where all views train.
+    points : PointCloud or None
+        Sparse points to start from.
+    extent : float, wu
+        1.1 x the largest distance of a training camera from the mean of all of them (> 0).
+    bounds : ndarray [2, 3] float64, wu
+        Smallest and largest corner of the box that the cameras look at.
+    T_metric_scene : ndarray [4, 4] float64
+        x_metric = T_metric_scene @ x_scene; for evaluation only (DTU: millimetres).
+    skipped : tuple of str
+        Views that are listed but could not be used, one sentence each, for the user to see.
+    notes : tuple of str
+        What loading decided that the user may want to know, one sentence each.
+    root : Path or None
+        The folder it came from.
+    """
+
+    name: str
+    format: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    points: PointCloud | None
+    extent: float
+    bounds: np.ndarray
+    T_metric_scene: np.ndarray = field(default_factory=lambda: np.eye(4))
+    skipped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    root: Path | None = None
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Training views, then test views."""
+        return self.train + self.test
+
+    def preload(self, threads: int = 2) -> Iterator[View]:
+        """Decode every picture once, yielding each view when its picture is good.
+
+        Fills the cache as far as its bound allows, and finds broken files before hours of training do.
+
+        Raises
+        ------
+        DataError
+            The first picture (in order of ``views``) that does not decode.
+        """
+
+        def decode(view: View) -> View:
+            view.image()
+            return view
+
+        with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+            try:
+                yield from pool.map(decode, self.views)
+            finally:
+                pool.shutdown(cancel_futures=True)

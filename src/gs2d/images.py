@@ -1,0 +1,186 @@
+"""Photographs as arrays: reading, writing, compositing, area filtering."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image
+
+from gs2d.check import check_shapes
+from gs2d.disk import atomic_write
+from gs2d.errors import DataError, ShapeError
+
+_BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+
+
+def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """(width, height) of an image file, px, from its header only. EXIF orientation is not applied.
+
+    Raises
+    ------
+    DataError
+        Missing, or not an image.
+    """
+    try:
+        with Image.open(path) as file:
+            return file.size
+    except FileNotFoundError as error:
+        raise DataError(f"image {os.fspath(path)} does not exist") from error
+    except _BROKEN as error:
+        raise DataError(f"{os.fspath(path)} must be an image, got: {_first_line(error)}") from error
+
+
+def read_image(path: str | os.PathLike[str]) -> np.ndarray:
+    """Decode an image.
+
+    EXIF orientation is **not** applied: COLMAP does not apply it either, so poses belong to the stored pixels.
+    Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit.
+
+    Returns
+    -------
+    ndarray uint8 [H, W, 3], or [H, W, 4] with straight alpha if the file has transparency
+
+    Raises
+    ------
+    DataError
+        Missing, not an image, or cut short; names the file.
+    """
+    try:
+        with Image.open(path) as file:
+            if file.mode.startswith("I;16") or file.mode == "I":
+                grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
+                return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)
+            has_alpha = file.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in file.info
+            return np.array(file.convert("RGBA" if has_alpha else "RGB"))
+    except FileNotFoundError as error:
+        raise DataError(f"image {os.fspath(path)} does not exist") from error
+    except _BROKEN as error:
+        raise DataError(
+            f"image {os.fspath(path)} does not decode: {_first_line(error)}; replace or remove the file"
+        ) from error
+
+
+def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
+    """Decode a mask: bool [H, W], True where the image is at least half white (its alpha counts if it is all white)."""
+    image = read_image(path)
+    grey = image[:, :, :3].max(axis=2)
+    if image.shape[2] == 4:
+        grey = np.minimum(grey, image[:, :, 3])
+    return np.asarray(grey >= 128)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def write_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
+    """Write a PNG atomically.
+
+    Parameters
+    ----------
+    path : path
+        Its folder must exist.
+    image : ndarray [H, W], [H, W, 3] or [H, W, 4]
+        uint8, bool (white = True), or float in [0, 1] (clipped, rounded to the nearest of 256 levels).
+
+    Raises
+    ------
+    ShapeError
+        Another shape, or NaN in a float image.
+    DiskError
+        The file could not be written.
+    """
+    pixels = to_uint8(image)
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise ShapeError(f"image must be [H, W], [H, W, 3] or [H, W, 4], got {list(pixels.shape)}")
+    with atomic_write(path) as file:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(file, format="PNG")
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """Float in [0, 1] (clipped) or bool to uint8; uint8 passes through."""
+    image = np.asarray(image)
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype == np.bool_:
+        return image.astype(np.uint8) * np.uint8(255)
+    if not np.issubdtype(image.dtype, np.floating):
+        raise ShapeError(f"image must be uint8, bool or float, got {image.dtype}")
+    if np.isnan(image).any():
+        raise ShapeError("image must not hold NaN")
+    return np.asarray((np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
+
+
+def composite(image: np.ndarray, background: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Straight-alpha image over a background: c alpha + (1 - alpha) b.
+
+    Parameters
+    ----------
+    image : ndarray uint8 [H, W, 3 or 4]
+    background : 3 floats in [0, 1]
+
+    Returns
+    -------
+    ndarray float32 [H, W, 3] in [0, 1]
+    """
+    scale = np.float32(1 / 255)
+    rgb = image[:, :, :3] * scale
+    if image.shape[2] == 3:
+        return np.asarray(rgb)
+    back = np.asarray(background, dtype=np.float32)
+    check_shapes({"background": (back, "3")})
+    alpha = image[:, :, 3:] * scale
+    rgb -= back
+    rgb *= alpha
+    rgb += back
+    return np.asarray(rgb)
+
+
+def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
+    """Average n x n blocks of pixels; rows and columns left over at the end are cut.
+
+    Colour is weighted by alpha (averaged premultiplied, stored straight), so transparent pixels do not bleed.
+
+    Parameters
+    ----------
+    image : ndarray uint8 [H, W, 3 or 4]
+    factor : int >= 1
+
+    Returns
+    -------
+    ndarray uint8 [H // n, W // n, 3 or 4], rounded to nearest
+    """
+    if factor == 1:
+        return image
+    blocks = _blocks(image, factor)  # [h, n, w, n, C]
+    if image.shape[2] == 3:
+        total = blocks.sum(axis=(1, 3), dtype=np.uint32)
+        count = np.uint32(factor * factor)
+        return ((total + count // 2) // count).astype(np.uint8)
+    alpha = blocks[..., 3:].astype(np.uint32)
+    weight = alpha.sum(axis=(1, 3), dtype=np.uint64)  # [h, w, 1]
+    color = (blocks[..., :3] * alpha).sum(axis=(1, 3), dtype=np.uint64)
+    safe = np.maximum(weight, np.uint64(1))
+    count64 = np.uint64(factor * factor)
+    straight = (color + safe // np.uint64(2)) // safe
+    return np.concatenate([straight, (weight + count64 // np.uint64(2)) // count64], axis=2).astype(np.uint8)
+
+
+def mask_downscale(mask: np.ndarray, factor: int, *, need: float) -> np.ndarray:
+    """Bool [H, W] to bool [H // n, W // n]: True where at least the share ``need`` of the n x n block is True."""
+    if factor == 1:
+        return mask
+    return np.asarray(_blocks(mask[:, :, None], factor).mean(axis=(1, 3))[:, :, 0] >= need)
+
+
+def _blocks(image: np.ndarray, factor: int) -> np.ndarray:
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    if factor < 1 or height < 1 or width < 1:
+        raise ShapeError(
+            f"downscale must leave at least one pixel of {image.shape[1]}x{image.shape[0]}, got {factor}"
+        )
+    return image[: height * factor, : width * factor].reshape(height, factor, width, factor, image.shape[2])

@@ -1,0 +1,51 @@
+"""Files of any kind: atomic writes, and JSON with errors that name the file."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from gs2d.disk import atomic_write, disk_error
+from gs2d.errors import DataError
+
+__all__ = ["atomic_write", "disk_error", "read_json", "write_json"]
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write JSON atomically: UTF-8, two spaces of indent, keys in the given order.
+
+    Raises
+    ------
+    DiskError
+        The file could not be written.
+    ValueError
+        NaN or infinity, which JSON does not have: say ``null`` and the reason.
+    """
+    text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
+    with atomic_write(path, "w") as file:
+        file.write(text + "\n")
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Read a JSON file.
+
+    Raises
+    ------
+    DataError
+        Missing, unreadable or not JSON; names the file, and the line where it stops being JSON.
+    """
+    name = os.fspath(path)
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")  # Windows tools write a byte-order mark
+    except UnicodeDecodeError as error:
+        raise DataError(f"{name} must be JSON in UTF-8, got a byte that is not at offset {error.start}") from error
+    except OSError as error:
+        raise DataError(f"cannot read {name}: {error.strerror or error}") from error
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise DataError(f"{name} must be JSON, got: {error}; is the file complete?") from error
+    except RecursionError as error:
+        raise DataError(f"{name} must be JSON, got brackets nested too deeply to read") from error
