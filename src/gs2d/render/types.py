@@ -30,6 +30,9 @@ class RasterSettings:
         Colour behind everything, in [0, 1].
     sh_degree : int
         SH degree that is evaluated (coefficients above it are ignored and get zero gradient).
+    lowpass_depth : str
+        Depth of a pair where the low-pass filter wins: "center" (the splat centre's), or "plane" (the ray-plane depth
+        of the current official code; reference backend only).
     """
 
     near: float = 0.2
@@ -41,6 +44,7 @@ class RasterSettings:
     lowpass_px: float = math.sqrt(2.0) / 2.0
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = 3
+    lowpass_depth: str = "center"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,209 @@
+"""The one public rasterizer, and the contract that every backend keeps. docs/math.md holds the formulas.
+
+The contract
+============
+Each number has a test in ``tests/render/test_contract.py`` that runs on every available backend.
+Notation: a splat has centre p (camera frame, depth z_c = p.z), tangents t_u, t_v, normal t_w, scales s_u, s_v,
+opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_min).
+
+ 1. *Pixel centres.* Pixel (column i, row j) is sampled at (i + 0.5, j + 0.5). The principal point is general.
+ 2. *Order.* Splats are blended by increasing z_c; equal z_c by increasing row index.
+ 3. *Intersection.* The ray of the pixel meets the splat's plane at p + u s_u t_u + v s_v t_v, at depth z along the
+    optical axis; rho3d = u^2 + v^2. Where the ray is parallel to the plane or meets it at z <= 0 there is no hit and
+    rho3d is infinite.
+ 4. *Low-pass filter.* rho2d = |pixel - c|^2 / lowpass_px^2, c the projection of p; rho = min(rho3d, rho2d). Where
+    rho3d <= rho2d the pair's depth is z; where the filter wins it is z_c (``lowpass_depth="center"``), or z
+    (``"plane"``: reference only; z_c where there is no hit).
+ 5. *Near.* A splat with z_c <= near is culled whole; a pair with depth < near is skipped. Splats that cross the near
+    plane or the camera plane are otherwise drawn like any other.
+ 6. *Alpha.* alpha = o exp(-rho / 2). A pair with alpha < alpha_min is skipped (equivalently rho > k^2; the footprint
+    follows opacity); a splat with o < alpha_min is culled. alpha is then limited to alpha_max; the limit passes
+    gradients unchanged.
+ 7. *Blending and early stop.* With T = 1 in front, each pair has weight w = alpha T, and then T becomes
+    T (1 - alpha). A pixel stops *before* the pair that would bring T below transmittance_min.
+    color = sum w c + T_final background; alpha image = sum w = 1 - T_final.
+ 8. *Normal* = sum w n in the world frame, not normalised. n is t_w, or -t_w where <t_w, p> > 0: the side that faces
+    the camera as seen at the splat's centre. The choice carries no gradient.
+ 9. *Depth.* depth_mean = sum w z / sum w. depth_median = depth of the last blended pair whose incoming T > 0.5; its
+    gradient goes to that depth alone. Both are 0 where nothing was blended.
+10. *Distortion* = sum over pairs i > j of w_i w_j (m_i - m_j)^2, m = far / (far - near) (1 - near / z). Gradients go
+    to weights and depths.
+11. *Colour* c = SH of degree min(settings.sh_degree, splats.sh_degree) along the unit vector from the camera centre to
+    the splat's centre, + 0.5, clamped at 0; clamped channels have zero gradient. The direction carries gradient.
+12. *Gradients* reach means, quats, log_scales, opacity_logits, sh0, shN and screen_probe; not the camera, settings,
+    radii, nor any threshold or order.
+13. *Screen probe.* screen_probe is zeros, [N, 2] or [N, 4]. Columns 0:2 of its gradient are
+    z_c (W/2, H/2) * dL/d(Tu.z, Tv.z), where Tu, Tv are the first rows of the splat-to-pixel map
+    (x z, y z, z) = (Tu, Tv, Tw) (u, v, 1): the densification signal of 2DGS. Only pairs with rho3d <= rho2d count.
+    Columns 2:4 are the same with the absolute value taken per pixel before the sum over pixels (AbsGS).
+14. *Radii* [N] px. The screen box of a splat is the bounding box of its projected disc rho3d <= k^2, united with the
+    low-pass disc |pixel - c| <= lowpass_px k, clipped to the image [0, W] x [0, H]. If the disc reaches the camera
+    plane (z_c <= k |(s_u t_u.z, s_v t_v.z)|) the box is the whole image. The radius is half the longer side of the box;
+    0 for culled splats and where the box holds no pixel centre.
+15. *Empty.* Without splats, or where no splat blends: the background, and 0 in all other images.
+16. *Non-finite.* A splat with a NaN or infinity in its parameters (SH: the evaluated degree), or a zero quaternion, is
+    culled: it changes no pixel, has radius 0 and zero gradients.
+17. *Splat errors.* e_i = sum over pixels inside the image with rho <= error_cutoff^2 (3, 4, 5 apply; opacity and 6 do
+    not) of sum over channels |c_i - image|. Pixels where mask is False do not count. With ``occlusion`` a pixel counts
+    only while it has not stopped (7) at or before this splat. No gradients. Culled splats have e_i = 0 (a splat is not
+    culled for its opacity here).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.errors import BackendError, ShapeError
+from gs2d.render.backend import Backend, get_backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.sh import MAX_DEGREE, sh_degree_of
+from gs2d.splats import Splats
+
+__all__ = ["rasterize", "splat_errors"]
+
+
+def rasterize(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
+    *,
+    backend: str | Backend = "auto",
+    screen_probe: Tensor | None = None,
+) -> RenderOutput:
+    """Render splats: all images of one view, differentiable (the contract is in this module's docstring).
+
+    Parameters
+    ----------
+    splats : Splats
+        N splats, float32, or float64 for the reference backend.
+    camera : Camera
+    settings : RasterSettings
+    backend : str or Backend
+        "auto", "cpu", "cuda" or "reference" (``gs2d.render.backend``).
+    screen_probe : Tensor [N, 2] or [N, 4], optional
+        Zeros with ``requires_grad``; its gradient is the densification signal (rule 13).
+
+    Returns
+    -------
+    RenderOutput
+        Images in the dtype and on the device of the splats.
+
+    Raises
+    ------
+    ShapeError
+        If a tensor has another shape or dtype than stated, or a setting is out of range.
+    BackendError
+        If the backend cannot run here, or not with these inputs.
+    """
+    chosen = backend if isinstance(backend, Backend) else get_backend(backend)
+    settings = _checked(splats, settings, chosen)
+    if screen_probe is not None:
+        columns = screen_probe.shape[1] if screen_probe.dim() == 2 else 0
+        if columns not in (2, 4):
+            raise ShapeError(f"screen_probe must be [N, 2] or [N, 4], got {list(screen_probe.shape)}")
+        check_shapes({"means": (splats.means, "N 3"), "screen_probe": (screen_probe, f"N {columns}")})
+        if screen_probe.dtype != splats.dtype or screen_probe.device != splats.device:
+            raise ShapeError(
+                f"screen_probe must be {splats.dtype} on {splats.device} like the splats, "
+                f"got {screen_probe.dtype} on {screen_probe.device}"
+            )
+        if bool((screen_probe.detach() != 0).any()):
+            raise ShapeError("screen_probe must be all zeros (its gradient is what matters), got other values")
+    return chosen.rasterize(splats, camera, settings, screen_probe)
+
+
+def splat_errors(
+    splats: Splats,
+    camera: Camera,
+    image: Tensor,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
+    *,
+    backend: str | Backend = "auto",
+    mask: Tensor | None = None,
+    occlusion: bool = False,
+) -> Tensor:
+    """The inner sum of the paper's E_i (Eq. 8) for one view: colour error of each splat over its footprint (rule 17).
+
+    Parameters
+    ----------
+    splats, camera, settings, backend
+        As for :func:`rasterize`.
+    image : Tensor [H, W, 3]
+        The photograph, in [0, 1], same dtype as the splats.
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+    occlusion : bool
+        Count a pixel only while it has not stopped at or before the splat. The paper does not.
+
+    Returns
+    -------
+    Tensor [N]
+        Sum over pixels and channels of |c_i - image|; no gradient.
+
+    Raises
+    ------
+    ShapeError, BackendError
+        As for :func:`rasterize`.
+    """
+    chosen = backend if isinstance(backend, Backend) else get_backend(backend)
+    settings = _checked(splats, settings, chosen)
+    H, W = camera.height, camera.width
+    arrays: dict[str, tuple[Tensor, str]] = {"image": (image, f"{H} {W} 3")}
+    if mask is not None:
+        arrays["mask"] = (mask, f"{H} {W}")
+        if mask.dtype != torch.bool:
+            raise ShapeError(f"mask must be bool (False = ignore), got {mask.dtype}")
+    check_shapes(arrays)
+    if image.dtype != splats.dtype:
+        raise ShapeError(f"image must be {splats.dtype} like the splats, in [0, 1], got {image.dtype}")
+    return chosen.splat_errors(splats, camera, image, settings, mask, occlusion)
+
+
+def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> RasterSettings:
+    """Validate splats and settings; return the settings with the SH degree that the splats can hold."""
+    check_shapes(
+        {
+            "means": (splats.means, "N 3"),
+            "quats": (splats.quats, "N 4"),
+            "log_scales": (splats.log_scales, "N 2"),
+            "opacity_logits": (splats.opacity_logits, "N"),
+            "sh0": (splats.sh0, "N 1 3"),
+            "shN": (splats.shN, "N _ 3"),
+        }
+    )
+    held = sh_degree_of(1 + splats.shN.shape[1])
+    for name, tensor in splats.items():
+        if tensor.dtype != splats.dtype or tensor.dtype not in (torch.float32, torch.float64):
+            raise ShapeError(f"{name} must be float32 or float64 like means ({splats.dtype}), got {tensor.dtype}")
+        if tensor.device != splats.device:
+            raise ShapeError(f"{name} must be on {splats.device} like means, got {tensor.device}")
+    _check_settings(settings)
+    if settings.lowpass_depth != "center" and backend.name != "reference":
+        raise BackendError(
+            f"lowpass_depth={settings.lowpass_depth!r} is a setting of the reference backend, got backend "
+            f"{backend.name!r}: use backend='reference' or lowpass_depth='center'"
+        )
+    return replace(settings, sh_degree=min(settings.sh_degree, held))
+
+
+def _check_settings(s: RasterSettings) -> None:
+    def require(holds: bool, field: str, rule: str) -> None:
+        if not holds:
+            raise ShapeError(f"RasterSettings.{field} must be {rule}, got {getattr(s, field)!r}")
+
+    require(math.isfinite(s.near) and s.near > 0, "near", "positive")
+    require(math.isfinite(s.far) and s.far > s.near, "far", f"larger than near ({s.near})")
+    require(0 < s.alpha_min < 1, "alpha_min", "in (0, 1)")
+    require(s.alpha_min <= s.alpha_max < 1, "alpha_max", f"in [alpha_min, 1) = [{s.alpha_min:.6g}, 1)")
+    require(0 < s.transmittance_min < 0.5, "transmittance_min", "in (0, 0.5)")
+    require(math.isfinite(s.error_cutoff) and s.error_cutoff > 0, "error_cutoff", "positive")
+    require(math.isfinite(s.lowpass_px) and s.lowpass_px > 0, "lowpass_px", "positive")
+    require(len(s.background) == 3 and all(0 <= b <= 1 for b in s.background), "background", "3 numbers in [0, 1]")
+    require(0 <= s.sh_degree <= MAX_DEGREE, "sh_degree", f"0 to {MAX_DEGREE}")
+    require(s.lowpass_depth in ("center", "plane"), "lowpass_depth", "'center' or 'plane'")
