@@ -1,0 +1,133 @@
+"""Light in the demo scene: a sky with occlusion, a large lamp with soft shadows, a highlight, and texture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from gs2d.data.toy_rays import Hits, occluded
+from gs2d.data.toy_scene import ToyScene
+
+_LAMP = np.array([0.55, -0.62, 1.25]) / np.linalg.norm([0.55, -0.62, 1.25])  # unit, towards the lamp
+_LAMP_COLOR = np.array([1.42, 1.30, 1.12])
+_LAMP_SPREAD = 0.16  # half-angle of the lamp, radians
+_LIFT = 2e-3  # wu, shadow rays start this far above the surface
+
+
+@dataclass(frozen=True, eq=False)
+class BakedLight:
+    """Light that reaches each vertex, computed once: nothing here depends on the camera.
+
+    Attributes
+    ----------
+    sky : ndarray [P, 3]
+        Irradiance from the sky and the ground, divided by pi; 1 is an open, white, upward-facing patch.
+    lamp : ndarray [P]
+        Fraction of the lamp that is seen, times the cosine of its incidence.
+    """
+
+    sky: np.ndarray
+    lamp: np.ndarray
+
+
+def bake(scene: ToyScene, *, sky_directions: int = 72, lamp_directions: int = 14, threads: int = 2) -> BakedLight:
+    """Cast shadow rays from every vertex to points of the sky and of the lamp."""
+    patch = scene.patch
+    sky_rays = _sphere(sky_directions)
+    lamp_rays = _cone(_LAMP, _LAMP_SPREAD, lamp_directions)
+
+    def seen(direction: np.ndarray) -> np.ndarray:
+        cosine = np.maximum(patch.normals @ direction, 0.0)
+        facing = np.flatnonzero(cosine > 0)
+        points = patch.vertices[facing] + _LIFT * patch.normals[facing]
+        cosine[facing[occluded(patch.vertices, patch.faces, points, direction)]] = 0.0
+        return cosine
+
+    with ThreadPoolExecutor(threads) as pool:
+        sky = _sum(pool.map(seen, sky_rays), lambda k, c: c[:, None] * _sky(sky_rays[k]), (len(patch.vertices), 3))
+        lamp = _sum(pool.map(seen, lamp_rays), lambda k, c: c, (len(patch.vertices),))
+    return BakedLight(sky * 4 / sky_directions, lamp / lamp_directions)
+
+
+def _sum(
+    items: Iterable[np.ndarray], weigh: Callable[[int, np.ndarray], np.ndarray], shape: tuple[int, ...]
+) -> np.ndarray:
+    """A sum in the order of the items, so that it does not depend on the threads."""
+    total = np.zeros(shape)
+    for k, item in enumerate(items):
+        total += weigh(k, item)
+    return total
+
+
+def _sky(direction: np.ndarray) -> np.ndarray:
+    """Radiance of the surroundings: bluish above, white at the horizon, a warm ground below."""
+    z = float(direction[2])
+    zenith, horizon, ground = np.array([0.66, 0.76, 0.92]), np.array([0.86, 0.84, 0.80]), np.array([0.42, 0.38, 0.34])
+    return horizon + (zenith - horizon) * z if z > 0 else horizon + (ground - horizon) * min(-3 * z, 1.0)
+
+
+def _sphere(count: int) -> np.ndarray:
+    """Directions [count, 3] spread evenly by the golden angle."""
+    k = np.arange(count) + 0.5
+    z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+def _cone(axis: np.ndarray, spread: float, count: int) -> np.ndarray:
+    """Directions [count, 3] spread evenly within an angle of an axis."""
+    k = np.arange(count) + 0.5
+    r, angle = np.tan(spread) * np.sqrt(k / count), np.pi * (1 + np.sqrt(5)) * k
+    across = np.cross([0.0, 0.0, 1.0], axis)
+    across /= np.linalg.norm(across)
+    d = axis + r[:, None] * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across))
+    return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))
+
+
+def shade(scene: ToyScene, light: BakedLight, hits: Hits, eye: np.ndarray) -> np.ndarray:
+    """Linear colour [H, W, 3] of every ray of a camera at ``eye``; 0 where nothing was hit.
+
+    Diffuse: texture times the interpolated baked light. Highlight: Blinn-Phong, lamp only.
+    """
+    color = np.zeros((*hits.face.shape, 3), dtype=np.float32)
+    mask = hits.face >= 0
+    face, weights = hits.face[mask], hits.weights[mask]
+    corner = scene.patch.faces[face]  # [hits, 3]
+
+    def at_hit(attribute: np.ndarray) -> np.ndarray:
+        values = attribute.astype(np.float32, copy=False)
+        first, second, third = (values[corner[:, k]] for k in range(3))
+        w = weights if values.ndim == 1 else weights[:, None, :]
+        return np.asarray(first * w[..., 0] + second * w[..., 1] + third * w[..., 2])
+
+    uv, part = at_hit(scene.patch.uvs), scene.part_of_face[face]
+    lamp = at_hit(light.lamp)
+    shaded = _albedo(scene, uv, part) * (at_hit(light.sky) * 0.62 + lamp[:, None] * _LAMP_COLOR.astype(np.float32) * 0.62)
+
+    gloss = np.array([p.gloss for p in scene.parts], dtype=np.float32)[part]
+    position, normal = at_hit(scene.patch.vertices), at_hit(scene.patch.normals)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+    view = eye.astype(np.float32) - position
+    half = view / np.linalg.norm(view, axis=1, keepdims=True) + _LAMP.astype(np.float32)
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    facing = np.maximum((normal * half).sum(axis=1), 0.0)
+    cosine = np.maximum(normal @ _LAMP.astype(np.float32), 0.05)
+    visible = np.minimum(lamp / cosine, 1.0)
+    shaded += (gloss * visible * facing**40)[:, None] * _LAMP_COLOR.astype(np.float32)
+    color[mask] = shaded
+    return color
+
+
+def _albedo(scene: ToyScene, uv: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Texture colour [hits, 3] at (u, v), the nearest texel (pixels are supersampled)."""
+    albedo = np.empty((len(uv), 3), dtype=np.float32)
+    for k, item in enumerate(scene.parts):
+        chosen = np.flatnonzero(part == k)
+        rows, columns = item.texture.shape[:2]
+        column = np.clip((uv[chosen, 0] * columns).astype(np.int64), 0, columns - 1)
+        row = np.clip((uv[chosen, 1] * rows).astype(np.int64), 0, rows - 1)
+        albedo[chosen] = item.texture[row, column]
+    return albedo
