@@ -1,0 +1,212 @@
+"""The commands and their options, as dataclasses that tyro turns into a command line. No torch: `--help` is instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg, subcommand
+
+Backend = Literal["auto", "cpu", "cuda", "reference"]
+RunPath = Annotated[Positional[Path], arg(metavar="RUN")]
+Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """Options of every command."""
+
+    quiet: bool = False
+    """No progress and no tables; errors only."""
+    json: bool = False
+    """Results as JSON on stdout, and nothing else there."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingCommon(Common):
+    """Options of the commands that train."""
+
+    backend: Backend = "auto"
+    """Rasterizer: auto takes the fastest that this machine has; `gs2d doctor` lists them."""
+    seed: int = 0
+    """Seed of every random choice; the same seed gives the same bytes."""
+    threads: int | None = None
+    """CPU threads (default: all cores that this process may use)."""
+    resume: bool = False
+    """Continue the run in --out from its last checkpoint (or start, if there is none)."""
+    overwrite: bool = False
+    """Replace the run in --out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(TrainingCommon):
+    """Make a small synthetic capture, train 2DGS-R on it, extract and score the mesh, write the report."""
+
+    out: Path = Path("runs/demo")
+    """Run folder; the capture goes to its sub-folder `capture`. An earlier demo there is replaced."""
+    schedule_scale: float | None = None
+    """Fraction of the full schedule (default: what fits five minutes on two cores)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(TrainingCommon):
+    """Posed photographs to splats, mesh and report."""
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder of the capture: COLMAP, Blender or nerfstudio transforms, DTU."""
+    out: Annotated[Path, arg(metavar="RUN")]
+    """Run folder to make."""
+    recipe: str = "2dgs-r"
+    """What is trained; `gs2d recipes` lists them."""
+    protocol: str = "auto"
+    """What depends on the data set: background, depth, near plane, fusion limits."""
+    format: Literal["auto", "blender", "nerfstudio", "dtu", "colmap"] = "auto"
+    """Format of the capture."""
+    downscale: int = 1
+    """Shrink the photographs by this integer, area-filtered."""
+    schedule_scale: float = 1.0
+    """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
+    start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
+    """Take the stages that this recipe shares with another run from that run."""
+    cache: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
+    overrides: Overrides = ()
+    """Change the recipe, e.g. --set refine.iterations=2000; may be repeated."""
+    checkpoint_every: int = 1000
+    """Iterations between checkpoints."""
+    checkpoint_seconds: float = 120.0
+    """Seconds between checkpoints, whichever comes first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh(Common):
+    """Extract the mesh of a trained run again, with other settings."""
+
+    run: RunPath
+    """Run folder."""
+    out: Path | None = None
+    """Mesh file (default: mesh.ply in the run)."""
+    voxel: float | None = None
+    """Voxel size in world units (default: from the scene)."""
+    truncation: float | None = None
+    """Truncation distance in world units (default: from the voxel size)."""
+    depth_limit: float | None = None
+    """Ignore depth beyond this, in world units (default: from the scene)."""
+    bbox: tuple[float, float, float, float, float, float] | None = None
+    """Keep only this box: x0 y0 z0 x1 y1 z1."""
+    depth: Literal["mean", "median"] | None = None
+    """Depth that is fused (default: the run's protocol)."""
+    keep_components: int | None = None
+    """Keep the so many largest connected pieces (default: all that are not small)."""
+    threads: int | None = None
+    """CPU threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Common):
+    """Render a trained run to PNG files."""
+
+    run: RunPath
+    """Run folder."""
+    split: Literal["test", "train"] = "test"
+    """Which views."""
+    orbit: int = 0
+    """Instead of the views, so many frames of a circle around the scene."""
+    out: Path | None = None
+    """Folder for the pictures (default: renders/SPLIT in the run)."""
+    threads: int | None = None
+    """CPU threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Common):
+    """Score a trained run: PSNR, SSIM, LPIPS; with a ground truth also Chamfer distance and F-score of the mesh."""
+
+    run: RunPath
+    """Run folder."""
+    ground_truth: Annotated[Path | None, arg(metavar="MESH_OR_POINTS")] = None
+    """PLY file of the true surface, in the frame of the capture."""
+    thresholds: tuple[float, ...] = ()
+    """Distances at which precision and recall are taken, world units (default: fractions of the true surface's size)."""
+    lpips_weights: Path | None = None
+    """VGG-16 and LPIPS weights for the LPIPS metric."""
+    threads: int | None = None
+    """CPU threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Common):
+    """Write the splats of a run in another layout."""
+
+    run: RunPath
+    """Run folder."""
+    out: Annotated[Path, arg(metavar="FILE")]
+    """PLY file to write."""
+    layout: Literal["2dgs", "3dgs"] = "3dgs"
+    """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Common):
+    """Write report.html of a run again."""
+
+    run: RunPath
+    """Run folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipesList(Common):
+    """All recipes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipesShow(Common):
+    """One recipe in full."""
+
+    name: Positional[str]
+    """Name of the recipe."""
+    schedule_scale: float = 1.0
+    """As in `gs2d train`."""
+    overrides: Overrides = ()
+    """As in `gs2d train`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipes:
+    """List the recipes, or show one."""
+
+    action: (
+        Annotated[RecipesList, subcommand("list", prefix_name=False)]
+        | Annotated[RecipesShow, subcommand("show", prefix_name=False)]
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor(Common):
+    """Say what this machine can run, and why not the rest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Info(Common):
+    """Show what a run folder, a capture or a PLY file holds."""
+
+    path: Annotated[Positional[Path], arg(metavar="PATH")]
+    """Run folder, capture folder or PLY file."""
+
+
+Command = (
+    Annotated[Demo, subcommand("demo")]
+    | Annotated[Train, subcommand("train")]
+    | Annotated[Mesh, subcommand("mesh")]
+    | Annotated[Render, subcommand("render")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[RecipesList, subcommand("recipes")]
+    | Annotated[Doctor, subcommand("doctor")]
+    | Annotated[Info, subcommand("info")]
+)

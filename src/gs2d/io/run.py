@@ -1,0 +1,384 @@
+"""The run folder: everything that defines a run, what it logged, its checkpoints and results.
+
+::
+
+    RUN/
+      run.json       what defines the run (recipe, protocol, scene, backend, seed ...), versions, machine
+      events.jsonl   one JSON object a line; after a resume it reads as if the run had never stopped
+      checkpoints/   <stage number>-<stage>-<iteration>.pt (the last two), <stage number>-<stage>-end.pt (all)
+      metrics.json  splats.ply  mesh.ply  renders/  report.html
+      lock           held by the process that trains; the kernel frees it when that process dies
+
+Every file is written to a temporary name and renamed, except the log, which only grows: each checkpoint holds the length
+of the log at its iteration, and a resume cuts the log there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gs2d.disk import atomic_write, disk_error
+from gs2d.errors import RunError
+from gs2d.io.files import read_json, write_json
+
+RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", "lock"
+CHECKPOINTS, RENDERS = "checkpoints", "renders"
+SPLATS, MESH, REPORT = "splats.ply", "mesh.ply", "report.html"
+FORMAT = 1
+KEPT_CHECKPOINTS = 2
+_CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
+
+
+@dataclass(frozen=True)
+class CheckpointFile:
+    """A checkpoint on disk; they sort by how far training had come."""
+
+    path: Path
+    stage_index: int
+    stage: str
+    iteration: int | None  # of the stage; None = its end
+
+    @property
+    def progress(self) -> tuple[int, float]:
+        """Sort key."""
+        return self.stage_index, float("inf") if self.iteration is None else float(self.iteration)
+
+
+class EventLog:
+    """``events.jsonl``: append-only, one JSON object a line, flushed at each line."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def append(self, event: dict[str, Any]) -> None:
+        """Write one event.
+
+        Raises
+        ------
+        DiskError
+            The line did not fit; the log is cut back to its last whole line.
+        """
+        line = (json.dumps(event, allow_nan=False, sort_keys=True) + "\n").encode()
+        self.append_text(line)
+
+    def append_text(self, lines: bytes) -> None:
+        """Write whole lines at once (the log of a cached stage)."""
+        start = self.size
+        try:
+            with open(self.path, "ab") as file:
+                file.write(lines)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self.cut(start)
+            raise disk_error(self.path, error) from error
+
+    @property
+    def size(self) -> int:
+        """Bytes of the log."""
+        return self.path.stat().st_size if self.path.exists() else 0
+
+    def cut(self, size: int) -> None:
+        """Forget everything after ``size`` bytes (and an unfinished last line)."""
+        if not self.path.exists():
+            return
+        with open(self.path, "r+b") as file:
+            kept = file.read(size)
+            file.truncate(kept.rfind(b"\n") + 1)
+
+    def sync(self) -> None:
+        """Bring the log to the disk, before a checkpoint that refers to it."""
+        if self.path.exists():
+            with open(self.path, "rb") as file:
+                os.fsync(file.fileno())
+
+    def read(self) -> list[dict[str, Any]]:
+        """All whole events."""
+        if not self.path.exists():
+            return []
+        text = self.path.read_text()
+        return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+
+
+class RunFolder:
+    """One run on disk. Use :func:`claim_run` to make or continue one, :func:`open_run` to read a finished one."""
+
+    def __init__(self, path: Path, made: tuple[Path, ...] = ()) -> None:
+        self.path = path
+        self.made = made  # folders that did not exist before
+        self.events = EventLog(path / EVENTS)
+
+    def file(self, name: str) -> Path:
+        """Path of a file of the run."""
+        return self.path / name
+
+    # -- definition and results ----------------------------------------------------------------------------------------
+    def write_definition(self, definition: dict[str, Any]) -> None:
+        """Write ``run.json``: the definition, with versions, machine and time beside it."""
+        extra = {"format": FORMAT, "versions": versions(), "machine": machine(), "created": now()}
+        write_json(self.file(RUN_JSON), {**extra, **definition})
+
+    def definition(self) -> dict[str, Any]:
+        """What ``run.json`` holds.
+
+        Raises
+        ------
+        RunError
+            Written by a later gs2d.
+        """
+        data = dict(read_json(self.file(RUN_JSON)))
+        if data.get("format") != FORMAT:
+            raise RunError(
+                f"{self.file(RUN_JSON)} has format {data.get('format')!r}, expected {FORMAT}; use the gs2d that made it"
+            )
+        return data
+
+    def metrics(self) -> dict[str, Any]:
+        """What ``metrics.json`` holds; ``{"stages": []}`` before the first stage is finished."""
+        path = self.file(METRICS)
+        return dict(read_json(path)) if path.exists() else {"stages": []}
+
+    def write_metrics(self, metrics: dict[str, Any]) -> None:
+        """Replace ``metrics.json``."""
+        write_json(self.file(METRICS), metrics)
+
+    # -- checkpoints ---------------------------------------------------------------------------------------------------
+    def checkpoints(self) -> list[CheckpointFile]:
+        """All checkpoints, oldest first."""
+        found = []
+        for path in self.file(CHECKPOINTS).glob("*.pt"):
+            match = _CHECKPOINT_NAME.fullmatch(path.name)
+            if match:
+                iteration = None if match[3] == "end" else int(match[3])
+                found.append(CheckpointFile(path, int(match[1]), match[2], iteration))
+        return sorted(found, key=lambda checkpoint: checkpoint.progress)
+
+    def save_checkpoint(self, stage_index: int, stage: str, iteration: int | None, payload: dict[str, Any]) -> Path:
+        """Write a checkpoint (``iteration=None``: the stage's end) and drop those it makes needless.
+
+        Mid-stage checkpoints go when their stage ends, and all but the last two before that.
+        """
+        folder = self.file(CHECKPOINTS)
+        make_folder(folder)
+        number = "end" if iteration is None else f"{iteration:07d}"
+        path = folder / f"{stage_index}-{stage}-{number}.pt"
+        self.events.sync()
+        save_tensors(path, {**payload, "events_bytes": self.events.size})
+        middle = [c for c in self.checkpoints() if c.iteration is not None]
+        needless = middle if iteration is None else middle[:-KEPT_CHECKPOINTS]
+        for checkpoint in needless:
+            checkpoint.path.unlink(missing_ok=True)
+        return path
+
+    # -- ownership -----------------------------------------------------------------------------------------------------
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the run against other processes.
+
+        Raises
+        ------
+        RunError
+            Another process trains in this folder.
+        """
+        try:
+            file = open(self.file(LOCK), "a+b")  # noqa: SIM115 - closed below; the lock lives as long as the file
+        except OSError as error:
+            raise disk_error(self.file(LOCK), error) from error
+        try:
+            if not _try_lock(file.fileno()):
+                raise RunError(f"{self.path} is being trained by another process; wait for it or choose another --out")
+            yield
+        finally:
+            file.close()
+
+    def clear(self) -> None:
+        """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
+        for name in (CHECKPOINTS, RENDERS):
+            shutil.rmtree(self.file(name), ignore_errors=True)
+        for name in (EVENTS, METRICS, SPLATS, MESH, REPORT, RUN_JSON):
+            self.file(name).unlink(missing_ok=True)
+
+    def discard(self) -> None:
+        """Undo a run that failed before it had anything worth keeping: its files and the folders made for it."""
+        self.clear()
+        self.file(LOCK).unlink(missing_ok=True)
+        for folder in self.made:
+            with contextlib.suppress(OSError):  # not empty: somebody else's files
+                folder.rmdir()
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run."""
+    return (path / RUN_JSON).is_file()
+
+
+def open_run(path: str | Path) -> RunFolder:
+    """An existing run, for reading.
+
+    Raises
+    ------
+    RunError
+        The folder does not exist or holds no run.
+    """
+    path = Path(path)
+    if not is_run(path):
+        got = "a folder without run.json" if path.is_dir() else "a file" if path.exists() else "nothing"
+        raise RunError(f"expected a run folder at {path}, found {got}; `gs2d train SCENE --out {path}` makes one")
+    return RunFolder(path)
+
+
+def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple[str, ...] = ()) -> None:
+    """Raise the error that :func:`claim_run` would raise, before anything slow happens; writes nothing.
+
+    Raises
+    ------
+    RunError
+        A file, a folder that holds a run (without ``resume`` or ``overwrite``), or one that holds something else.
+    """
+    path = Path(path)
+    if resume and overwrite:
+        raise RunError("--resume and --overwrite exclude each other; give one")
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise RunError(f"--out must be a folder, {path} is a file")
+    if is_run(path):
+        if not (resume or overwrite):
+            raise RunError(f"{path} already holds a run; continue it with --resume, replace it with --overwrite")
+        return
+    others = sorted(entry.name for entry in path.iterdir() if entry.name not in (LOCK, *allowed))
+    if others:
+        raise RunError(
+            f"--out must be new, empty or a run; {path} holds other files ({others[0]}); choose another folder"
+        )
+
+
+def claim_run(path: str | Path, *, resume: bool, overwrite: bool, allowed: tuple[str, ...] = ()) -> RunFolder:
+    """Make a run folder, or take over an existing run.
+
+    Parameters
+    ----------
+    path : path
+    resume, overwrite : bool
+        What to do with a run that is already there; ``overwrite`` deletes the run's own files only.
+    allowed : tuple of str
+        Names that may already be in a folder that holds no run.
+
+    Raises
+    ------
+    RunError, DiskError
+    """
+    check_claim(path, resume=resume, overwrite=overwrite, allowed=allowed)
+    path = Path(path)
+    made = make_folder(path)
+    run = RunFolder(path, made)
+    if overwrite:
+        with run.locked():
+            run.clear()
+    return run
+
+
+def make_folder(path: Path) -> tuple[Path, ...]:
+    """Make a folder and its parents; returns those that were made, innermost first.
+
+    Raises
+    ------
+    DiskError
+    """
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise disk_error(path, error) from error
+    return tuple(missing)
+
+
+def save_tensors(path: Path, payload: dict[str, Any]) -> None:
+    """``torch.save`` to a temporary name, then rename.
+
+    Raises
+    ------
+    DiskError
+    """
+    import torch
+
+    with atomic_write(path) as file:
+        torch.save(payload, file)
+
+
+def load_tensors(path: Path) -> dict[str, Any]:
+    """Read what :func:`save_tensors` wrote; tensors and plain values only, nothing is executed.
+
+    Raises
+    ------
+    RunError
+        Missing, cut short, or not such a file.
+    """
+    import pickle
+
+    import torch
+
+    try:
+        return dict(torch.load(path, map_location="cpu", weights_only=True))
+    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        raise RunError(f"{path} is not a readable checkpoint ({str(error).splitlines()[0]}); delete it") from error
+
+
+def versions() -> dict[str, str]:
+    """Versions that decide the result."""
+    found = {"python": platform.python_version()}
+    for name in ("2dgs-r", "torch", "numpy", "scipy", "pillow"):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """The machine, as far as times depend on it."""
+    model = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                model = line.partition(":")[2].strip()
+                break
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"system": f"{platform.system()} {platform.release()}", "processor": model, "cores": cores}
+
+
+def now() -> str:
+    """UTC time, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _try_lock(descriptor: int) -> bool:
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+
+else:
+    import fcntl
+
+    def _try_lock(descriptor: int) -> bool:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True

@@ -1,0 +1,262 @@
+"""Run folders: who may write where, what survives a kill, what a resume sees."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import multiprocessing
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from gs2d.errors import DiskError, RunError
+from gs2d.io import run as run_module
+from gs2d.io.run import CheckpointFile, EventLog, RunFolder, claim_run, load_tensors, open_run, save_tensors
+
+DEFINITION = {"recipe": {"name": "2dgs-r"}}
+
+
+def new_run(path: Path) -> RunFolder:
+    run = claim_run(path, resume=False, overwrite=False)
+    run.write_definition(DEFINITION)
+    return run
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_a_new_run_has_a_definition_with_versions_and_machine(tmp_path: Path) -> None:
+    run = new_run(tmp_path / "a" / "b")
+    written = open_run(tmp_path / "a" / "b").definition()
+    assert written["recipe"] == DEFINITION["recipe"]
+    assert written["versions"]["torch"] == importlib.metadata.version("torch")
+    assert written["machine"]["cores"] >= 1
+    assert names(run.path) == ["run.json"]
+
+
+def test_a_folder_that_holds_a_run_is_refused_unless_resumed_or_overwritten(tmp_path: Path) -> None:
+    new_run(tmp_path / "run")
+    with pytest.raises(RunError, match="already holds a run; continue it with --resume, replace it with --overwrite"):
+        claim_run(tmp_path / "run", resume=False, overwrite=False)
+    assert claim_run(tmp_path / "run", resume=True, overwrite=False).definition()["recipe"] == DEFINITION["recipe"]
+
+
+def test_overwriting_deletes_the_files_of_the_run_and_nothing_else(tmp_path: Path) -> None:
+    run = new_run(tmp_path / "run")
+    run.save_checkpoint(0, "surface", 10, {"x": 1})
+    run.events.append({"kind": "x"})
+    run.write_metrics({"stages": []})
+    (run.path / "notes.txt").write_text("mine")
+    claim_run(run.path, resume=False, overwrite=True)
+    assert names(run.path) == ["lock", "notes.txt"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_with_other_files_is_never_taken(tmp_path: Path, overwrite: bool) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(RunError, match=r"holds other files \(thesis.tex\)"):
+        claim_run(tmp_path, resume=False, overwrite=overwrite)
+    assert names(tmp_path) == ["thesis.tex"]
+
+
+def test_a_file_is_not_a_run_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="must be a folder"):
+        claim_run(tmp_path / "file", resume=False, overwrite=False)
+
+
+def test_resume_and_overwrite_exclude_each_other(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="exclude each other"):
+        claim_run(tmp_path / "run", resume=True, overwrite=True)
+
+
+def test_resuming_an_empty_folder_starts(tmp_path: Path) -> None:
+    assert claim_run(tmp_path, resume=True, overwrite=False).checkpoints() == []
+
+
+@pytest.mark.parametrize(
+    ("make", "found"), [(None, "nothing"), ("folder", "a folder without run.json"), ("file", "a file")]
+)
+def test_opening_what_is_no_run_says_what_was_found(tmp_path: Path, make: str | None, found: str) -> None:
+    path = tmp_path / "x"
+    if make == "folder":
+        path.mkdir()
+    elif make == "file":
+        path.write_text("")
+    with pytest.raises(RunError, match=f"expected a run folder at .*x, found {found}"):
+        open_run(path)
+
+
+def test_a_run_of_a_later_format_is_refused(tmp_path: Path) -> None:
+    run = new_run(tmp_path)
+    (tmp_path / "run.json").write_text(json.dumps({"format": 99}))
+    with pytest.raises(RunError, match="format 99, expected 1"):
+        run.definition()
+
+
+def test_the_log_is_cut_to_the_checkpoint_and_loses_a_half_written_line(tmp_path: Path) -> None:
+    log = EventLog(tmp_path / "events.jsonl")
+    log.append({"iteration": 1})
+    size = log.size
+    log.append({"iteration": 2})
+    with open(log.path, "ab") as file:
+        file.write(b'{"iterat')
+    assert log.read() == [{"iteration": 1}, {"iteration": 2}]
+    log.cut(size)
+    assert log.read() == [{"iteration": 1}]
+    log.append({"iteration": 2})
+    assert log.path.read_text() == '{"iteration": 1}\n{"iteration": 2}\n'
+
+
+def test_a_log_shorter_than_the_checkpoint_says_is_kept_to_its_last_whole_line(tmp_path: Path) -> None:
+    log = EventLog(tmp_path / "events.jsonl")
+    log.path.write_bytes(b'{"a": 1}\n{"b"')
+    log.cut(1000)
+    assert log.path.read_bytes() == b'{"a": 1}\n'
+
+
+def test_a_log_line_that_does_not_fit_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import resource
+
+    log = EventLog(tmp_path / "events.jsonl")
+    log.append({"a": 1})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    import signal
+
+    previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, hard))
+    try:
+        with pytest.raises(DiskError, match="cannot write .*events.jsonl"):
+            log.append({"b": "x" * 100})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, previous)
+    assert log.path.read_bytes() == b'{"a": 1}\n'
+
+
+def test_the_log_refuses_nan(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        EventLog(tmp_path / "events.jsonl").append({"loss": float("nan")})
+
+
+def test_the_last_two_checkpoints_of_a_stage_are_kept_and_its_end_for_ever(tmp_path: Path) -> None:
+    run = new_run(tmp_path)
+    for iteration in (10, 20, 30):
+        run.save_checkpoint(0, "surface", iteration, {"i": iteration})
+    assert [c.iteration for c in run.checkpoints()] == [20, 30]
+    run.save_checkpoint(0, "surface", None, {"i": 40})
+    run.save_checkpoint(1, "appearance", 5, {"i": 45})
+    found = run.checkpoints()
+    assert [(c.stage_index, c.stage, c.iteration) for c in found] == [(0, "surface", None), (1, "appearance", 5)]
+    assert load_tensors(found[-1].path)["i"] == 45
+
+
+def test_a_stage_end_is_later_than_any_iteration_of_the_stage(tmp_path: Path) -> None:
+    end, late = CheckpointFile(tmp_path, 0, "s", None), CheckpointFile(tmp_path, 0, "s", 10**9)
+    assert end.progress > late.progress
+    assert CheckpointFile(tmp_path, 1, "t", 1).progress > end.progress
+
+
+def test_a_checkpoint_remembers_the_length_of_the_log(tmp_path: Path) -> None:
+    run = new_run(tmp_path)
+    run.events.append({"iteration": 1})
+    path = run.save_checkpoint(0, "surface", 1, {"tensor": torch.arange(3)})
+    payload = load_tensors(path)
+    assert payload["events_bytes"] == len('{"iteration": 1}\n')
+    assert torch.equal(payload["tensor"], torch.arange(3))
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "missing"])
+def test_a_broken_checkpoint_is_named(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "x.pt"
+    save_tensors(path, {"a": torch.zeros(1000)})
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:500])
+    elif damage == "garbage":
+        path.write_bytes(b"not a checkpoint")
+    else:
+        path.unlink()
+    with pytest.raises(RunError, match="x.pt is not a readable checkpoint"):
+        load_tensors(path)
+
+
+def test_a_checkpoint_that_would_execute_code_is_refused(tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return os.mkdir, (str(tmp_path / "executed"),)
+
+    torch.save({"x": Evil()}, tmp_path / "x.pt")
+    with pytest.raises(RunError, match="not a readable checkpoint"):
+        load_tensors(tmp_path / "x.pt")
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_checkpoint_that_does_not_fit_leaves_the_older_one_and_no_temporary(tmp_path: Path) -> None:
+    import resource
+    import signal
+
+    run = new_run(tmp_path)
+    run.save_checkpoint(0, "surface", 1, {"a": torch.zeros(10)})
+    before = names(tmp_path / "checkpoints")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    previous = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.raises(DiskError, match=r"cannot write .*surface-0000002.pt: .*; "):
+            run.save_checkpoint(0, "surface", 2, {"a": torch.zeros(1_000_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, previous)
+    assert names(tmp_path / "checkpoints") == before
+
+
+def _hold(path: str, ready: object, done: object) -> None:
+    with RunFolder(Path(path)).locked():
+        ready.set()  # type: ignore[attr-defined]
+        done.wait(30)  # type: ignore[attr-defined]
+
+
+def test_two_processes_cannot_train_in_one_folder_and_a_dead_one_frees_it(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    ready, done = context.Event(), context.Event()
+    process = context.Process(target=_hold, args=(str(tmp_path), ready, done))
+    process.start()
+    assert ready.wait(60)
+    run = RunFolder(tmp_path)
+    with pytest.raises(RunError, match="being trained by another process"), run.locked():
+        pass
+    process.kill()
+    process.join()
+    with run.locked():
+        pass
+
+
+def test_discarding_removes_the_run_and_the_folders_made_for_it(tmp_path: Path) -> None:
+    run = new_run(tmp_path / "a" / "b")
+    with run.locked():
+        run.save_checkpoint(0, "s", 1, {})
+    run.discard()
+    assert names(tmp_path) == []
+
+
+def test_discarding_keeps_folders_that_were_there_before(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    new_run(tmp_path / "mine" / "run").discard()
+    assert names(tmp_path) == ["mine"]
+
+
+def test_a_folder_that_cannot_be_made_is_a_disk_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DiskError, match="a part of the path is a file"):
+        claim_run(tmp_path / "file" / "run", resume=False, overwrite=False)
+
+
+def test_a_package_that_is_not_installed_is_said_to_be_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> str:
+        raise run_module.importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(run_module.importlib.metadata, "version", missing)
+    assert run_module.versions()["torch"] == "not installed"
