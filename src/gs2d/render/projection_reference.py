@@ -1,0 +1,190 @@
+"""First half of the reference rasterizer: from splats to screen (docs/math.md, "Projection" and "Footprint").
+
+Everything here is per splat; :mod:`gs2d.render.reference` is per pair of splat and pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from gs2d.camera import Camera
+from gs2d.geometry import quats_to_matrices
+from gs2d.render.types import RasterSettings
+from gs2d.sh import num_coefficients, sh_to_rgb
+from gs2d.splats import Splats
+
+TILE = 16  # px; side of the blocks of pixels that share a list of splats
+MAX_PAIRS = 1 << 21  # pairs of splat and pixel evaluated at once; bounds the memory
+
+
+@dataclass(frozen=True)
+class ScreenSplats:
+    """M splats that can touch the image, in blending order, as one camera sees them.
+
+    The splat-to-pixel map (x z, y z, z) = (Tu, Tv, Tw) (u, v, 1) is stored relative to the projected centre c, so that
+    float32 keeps its digits: Au = Tu - c_x Tw and Av = Tv - c_y Tw, whose third components are 0.
+    """
+
+    center: Tensor  # [M, 2] px, c
+    Au: Tensor  # [M, 3]
+    Av: Tensor  # [M, 3]
+    Tw: Tensor  # [M, 3] wu; depth z = Tw . (u, v, 1), so Tw.z = z_c
+    opacity: Tensor  # [M]
+    color: Tensor  # [M, 3]
+    normal: Tensor  # [M, 3] world, facing the camera
+
+    def rows(self, index: Tensor) -> ScreenSplats:
+        """The splats picked by an index tensor, in its order."""
+        return ScreenSplats(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some pixels and the splats whose boxes reach them."""
+
+    pixels: Tensor  # [P] row-major index into the image
+    points: Tensor  # [P, 2] px, pixel centres
+    splats: Tensor  # [n] index into ScreenSplats, in blending order
+
+
+def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, for_errors: bool) -> Tensor:
+    """Rows that are not culled by rules 5, 6 and 16, by increasing camera depth, ties by index (rule 2).
+
+    Returns
+    -------
+    Tensor [M] int64
+    """
+    used = splats.detach()
+    keep = used.quats.norm(dim=1) > 0
+    shN = used.shN[:, : num_coefficients(settings.sh_degree) - 1]
+    for tensor in (used.means, used.quats, used.scales, used.log_scales, used.opacity_logits, used.sh0, shN):
+        keep &= tensor.isfinite().reshape(len(splats), -1).all(dim=1)
+    depth = _to_camera(used.means, camera)[:, 2]
+    keep &= depth > settings.near
+    if not for_errors:
+        keep &= used.opacities >= settings.alpha_min
+    rows = keep.nonzero()[:, 0]
+    return rows[depth[rows].sort(stable=True).indices]
+
+
+def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettings) -> ScreenSplats:
+    """Splats as the camera sees them; differentiable.
+
+    Parameters
+    ----------
+    splats : Splats
+    rows : Tensor [M] int64
+        From :func:`visible_rows`.
+    """
+    means = splats.means[rows]
+    frames = quats_to_matrices(splats.quats[rows])  # [M, 3, 3], columns t_u, t_v, t_w in the world
+    scales = splats.log_scales[rows].exp()  # [M, 2] wu
+    R = torch.as_tensor(camera.rotation, dtype=means.dtype, device=means.device)
+
+    p = _to_camera(means, camera)  # [M, 3] wu
+    tangents = torch.einsum("ij,mjk->mik", R, frames[:, :, :2] * scales[:, None, :])  # [M, 3, 2], s_u t_u and s_v t_v
+    H = torch.cat([tangents, p[:, :, None]], dim=2)  # [M, 3, 3]: x_cam = H (u, v, 1)
+    Tw = H[:, 2]
+    # c - (cx, cy) = f p.xy / p.z, hence Tu - c_x Tw = fx H_x - (c_x - cx) H_z
+    offset = p[:, :2] / p[:, 2:]  # [M, 2]
+    Au = camera.fx * (H[:, 0] - offset[:, :1] * H[:, 2])
+    Av = camera.fy * (H[:, 1] - offset[:, 1:] * H[:, 2])
+    third = torch.tensor([1.0, 1.0, 0.0], dtype=means.dtype, device=means.device)  # 0 but for rounding: say so
+    focal = torch.tensor([camera.fx, camera.fy], dtype=means.dtype, device=means.device)
+    principal = torch.tensor([camera.cx, camera.cy], dtype=means.dtype, device=means.device)
+
+    to_splat = means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
+    directions = to_splat / to_splat.norm(dim=1, keepdim=True)
+    normal = frames[:, :, 2]
+    away = (normal * to_splat).sum(dim=1).detach() > 0  # rule 8
+    return ScreenSplats(
+        center=focal * offset + principal,
+        Au=Au * third,
+        Av=Av * third,
+        Tw=Tw,
+        opacity=splats.opacity_logits[rows].sigmoid(),
+        color=sh_to_rgb(splats.sh0[rows], splats.shN[rows], directions, settings.sh_degree),
+        normal=torch.where(away[:, None], -normal, normal),
+    )
+
+
+def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
+    """Screen boxes of rule 14 for the disc rho3d <= k^2, clipped to the image; float64.
+
+    Parameters
+    ----------
+    screen : ScreenSplats
+    cutoff_squared : Tensor [M]
+        k^2.
+
+    Returns
+    -------
+    Tensor [M, 4] float64, px
+        x_min, y_min, x_max, y_max. Empty boxes have max < min.
+    """
+    k2 = cutoff_squared.detach().double()
+    center, Au, Av, Tw = (t.detach().double() for t in (screen.center, screen.Au, screen.Av, screen.Tw))
+    # Tangent lines x = const of the conic (u, v, 1): |(u, v)|^2 = k^2. The line x = X is (Au - X Tw) . q = 0; it
+    # touches the disc where k^2 |(Au - X Tw).uv|^2 = ((Au - X Tw).1)^2: a quadratic d X^2 - 2 b X + a = 0, the same for y.
+    t = torch.stack([k2, k2, -torch.ones_like(k2)], dim=1)  # [M, 3]
+    d = (t * Tw * Tw).sum(dim=1)  # < 0 while the whole disc is in front of the camera
+    crosses = d >= 0
+    safe = torch.where(crosses, -torch.ones_like(d), d)
+    low, high = [], []
+    for axis, A in enumerate((Au, Av)):
+        b = (t * A * Tw).sum(dim=1) / safe
+        a = (t * A * A).sum(dim=1) / safe
+        half = (b * b - a).clamp(min=0).sqrt()
+        disc = settings.lowpass_px * k2.sqrt()
+        low.append(center[:, axis] + torch.minimum(b - half, -disc))
+        high.append(center[:, axis] + torch.maximum(b + half, disc))
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=d.device)
+    lower = torch.where(crosses[:, None], torch.zeros_like(size), torch.stack(low, dim=1).clamp(min=0))
+    upper = torch.where(crosses[:, None], size, torch.minimum(torch.stack(high, dim=1), size))
+    return torch.cat([lower, upper], dim=1)
+
+
+def holds_pixel(boxes: Tensor) -> Tensor:
+    """Whether a clipped box holds a pixel centre [M] bool."""
+    first = (boxes[:, :2] - 0.5).ceil() + 0.5
+    return (first <= boxes[:, 2:]).all(dim=1)
+
+
+def blocks(boxes: Tensor, camera: Camera, dtype: torch.dtype) -> Iterator[Block]:
+    """Blocks of pixels that together cover every pixel that some box reaches.
+
+    Boxes are widened a little (rounding must not hide a pair that passes the exact tests), and a block holds at most
+    ``MAX_PAIRS`` pairs (at least one pixel).
+    """
+    widened = boxes + torch.tensor([-1e-2, -1e-2, 1e-2, 1e-2], dtype=boxes.dtype, device=boxes.device)
+    for y in range(0, camera.height, TILE):
+        y_end = min(y + TILE, camera.height)
+        row = ((widened[:, 1] <= y_end - 0.5) & (widened[:, 3] >= y + 0.5)).nonzero()[:, 0]
+        for x in range(0, camera.width, TILE):
+            x_end = min(x + TILE, camera.width)
+            ids = row[(widened[row, 0] <= x_end - 0.5) & (widened[row, 2] >= x + 0.5)]
+            if len(ids) == 0:
+                continue
+            i = torch.arange(x, x_end, device=boxes.device)
+            j = torch.arange(y, y_end, device=boxes.device)
+            pixels = (j[:, None] * camera.width + i).reshape(-1)
+            points = torch.stack([pixels % camera.width, pixels // camera.width], dim=1).to(dtype) + 0.5
+            step = max(1, MAX_PAIRS // len(ids))
+            for start in range(0, len(pixels), step):
+                yield Block(pixels[start : start + step], points[start : start + step], ids)
+
+
+def cutoff_squared(opacity: Tensor, settings: RasterSettings) -> Tensor:
+    """k^2 = 2 ln(o / alpha_min): the rho at which alpha falls to alpha_min."""
+    return 2 * (opacity.log() - math.log(settings.alpha_min))
+
+
+def _to_camera(points: Tensor, camera: Camera) -> Tensor:
+    """World points [N, 3] in the camera frame [N, 3] wu."""
+    T = torch.as_tensor(camera.T_cam_world, dtype=points.dtype, device=points.device)
+    return points @ T[:3, :3].T + T[:3, 3]
