@@ -2,17 +2,23 @@
 
 A variant is a value, never an ``if``: every ablation of the paper is another :class:`Recipe` (see ``recipes.py``).
 Iterations are counted from 1 within a stage; ``start`` fields mean "active when iteration > start", as in the
-official 2DGS code. This module never imports torch.
+official 2DGS code. ``recipe_json`` writes and reads recipes and applies ``--set``; ``schedule`` scales them.
+This module never imports torch.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
+
+from gs2d.errors import RecipeError
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
+LOSS_KINDS = ("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion")
+DEPTH_KINDS = ("mean", "median")
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,8 @@ class LossTerm:
     kind : str
         "l1", "ssim" (1 - SSIM), "normal_consistency", "normal_consistency_per_splat" (the paper's Eq. 7 form) or
         "distortion".
-    weight : float
+    weight : float or None
+        None, for "distortion" only: the protocol's weight (Table 1 of the paper writes it 100/10).
     start : int
         Iterations of the stage without this term.
     depth : "mean", "median" or None
@@ -32,7 +39,7 @@ class LossTerm:
     """
 
     kind: str
-    weight: float
+    weight: float | None
     start: int = 0
     depth: str | None = None
 
@@ -56,6 +63,16 @@ class Rates:
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
+
+    def means_at(self, iteration: int) -> float:
+        """Rate of ``means`` at an iteration (1-based), without the extent: log-linear, then constant."""
+        t = min(max(iteration / self.means_horizon, 0.0), 1.0)
+        return math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
+
+    def at_end(self, iterations: int) -> Rates:
+        """Constant rates, at the values that these reach after so many iterations."""
+        means = self.means_final if iterations >= self.means_horizon else self.means_at(iterations)
+        return replace(self, means=means, means_final=means)
 
 
 @dataclass(frozen=True)
@@ -83,7 +100,11 @@ class GradDensify:
     reset_every, reset_opacity : int, float
         Every so many iterations (before ``stop``) opacity = min(opacity, reset_opacity); 0 = never.
     reset_at : tuple of int
-        Further iterations with a reset (the official code adds ``start`` on white backgrounds).
+        Further iterations with a reset.
+    reset_at_start_on_white : bool
+        A reset at iteration ``start`` too when the background is white, as in the official code.
+    last_reset : int or None
+        No reset after this iteration; None = any before ``stop``.
     prune_grace : int
         Nothing is pruned for opacity within so many iterations of a reset (0 in the official code).
     opacity_cap, cap_every : float, int
@@ -107,15 +128,36 @@ class GradDensify:
     reset_opacity: float = 0.01
     reset_at: tuple[int, ...] = ()
     reset_at_start_on_white: bool = True
+    last_reset: int | None = None
     prune_grace: int = 0
     opacity_cap: float = 0.8
     cap_every: int = 0
     max_splats: int | None = None
 
+    def resets(self, iteration: int, *, white: bool) -> bool:
+        """Whether opacity is reset at the end of this iteration."""
+        if iteration >= self.stop or (self.last_reset is not None and iteration > self.last_reset):
+            return False
+        regular = self.reset_every > 0 and iteration % self.reset_every == 0
+        at_start = white and self.reset_at_start_on_white and self.reset_every > 0 and iteration == self.start
+        return regular or at_start or iteration in self.reset_at
+
+    def densifies(self, iteration: int) -> bool:
+        """Whether splats are cloned, split and pruned at the end of this iteration."""
+        return self.start < iteration < self.stop and iteration % self.every == 0
+
+    def spares_faint(self, iteration: int, *, white: bool) -> bool:
+        """Whether faint splats are spared because a reset is at most ``prune_grace`` iterations back."""
+        first = max(1, iteration - self.prune_grace)
+        return any(self.resets(earlier, white=white) for earlier in range(first, iteration))
+
 
 @dataclass(frozen=True)
 class RankByError:
-    """Entry action: E_i over all training views (paper Eq. 8); the worst ``top_percent`` become a row group."""
+    """Entry action: E_i over all training views (paper Eq. 8); the worst ``top_percent`` become a row group.
+
+    With ``occlusion`` a pixel counts only for the splats that are blended there.
+    """
 
     top_percent: float = 1.0
     writes: str = "high_error"
@@ -169,17 +211,157 @@ class Stage:
     sh_interval: int = 0
     moments: str = "fresh"
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "train", MappingProxyType(dict(self.train)))
+
+    def active_sh_degree(self, iteration: int, max_degree: int) -> int:
+        """SH degree that is trained at an iteration (1-based): 0, then one more every ``sh_interval`` iterations."""
+        return max_degree if self.sh_interval == 0 else min(max_degree, iteration // self.sh_interval)
+
 
 @dataclass(frozen=True)
 class Recipe:
-    """Stages in order, and the seed of every random choice."""
+    """Stages in order, the seed of every random choice, and the start.
+
+    ``init_points`` is how many random points training starts from when the scene has none.
+    """
 
     name: str
     stages: tuple[Stage, ...]
     seed: int = 0
     sh_degree: int = 3
+    init_points: int = 100_000
 
     @property
     def iterations(self) -> int:
         """Iterations of all stages."""
         return sum(stage.iterations for stage in self.stages)
+
+
+def validate(recipe: Recipe) -> Recipe:
+    """Check that a recipe can be trained as written; returns it.
+
+    Raises
+    ------
+    RecipeError
+        Names the stage, what was found and what exists.
+    """
+    where = f"recipe {recipe.name!r}"
+    _require(bool(recipe.stages), f"{where}: expected at least one stage, got none")
+    _integer(f"{where}: seed", recipe.seed, low=0)
+    _require(recipe.sh_degree in (0, 1, 2, 3), f"{where}: sh_degree must be 0, 1, 2 or 3, got {recipe.sh_degree!r}")
+    _integer(f"{where}: init_points", recipe.init_points, low=1)
+    names = [stage.name for stage in recipe.stages]
+    for name in names:
+        _require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")
+        _require(
+            name.replace("-", "_").isidentifier(), f"{where}: a stage name is letters, digits, '-', '_'; got {name!r}"
+        )
+    groups: list[str] = []
+    for stage in recipe.stages:
+        _check_stage(f"stage {stage.name!r}", stage, groups)
+    return recipe
+
+
+def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
+    """Check one stage; ``groups`` are the row groups written so far, and is extended."""
+    _integer(f"{where}: iterations", stage.iterations, low=0)
+    _integer(f"{where}: sh_interval", stage.sh_interval, low=0)
+    _one_of(f"{where}: moments", stage.moments, ("fresh", "kept"))
+    for action in stage.on_enter:
+        if isinstance(action, RankByError):
+            percent = _number(f"{where}: RankByError.top_percent", action.top_percent, low=0.0)
+            _require(0 < percent <= 100, f"{where}: RankByError.top_percent must be in (0, 100], got {percent}")
+        else:
+            _one_of(f"{where}: CloneInPlace.opacity", action.opacity, ("copy", "preserve"))
+            _group(f"{where}: CloneInPlace.rows", action.rows, groups)
+        _require(action.writes not in ("", "all"), f"{where}: a row group cannot be called {action.writes!r}")
+        groups.append(action.writes)
+    for attribute, rows in stage.train.items():
+        _one_of(f"{where}: train", attribute, ALL)
+        if rows != "all":
+            _group(f"{where}: train[{attribute!r}]", rows, groups)
+    _check_losses(where, stage)
+    for entry in fields(Rates):
+        _number(f"{where}: rates.{entry.name}", getattr(stage.rates, entry.name), low=0.0)
+    _require(
+        stage.rates.means > 0 and stage.rates.means_final > 0 and stage.rates.eps > 0,
+        f"{where}: rates.means, rates.means_final and rates.eps must be positive (to freeze, leave out of train)",
+    )
+    _integer(f"{where}: rates.means_horizon", stage.rates.means_horizon, low=1)
+    _require(max(stage.rates.beta1, stage.rates.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
+    if stage.densify is not None:
+        _check_densify(f"{where}: densify", stage.densify, stage)
+
+
+def _check_losses(where: str, stage: Stage) -> None:
+    kinds = [term.kind for term in stage.losses]
+    for term in stage.losses:
+        _one_of(f"{where}: loss", term.kind, LOSS_KINDS)
+        _require(kinds.count(term.kind) == 1, f"{where}: loss {term.kind!r} is there twice; add up the weights")
+        if term.weight is None:
+            _require(
+                term.kind == "distortion",
+                f"{where}: loss {term.kind!r} needs a weight; only distortion may leave it to the protocol",
+            )
+        else:
+            _number(f"{where}: weight of loss {term.kind!r}", term.weight, low=0.0)
+        _integer(f"{where}: start of loss {term.kind!r}", term.start, low=0)
+        if term.depth is not None:
+            _one_of(f"{where}: depth of loss {term.kind!r}", term.depth, DEPTH_KINDS)
+    if stage.iterations > 0:
+        active = [term for term in stage.losses if term.weight != 0 and term.start == 0]
+        _require(bool(active), f"{where}: no loss is active from the first iteration: got {kinds or 'none'}")
+        _require(bool(stage.train), f"{where}: train names no attribute for {stage.iterations} iterations")
+
+
+def _check_densify(where: str, densify: GradDensify, stage: Stage) -> None:
+    for name in ("start", "stop", "reset_every", "prune_grace", "cap_every"):
+        _integer(f"{where}.{name}", getattr(densify, name), low=0)
+    _integer(f"{where}.every", densify.every, low=1)
+    _integer(f"{where}.split_count", densify.split_count, low=2)
+    for name in ("grad_threshold", "abs_threshold", "percent_dense", "opacity_cull", "scale_cull"):
+        _number(f"{where}.{name}", getattr(densify, name), low=0.0)
+    shrink = _number(f"{where}.split_shrink", densify.split_shrink, low=0.0)
+    _require(shrink > 0, f"{where}.split_shrink must be positive, got {shrink}")
+    for name in ("reset_opacity", "opacity_cap"):
+        value = _number(f"{where}.{name}", getattr(densify, name), low=0.0)
+        _require(0 < value < 1, f"{where}.{name} must be in (0, 1), got {value}")
+    for value in densify.reset_at:
+        _integer(f"{where}.reset_at", value, low=1)
+    if densify.last_reset is not None:
+        _integer(f"{where}.last_reset", densify.last_reset, low=0)
+    if densify.max_splats is not None:
+        _integer(f"{where}.max_splats", densify.max_splats, low=1)
+    touches_opacity = densify.reset_every > 0 or densify.cap_every > 0 or bool(densify.reset_at)
+    _require(
+        not touches_opacity or stage.train.get("opacity_logits") == "all",
+        f"{where} resets or caps opacity, which the stage must then train for all rows; "
+        "set reset_every and cap_every to 0 or train opacity_logits",
+    )
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise RecipeError(message)
+
+
+def _integer(where: str, value: object, *, low: int) -> None:
+    ok = isinstance(value, int) and not isinstance(value, bool) and value >= low
+    _require(ok, f"{where} must be an integer >= {low}, got {value!r}")
+
+
+def _number(where: str, value: object, *, low: float) -> float:
+    ok = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= low
+    _require(ok, f"{where} must be a finite number >= {low:g}, got {value!r}")
+    assert isinstance(value, int | float)
+    return float(value)
+
+
+def _one_of(where: str, value: str, known: tuple[str, ...]) -> None:
+    _require(value in known, f"{where} must be one of {', '.join(known)}; got {value!r}")
+
+
+def _group(where: str, name: str, groups: list[str]) -> None:
+    written = f"the groups written so far are {', '.join(groups)}" if groups else "no action has written a group yet"
+    _require(name in groups, f"{where}: no earlier action writes the row group {name!r}; {written}")

@@ -1,0 +1,205 @@
+"""What depends on the data set: depth, background, near, split, masks, fusion limits, metric conventions.
+
+Sources, marked at each number: [s] the official 2DGS scripts (dtu_eval, tnt_eval, nerf_eval, m360_eval), [c] the official
+2DGS code, [2dgs] the 2DGS paper, [r] the 2DGS-R paper, [d] a decision of this project. Pure Python; never imports torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+from gs2d.errors import ProtocolError
+from gs2d.recipe import LossTerm
+
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+RELATIVE_NEAR = 0.01  # [d] of the extent, where a protocol names no near
+
+
+@dataclass(frozen=True)
+class FusionLimits:
+    """How depth maps become a mesh; None is derived from the scene.
+
+    Attributes
+    ----------
+    voxel, truncation : float or None
+        wu. Voxel size, and the distance at which the signed distance saturates.
+    depth_limit : float or None
+        wu. Depths beyond it are ignored.
+    clusters : int
+        How many of the largest connected components are kept; 0 keeps all.
+    """
+
+    voxel: float | None = None
+    truncation: float | None = None
+    depth_limit: float | None = None
+    clusters: int = 50
+
+
+@dataclass(frozen=True)
+class MetricConventions:
+    """How image and surface quality are reported.
+
+    Attributes
+    ----------
+    from_8bit : bool
+        Image metrics on renders quantised to 8 bits, as the official code measures them from PNG files.
+    lpips_unit_range : bool
+        LPIPS fed with [0, 1], as the official code does, instead of the [-1, 1] the network was made for.
+    surface : str
+        "chamfer" or "f_score": the headline figure against ground truth.
+    """
+
+    from_8bit: bool = True
+    lpips_unit_range: bool = True
+    surface: str = "f_score"
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The facts of a data set that a recipe leaves open.
+
+    Attributes
+    ----------
+    name : str
+    depth : str
+        "mean" or "median": depth of surface normals and of fusion, where a loss names none.
+    distortion_weight : float
+        Weight of a distortion loss that names none (Table 1 of the 2DGS-R paper).
+    background : tuple of 3 floats
+        Colour behind everything, in [0, 1].
+    near : float or None
+        wu. None: 1 % of the scene's extent.
+    downscale : int
+        Hint: what the paper divides the image size by.
+    test_every : int
+        Every so many views (by name) are test views where the format has no split; 0 = all train.
+    test_on : str
+        "test" or "train": the views on which the headline image metrics are measured.
+    use_mask_in_training, use_mask_in_fusion : bool
+        Whether masked-out pixels are ignored by losses and ranking, and by fusion.
+    fusion : FusionLimits
+    metrics : MetricConventions
+    """
+
+    name: str
+    depth: str
+    distortion_weight: float
+    background: tuple[float, float, float] = BLACK
+    near: float | None = None
+    downscale: int = 1
+    test_every: int = 8
+    test_on: str = "test"
+    use_mask_in_training: bool = True
+    use_mask_in_fusion: bool = True
+    fusion: FusionLimits = FusionLimits()
+    metrics: MetricConventions = MetricConventions()
+
+    @property
+    def white(self) -> bool:
+        """Whether the background is white (2DGS resets opacity once more on white)."""
+        return self.background == WHITE
+
+    def near_for(self, extent: float) -> float:
+        """Near distance, wu, in a scene of this extent."""
+        return RELATIVE_NEAR * extent if self.near is None else self.near
+
+    def resolve(self, terms: Sequence[LossTerm]) -> tuple[LossTerm, ...]:
+        """Loss terms with the weights and depths that they left open; terms of weight 0 are dropped."""
+        resolved = (
+            replace(
+                term,
+                weight=self.distortion_weight if term.weight is None else term.weight,
+                depth=self.depth if term.depth is None else term.depth,
+            )
+            for term in terms
+        )
+        return tuple(term for term in resolved if term.weight)
+
+
+DTU = Protocol(
+    "dtu",
+    depth="median",  # [s] depth_ratio 1
+    distortion_weight=1000.0,  # [s] lambda_dist 1000
+    near=0.2,  # [c] rasterizer
+    downscale=2,  # [s] -r 2, [r]
+    test_every=0,  # [s] all views train
+    test_on="train",  # [r] "we evaluated PSNR on the training set"
+    use_mask_in_training=False,  # [c] the mask multiply is commented out: the background is trained
+    fusion=FusionLimits(voxel=0.004, truncation=0.016, depth_limit=3.0, clusters=1),  # [s]
+    metrics=MetricConventions(surface="chamfer"),  # [r]
+)
+TNT = Protocol(
+    "tnt",  # Barn, Caterpillar, Ignatius, Truck
+    depth="median",  # [s] depth_ratio 1
+    distortion_weight=100.0,  # [s] printed (not executed); [r] Table 1 "100"
+    near=0.2,  # [c]
+    downscale=2,  # [s] -r 2, [r]
+    test_every=8,  # [c] --eval; [r] its PSNR is of novel views
+    use_mask_in_training=False,  # [c]
+    fusion=FusionLimits(voxel=0.004, truncation=0.016, depth_limit=3.0, clusters=1),  # [s]
+)
+TNT_LARGE = replace(
+    TNT,
+    name="tnt-large",  # Meetingroom, Courthouse
+    distortion_weight=10.0,  # [s] printed (not executed); [r] Table 1 "10"
+    fusion=FusionLimits(voxel=0.006, truncation=0.024, depth_limit=4.5, clusters=1),  # [s]
+)
+NERF_SYNTHETIC = Protocol(
+    "nerf-synthetic",
+    depth="mean",  # [s] depth_ratio stays 0
+    distortion_weight=1000.0,  # [2dgs] bounded scenes; the script uses none
+    background=WHITE,  # [s] --white_background
+    near=0.2,  # [c]
+    test_every=0,  # the data set has its own split
+    use_mask_in_training=False,  # the images are composited on the background instead
+    fusion=FusionLimits(clusters=1),  # [d] no script meshes this set: one object, limits from the scene
+)
+MIP_NERF_360 = Protocol(
+    "mip-nerf-360",
+    depth="mean",  # [s] depth_ratio stays 0
+    distortion_weight=100.0,  # [2dgs] unbounded scenes; the script uses none
+    near=0.2,  # [c]
+    downscale=4,  # [s] images_4 outdoors (images_2 indoors)
+    test_every=8,  # [c] --eval
+    use_mask_in_training=False,  # [c]
+)
+GENERIC = Protocol(
+    "generic",
+    depth="mean",  # [d] as 2DGS advises for scenes that are not object-centred
+    distortion_weight=100.0,  # [2dgs] unbounded scenes
+    near=None,  # [d] 0.2 is meaningless in a frame of unknown size
+    test_every=8,  # [c] --eval
+)
+
+PROTOCOLS: Mapping[str, Protocol] = MappingProxyType(
+    {p.name: p for p in (DTU, TNT, TNT_LARGE, NERF_SYNTHETIC, MIP_NERF_360, GENERIC)}
+)
+_BY_FORMAT = MappingProxyType({"blender": NERF_SYNTHETIC, "dtu": DTU, "colmap": GENERIC, "nerfstudio": GENERIC})
+
+
+def get_protocol(name: str) -> Protocol:
+    """The protocol of a name.
+
+    Raises
+    ------
+    ProtocolError
+        Unknown name; says which exist.
+    """
+    if name not in PROTOCOLS:
+        raise ProtocolError(f"no protocol {name!r}; there is auto, {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+def protocol_for(scene_format: str) -> Protocol:
+    """The protocol that ``--protocol auto`` takes for a scene format (``Scene.format``).
+
+    Raises
+    ------
+    ProtocolError
+        Unknown format.
+    """
+    if scene_format not in _BY_FORMAT:
+        raise ProtocolError(f"no protocol for format {scene_format!r}; formats are {', '.join(_BY_FORMAT)}")
+    return _BY_FORMAT[scene_format]

@@ -1,0 +1,196 @@
+"""Recipes as JSON, there and back without loss, and overrides ``stage.field=value`` from the command line.
+
+The reader is strict: an unknown key, a missing one or a value of another type is a :class:`RecipeError` that says
+where. Pure Python; never imports torch.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from gs2d.errors import RecipeError
+from gs2d.recipe import CloneInPlace, RankByError, Recipe, validate
+
+ACTIONS: Mapping[str, type] = {"rank_by_error": RankByError, "clone_in_place": CloneInPlace}
+ACTION_KEY = "action"
+
+
+def to_json(recipe: Recipe) -> dict[str, Any]:
+    """A recipe as plain dicts, lists, numbers and strings; every field is written out."""
+    encoded = _encode(recipe)
+    assert isinstance(encoded, dict)
+    return encoded
+
+
+def from_json(data: Mapping[str, Any]) -> Recipe:
+    """The recipe that :func:`to_json` wrote, validated.
+
+    Raises
+    ------
+    RecipeError
+        Where a key is unknown or missing, or a value has another type.
+    """
+    recipe = _decode(data, Recipe, "recipe")
+    assert isinstance(recipe, Recipe)
+    return validate(recipe)
+
+
+def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
+    """Change fields of a recipe.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    overrides : sequence of str
+        ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Deeper fields are reached by
+        more dots: ``surface.densify.grad_threshold=1e-4``, ``refine.rates.sh0=0.001``; losses by their kind,
+        ``surface.losses.normal_consistency.weight=0.1``; entry actions by their name,
+        ``refine.on_enter.clone_in_place.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
+        Values are JSON; what is not JSON is taken as a string.
+
+    Returns
+    -------
+    Recipe
+        Validated.
+
+    Raises
+    ------
+    RecipeError
+        Unknown field (says which exist), or a value of another type.
+    """
+    data = to_json(recipe)
+    for override in overrides:
+        path, equals, text = override.partition("=")
+        words = path.strip().split(".")
+        if not equals or not all(words):
+            raise RecipeError(f"an override is stage.field=value, got {override!r}")
+        _set(data, words, _parse(text.strip()), override)
+    return from_json(data)
+
+
+def _parse(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def _set(data: dict[str, Any], words: list[str], value: Any, override: str) -> None:
+    """Put a value at a path inside the JSON form of a recipe."""
+    node: Any = data
+    if words[0] not in data or words[0] == "stages":
+        names = [stage["name"] for stage in data["stages"]]
+        plain = [key for key in data if key != "stages"]
+        if words[0] not in names:
+            raise RecipeError(
+                f"override {override!r}: no stage or field {words[0]!r}; stages are {', '.join(names)}; "
+                f"fields are {', '.join(plain)}"
+            )
+        node = data["stages"][names.index(words[0])]
+        words = words[1:]
+        if not words:
+            raise RecipeError(f"override {override!r}: name a field of the stage: {', '.join(node)}")
+    for depth, word in enumerate(words):
+        last = depth == len(words) - 1
+        if isinstance(node, list) and not last:
+            node = _entry(node, word, override)
+        elif isinstance(node, dict) and last and words[max(depth - 1, 0)] == "train" and depth > 0:
+            _set_trained(node, word, value)  # validate() knows the attributes
+        elif isinstance(node, dict) and word in node:
+            if last:
+                node[word] = value
+            else:
+                node = node[word]
+        else:
+            known = ", ".join(node) if isinstance(node, dict) else "nothing below it (it is null or a plain value)"
+            raise RecipeError(f"override {override!r}: no field {word!r}; there is {known}")
+
+
+def _set_trained(train: dict[str, Any], attribute: str, rows: Any) -> None:
+    if rows is None:
+        train.pop(attribute, None)
+    else:
+        train[attribute] = rows
+
+
+def _entry(entries: list[Any], word: str, override: str) -> Any:
+    """The loss of a kind, or the action of a name."""
+    tags = [str(entry.get("kind", entry.get(ACTION_KEY))) if isinstance(entry, dict) else "?" for entry in entries]
+    if word not in tags:
+        raise RecipeError(f"override {override!r}: no entry {word!r}; there is {', '.join(tags) or 'none'}")
+    return entries[tags.index(word)]
+
+
+def _encode(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        encoded = {entry.name: _encode(getattr(value, entry.name)) for entry in fields(value)}
+        tags = [name for name, kind in ACTIONS.items() if type(value) is kind]
+        return {ACTION_KEY: tags[0], **encoded} if tags else encoded
+    if isinstance(value, Mapping):
+        return {str(key): _encode(entry) for key, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [_encode(entry) for entry in value]
+    return value
+
+
+def _decode(value: Any, kind: Any, where: str) -> Any:
+    """A JSON value as the annotated type."""
+    origin = get_origin(kind)
+    if origin in (Union, UnionType):
+        return _decode_union(value, get_args(kind), where)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise RecipeError(f"{where} must be a list, got {value!r}")
+        return tuple(_decode(entry, get_args(kind)[0], f"{where}[{i}]") for i, entry in enumerate(value))
+    if origin is not None and issubclass(origin, Mapping):
+        if not isinstance(value, Mapping):
+            raise RecipeError(f"{where} must be an object, got {value!r}")
+        return {str(key): _decode(entry, get_args(kind)[1], f"{where}.{key}") for key, entry in value.items()}
+    if is_dataclass(kind):
+        assert isinstance(kind, type)
+        return _decode_dataclass(value, kind, where)
+    return _decode_plain(value, kind, where)
+
+
+def _decode_union(value: Any, kinds: tuple[Any, ...], where: str) -> Any:
+    if value is None and NoneType in kinds:
+        return None
+    kinds = tuple(kind for kind in kinds if kind is not NoneType)
+    if len(kinds) == 1:
+        return _decode(value, kinds[0], where)
+    tag = value.get(ACTION_KEY) if isinstance(value, Mapping) else None
+    if tag not in ACTIONS:
+        raise RecipeError(f"{where} needs {ACTION_KEY!r}, one of {', '.join(ACTIONS)}; got {tag!r}")
+    rest = {key: entry for key, entry in value.items() if key != ACTION_KEY}
+    return _decode(rest, ACTIONS[str(tag)], where)
+
+
+def _decode_dataclass(value: Any, kind: type, where: str) -> Any:
+    if not isinstance(value, Mapping):
+        raise RecipeError(f"{where} must be an object, got {value!r}")
+    hints = get_type_hints(kind)
+    known = {entry.name: entry for entry in fields(kind)}
+    for key in value:
+        if key not in known:
+            raise RecipeError(f"{where} has no field {key!r}; it has {', '.join(known)}")
+    for name, entry in known.items():
+        if name not in value and entry.default is MISSING and entry.default_factory is MISSING:
+            raise RecipeError(f"{where} lacks the field {name!r}")
+    label = value.get("name", "") if isinstance(value.get("name", ""), str) else ""
+    inner = f"stage {label!r}" if kind.__name__ == "Stage" else where
+    return kind(**{name: _decode(entry, hints[name], f"{inner}.{name}") for name, entry in value.items()})
+
+
+def _decode_plain(value: Any, kind: Any, where: str) -> Any:
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if kind is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
+        return value
+    names = {int: "an integer", float: "a number", str: "a string", bool: "true or false"}
+    raise RecipeError(f"{where} must be {names[kind]}, got {value!r}")

@@ -1,0 +1,87 @@
+"""Short runs that still behave: a recipe scaled by a factor.
+
+Scaled: stage lengths, loss starts, the SH interval, start and stop of densification, the horizon of the means' rate (so
+that rates end where they should). *Not* scaled: the densification interval, as long as ten densifications fit, and
+opacity resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit by about its
+rate, 0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back. Pure Python; never imports torch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from gs2d.errors import RecipeError
+from gs2d.recipe import GradDensify, Recipe, Stage
+
+MIN_DENSIFICATIONS = 10
+PRUNE_GRACE = 100  # iterations after a reset in which nothing is pruned for opacity
+RESET_MARGIN = 200  # iterations of densification that a reset must leave
+MIN_INIT_POINTS = 10_000
+
+
+def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
+    """The same recipe, ``factor`` times as long; at factor 1 the recipe itself.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    factor : float
+        Positive. The random start shrinks with its square root (never below 10 000 points, nor above what it was): a
+        short run cannot place as many splats.
+
+    Raises
+    ------
+    RecipeError
+        A factor that is not a positive finite number.
+    """
+    if not (math.isfinite(factor) and factor > 0):
+        raise RecipeError(f"schedule scale must be a positive number, got {factor}")
+    if factor == 1:
+        return recipe
+    points = max(MIN_INIT_POINTS, round(recipe.init_points * math.sqrt(factor)))
+    return replace(
+        recipe,
+        stages=tuple(_scale_stage(stage, factor) for stage in recipe.stages),
+        init_points=min(recipe.init_points, points),
+    )
+
+
+def _scale_stage(stage: Stage, factor: float) -> Stage:
+    return replace(
+        stage,
+        iterations=_scaled(stage.iterations, factor),
+        losses=tuple(replace(term, start=round(term.start * factor)) for term in stage.losses),
+        rates=replace(stage.rates, means_horizon=_scaled(stage.rates.means_horizon, factor)),
+        sh_interval=_scaled(stage.sh_interval, factor),
+        densify=None if stage.densify is None else _scale_densify(stage.densify, factor),
+    )
+
+
+def _scale_densify(densify: GradDensify, factor: float) -> GradDensify:
+    start, stop = round(densify.start * factor), round(densify.stop * factor)
+    wanted = min(MIN_DENSIFICATIONS, count_densifications(densify))
+    every = densify.every
+    while every > 1 and count_densifications(replace(densify, start=start, stop=stop, every=every)) < wanted:
+        every -= 1
+    if factor >= 1:
+        return replace(densify, start=start, stop=stop, every=every)
+    latest = max(0, stop - RESET_MARGIN)
+    return replace(
+        densify,
+        start=start,
+        stop=stop,
+        every=every,
+        prune_grace=max(densify.prune_grace, PRUNE_GRACE),
+        last_reset=latest if densify.last_reset is None else min(latest, densify.last_reset),
+    )
+
+
+def count_densifications(densify: GradDensify) -> int:
+    """How many multiples of ``every`` lie strictly between ``start`` and ``stop``."""
+    return max(0, (densify.stop - 1) // densify.every - densify.start // densify.every)
+
+
+def _scaled(count: int, factor: float) -> int:
+    """A count of iterations, scaled; something stays something, and 0 (off) stays 0."""
+    return max(1, round(count * factor)) if count > 0 else 0
