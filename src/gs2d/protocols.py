@@ -1,7 +1,8 @@
 """What depends on the data set: depth, background, near, split, masks, fusion limits, metric conventions.
 
-Sources, marked at each number: [s] the official 2DGS scripts (dtu_eval, tnt_eval, nerf_eval, m360_eval), [c] the official
-2DGS code, [2dgs] the 2DGS paper, [r] the 2DGS-R paper, [d] a decision of this project. Pure Python; never imports torch.
+Sources, marked at each number: [s] the official 2DGS scripts (dtu_eval, tnt_eval, nerf_eval, m360_eval), [c] the
+official 2DGS code, [2dgs] the 2DGS paper, [r] the 2DGS-R paper, [d] a decision of this project.
+Pure Python; never imports torch.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def refine(
     """Stage 3: clone the high-error splats in place, then train everything but ``freeze``, NC from the start.
 
     ``clone`` is the opacity of the clones ("copy" or "preserve"), None for no clone (AbsGS densifies instead);
-    ``rerank`` ranks by E_i once more (top percent) before the clone; ``rows`` limits training to a row group ("clones").
+    ``rerank`` ranks by E_i once more (top percent) before the clone; ``rows`` limits training to a group ("clones").
     """
     rank = () if rerank is None else (RankByError(top_percent=rerank),)
     return Stage(
@@ -152,12 +152,9 @@ def _registry() -> dict[str, NamedRecipe]:
     add("2dgs", "2DGS with normal consistency 0.05: the paper's baseline and its stage 1", two_dgs)
     add("2dgs-no-nc", "2DGS without normal consistency", partial(two_dgs, nc=0.0))
     add("2dgs-60k", "2DGS for as many iterations as 2DGS-R: the fair control", two_dgs_60k)
-    add("2dgs-distortion", "Table 1: the protocol's distortion weight (100/10), NC 0.05", partial(two_dgs, 0.05, None))
-    add(
-        "2dgs-distortion-no-nc",
-        "Table 1: the protocol's distortion weight (100/10), no NC",
-        partial(two_dgs, 0.0, None),
-    )
+    for label, nc in {"distortion": 0.05, "distortion-no-nc": 0.0}.items():
+        about = f"Table 1: the protocol's distortion weight (100/10), NC {nc:g}"
+        add(f"2dgs-{label}", about, partial(two_dgs, nc, None))
     for nc in (0.1, 0.3):
         add(f"2dgs-nc-{nc}", f"Table 1: NC {nc}", partial(two_dgs, nc))
     add("2dgs-r", "2DGS-R: surface, appearance of the worst 1 %, clone in place and refine", two_dgs_r)
@@ -184,18 +181,14 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
     """The other readings of what the paper leaves open."""
     preserve = partial(two_dgs_r, stage_3=refine(clone="preserve"))
     add("2dgs-r-clone-preserve", "Variant: clones share the opacity, so the clone leaves the image as it is", preserve)
-    add(
-        "2dgs-r-sh-of-all",
-        "Variant: stage 2 trains the SH of every splat",
-        partial(two_dgs_r, stage_2=appearance(rows="all")),
-    )
-    add(
-        "2dgs-r-clones-only",
-        "Variant: stage 3 trains the clones alone",
-        partial(two_dgs_r, stage_3=refine(rows="clones")),
-    )
-    add("2dgs-r-rerank", "Variant: E_i is ranked again after stage 2", partial(two_dgs_r, stage_3=refine(rerank=1.0)))
-    return entries
+    sh_of_all = partial(two_dgs_r, stage_2=appearance(rows="all"))
+    add("2dgs-r-sh-of-all", "Variant: stage 2 trains the SH of every splat", sh_of_all)
+    clones_only = partial(two_dgs_r, stage_3=refine(rows="clones"))
+    add("2dgs-r-clones-only", "Variant: stage 3 trains the clones alone", clones_only)
+    rerank = partial(two_dgs_r, stage_3=refine(rerank=1.0))
+    add("2dgs-r-rerank", "Variant: E_i is ranked again after stage 2", rerank)
+    visible = replace(appearance(), on_enter=(RankByError(occlusion=True),))
+    add("2dgs-r-occlusion", "Variant: E_i counts visible pixels only", partial(two_dgs_r, stage_2=visible))
 
 
 RECIPES: Mapping[str, NamedRecipe] = MappingProxyType(_registry())

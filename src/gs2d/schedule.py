@@ -1,9 +1,10 @@
 """Short runs that still behave: a recipe scaled by a factor.
 
-Scaled: stage lengths, loss starts, the SH interval, start and stop of densification, the horizon of the means' rate (so
-that rates end where they should). *Not* scaled: the densification interval, as long as ten densifications fit, and
+Scaled: stage lengths, loss starts, the SH interval, start and stop of densification, the horizon of the means' rate
+(so that rates end where they should). *Not* scaled: the densification interval, as long as ten densifications fit, and
 opacity resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit by about its
-rate, 0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back. Pure Python; never imports torch.
+rate, 0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back.
+Pure Python; never imports torch.
 """
 
 from __future__ import annotations
