@@ -63,7 +63,7 @@ def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
     if not np.isfinite(points).all():
         raise ShapeError("nearest_distances needs finite points, got NaN or infinity: drop those points")
     k = min(k, len(points) - 1)
-    distances, _ = cKDTree(points).query(points, k=k + 1)  # the nearest is the point itself, or a twin of it
+    distances = np.asarray(cKDTree(points).query(points, k=k + 1)[0])  # first: the point itself, or a twin of it
     return np.asarray(np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1)))
 
 

@@ -1,4 +1,4 @@
-"""Which rasterizers this machine can run. "auto" is an explicit choice, reported by name; there is no silent fallback."""
+"""Which rasterizers this machine can run. "auto" is an explicit choice, reported by name; no silent fallback."""
 
 from __future__ import annotations
 

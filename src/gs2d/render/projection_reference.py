@@ -129,8 +129,8 @@ def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, s
     """
     k2 = cutoff_squared.detach().double()
     center, Au, Av, Tw = (t.detach().double() for t in (screen.center, screen.Au, screen.Av, screen.Tw))
-    # Tangent lines x = const of the conic (u, v, 1): |(u, v)|^2 = k^2. The line x = X is (Au - X Tw) . q = 0; it
-    # touches the disc where k^2 |(Au - X Tw).uv|^2 = ((Au - X Tw).1)^2: a quadratic d X^2 - 2 b X + a = 0, the same for y.
+    # The line x = X on the screen is (Au - X Tw) . (u, v, 1) = 0 on the disc's plane. It touches |(u, v)| = k where
+    # k^2 |(Au - X Tw).uv|^2 = ((Au - X Tw).1)^2, a quadratic in X: d (X^2 - 2 b X + a) = 0; the same for y.
     t = torch.stack([k2, k2, -torch.ones_like(k2)], dim=1)  # [M, 3]
     d = (t * Tw * Tw).sum(dim=1)  # < 0 while the whole disc is in front of the camera
     crosses = d >= 0

@@ -80,7 +80,9 @@ class Pairs:
     near_enough: Tensor  # [n, P] bool: passes the near test of rule 5
 
 
-def evaluate_pairs(screen: ScreenSplats, points: Tensor, settings: RasterSettings, shift: Tensor | None = None) -> Pairs:
+def evaluate_pairs(
+    screen: ScreenSplats, points: Tensor, settings: RasterSettings, shift: Tensor | None = None
+) -> Pairs:
     """Intersection, low-pass filter, near (rules 3, 4, 5).
 
     Parameters
@@ -101,7 +103,7 @@ def evaluate_pairs(screen: ScreenSplats, points: Tensor, settings: RasterSetting
     cross = torch.linalg.cross(h_u, h_v)  # (u, v, 1) up to scale: both planes contain the intersection
 
     rho2d = (delta * delta).sum(dim=2) / settings.lowpass_px**2
-    with torch.no_grad():  # which branch: no gradient (rule 12). Comparisons with NaN and infinity are False, as wanted.
+    with torch.no_grad():  # the choice of branch has no gradient; comparisons with NaN are False, as wanted
         uv = cross[..., :2] / cross[..., 2:]
         z = (uv * screen.Tw[:, None, :2]).sum(dim=2) + screen.Tw[:, None, 2]
         hit = (cross[..., 2] != 0) & (z > 0) & z.isfinite()
@@ -186,7 +188,7 @@ def _probe_shift(probe: Tensor, z_c: Tensor, pixels: int, camera: Camera) -> Ten
 
 
 class _PerPixel(torch.autograd.Function):
-    """Copies [n, 2] to every pixel; backward sums the *absolute* values. No gradient of a scalar: AbsGS defines it so."""
+    """Copy [n, 2] to every pixel; backward sums *absolute* values (AbsGS): the gradient of no scalar."""
 
     @staticmethod
     def forward(ctx: torch.autograd.function.FunctionCtx, probe: Tensor, pixels: int) -> Tensor:
