@@ -1,0 +1,225 @@
+"""Splats, meshes and point clouds as PLY files.
+
+Splats are raw (before activation). The official 2DGS layout has two scales; common viewers know only the 3DGS layout,
+whose third scale we write as ``log 1e-6``: a disk with no thickness, its normal along the third axis in both.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gs2d.errors import DataError
+from gs2d.io.obj import read_obj
+from gs2d.io.ply_format import PlyElement, PlyFile, PlyList, read_ply, write_ply
+from gs2d.splats import Splats
+from gs2d.triangles import Mesh
+
+FLAT_LOG_SCALE = math.log(1e-6)  # wu, the thickness viewers are told
+_ROT = ("rot_0", "rot_1", "rot_2", "rot_3")
+_FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", *_ROT)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A point cloud as a file holds it: ``points`` [P, 3] float64 wu, ``colors`` and ``normals`` or None."""
+
+    points: np.ndarray
+    colors: np.ndarray | None = None  # [P, 3] uint8
+    normals: np.ndarray | None = None  # [P, 3] float64
+
+
+def splat_fields(n_rest: int, *, layout: str) -> list[str]:
+    """Property names of a splat file in order, with ``n_rest`` = 3 (K - 1) higher SH coefficients."""
+    if layout not in ("2dgs", "3dgs"):
+        raise ValueError(f"layout must be '2dgs' or '3dgs', got {layout!r}")
+    scales = ["scale_0", "scale_1"] + (["scale_2"] if layout == "3dgs" else [])
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    return names + [f"f_rest_{i}" for i in range(n_rest)] + ["opacity", *scales] + [f"rot_{i}" for i in range(4)]
+
+
+def write_splats(path: str | os.PathLike[str], splats: Splats, *, layout: str = "2dgs") -> None:
+    """Write splats as float32, atomically.
+
+    Parameters
+    ----------
+    path : path
+    splats : Splats
+        On any device; float32 comes back bit for bit (``layout="2dgs"``).
+    layout : "2dgs" or "3dgs"
+        The official 2DGS layout, or the one common viewers open (``scale_2`` = log 1e-6 after ``scale_1``).
+
+    Raises
+    ------
+    DiskError
+        If the file could not be written.
+    """
+    n, n_rest = len(splats), 3 * splats.shN.shape[1]
+    columns = {name: tensor.detach().to("cpu", torch.float32).numpy() for name, tensor in splats.items()}
+    rows = np.zeros(n, dtype=[(name, "<f4") for name in splat_fields(n_rest, layout=layout)])  # nx ny nz stay 0
+    _fill(rows, ("x", "y", "z"), columns["means"])
+    _fill(rows, [f"f_dc_{i}" for i in range(3)], columns["sh0"].reshape(n, 3))
+    _fill(rows, [f"f_rest_{i}" for i in range(n_rest)], columns["shN"].transpose(0, 2, 1).reshape(n, n_rest))
+    rows["opacity"] = columns["opacity_logits"]
+    _fill(rows, ("scale_0", "scale_1"), columns["log_scales"])
+    if layout == "3dgs":
+        rows["scale_2"] = FLAT_LOG_SCALE
+    _fill(rows, [f"rot_{i}" for i in range(4)], columns["quats"])
+    write_ply(path, {"vertex": rows})
+
+
+def _fill(rows: np.ndarray, names: list[str] | tuple[str, ...], columns: np.ndarray) -> None:
+    for i, name in enumerate(names):
+        rows[name] = columns[:, i]
+
+
+def read_splats(path: str | os.PathLike[str]) -> Splats:
+    """Read splats in the official 2DGS layout (extra properties are passed over), float32 on the CPU.
+
+    Raises
+    ------
+    DataError
+        If the file is no PLY, is broken, or is of another kind: 3DGS (three scales), compressed, a mesh, points.
+    """
+    file = read_ply(path)
+    vertex = _splat_element(path, file)
+    names = set(vertex.properties)
+    n_rest = sum(name.startswith("f_rest_") for name in names)
+    degree = round((1 + n_rest / 3) ** 0.5) - 1
+    rest = [f"f_rest_{i}" for i in range(n_rest)]
+    if n_rest != 3 * ((degree + 1) ** 2 - 1) or not names.issuperset(rest):
+        raise DataError(f"{path}: 0, 9, 24 or 45 properties f_rest_* were expected, got {n_rest}; export it again")
+
+    def columns(*wanted: str) -> torch.Tensor:
+        table = np.empty((vertex.count, len(wanted)), np.float32)
+        for i, name in enumerate(wanted):
+            table[:, i] = _scalar(vertex, name)
+        return torch.from_numpy(table)
+
+    return Splats(
+        means=columns("x", "y", "z"),
+        quats=columns(*_ROT),
+        log_scales=columns("scale_0", "scale_1"),
+        opacity_logits=columns("opacity")[:, 0].contiguous(),
+        sh0=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :].contiguous(),
+        shN=columns(*rest).reshape(vertex.count, 3, n_rest // 3).transpose(1, 2).contiguous(),
+    )
+
+
+def _scalar(vertex: PlyElement, name: str) -> np.ndarray:
+    column = vertex.properties[name]
+    assert isinstance(column, np.ndarray), name  # its callers have looked
+    return column
+
+
+def _splat_element(path: object, file: PlyFile) -> PlyElement:
+    """The vertex element of a 2DGS file, or an error that says what the file is instead."""
+    vertex = file.elements.get("vertex")
+    names = set(vertex.properties) if vertex else set()
+    expected = f"{path}: 2DGS splats (scale_0 and scale_1 only) were expected"
+    if "chunk" in file.elements or "packed_position" in names:
+        raise DataError(f"{expected}, got a compressed PLY; give the uncompressed splats.ply of a gs2d or 2DGS run")
+    if "scale_2" in names:
+        raise DataError(f"{expected}, got 3DGS splats with three scales; give the splats.ply of a gs2d or 2DGS run")
+    if vertex is None or "scale_0" not in names:
+        has_faces = "face" in file.elements and file.elements["face"].count > 0
+        kind = "a mesh" if has_faces else "a point cloud" if {"x", "y", "z"} <= names else "a PLY without vertices"
+        raise DataError(f"{expected}, got {kind}; give the splats.ply of a gs2d or 2DGS run")
+    missing = [name for name in _FIXED if not isinstance(vertex.properties.get(name), np.ndarray)]
+    if missing:
+        raise DataError(f"{expected}, the properties {', '.join(missing)} are missing; export the splats again")
+    return vertex
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
+    """Write a triangle mesh, atomically: float32 or float64 vertices as they are, uchar vertex colours.
+
+    The vertex list is the only property of a face, which is all that common readers understand.
+
+    Raises
+    ------
+    DiskError
+        If the file could not be written.
+    """
+    real = "<f8" if mesh.vertices.dtype == np.float64 else "<f4"
+    fields = [(name, real) for name in "xyz"]
+    if mesh.colors is not None:
+        fields += [(name, "u1") for name in ("red", "green", "blue")]
+    vertices = np.empty(len(mesh.vertices), dtype=fields)
+    _fill(vertices, ("x", "y", "z"), mesh.vertices)
+    if mesh.colors is not None:
+        _fill(vertices, ("red", "green", "blue"), mesh.colors)
+    faces = np.empty(len(mesh.faces), dtype=[("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.faces
+    write_ply(path, {"vertex": vertices, "face": faces})
+
+
+def read_mesh(path: str | os.PathLike[str]) -> Mesh:
+    """Read a mesh from PLY or OBJ; polygons become triangle fans, other properties are passed over.
+
+    Returns
+    -------
+    Mesh
+        Vertices float32, or float64 where the file has doubles (or is text, as OBJ is).
+
+    Raises
+    ------
+    DataError
+        If the file is broken, has no faces, or a face names a vertex that does not exist.
+    """
+    if os.fspath(path).lower().endswith(".obj"):
+        return read_obj(path)
+    file = read_ply(path)
+    vertex, face = file.elements.get("vertex"), file.elements.get("face")
+    positions = vertex.scalars("x", "y", "z") if vertex else None
+    if vertex is None or positions is None:
+        raise DataError(f"{path}: a mesh was expected, got a PLY without vertex positions; give a triangle mesh")
+    if face is None or face.count == 0:
+        raise DataError(f"{path}: a mesh was expected, got a PLY without faces (points or splats); give a mesh")
+    lists = face.properties.get("vertex_indices", face.properties.get("vertex_index"))
+    if not isinstance(lists, PlyList):
+        raise DataError(f"{path}: faces with a list vertex_indices were expected, got {sorted(face.properties)}")
+    faces = triangulate(lists.counts, lists.values)
+    if len(faces) and (faces.min() < 0 or faces.max() >= vertex.count):
+        raise DataError(f"{path}: vertex indices below {vertex.count} were expected, got {faces.max()}")
+    dtype = np.float64 if _scalar(vertex, "x").dtype == np.float64 else np.float32
+    return Mesh(positions.astype(dtype), faces.astype(np.int32), _colors(vertex))
+
+
+def triangulate(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Triangle fans [F, 3] of polygons given as ``counts`` [n] and flat ``indices``; shorter than 3 give nothing."""
+    counts = np.asarray(counts, dtype=np.int64)
+    fans = np.maximum(counts - 2, 0)  # triangles of each polygon
+    first = np.repeat(np.cumsum(counts) - counts, fans)  # flat position of the polygon's first index
+    k = np.arange(len(first)) - np.repeat(np.cumsum(fans) - fans, fans)  # 0, 1, ... within the polygon
+    return np.stack([indices[first], indices[first + k + 1], indices[first + k + 2]], axis=1).astype(np.int64)
+
+
+def _colors(vertex: PlyElement) -> np.ndarray | None:
+    """Vertex colours as uint8: as stored, or from floats in [0, 1]."""
+    names = ("red", "green", "blue")
+    colors = vertex.scalars(*names)
+    if colors is None:
+        return None
+    if all(_scalar(vertex, name).dtype.kind == "f" for name in names):
+        colors = colors * 255.0
+    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+
+
+def read_points(path: str | os.PathLike[str]) -> Points:
+    """Read the vertices of any PLY file as a point cloud.
+
+    Raises
+    ------
+    DataError
+        If the file is broken or has no vertex positions.
+    """
+    vertex = read_ply(path).elements.get("vertex")
+    positions = vertex.scalars("x", "y", "z") if vertex else None
+    if vertex is None or positions is None:
+        raise DataError(f"{path}: points were expected, got a PLY without vertex positions; give a point cloud")
+    return Points(positions, _colors(vertex), vertex.scalars("nx", "ny", "nz"))

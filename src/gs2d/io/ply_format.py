@@ -1,0 +1,331 @@
+"""The PLY container: a header of named elements, then their rows, in ASCII or binary of either byte order.
+
+Elements of scalars only become structured numpy arrays in one read. A list property (the vertex indices of a face)
+becomes a ``PlyList``: the counts and the flat values.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gs2d.errors import DataError
+from gs2d.io.files import atomic_write
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # fmt: skip # noqa: E501
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_HEADER_LIMIT = 1 << 20  # bytes: a header longer than this is no PLY header
+
+
+@dataclass(frozen=True, eq=False)
+class PlyList:
+    """A list property: ``counts`` [n] and the rows' values one after the other, ``values`` [sum(counts)]."""
+
+    counts: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """One element: its number of rows, and its properties by name, in the order of the file."""
+
+    count: int
+    properties: Mapping[str, np.ndarray | PlyList]
+
+    def scalars(self, *names: str) -> np.ndarray | None:
+        """The named scalar properties as float64 columns [count, len(names)], or None where one is missing."""
+        columns = [self.properties.get(name) for name in names]
+        arrays = [column for column in columns if isinstance(column, np.ndarray)]
+        return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == len(names) else None
+
+
+@dataclass(frozen=True)
+class PlyFile:
+    """Elements by name, in the order of the file, and the comment lines."""
+
+    elements: Mapping[str, PlyElement]
+    comments: tuple[str, ...] = ()
+
+
+@dataclass
+class _Property:
+    name: str
+    dtype: str
+    count_dtype: str | None = None  # a list property's count type
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property] = field(default_factory=list)
+
+
+@dataclass
+class _Header:
+    order: str  # "" for ASCII, else numpy's byte-order mark
+    elements: list[_Element]
+    comments: tuple[str, ...]
+    size: int  # bytes, with the end_header line
+
+
+def read_ply(path: str | os.PathLike[str]) -> PlyFile:
+    """Read every element of a PLY file.
+
+    Raises
+    ------
+    DataError
+        If the file is missing, is no PLY, has a malformed header, or ends early.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read()
+    except OSError as error:
+        raise DataError(f"{path}: a PLY file was expected, it cannot be read: {error.strerror}") from error
+    header = _parse_header(path, data)
+    reader = _AsciiReader(path, data, header) if not header.order else _BinaryReader(path, data, header)
+    return PlyFile({e.name: reader.element(e) for e in header.elements}, header.comments)
+
+
+def _broken(path: object, what: str) -> DataError:
+    return DataError(f"{path}: a well-formed PLY file was expected, {what}; export or copy the file again")
+
+
+def _parse_header(path: object, data: bytes) -> _Header:
+    if not data.startswith((b"ply\n", b"ply\r")):
+        raise DataError(f"{path}: a PLY file was expected, it does not start with 'ply'; give a .ply file")
+    end = data.find(b"end_header", 0, _HEADER_LIMIT)
+    newline = data.find(b"\n", end)
+    if end < 0 or newline < 0:
+        raise _broken(path, "its header has no end_header line")
+    order: str | None = None
+    elements: list[_Element] = []
+    comments: list[str] = []
+    for line in data[:end].decode("latin-1").splitlines()[1:]:
+        words = line.split()
+        if not words or words[0] == "obj_info":
+            continue
+        try:
+            if words[0] == "comment":
+                comments.append(line.strip()[len("comment") :].strip())
+            elif words[0] == "format":
+                order = _FORMATS[words[1]]
+            elif words[0] == "element":
+                elements.append(_Element(words[1], int(words[2])))
+            elif words[0] == "property" and words[1] == "list":
+                elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
+            elif words[0] == "property":
+                elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
+            else:
+                raise KeyError(words[0])
+        except (KeyError, IndexError, ValueError) as error:
+            raise _broken(path, f"its header line {line.strip()!r} is not understood") from error
+    if order is None:
+        raise _broken(path, "its header has no format line")
+    if any(e.count < 0 for e in elements):
+        raise _broken(path, "its header has a negative count")
+    if any(len({p.name for p in e.properties}) < len(e.properties) for e in elements):
+        raise _broken(path, "its header names a property twice")
+    return _Header(order, elements, tuple(comments), newline + 1)
+
+
+class _BinaryReader:
+    """Reads elements one after the other from the bytes behind the header."""
+
+    def __init__(self, path: object, data: bytes, header: _Header) -> None:
+        self.path, self.data, self.order, self.offset = path, data, header.order, header.size
+
+    def element(self, element: _Element) -> PlyElement:
+        if not element.properties:
+            return PlyElement(element.count, {})
+        if all(p.count_dtype is None for p in element.properties):
+            rows = self._rows(element, [(p.name, self.order + p.dtype) for p in element.properties])
+            return PlyElement(element.count, {p.name: _native(rows[p.name]) for p in element.properties})
+        return self._equal_lists(element) or self._ragged_lists(element)
+
+    def _rows(self, element: _Element, fields: list) -> np.ndarray:
+        dtype = np.dtype(fields)
+        if element.count * dtype.itemsize > len(self.data) - self.offset:
+            raise _broken(
+                self.path,
+                f"it ends early ({element.count} rows of {element.name!r} need "
+                f"{element.count * dtype.itemsize} bytes, {len(self.data) - self.offset} are left)",
+            )
+        rows = np.frombuffer(self.data, dtype, element.count, self.offset)
+        self.offset += rows.nbytes
+        return rows
+
+    def _equal_lists(self, element: _Element) -> PlyElement | None:
+        """One read for the usual case: every row has lists as long as the first row's (all triangles)."""
+        if element.count == 0:
+            empty = {p.name: _empty(p) for p in element.properties}
+            return PlyElement(0, empty)
+        start = self.offset
+        lengths = self._first_row_lengths(element)
+        fields: list = []
+        for p in element.properties:
+            if p.count_dtype is None:
+                fields.append((p.name, self.order + p.dtype))
+            else:
+                fields.append((f"{p.name} count", self.order + p.count_dtype))
+                fields.append((p.name, self.order + p.dtype, (lengths[p.name],)))
+        if element.count * np.dtype(fields).itemsize > len(self.data) - start:
+            return None
+        rows = self._rows(element, fields)
+        if any((rows[f"{name} count"] != length).any() for name, length in lengths.items()):
+            self.offset = start
+            return None
+        properties: dict[str, np.ndarray | PlyList] = {}
+        for p in element.properties:
+            values = _native(rows[p.name])
+            counts = np.full(element.count, lengths.get(p.name, 1))
+            properties[p.name] = values if p.count_dtype is None else PlyList(counts, values.reshape(-1))
+        return PlyElement(element.count, properties)
+
+    def _first_row_lengths(self, element: _Element) -> dict[str, int]:
+        lengths, offset = {}, self.offset
+        for p in element.properties:
+            if p.count_dtype is not None:
+                lengths[p.name] = self._scalar(p.count_dtype, offset)
+                offset += np.dtype(p.count_dtype).itemsize
+            offset += np.dtype(p.dtype).itemsize * lengths.get(p.name, 1)
+        return lengths
+
+    def _scalar(self, dtype: str, offset: int) -> int:
+        if offset + np.dtype(dtype).itemsize > len(self.data):
+            raise _broken(self.path, "it ends early")
+        value = int(np.frombuffer(self.data, self.order + dtype, 1, offset)[0])
+        if value < 0:
+            raise _broken(self.path, "it has a list of negative length")
+        return value
+
+    def _ragged_lists(self, element: _Element) -> PlyElement:
+        """Rows of different length: walk them one by one."""
+        starts: dict[str, list[int]] = {p.name: [] for p in element.properties}
+        counts: dict[str, list[int]] = {p.name: [] for p in element.properties}
+        offset = self.offset
+        for _ in range(element.count):
+            for p in element.properties:
+                n = 1
+                if p.count_dtype is not None:
+                    n = self._scalar(p.count_dtype, offset)
+                    offset += np.dtype(p.count_dtype).itemsize
+                starts[p.name].append(offset)
+                counts[p.name].append(n)
+                offset += n * np.dtype(p.dtype).itemsize
+            if offset > len(self.data):
+                raise _broken(self.path, "it ends early")
+        self.offset = offset
+        properties: dict[str, np.ndarray | PlyList] = {}
+        for p in element.properties:
+            size = np.dtype(p.dtype).itemsize
+            raw = b"".join(
+                self.data[s : s + n * size] for s, n in zip(starts[p.name], counts[p.name], strict=True)
+            )
+            values = _native(np.frombuffer(raw, self.order + p.dtype))
+            properties[p.name] = values if p.count_dtype is None else PlyList(np.array(counts[p.name]), values)
+        return PlyElement(element.count, properties)
+
+
+class _AsciiReader:
+    """Reads elements one after the other from the words behind the header."""
+
+    def __init__(self, path: object, data: bytes, header: _Header) -> None:
+        self.path, self.words, self.at = path, data[header.size :].split(), 0
+
+    def _take(self, count: int) -> np.ndarray:
+        words = self.words[self.at : self.at + count]
+        if len(words) < count:
+            raise _broken(self.path, f"it ends early ({count} more numbers were announced, {len(words)} are left)")
+        self.at += count
+        try:
+            return np.array(words, dtype="S").astype(np.float64) if count else np.zeros(0)
+        except ValueError as error:
+            raise _broken(self.path, f"it has a word that is no number ({error})") from error
+
+    def element(self, element: _Element) -> PlyElement:
+        if all(p.count_dtype is None for p in element.properties):
+            width = len(element.properties)
+            table = self._take(element.count * width).reshape(element.count, width)
+            return PlyElement(
+                element.count, {p.name: table[:, i].astype(p.dtype) for i, p in enumerate(element.properties)}
+            )
+        values: dict[str, list[np.ndarray]] = {p.name: [] for p in element.properties}
+        counts: dict[str, list[int]] = {p.name: [] for p in element.properties}
+        for _ in range(element.count):
+            for p in element.properties:
+                n = 1 if p.count_dtype is None else int(self._take(1)[0])
+                if n < 0:
+                    raise _broken(self.path, "it has a list of negative length")
+                counts[p.name].append(n)
+                values[p.name].append(self._take(n))
+        properties: dict[str, np.ndarray | PlyList] = {}
+        for p in element.properties:
+            flat = np.concatenate(values[p.name]).astype(p.dtype) if element.count else np.zeros(0, p.dtype)
+            properties[p.name] = flat if p.count_dtype is None else PlyList(np.array(counts[p.name], np.int64), flat)
+        return PlyElement(element.count, properties)
+
+
+def _native(values: np.ndarray) -> np.ndarray:
+    """A contiguous, writable copy in the machine's byte order."""
+    return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("=")).copy()
+
+
+def _empty(p: _Property) -> np.ndarray | PlyList:
+    values = np.zeros(0, p.dtype)
+    return values if p.count_dtype is None else PlyList(np.zeros(0, np.int64), values)
+
+
+def write_ply(
+    path: str | os.PathLike[str], elements: Mapping[str, np.ndarray], *, comments: tuple[str, ...] = ()
+) -> None:
+    """Write a binary little-endian PLY, atomically.
+
+    Parameters
+    ----------
+    path : path
+    elements : mapping of element name to structured array [n]
+        A field of shape (k,) becomes a list property of k items with a uchar count (k < 256).
+    comments : tuple of str
+        One comment line each.
+
+    Raises
+    ------
+    DiskError
+        If the file could not be written; nothing is left behind.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
+    bodies = []
+    for name, rows in elements.items():
+        lines.append(f"element {name} {len(rows)}")
+        fields: list = []
+        names = rows.dtype.names or ()
+        for key in names:
+            base, shape = rows.dtype[key].base, rows.dtype[key].shape
+            code = base.str[1:]
+            if shape:
+                lines.append(f"property list uchar {_NAMES[code]} {key}")
+                fields += [(f"{key} count", "u1"), (key, "<" + code, shape)]
+            else:
+                lines.append(f"property {_NAMES[code]} {key}")
+                fields.append((key, "<" + code))
+        body = np.empty(len(rows), dtype=fields)
+        for key in names:
+            body[key] = rows[key]
+            if rows.dtype[key].shape:
+                body[f"{key} count"] = rows.dtype[key].shape[0]
+        bodies.append(body)
+    header = "\n".join([*lines, "end_header"]) + "\n"
+    with atomic_write(path, mode="wb") as file:
+        file.write(header.encode("ascii"))
+        for body in bodies:
+            file.write(body.tobytes())

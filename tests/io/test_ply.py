@@ -1,0 +1,292 @@
+"""PLY and OBJ files: what is written comes back, and every other kind of file is named for what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.errors import DataError, DiskError
+from gs2d.io.ply import read_mesh, read_points, read_splats, triangulate, write_mesh, write_splats
+from gs2d.io.ply_format import PlyList, read_ply, write_ply
+from gs2d.splats import Splats
+from gs2d.triangles import Mesh
+
+
+def random_splats(n: int, degree: int, seed: int = 0) -> Splats:
+    g = torch.Generator().manual_seed(seed)
+    k = (degree + 1) ** 2
+    shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 2), "opacity_logits": (n,), "sh0": (n, 1, 3)}
+    shapes["shN"] = (n, k - 1, 3)
+    return Splats(**{a: torch.randn(s, generator=g) for a, s in shapes.items()})
+
+
+def tetrahedron(colors: bool = True, dtype: type = np.float32) -> Mesh:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=dtype)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
+    rgb = np.array([[0, 1, 2], [255, 4, 5], [6, 7, 8], [9, 10, 255]], np.uint8)
+    return Mesh(vertices, faces, rgb if colors else None)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("n", [0, 7])
+def test_splats_come_back_bit_for_bit(tmp_path: Path, degree: int, n: int) -> None:
+    splats = random_splats(n, degree)
+    if n:
+        splats.means[0, 0] = -0.0  # the sign of zero and subnormals survive too
+        splats.means[1, 1] = 1e-42
+    write_splats(tmp_path / "a.ply", splats)
+    for (name, before), (_, after) in zip(splats.items(), read_splats(tmp_path / "a.ply").items(), strict=True):
+        assert after.dtype == torch.float32, name
+        assert after.is_contiguous(), name
+        assert np.array_equal(before.numpy().view(np.int32), after.numpy().view(np.int32)), name
+
+
+def test_the_2dgs_layout_is_the_official_one(tmp_path: Path) -> None:
+    splats = random_splats(2, 1)
+    write_splats(tmp_path / "a.ply", splats)
+    vertex = read_ply(tmp_path / "a.ply").elements["vertex"]
+    assert list(vertex.properties) == (
+        ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+        + [f"f_rest_{i}" for i in range(9)]
+        + ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+    )
+    # f_rest is channel-major: with K-1 = 3 coefficients, f_rest_4 is green's second one
+    assert vertex.properties["f_rest_4"][1] == splats.shN[1, 1, 1].item()
+    assert (vertex.properties["nx"] == 0).all()
+
+
+def test_the_viewer_layout_has_a_flat_third_scale_after_the_second(tmp_path: Path) -> None:
+    splats = random_splats(3, 3)
+    write_splats(tmp_path / "a.ply", splats, layout="3dgs")
+    vertex = read_ply(tmp_path / "a.ply").elements["vertex"]
+    names = list(vertex.properties)
+    assert names[names.index("scale_1") + 1] == "scale_2"
+    np.testing.assert_allclose(vertex.properties["scale_2"], np.log(1e-6), rtol=1e-6)
+    np.testing.assert_array_equal(vertex.properties["scale_1"], splats.log_scales[:, 1])
+
+
+def test_an_unknown_layout_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="'2dgs' or '3dgs'"):
+        write_splats(tmp_path / "a.ply", random_splats(1, 0), layout="4dgs")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_3dgs_file_a_mesh_and_points_are_told_apart(tmp_path: Path) -> None:
+    write_splats(tmp_path / "3dgs.ply", random_splats(3, 0), layout="3dgs")
+    write_mesh(tmp_path / "mesh.ply", tetrahedron())
+    points = np.zeros(3, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+    write_ply(tmp_path / "points.ply", {"vertex": points})
+    write_ply(tmp_path / "empty.ply", {"camera": points})
+    cases = {"3dgs": "3DGS splats with three", "mesh": "got a mesh", "points": "got a point cloud", "empty": "without"}
+    for name, words in cases.items():
+        with pytest.raises(DataError, match=words) as error:
+            read_splats(tmp_path / f"{name}.ply")
+        assert "\n" not in str(error.value)
+        assert "expected" in str(error.value)
+
+
+def test_published_3dgs_and_compressed_files_are_named(shared: Callable[[str], Path]) -> None:
+    folder = shared("gaussians_plush_dog")
+    with pytest.raises(DataError, match="3DGS splats with three scales"):
+        read_splats(folder / "point_cloud_29999_clean.ply")
+    with pytest.raises(DataError, match="compressed PLY"):
+        read_splats(folder / "point_cloud_29999_clean.compressed.ply")
+    assert read_points(folder / "point_cloud_29999_clean.ply").points.shape == (15105, 3)
+
+
+def test_missing_splat_properties_are_named(tmp_path: Path) -> None:
+    rows = np.zeros(1, dtype=[(name, "f4") for name in ("x", "y", "z", "scale_0", "scale_1", "opacity")])
+    write_ply(tmp_path / "a.ply", {"vertex": rows})
+    with pytest.raises(DataError, match=r"f_dc_0, .* rot_3 are missing"):
+        read_splats(tmp_path / "a.ply")
+
+
+def test_an_odd_number_of_sh_coefficients_is_refused(tmp_path: Path) -> None:
+    write_splats(tmp_path / "a.ply", random_splats(1, 1))
+    data = (tmp_path / "a.ply").read_bytes().replace(b"property float f_rest_8\n", b"property float f_else_8\n")
+    (tmp_path / "b.ply").write_bytes(data)
+    with pytest.raises(DataError, match="got 8"):
+        read_splats(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("colors", [True, False])
+def test_a_mesh_comes_back(tmp_path: Path, dtype: type, colors: bool) -> None:
+    mesh = tetrahedron(colors, dtype)
+    write_mesh(tmp_path / "a.ply", mesh)
+    back = read_mesh(tmp_path / "a.ply")
+    assert back.vertices.dtype == dtype
+    np.testing.assert_array_equal(back.vertices, mesh.vertices)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    assert (back.colors is None) if mesh.colors is None else np.array_equal(back.colors, mesh.colors)
+
+
+def test_a_mesh_file_has_only_the_vertex_list_on_faces_and_colours_on_vertices(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "a.ply", tetrahedron())
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode().splitlines()
+    assert header[1] == "format binary_little_endian 1.0"
+    assert header[-5:] == [
+        "property uchar red",
+        "property uchar green",
+        "property uchar blue",
+        "element face 4",
+        "property list uchar int vertex_indices",
+    ]
+
+
+def test_trimesh_reads_our_mesh(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    write_mesh(tmp_path / "a.ply", tetrahedron())
+    back = trimesh.load(tmp_path / "a.ply", process=False)
+    assert back.volume == pytest.approx(1 / 6)  # positive: the faces look outward
+    assert back.visual.vertex_colors[1].tolist() == [255, 4, 5, 255]
+
+
+MIXED = """ply
+format {} 1.0
+comment polygons of 3 and 4 corners, colours before positions, a property of another kind on the faces
+element vertex 5
+property uchar red
+property uchar green
+property uchar blue
+property double y
+property double x
+property float z
+element face 2
+property uchar material
+property list uchar {} vertex_index
+property float area
+end_header
+"""
+
+
+def mixed_ply(order: str) -> bytes:
+    """A square 0 1 2 3 and a triangle 0 3 4, in ASCII ("") or binary of either byte order."""
+    name = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = MIXED.format(name, "uint" if order else "int").encode()
+    vertices = [(i, 2 * i, 255, 0.5 * i, -1.0 * i, 4.0) for i in range(5)]
+    polygons = [(7, [0, 1, 2, 3], 1.5), (8, [0, 3, 4], 2.5)]
+    if not order:
+        lines = [" ".join(map(str, v)) for v in vertices]
+        lines += [" ".join(map(str, [m, len(p), *p, a])) for m, p, a in polygons]
+        return head + "\n".join(lines).encode() + b"\n"
+    o = order
+    types = [("r", "u1"), ("g", "u1"), ("b", "u1"), ("y", o + "f8"), ("x", o + "f8"), ("z", o + "f4")]
+    table = np.array(vertices, dtype=types)
+    body = table.tobytes()
+    for material, polygon, area in polygons:
+        body += bytes([material, len(polygon)]) + np.array(polygon, o + "u4").tobytes()
+        body += np.array(area, o + "f4").tobytes()
+    return head + body
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+def test_polygons_any_property_order_and_every_format_are_read(tmp_path: Path, order: str) -> None:
+    (tmp_path / "a.ply").write_bytes(mixed_ply(order))
+    mesh = read_mesh(tmp_path / "a.ply")
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3], [0, 3, 4]])
+    np.testing.assert_array_equal(mesh.vertices[:, :2], [[-1.0 * i, 0.5 * i] for i in range(5)])
+    assert mesh.colors is not None
+    assert mesh.colors[3].tolist() == [3, 6, 255]
+    assert read_points(tmp_path / "a.ply").points[2].tolist() == [-2.0, 1.0, 4.0]
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+@pytest.mark.parametrize("lost", [1, 9, 40])
+def test_a_truncated_file_is_a_data_error(tmp_path: Path, order: str, lost: int) -> None:
+    data = mixed_ply(order).rstrip() if not order else mixed_ply(order)
+    if not order and lost == 1:
+        lost = 4  # one character less of "2.5" is still a number
+    (tmp_path / "a.ply").write_bytes(data[:-lost])
+    with pytest.raises(DataError, match="ends early"):
+        read_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"solid cube\n", "does not start with 'ply'"),
+        (b"ply\nformat ascii 1.0\n", "no end_header"),
+        (b"ply\nformat middle_endian 1.0\nend_header\n", "format middle_endian"),
+        (b"ply\nelement vertex 1\nend_header\n", "no format line"),
+        (b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "element vertex many"),
+        (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "property float x"),
+        (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "negative count"),
+        (b"ply\nformat ascii 1.0\nelement v 1\nproperty float x\nproperty float x\nend_header\n1 1\n", "twice"),
+        (b"ply\nformat binary_little_endian 1.0\nelement v 999999999999\nproperty float x\nend_header\n", "ends early"),
+        (b"ply\nformat ascii 1.0\nelement v 1\nproperty float x\nend_header\nfive\n", "no number"),
+    ],
+)
+def test_a_malformed_file_is_a_data_error_in_one_line(tmp_path: Path, text: bytes, words: str) -> None:
+    (tmp_path / "a.ply").write_bytes(text)
+    with pytest.raises(DataError, match=words) as error:
+        read_ply(tmp_path / "a.ply")
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_is_a_data_error(tmp_path: Path) -> None:
+    for read in (read_ply, read_splats, read_mesh, read_points):
+        with pytest.raises(DataError, match="cannot be read"):
+            read(tmp_path / "none.ply")
+    with pytest.raises(DataError, match="cannot be read"):
+        read_mesh(tmp_path / "none.obj")
+
+
+def test_a_face_that_names_no_vertex_is_a_data_error(tmp_path: Path) -> None:
+    mesh = tetrahedron()
+    write_mesh(tmp_path / "a.ply", Mesh(mesh.vertices[:3], mesh.faces))
+    with pytest.raises(DataError, match="below 3 were expected, got 3"):
+        read_mesh(tmp_path / "a.ply")
+
+
+def test_points_are_no_mesh(tmp_path: Path) -> None:
+    write_splats(tmp_path / "a.ply", random_splats(3, 0))
+    with pytest.raises(DataError, match="without faces"):
+        read_mesh(tmp_path / "a.ply")
+
+
+def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises(DiskError):
+        write_mesh(tmp_path / "no such folder" / "a.ply", tetrahedron())
+    write_mesh(tmp_path / "a.ply", tetrahedron())
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_polygons_become_fans() -> None:
+    faces = triangulate(np.array([2, 5, 3]), np.array([0, 1, 10, 11, 12, 13, 14, 20, 21, 22]))
+    assert faces.tolist() == [[10, 11, 12], [10, 12, 13], [10, 13, 14], [20, 21, 22]]
+
+
+def test_equal_lists_and_ragged_lists_read_alike(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "a.ply", tetrahedron())
+    fast = read_ply(tmp_path / "a.ply").elements["face"].properties["vertex_indices"]
+    assert isinstance(fast, PlyList)
+    assert fast.counts.tolist() == [3, 3, 3, 3]
+    assert fast.values.tolist() == tetrahedron().faces.reshape(-1).tolist()
+
+
+def test_obj_faces_with_texture_indices_negative_indices_and_polygons_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(
+        "# a comment\nmtllib none.mtl\nv 0 0 0\nv 1 0 0 0.5 0.5 0.5\nv 1 1 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n"
+        "f 1/1/1 2//1 3/1 4 # a square\nf -4 -3 -2\n"
+    )
+    mesh = read_mesh(tmp_path / "a.obj")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2]]
+
+
+@pytest.mark.parametrize("text", ["v 0 0\n", "v 0 0 0\nf 1 2 x\n", "v 0 0 0\nf 1 2 3\n", "v 0 0 0\n"])
+def test_a_broken_obj_is_a_data_error(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(DataError):
+        read_mesh(tmp_path / "a.obj")
+
+
+def test_real_meshes_are_read(shared: Callable[[str], Path]) -> None:
+    mesh = read_mesh(shared("rendered_bottle") / "mesh_gt.ply")
+    assert (len(mesh.vertices), len(mesh.faces)) == (20341, 40670)
+    assert np.allclose(mesh.vertices.min(0), [-0.9, -0.9, -0.85], atol=1e-3)
