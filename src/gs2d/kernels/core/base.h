@@ -1,0 +1,68 @@
+// The vocabulary of core/: arithmetic on a value type V.
+//
+// core/ holds every formula of the rasterizer once, as header-only templates on V. V is float or double here (and float
+// in a CUDA thread), or a vector of pixels or splats on the CPU (cpu/simd.h overloads the same names). Rules: no branch
+// on a V (use select), no std::, every fused multiply-add written out as fma, so that forward and backward of every
+// backend round alike.
+#pragma once
+
+#if defined(__CUDACC__) || defined(__CUDACC_RTC__)
+#define GS2D_HD __host__ __device__ __forceinline__
+#else
+#define GS2D_HD inline __attribute__((always_inline))
+#endif
+
+namespace gs2d {
+
+constexpr double LN2 = 0.69314718055994530942;
+constexpr double LOG2E = 1.44269504088896340736;
+
+#if defined(__CUDACC_RTC__)
+GS2D_HD float fma(float a, float b, float c) { return fmaf(a, b, c); }
+GS2D_HD float sqrt(float a) { return sqrtf(a); }
+GS2D_HD float abs(float a) { return fabsf(a); }
+GS2D_HD float exp(float a) { return expf(a); }
+GS2D_HD float exp2(float a) { return exp2f(a); }
+GS2D_HD float log2(float a) { return log2f(a); }
+#else
+GS2D_HD float fma(float a, float b, float c) { return __builtin_fmaf(a, b, c); }
+GS2D_HD float sqrt(float a) { return __builtin_sqrtf(a); }
+GS2D_HD float abs(float a) { return __builtin_fabsf(a); }
+GS2D_HD float exp(float a) { return __builtin_expf(a); }
+GS2D_HD float exp2(float a) { return __builtin_exp2f(a); }
+GS2D_HD float log2(float a) { return __builtin_log2f(a); }
+GS2D_HD double fma(double a, double b, double c) { return __builtin_fma(a, b, c); }
+GS2D_HD double sqrt(double a) { return __builtin_sqrt(a); }
+GS2D_HD double abs(double a) { return __builtin_fabs(a); }
+GS2D_HD double exp(double a) { return __builtin_exp(a); }
+GS2D_HD double exp2(double a) { return __builtin_exp2(a); }
+GS2D_HD double log2(double a) { return __builtin_log2(a); }
+#endif
+
+// select(m, a, b) is a where m holds, else b. min(a, b) is b when a is NaN.
+GS2D_HD float select(bool m, float a, float b) { return m ? a : b; }
+GS2D_HD double select(bool m, double a, double b) { return m ? a : b; }
+GS2D_HD float min(float a, float b) { return a < b ? a : b; }
+GS2D_HD float max(float a, float b) { return a > b ? a : b; }
+GS2D_HD double min(double a, double b) { return a < b ? a : b; }
+GS2D_HD double max(double a, double b) { return a > b ? a : b; }
+
+// c - a * b, fused.
+template <class V> GS2D_HD V fnma(V a, V b, V c) { return fma(-a, b, c); }
+
+template <class V> struct Vec3 {
+    V x, y, z;
+};
+template <class V> GS2D_HD Vec3<V> operator+(Vec3<V> a, Vec3<V> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class V> GS2D_HD Vec3<V> operator-(Vec3<V> a, Vec3<V> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class V> GS2D_HD Vec3<V> operator*(V s, Vec3<V> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class V> GS2D_HD V dot(Vec3<V> a, Vec3<V> b) { return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z)); }
+template <class V> GS2D_HD Vec3<V> cross(Vec3<V> a, Vec3<V> b) {
+    return {fma(a.y, b.z, -(a.z * b.y)), fma(a.z, b.x, -(a.x * b.z)), fma(a.x, b.y, -(a.y * b.x))};
+}
+// a + s * b
+template <class V> GS2D_HD Vec3<V> axpy(V s, Vec3<V> b, Vec3<V> a) {
+    return {fma(s, b.x, a.x), fma(s, b.y, a.y), fma(s, b.z, a.z)};
+}
+
+}  // namespace gs2d

@@ -1,0 +1,76 @@
+// The losses of one pixel, and their vector-Jacobian products (docs/math_losses.md has the same formulas in words).
+#pragma once
+
+#include "base.h"
+
+namespace gs2d {
+
+constexpr double SSIM_C1 = 0.01 * 0.01;
+constexpr double SSIM_C2 = 0.03 * 0.03;
+
+// SSIM of one pixel and channel, and its derivatives by the blurred moments that depend on the rendered image x:
+// a = B(x), s = B(x^2 + y^2), p = B(x y); b = B(y) is the target's. The sum of both second moments is enough, because
+// the variances occur only as a sum. The pullback to the image is  dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product).
+template <class V> struct SsimPoint {
+    V value, d_mean, d_squares, d_product;
+};
+
+template <class V> GS2D_HD SsimPoint<V> ssim_point(V a, V b, V s, V p) {
+    const V two = V(2.0f);
+    const V ab = a * b;
+    const V means = fma(a, a, b * b);
+    const V a1 = fma(two, ab, V(SSIM_C1));
+    const V a2 = fma(two, p - ab, V(SSIM_C2));
+    const V b1 = means + V(SSIM_C1);
+    const V b2 = (s - means) + V(SSIM_C2);
+    const V inverse = V(1.0f) / (b1 * b2);
+    const V value = (a1 * a2) * inverse;
+    const V d_squares = -(value * (b1 * inverse));                         // -value / b2
+    const V d_product = two * (a1 * inverse);                              // 2 a1 / (b1 b2)
+    const V same = value * (b1 - b2);                                      // value (1/b2 - 1/b1) b1 b2
+    const V d_mean = (two * inverse) * fma(b, a2 - a1, a * same);
+    return {value, d_mean, d_squares, d_product};
+}
+
+// d|x - y| / dx, 0 where they are equal.
+template <class V> GS2D_HD V l1_sign(V x, V y) {
+    const V zero = V(0.0f), one = V(1.0f);
+    return select(x > y, one, select(x < y, -one, zero));
+}
+
+// The surface normal of a pixel from the z-depths of its four neighbours, not normalised, in the camera frame:
+// (P_down - P_up) x (P_right - P_left) is proportional to
+//     n = (fx gx, fy gy, -(1 + (px - cx) gx + (py - cy) gy)),  gx = (zr - zl)/(zr + zl),  gy = (zd - zu)/(zd + zu)
+// with the positive factor (zr + zl)(zd + zu) / (fx fy). Its product with the pixel's ray is -1 before scaling: it faces
+// the camera and is never 0, so nothing is guarded here but the depths being positive.
+template <class V> struct DepthNormal {
+    Vec3<V> direction;                 // unit, camera frame
+    V inverse_length;                  // 1 / |n|
+    V slope_x, slope_y;                // 2 / (zr + zl)^2, 2 / (zd + zu)^2: d gx/d zr = slope_x zl, d gx/d zl = -slope_x zr
+};
+
+template <class V>
+GS2D_HD DepthNormal<V> depth_normal(V left, V right, V up, V down, V offset_x, V offset_y, V fx, V fy) {
+    const V one = V(1.0f), two = V(2.0f);
+    const V inverse_x = one / (right + left), inverse_y = one / (down + up);
+    const V gx = (right - left) * inverse_x, gy = (down - up) * inverse_y;
+    const Vec3<V> n = {fx * gx, fy * gy, -fma(offset_x, gx, fma(offset_y, gy, one))};
+    const V inverse_length = one / sqrt(dot(n, n));
+    return {inverse_length * n, inverse_length, two * inverse_x * inverse_x, two * inverse_y * inverse_y};
+}
+
+// The pullback of a cotangent of the unit normal to gx and gy, times slope_x and slope_y: the depth of the right
+// neighbour gets x * left, the left one -x * right, the lower one y * up, the upper one -y * down.
+template <class V> struct DepthNormalGrad {
+    V x, y;
+};
+
+template <class V>
+GS2D_HD DepthNormalGrad<V> depth_normal_vjp(const DepthNormal<V>& f, Vec3<V> g, V offset_x, V offset_y, V fx, V fy) {
+    const Vec3<V> n = f.direction;
+    const V along = dot(g, n);
+    const Vec3<V> d = f.inverse_length * Vec3<V>{fnma(along, n.x, g.x), fnma(along, n.y, g.y), fnma(along, n.z, g.z)};
+    return {f.slope_x * fma(fx, d.x, -(offset_x * d.z)), f.slope_y * fma(fy, d.y, -(offset_y * d.z))};
+}
+
+}  // namespace gs2d

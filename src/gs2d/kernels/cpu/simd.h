@@ -1,0 +1,89 @@
+// A vector of LANES reals (V) and a mask of LANES bits (M): the only place that knows the instruction set.
+//
+// Each library is one instruction set (CMakeLists.txt), so `V` is one type per library:
+//
+//   library    real     LANES   file
+//   v4         float    16      simd_avx512.h
+//   v3         float    8       simd_avx2.h
+//   portable   float    8       simd_portable.h (GCC vector extensions; any processor)
+//   f64        double   8       simd_portable.h (tests only)
+//
+// Offered, besides + - * / on V and < <= > >= on V giving M, and & | ~ on M:
+//   V(real)                   broadcast               load(p), store(p, v)        unaligned, LANES reals
+//   load_first(p, n)          first n lanes, rest 0   store_first(p, v, n)        n in 0..LANES
+//   fma(a,b,c), fnma(a,b,c)   a*b+c, c-a*b            min, max, abs, sqrt, round  min(a,b) is b where a is NaN
+//   exp2, exp, log2           a few ulp               select(m, a, b)             m ? a : b
+//   keep(m, a)                m ? a : 0               any(m), all(m), bits(m), mask_of(bits), first(n)
+//   iota()                    0, 1, 2, ...            sum(v)                      fixed order
+//   transpose_reduce<K>(v, p) p[k] = sum(v[k]), K = 16 or 4, fixed order
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "core/base.h"
+
+#if defined(GS2D_DOUBLE)
+#include "cpu/simd_portable.h"
+#elif defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__) && defined(__AVX512BW__)
+#include "cpu/simd_avx512.h"
+#elif defined(__AVX2__) && defined(__FMA__)
+#include "cpu/simd_avx2.h"
+#else
+#include "cpu/simd_portable.h"
+#endif
+
+namespace gs2d {
+
+// One pass over one vector of pixels: 4 wide and LANES / 4 high.
+constexpr int BLOCK_W = 4;
+constexpr int BLOCK_H = LANES / BLOCK_W;
+constexpr int TILE = 16;
+constexpr int BLOCKS = TILE * TILE / LANES;
+constexpr int BLOCKS_X = TILE / BLOCK_W;
+
+GS2D_HD V operator-(V a) { return V(real(0)) - a; }
+GS2D_HD V& operator+=(V& a, V b) { return a = a + b; }
+GS2D_HD V& operator-=(V& a, V b) { return a = a - b; }
+GS2D_HD V& operator*=(V& a, V b) { return a = a * b; }
+
+#if !defined(GS2D_DOUBLE)
+// 2^x for x in [-126, 127]; relative error below 2e-7. Degree 5, minimax on [-1/2, 1/2] with value 1 at 0.
+GS2D_HD V exp2(V x) {
+    x = min(max(x, V(-126.f)), V(127.f));
+    const V n = round(x), f = x - n;
+    const V f2 = f * f;
+    const V p01 = fma(V(0.69314697f), f, V(1.f)), p23 = fma(V(0.05550713f), f, V(0.2402212f));
+    const V p45 = fma(V(0.0013276472f), f, V(0.0096755413f));
+    return scale2(fma(fma(p45, f2, p23), f2, p01), n);
+}
+
+// e^x, relative error below 4e-7 where the result is a normal number; saturates outside.
+GS2D_HD V exp(V x) {
+    const V n = round(min(max(x * V(float(LOG2E)), V(-126.f)), V(127.f)));
+    V f = fnma(n, V(0.693359375f), x);
+    f = fnma(n, V(-2.12194440e-4f), f);
+    V p = fma(V(1.9875691500e-4f), f, V(1.3981999507e-3f));
+    p = fma(p, f, V(8.3334519073e-3f));
+    p = fma(p, f, V(4.1665795894e-2f));
+    p = fma(p, f, V(1.6666665459e-1f));
+    p = fma(p, f, V(0.5f));
+    p = fma(p, f * f, f) + V(1.f);
+    const V y = scale2(p, n);
+    return select(x > V(88.02f), V(__builtin_inff()), select(x < V(-87.3f), V(0.f), y));
+}
+
+// log2(x) for normal x > 0: x = 2^e m with m in [sqrt(1/2), sqrt 2], series of atanh((m - 1) / (m + 1)).
+GS2D_HD V log2(V x) {
+    V e;
+    const V m = split2(x, e);
+    const V s = (m - V(1.f)) / (m + V(1.f)), s2 = s * s;
+    V p = fma(V(2.8853901f / 9.f), s2, V(2.8853901f / 7.f));
+    p = fma(p, s2, V(2.8853901f / 5.f));
+    p = fma(p, s2, V(2.8853901f / 3.f));
+    p = fma(p, s2, V(2.8853901f));
+    return fma(p, s, e);
+}
+#endif
+
+}  // namespace gs2d

@@ -1,0 +1,87 @@
+// simd.h for AVX2 and FMA: 8 floats, masks as vectors of all-ones or all-zeros.
+#pragma once
+
+#include <immintrin.h>
+
+namespace gs2d {
+
+using real = float;
+constexpr int LANES = 8;
+
+struct M {
+    __m256 m;
+};
+struct V {
+    __m256 v;
+    V() = default;
+    GS2D_HD V(__m256 x) : v(x) {}
+    GS2D_HD V(float x) : v(_mm256_set1_ps(x)) {}
+};
+
+GS2D_HD V operator+(V a, V b) { return _mm256_add_ps(a.v, b.v); }
+GS2D_HD V operator-(V a, V b) { return _mm256_sub_ps(a.v, b.v); }
+GS2D_HD V operator*(V a, V b) { return _mm256_mul_ps(a.v, b.v); }
+GS2D_HD V operator/(V a, V b) { return _mm256_div_ps(a.v, b.v); }
+GS2D_HD V fma(V a, V b, V c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
+GS2D_HD V fnma(V a, V b, V c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
+GS2D_HD V min(V a, V b) { return _mm256_min_ps(a.v, b.v); }
+GS2D_HD V max(V a, V b) { return _mm256_max_ps(a.v, b.v); }
+GS2D_HD V sqrt(V a) { return _mm256_sqrt_ps(a.v); }
+GS2D_HD V abs(V a) { return _mm256_andnot_ps(_mm256_set1_ps(-0.f), a.v); }
+GS2D_HD V round(V a) { return _mm256_round_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
+GS2D_HD V scale2(V a, V n) {
+    const __m256i e = _mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(n.v), _mm256_set1_epi32(127)), 23);
+    return _mm256_mul_ps(a.v, _mm256_castsi256_ps(e));
+}
+GS2D_HD V split2(V x, V& e) {
+    const __m256i i = _mm256_castps_si256(x.v), root_half = _mm256_set1_epi32(0x3f3504f3);
+    const __m256i n = _mm256_srai_epi32(_mm256_sub_epi32(i, root_half), 23);
+    e = _mm256_cvtepi32_ps(n);
+    return _mm256_castsi256_ps(_mm256_sub_epi32(i, _mm256_slli_epi32(n, 23)));
+}
+
+GS2D_HD M operator<(V a, V b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_LT_OQ)}; }
+GS2D_HD M operator<=(V a, V b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_LE_OQ)}; }
+GS2D_HD M operator>(V a, V b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GT_OQ)}; }
+GS2D_HD M operator>=(V a, V b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
+GS2D_HD M operator&(M a, M b) { return {_mm256_and_ps(a.m, b.m)}; }
+GS2D_HD M operator|(M a, M b) { return {_mm256_or_ps(a.m, b.m)}; }
+GS2D_HD M and_not(M a, M b) { return {_mm256_andnot_ps(b.m, a.m)}; }  // a & ~b
+GS2D_HD M operator~(M a) { return {_mm256_xor_ps(a.m, _mm256_castsi256_ps(_mm256_set1_epi32(-1)))}; }
+GS2D_HD uint32_t bits(M m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.m)); }
+GS2D_HD bool any(M m) { return bits(m) != 0; }
+GS2D_HD bool all(M m) { return bits(m) == 0xffu; }
+GS2D_HD M mask_of(uint32_t b) {
+    const __m256i bit = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+    const __m256i v = _mm256_and_si256(_mm256_set1_epi32(static_cast<int>(b)), bit);
+    return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(v, bit))};
+}
+GS2D_HD M first(int n) {
+    return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_set1_epi32(n), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7)))};
+}
+GS2D_HD V select(M m, V a, V b) { return _mm256_blendv_ps(b.v, a.v, m.m); }
+GS2D_HD V keep(M m, V a) { return _mm256_and_ps(m.m, a.v); }
+
+GS2D_HD V load(const float* p) { return _mm256_loadu_ps(p); }
+GS2D_HD void store(float* p, V a) { _mm256_storeu_ps(p, a.v); }
+GS2D_HD V load_first(const float* p, int n) { return _mm256_maskload_ps(p, _mm256_castps_si256(first(n).m)); }
+GS2D_HD void store_first(float* p, V a, int n) { _mm256_maskstore_ps(p, _mm256_castps_si256(first(n).m), a.v); }
+GS2D_HD V iota() { return _mm256_setr_ps(0, 1, 2, 3, 4, 5, 6, 7); }
+GS2D_HD float sum(V a) {
+    __m128 h = _mm_add_ps(_mm256_castps256_ps128(a.v), _mm256_extractf128_ps(a.v, 1));
+    h = _mm_add_ps(h, _mm_movehl_ps(h, h));
+    return _mm_cvtss_f32(_mm_add_ss(h, _mm_movehdup_ps(h)));
+}
+
+template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {
+    static_assert(K % 4 == 0);
+    for (int i = 0; i < K / 4; ++i) {
+        const __m256 a = v[4 * i].v, b = v[4 * i + 1].v, c = v[4 * i + 2].v, d = v[4 * i + 3].v;
+        const __m256 ab = _mm256_add_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b));
+        const __m256 cd = _mm256_add_ps(_mm256_unpacklo_ps(c, d), _mm256_unpackhi_ps(c, d));
+        const __m256 q = _mm256_add_ps(_mm256_shuffle_ps(ab, cd, 0x44), _mm256_shuffle_ps(ab, cd, 0xee));
+        _mm_storeu_ps(p + 4 * i, _mm_add_ps(_mm256_castps256_ps128(q), _mm256_extractf128_ps(q, 1)));
+    }
+}
+
+}  // namespace gs2d

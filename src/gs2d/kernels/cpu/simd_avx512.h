@@ -1,0 +1,83 @@
+// simd.h for AVX-512: 16 floats, masks in k registers.
+#pragma once
+
+#include <immintrin.h>
+
+namespace gs2d {
+
+using real = float;
+constexpr int LANES = 16;
+
+struct M {
+    __mmask16 k;
+};
+struct V {
+    __m512 v;
+    V() = default;
+    GS2D_HD V(__m512 x) : v(x) {}
+    GS2D_HD V(float x) : v(_mm512_set1_ps(x)) {}
+};
+
+GS2D_HD V operator+(V a, V b) { return _mm512_add_ps(a.v, b.v); }
+GS2D_HD V operator-(V a, V b) { return _mm512_sub_ps(a.v, b.v); }
+GS2D_HD V operator*(V a, V b) { return _mm512_mul_ps(a.v, b.v); }
+GS2D_HD V operator/(V a, V b) { return _mm512_div_ps(a.v, b.v); }
+GS2D_HD V fma(V a, V b, V c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
+GS2D_HD V fnma(V a, V b, V c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
+GS2D_HD V min(V a, V b) { return _mm512_min_ps(a.v, b.v); }
+GS2D_HD V max(V a, V b) { return _mm512_max_ps(a.v, b.v); }
+GS2D_HD V sqrt(V a) { return _mm512_sqrt_ps(a.v); }
+GS2D_HD V abs(V a) { return _mm512_abs_ps(a.v); }
+GS2D_HD V round(V a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
+GS2D_HD V scale2(V a, V n) { return _mm512_scalef_ps(a.v, n.v); }
+GS2D_HD V split2(V x, V& e) {
+    const V m = _mm512_getmant_ps(x.v, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_src);
+    e = _mm512_getexp_ps(_mm512_div_ps(x.v, m.v));
+    return m;
+}
+
+GS2D_HD M operator<(V a, V b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
+GS2D_HD M operator<=(V a, V b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }
+GS2D_HD M operator>(V a, V b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+GS2D_HD M operator>=(V a, V b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+GS2D_HD M operator&(M a, M b) { return {_kand_mask16(a.k, b.k)}; }
+GS2D_HD M operator|(M a, M b) { return {_kor_mask16(a.k, b.k)}; }
+GS2D_HD M operator~(M a) { return {_knot_mask16(a.k)}; }
+GS2D_HD M and_not(M a, M b) { return {_kandn_mask16(b.k, a.k)}; }  // a & ~b
+GS2D_HD bool any(M m) { return !_kortestz_mask16_u8(m.k, m.k); }
+GS2D_HD bool all(M m) { return _kortestc_mask16_u8(m.k, m.k); }
+GS2D_HD uint32_t bits(M m) { return _cvtmask16_u32(m.k); }
+GS2D_HD M mask_of(uint32_t b) { return {static_cast<__mmask16>(b)}; }
+GS2D_HD M first(int n) { return {static_cast<__mmask16>((1u << n) - 1u)}; }
+GS2D_HD V select(M m, V a, V b) { return _mm512_mask_blend_ps(m.k, b.v, a.v); }
+GS2D_HD V keep(M m, V a) { return _mm512_maskz_mov_ps(m.k, a.v); }
+
+GS2D_HD V load(const float* p) { return _mm512_loadu_ps(p); }
+GS2D_HD void store(float* p, V a) { _mm512_storeu_ps(p, a.v); }
+GS2D_HD V load_first(const float* p, int n) { return _mm512_maskz_loadu_ps(first(n).k, p); }
+GS2D_HD void store_first(float* p, V a, int n) { _mm512_mask_storeu_ps(p, first(n).k, a.v); }
+GS2D_HD V iota() { return _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
+GS2D_HD float sum(V a) { return _mm512_reduce_add_ps(a.v); }
+
+// Each step halves the number of vectors and of partial sums per vector.
+template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {
+    static_assert(K == 16 || K == 4);
+    __m512 q[K / 4];
+    for (int i = 0; i < K / 4; ++i) {
+        // 4 vectors -> 1: within each 128-bit part, lane k holds the part's sum of vector k
+        const __m512 a = v[4 * i].v, b = v[4 * i + 1].v, c = v[4 * i + 2].v, d = v[4 * i + 3].v;
+        const __m512 ab = _mm512_add_ps(_mm512_unpacklo_ps(a, b), _mm512_unpackhi_ps(a, b));
+        const __m512 cd = _mm512_add_ps(_mm512_unpacklo_ps(c, d), _mm512_unpackhi_ps(c, d));
+        q[i] = _mm512_add_ps(_mm512_shuffle_ps(ab, cd, 0x44), _mm512_shuffle_ps(ab, cd, 0xee));
+    }
+    if constexpr (K == 16) {
+        const __m512 s01 = _mm512_add_ps(_mm512_shuffle_f32x4(q[0], q[1], 0x88), _mm512_shuffle_f32x4(q[0], q[1], 0xdd));
+        const __m512 s23 = _mm512_add_ps(_mm512_shuffle_f32x4(q[2], q[3], 0x88), _mm512_shuffle_f32x4(q[2], q[3], 0xdd));
+        _mm512_storeu_ps(p, _mm512_add_ps(_mm512_shuffle_f32x4(s01, s23, 0x88), _mm512_shuffle_f32x4(s01, s23, 0xdd)));
+    } else {
+        const __m256 h = _mm256_add_ps(_mm512_castps512_ps256(q[0]), _mm512_extractf32x8_ps(q[0], 1));
+        _mm_storeu_ps(p, _mm_add_ps(_mm256_castps256_ps128(h), _mm256_extractf128_ps(h, 1)));
+    }
+}
+
+}  // namespace gs2d

@@ -1,0 +1,124 @@
+#include "cpu/threads.h"
+
+#include <pthread.h>
+
+#include <atomic>
+
+#include "cpu/export.h"
+
+namespace gs2d {
+namespace {
+
+constexpr int MAX_THREADS = 256;
+
+struct Pool {
+    pthread_mutex_t run_lock = PTHREAD_MUTEX_INITIALIZER;  // one parallel_for at a time
+    pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;      // guards everything below
+    pthread_cond_t wake = PTHREAD_COND_INITIALIZER, done = PTHREAD_COND_INITIALIZER;
+    int wanted = 1;   // threads asked for, the caller included
+    int started = 0;  // pool threads alive
+    int busy = 0;     // pool threads inside the current job
+    int seats = 0;    // pool threads that may still join it
+    uint64_t job = 0;
+    Task task = nullptr;
+    void* context = nullptr;
+    int64_t count = 0;
+    std::atomic<int64_t> next{0};
+};
+
+Pool pool;
+thread_local bool inside = false;
+
+void work(Task task, void* context, int64_t count) {
+    for (int64_t i; (i = pool.next.fetch_add(1, std::memory_order_relaxed)) < count;) task(context, i);
+}
+
+void* thread_main(void*) {
+    inside = true;
+    uint64_t seen = 0;
+    pthread_mutex_lock(&pool.lock);
+    for (;;) {
+        while (pool.seats == 0 || pool.job == seen) pthread_cond_wait(&pool.wake, &pool.lock);
+        seen = pool.job;
+        --pool.seats;
+        ++pool.busy;
+        const Task task = pool.task;
+        void* const context = pool.context;
+        const int64_t count = pool.count;
+        pthread_mutex_unlock(&pool.lock);
+        work(task, context, count);
+        pthread_mutex_lock(&pool.lock);
+        if (--pool.busy == 0) pthread_cond_signal(&pool.done);
+    }
+    return nullptr;
+}
+
+// A forked child has only the forking thread: it starts with an empty pool and fresh locks.
+void after_fork() {
+    pthread_mutex_init(&pool.run_lock, nullptr);
+    pthread_mutex_init(&pool.lock, nullptr);
+    pthread_cond_init(&pool.wake, nullptr);
+    pthread_cond_init(&pool.done, nullptr);
+    pool.started = pool.busy = pool.seats = 0;
+    inside = false;
+}
+
+void start_missing(int needed) {  // with pool.lock held
+    if (pool.started == 0) {
+        static bool registered = false;
+        if (!registered) pthread_atfork(nullptr, nullptr, after_fork);
+        registered = true;
+    }
+    for (; pool.started < needed; ++pool.started) {
+        pthread_t thread;
+        if (pthread_create(&thread, nullptr, thread_main, nullptr) != 0) break;  // fewer threads, same result
+        pthread_detach(thread);
+    }
+}
+
+}  // namespace
+
+void set_threads(int n) {
+    pthread_mutex_lock(&pool.lock);
+    pool.wanted = n < 1 ? 1 : n > MAX_THREADS ? MAX_THREADS : n;
+    pthread_mutex_unlock(&pool.lock);
+}
+
+int get_threads() {
+    pthread_mutex_lock(&pool.lock);
+    const int n = pool.wanted;
+    pthread_mutex_unlock(&pool.lock);
+    return n;
+}
+
+void run_tasks(int64_t n, Task task, void* context) {
+    const int helpers = static_cast<int>(n - 1 < get_threads() - 1 ? n - 1 : get_threads() - 1);
+    if (helpers <= 0 || inside) {  // also a parallel_for inside a task: run it here
+        for (int64_t i = 0; i < n; ++i) task(context, i);
+        return;
+    }
+    pthread_mutex_lock(&pool.run_lock);
+    pthread_mutex_lock(&pool.lock);
+    start_missing(helpers);
+    pool.task = task;
+    pool.context = context;
+    pool.count = n;
+    pool.next.store(0, std::memory_order_relaxed);
+    pool.seats = helpers;
+    ++pool.job;
+    pthread_cond_broadcast(&pool.wake);
+    pthread_mutex_unlock(&pool.lock);
+    inside = true;
+    work(task, context, n);
+    inside = false;
+    pthread_mutex_lock(&pool.lock);
+    pool.seats = 0;  // latecomers find nothing to do
+    while (pool.busy > 0) pthread_cond_wait(&pool.done, &pool.lock);
+    pthread_mutex_unlock(&pool.lock);
+    pthread_mutex_unlock(&pool.run_lock);
+}
+
+}  // namespace gs2d
+
+GS2D_EXPORT void gs2d_set_threads(int n) { gs2d::set_threads(n); }
+GS2D_EXPORT int gs2d_get_threads() { return gs2d::get_threads(); }

@@ -1,0 +1,126 @@
+"""Find, load and describe the native CPU library.
+
+There is one library per instruction set (CMakeLists.txt); ``load()`` picks the best one this processor can run.
+The environment variable ``GS2D_CPU_VARIANT`` (``v4``, ``v3`` or ``portable``) overrides the choice.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gs2d.errors import BackendError
+
+ABI_VERSION = 1
+VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
+LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "portable", "f64": "portable, float64"}
+FOLDER = Path(__file__).parent / "lib"
+REMEDY = (
+    "install a C++20 compiler (g++ >= 11 or clang++ >= 14) and run `pip install --force-reinstall --no-deps .` "
+    "(in a source checkout: `make kernels`), or use --backend reference"
+)
+
+
+class Library:
+    """One loaded native library.
+
+    Attributes
+    ----------
+    variant : str
+        ``"v4"``, ``"v3"``, ``"portable"``, or ``"f64"`` (all arithmetic in float64; tests only).
+    dtype : torch.dtype
+        Of the arrays its functions take.
+    lanes : int
+        Pixels per vector.
+    """
+
+    def __init__(self, path: Path, variant: str) -> None:
+        try:
+            self._dll = ctypes.CDLL(str(path))
+            version = int(self._dll.gs2d_abi_version())
+        except (OSError, AttributeError) as error:
+            raise BackendError(f"the CPU kernels {path.name} cannot be loaded ({error}); {REMEDY}") from error
+        if version != ABI_VERSION:
+            raise BackendError(f"the CPU kernels {path.name} have version {version}, expected {ABI_VERSION}; {REMEDY}")
+        self.path = path
+        self.variant = variant
+        self.lanes = int(self._dll.gs2d_lanes())
+        self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32
+
+    def function(self, name: str, restype: Any, argtypes: Sequence[Any]) -> Any:
+        """The exported function ``name`` with its C signature. The GIL is released while it runs."""
+        function = self._dll[name]  # a fresh object: two callers cannot disturb each other's signature
+        function.restype = restype
+        function.argtypes = list(argtypes)
+        return function
+
+    def use_threads(self, n: int) -> None:
+        """Let the following calls use ``n`` threads. Results do not depend on it."""
+        self._dll.gs2d_set_threads(int(n))
+
+    @property
+    def threads(self) -> int:
+        """Number of threads the next call will use."""
+        return int(self._dll.gs2d_get_threads())
+
+    @property
+    def instruction_set(self) -> str:
+        """For people."""
+        return LANGUAGE[self.variant]
+
+
+def _path(variant: str) -> Path:
+    suffix = "dylib" if sys.platform == "darwin" else "so"
+    return FOLDER / f"libgs2d_cpu_{variant}.{suffix}"
+
+
+def available_variants() -> tuple[str, ...]:
+    """Names of the built variants that this processor can run, best first; empty without the native library."""
+    if not _path("portable").exists():
+        return ()
+    level = int(ctypes.CDLL(str(_path("portable"))).gs2d_cpu_level())
+    return tuple(name for name, needs in VARIANTS.items() if level >= needs and _path(name).exists())
+
+
+@cache
+def _load(variant: str) -> Library:
+    return Library(_path(variant), variant)
+
+
+def load(variant: str | None = None) -> Library:
+    """The native library: the best variant of this machine, or the one that is named.
+
+    Parameters
+    ----------
+    variant : str, optional
+        One of ``available_variants()``, or ``"f64"``. Without it, ``GS2D_CPU_VARIANT`` from the environment decides,
+        and without that the processor.
+
+    Raises
+    ------
+    BackendError
+        If the library was not built, or the named variant cannot run here.
+    """
+    wanted = variant or os.environ.get("GS2D_CPU_VARIANT")
+    choices = available_variants()
+    if not choices:
+        raise BackendError(f"expected the native CPU library in the package's kernels/lib, found none; {REMEDY}")
+    if wanted is None:
+        return _load(choices[0])
+    if wanted in choices or (wanted == "f64" and _path("f64").exists()):
+        return _load(wanted)
+    raise BackendError(f"CPU kernels: expected a variant of {', '.join(choices)}, got {wanted!r}; unset GS2D_CPU_VARIANT")
+
+
+def prepare() -> Library:
+    """``load()``, set to as many threads as torch uses: call it at the start of every native operation."""
+    library = load()
+    library.use_threads(torch.get_num_threads())
+    return library
