@@ -65,7 +65,7 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
-    """Decode a mask: bool [H, W], True where the image is at least half white (its alpha counts if it is all white)."""
+    """Decode a mask: bool [H, W], True where the image is at least half white and half opaque."""
     image = read_image(path)
     grey = image[:, :, :3].max(axis=2)
     if image.shape[2] == 4:
@@ -180,7 +180,5 @@ def mask_downscale(mask: np.ndarray, factor: int, *, need: float) -> np.ndarray:
 def _blocks(image: np.ndarray, factor: int) -> np.ndarray:
     height, width = image.shape[0] // factor, image.shape[1] // factor
     if factor < 1 or height < 1 or width < 1:
-        raise ShapeError(
-            f"downscale must leave at least one pixel of {image.shape[1]}x{image.shape[0]}, got {factor}"
-        )
+        raise ShapeError(f"downscale must leave at least one pixel of {image.shape[1]}x{image.shape[0]}, got {factor}")
     return image[: height * factor, : width * factor].reshape(height, factor, width, factor, image.shape[2])

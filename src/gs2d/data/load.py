@@ -5,7 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from gs2d.data.capture import build_scene
+from gs2d.data.colmap import MODEL_FOLDERS, model_folder, read_colmap
+from gs2d.data.dtu import CAMERA_FILES, read_dtu
 from gs2d.data.scene import Scene
+from gs2d.data.transforms import read_blender, read_nerfstudio
 from gs2d.errors import DataError
 
 FORMATS = ("blender", "nerfstudio", "dtu", "colmap")
@@ -20,7 +24,36 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     DataError
         Missing or empty folder, or no known layout; lists what was looked for.
     """
-    raise NotImplementedError
+    root = _folder(path)
+    if (root / "transforms_train.json").is_file():
+        return "blender"
+    if (root / "transforms.json").is_file():
+        return "nerfstudio"
+    if any((root / name).is_file() for name in CAMERA_FILES):
+        return "dtu"
+    if model_folder(root) is not None:
+        return "colmap"
+    held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
+    if not held:
+        raise DataError(f"{root} must hold a capture, got an empty folder")
+    raise DataError(
+        f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
+        f"(DTU), or cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP); "
+        f"got {', '.join(held[:8])}{' ...' if len(held) > 8 else ''}"
+    )
+
+
+def _folder(path: str | os.PathLike[str]) -> Path:
+    root = Path(path)
+    if not root.exists():
+        raise DataError(f"{root} must be the folder of a capture, got no such folder")
+    if not root.is_dir():
+        raise DataError(f"{root} must be the folder of a capture, got a file; give its folder")
+    try:
+        os.listdir(root)
+    except OSError as error:
+        raise DataError(f"cannot read the folder {root}: {error.strerror or error}") from error
+    return root
 
 
 def load_scene(
@@ -52,4 +85,19 @@ def load_scene(
     DataError
         Anything missing or wrong with the files; one line with expected, got and remedy.
     """
-    raise NotImplementedError
+    root = _folder(path)
+    if format == "auto":
+        format = detect_format(root)
+    if format not in FORMATS:
+        raise DataError(f"format must be auto or one of {', '.join(FORMATS)}, got {format}")
+    if downscale < 1:
+        raise DataError(f"downscale must be a whole number >= 1, got {downscale}")
+    if format == "blender":
+        capture = read_blender(root)
+    elif format == "nerfstudio":
+        capture = read_nerfstudio(root)
+    elif format == "dtu":
+        capture = read_dtu(root)
+    else:
+        capture = read_colmap(root, downscale)
+    return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes)

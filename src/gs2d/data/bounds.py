@@ -1,0 +1,107 @@
+"""Where the cameras look: the box that a scene without points starts in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.data.scene import PointCloud
+from gs2d.geometry import camera_extent, focus_point
+
+_GRID = 48  # samples along each side of the search box
+_BLENDER_HALF = 1.3  # the initial box of NeRF-Synthetic in the 3DGS and 2DGS recipes
+
+
+def scene_bounds(
+    cameras: Sequence[Camera], points: PointCloud | None, *, blender: bool = False
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The box that the cameras look at.
+
+    With sparse points, their 1st to 99th percentile on each axis, widened by a tenth. Without, the box around the
+    places that most cameras see. For a NeRF-Synthetic data set the customary [-1.3, 1.3]^3, if the cameras
+    agree with it.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        The training cameras.
+    points : PointCloud or None
+
+    Returns
+    -------
+    bounds : ndarray [2, 3] float64, wu
+    notes : tuple of str
+        What a user should know about a box that is a guess.
+    """
+    if points is not None and len(points) >= 10:
+        low, high = np.percentile(points.points, (1, 99), axis=0)
+        margin = 0.1 * np.maximum(high - low, 1e-3 * (high - low).max())
+        if (margin > 0).all():
+            return np.stack([low - margin, high + margin]), ()
+    if blender and _fits_blender_box(cameras):
+        return np.array([[-_BLENDER_HALF] * 3, [_BLENDER_HALF] * 3]), ()
+    box = _box_seen_by_most(cameras)
+    if box is not None:
+        return box, ()
+    return _box_ahead(cameras), (
+        "the optical axes do not meet, so the depth of the scene is a guess; give sparse points for a good start",
+    )
+
+
+def _fits_blender_box(cameras: Sequence[Camera]) -> bool:
+    """All cameras stand outside the customary box and look at its middle."""
+    focus = focus_point(cameras)
+    if not _axes_meet(cameras) or np.abs(focus).max() > 0.5 * _BLENDER_HALF:
+        return False
+    distances = [np.abs(camera.center).max() for camera in cameras]
+    if min(distances) <= _BLENDER_HALF:
+        return False
+    # The box must fill a fair part of the pictures: in other units (centimetres) it would be a dot or the whole world.
+    radius = np.median([np.linalg.norm(camera.center) for camera in cameras])
+    half_view = np.median([min(c.width / c.fx, c.height / c.fy) / 2 for c in cameras]) * radius
+    return bool(0.5 < half_view / _BLENDER_HALF < 3.0)
+
+
+def _axes_meet(cameras: Sequence[Camera]) -> bool:
+    """The axes fix a point (they are not nearly parallel) and it lies ahead of most cameras."""
+    axes = np.stack([camera.forward for camera in cameras])
+    spread = np.linalg.eigvalsh(np.eye(3) - axes.T @ axes / len(axes))[0]  # mean sin^2 to the best common axis
+    ahead = np.mean([(focus_point(cameras) - c.center) @ c.forward > 0 for c in cameras])
+    return bool(spread > np.sin(np.radians(3.0)) ** 2 and ahead > 0.5)
+
+
+def _box_seen_by_most(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """The box around grid points that are seen by nearly as many cameras as the best seen one is."""
+    if len(cameras) < 2 or not _axes_meet(cameras):
+        return None
+    focus = focus_point(cameras)
+    centers = np.stack([camera.center for camera in cameras])
+    reach = np.median(np.linalg.norm(centers - focus, axis=1))
+    ticks = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
+    grid = focus + reach * np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    seen = np.zeros(len(grid))
+    for camera in cameras:
+        pixels, depth = camera.project(grid)
+        inside = (pixels >= 0).all(axis=1) & (pixels <= (camera.width, camera.height)).all(axis=1)
+        seen += inside & (depth > 0.05 * reach)
+    if seen.max() < 2:
+        return None
+    chosen = grid[seen >= 0.8 * seen.max()]
+    half_cell = reach / _GRID
+    return np.stack([chosen.min(axis=0) - half_cell, chosen.max(axis=0) + half_cell])
+
+
+def _box_ahead(cameras: Sequence[Camera]) -> np.ndarray:
+    """Around the pictures at the depths between one and four camera extents: all that parallel axes tell."""
+    extent = max(camera_extent(cameras), 1e-6)
+    corners = []
+    for camera in cameras:
+        for depth in (extent, 4 * extent):
+            u = (np.array([0.0, camera.width]) - camera.cx) / camera.fx
+            v = (np.array([0.0, camera.height]) - camera.cy) / camera.fy
+            rays = np.array([[x, y, 1.0] for x in u for y in v])
+            corners.append(camera.center + depth * rays @ camera.rotation)
+    stacked = np.concatenate(corners)
+    return np.stack([stacked.min(axis=0), stacked.max(axis=0)])

@@ -1,0 +1,278 @@
+"""What every reader produces, and the one way from there to a Scene."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from gs2d.camera import Camera
+from gs2d.data.bounds import scene_bounds
+from gs2d.data.cache import ImageCache, Picture
+from gs2d.data.lens import Intrinsics, source_positions, undistort_image, undistort_mask
+from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.errors import DataError, ShapeError
+from gs2d.geometry import camera_extent
+from gs2d.images import area_downscale, image_size, mask_downscale, read_image, read_mask
+
+# An image may differ from its camera's size by a factor; each axis may then be off by rounding.
+_ASPECT_TOLERANCE = 0.01
+
+LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a data set says about one photograph that exists.
+
+    Attributes
+    ----------
+    name : str
+        Unique, with ``/``.
+    path : Path
+    intrinsics : Intrinsics
+        For the size that the data set states.
+    T_cam_world : ndarray [4, 4]
+    split : "train", "test" or None
+        None: the data set has no split of its own.
+    mask, object_mask : Path or None
+        Image files; white = counts, white = object.
+    """
+
+    name: str
+    path: Path
+    intrinsics: Intrinsics
+    T_cam_world: np.ndarray
+    split: str | None = None
+    mask: Path | None = None
+    object_mask: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A data set as its reader understood it (fields as in Scene).
+
+    ``downscaled_by`` is the factor by which the image files that were chosen are already smaller (``images_N``).
+    """
+
+    format: str
+    frames: tuple[Frame, ...]
+    points: PointCloud | None = None
+    T_metric_scene: np.ndarray = field(default_factory=lambda: np.eye(4))
+    default_test_every: int = 8
+    downscaled_by: int = 1
+    skipped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Decoder:
+    """Reads one photograph: decode, undistort, downscale; with its masks."""
+
+    frame: Frame
+    downscale: int
+    lens_maps: LensMaps
+
+    def __call__(self) -> Picture:
+        frame, k = self.frame, self.frame.intrinsics
+        image = read_image(frame.path)
+        if image.shape[:2] != (k.height, k.width):
+            raise DataError(
+                f"image {frame.path} must be {k.width}x{k.height}, got {image.shape[1]}x{image.shape[0]}; "
+                "did the file change since the scene was loaded?"
+            )
+        mask = self._read_mask(frame.mask, need=1.0)
+        object_mask = self._read_mask(frame.object_mask, need=0.5)
+        if k.lens is not None:
+            positions, valid = self.lens_maps(k)
+            image = undistort_image(image, positions, valid)
+            mask = valid if mask is None else valid & undistort_mask(mask, positions, need=1.0)
+            if object_mask is not None:
+                object_mask = valid & undistort_mask(object_mask, positions, need=0.5)
+        if self.downscale > 1:
+            image = area_downscale(image, self.downscale)
+            mask = None if mask is None else mask_downscale(mask, self.downscale, need=1.0)
+            object_mask = None if object_mask is None else mask_downscale(object_mask, self.downscale, need=0.5)
+        if mask is not None and mask.all():
+            mask = None
+        return Picture(np.ascontiguousarray(image), mask, object_mask)
+
+    def _read_mask(self, path: Path | None, need: float) -> np.ndarray | None:
+        """A mask at the image's size: True where at least ``need`` of the pixel's area is white."""
+        if path is None:
+            return None
+        mask = read_mask(path)
+        k = self.frame.intrinsics
+        if mask.shape == (k.height, k.width):
+            return mask
+        # A mask of another resolution (full-size masks beside images_4): its aspect was checked at load.
+        grey = Image.fromarray(mask.astype(np.uint8) * np.uint8(255))
+        return np.asarray(grey.resize((k.width, k.height), Image.Resampling.BOX)) >= 255 * need
+
+
+def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np.ndarray:
+    """T_cam_world of a camera-to-world matrix [3 or 4, 4], as nested lists; rotations are cleaned of rounding.
+
+    OpenGL cameras look along -z with y up; ours look along z with y down: axes y and z change sign.
+
+    Raises
+    ------
+    DataError
+        Not a matrix, NaN, or not a rigid motion.
+    """
+    try:
+        M = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{where} must be a 4x4 matrix of numbers, got {str(matrix)[:60]}") from error
+    if M.shape not in ((4, 4), (3, 4)):
+        raise DataError(f"{where} must be a 4x4 matrix, got shape {list(M.shape)}")
+    if not np.isfinite(M).all():
+        raise DataError(f"{where} must be finite, got NaN or infinity; remove this frame")
+    R = M[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise DataError(
+            f"{where} must hold a rotation, got columns of length {np.linalg.norm(R, axis=0).round(4).tolist()} and "
+            f"determinant {np.linalg.det(R):.4g}; remove scale or mirroring from it"
+        )
+    u, _, vt = np.linalg.svd(R)
+    R = u @ vt
+    if opengl:
+        R = R * (1.0, -1.0, -1.0)
+    T = np.eye(4)
+    T[:3, :3] = R.T
+    T[:3, 3] = -R.T @ M[:3, 3]
+    return T
+
+
+def fit_to_file(frame: Frame) -> Frame:
+    """The frame with intrinsics for the size that its file really has.
+
+    Raises
+    ------
+    DataError
+        The file is no image, or its aspect is another one; or a mask's.
+    """
+    k = frame.intrinsics
+    width, height = image_size(frame.path)
+    if (width, height) != (k.width, k.height):
+        _check_aspect(f"image {frame.path}", (width, height), (k.width, k.height), "camera")
+        k = k.scaled(width, height)
+    for path in (frame.mask, frame.object_mask):
+        if path is not None and image_size(path) != (width, height):
+            _check_aspect(f"mask {path}", image_size(path), (width, height), "image")
+    return replace(frame, intrinsics=k)
+
+
+def _check_aspect(what: str, got: tuple[int, int], expected: tuple[int, int], owner: str) -> None:
+    sx, sy = got[0] / expected[0], got[1] / expected[1]
+    # A pixel of rounding on either axis is no other aspect.
+    if abs(sx / sy - 1) > max(_ASPECT_TOLERANCE, 1 / min(got), 1 / min(expected)):
+        raise DataError(
+            f"{what} must have the size (or aspect) of its {owner}, {expected[0]}x{expected[1]}, "
+            f"got {got[0]}x{got[1]}; was it rotated or cropped after calibration?"
+        )
+
+
+def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int | None, cache_bytes: int) -> Scene:
+    """A Scene of a Capture: sizes checked, cameras downscaled, views split, extent and bounds measured.
+
+    Raises
+    ------
+    DataError
+        No view, no training view, twice the same name, or cameras that all stand at one point.
+    """
+    if not capture.frames:
+        first = f", first: {capture.skipped[0]}" if capture.skipped else ""
+        raise DataError(f"{root} must have at least one view, got none ({len(capture.skipped)} skipped{first})")
+    if downscale < 1 or (test_every is not None and test_every < 0):
+        raise DataError(f"downscale must be >= 1 and test_every >= 0, got {downscale} and {test_every}")
+    factor = max(1, downscale // capture.downscaled_by)
+    cache = ImageCache(cache_bytes)
+    lens_maps = functools.lru_cache(maxsize=4)(source_positions)  # 12 bytes a pixel; cameras are mostly shared
+    frames = sorted((fit_to_file(frame) for frame in capture.frames), key=lambda frame: frame.name)
+    names = [frame.name for frame in frames]
+    if len(set(names)) != len(names):
+        twice = next(a for a, b in itertools.pairwise(names) if a == b)
+        raise DataError(f"{root} must name each view once, got {twice} more than once")
+    views = [_view(frame, factor, cache, lens_maps) for frame in frames]
+    train, test, split_notes = _split(frames, views, capture.default_test_every, test_every, root)
+    cameras = [view.camera for view in train]
+    extent = camera_extent(cameras)
+    if not extent > 1e-9 * (1 + max(float(np.abs(camera.center).max()) for camera in cameras)):
+        raise DataError(
+            f"{root} must have training cameras at two or more places, got {len(cameras)} at one place: "
+            "nothing can be reconstructed without a baseline"
+        )
+    points, point_notes = _finite_points(capture.points)
+    bounds, bound_notes = scene_bounds(cameras, points, blender=capture.format == "blender")
+    return Scene(
+        name=root.resolve().name,
+        format=capture.format,
+        train=train,
+        test=test,
+        points=points,
+        extent=extent,
+        bounds=bounds,
+        T_metric_scene=capture.T_metric_scene,
+        skipped=capture.skipped,
+        notes=capture.notes + _lens_notes(frames) + split_notes + point_notes + bound_notes,
+        root=root,
+    )
+
+
+def _view(frame: Frame, factor: int, cache: ImageCache, lens_maps: LensMaps) -> View:
+    k = frame.intrinsics
+    try:
+        camera = Camera(k.width, k.height, k.fx, k.fy, k.cx, k.cy, frame.T_cam_world).downscaled(factor)
+    except ShapeError as error:
+        raise DataError(f"view {frame.name}: {error}") from error
+    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path)
+
+
+def _split(
+    frames: list[Frame], views: list[View], default_every: int, test_every: int | None, root: Path
+) -> tuple[tuple[View, ...], tuple[View, ...], tuple[str, ...]]:
+    notes: tuple[str, ...] = ()
+    if any(frame.split for frame in frames):
+        is_test = [frame.split == "test" for frame in frames]
+        if test_every is not None:
+            notes = ("the data set has its own split into training and test views, so test_every has no effect",)
+    else:
+        every = default_every if test_every is None else test_every
+        is_test = [bool(every) and index % every == 0 for index in range(len(views))]
+    train = tuple(view for view, test in zip(views, is_test, strict=True) if not test)
+    test = tuple(view for view, test in zip(views, is_test, strict=True) if test)
+    if not train:
+        raise DataError(f"{root} must have a training view, got {len(test)} test views only; use test_every=0")
+    return train, test, notes
+
+
+def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, tuple[str, ...]]:
+    if points is None or not len(points):
+        return None, ()
+    finite = np.isfinite(points.points).all(axis=1)
+    if finite.all():
+        return points, ()
+    note = f"{int((~finite).sum())} of {len(points)} sparse points are NaN or infinite and were left out"
+    if not finite.any():
+        return None, (note,)
+    return PointCloud(points.points[finite], None if points.colors is None else points.colors[finite]), (note,)
+
+
+def _lens_notes(frames: list[Frame]) -> tuple[str, ...]:
+    lenses = {frame.intrinsics for frame in frames if frame.intrinsics.lens is not None}
+    if not lenses:
+        return ()
+    kinds = sorted({k.lens.kind for k in lenses if k.lens is not None})
+    bent = sum(frame.intrinsics.lens is not None for frame in frames)
+    wide = max(math.degrees(2 * math.atan(max(k.width / k.fx, k.height / k.fy) / 2)) for k in lenses)
+    return (
+        f"{bent} of {len(frames)} views are undistorted on load ({' and '.join(kinds)} lenses; a pinhole image of "
+        f"{wide:.0f} degrees is kept)",
+    )
