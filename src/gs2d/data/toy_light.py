@@ -11,8 +11,8 @@ import numpy as np
 from gs2d.data.toy_rays import Hits, occluded
 from gs2d.data.toy_scene import ToyScene
 
-_LAMP = np.array([0.55, -0.62, 1.25]) / np.linalg.norm([0.55, -0.62, 1.25])  # unit, towards the lamp
-_LAMP_COLOR = np.array([1.42, 1.30, 1.12])
+_LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
+_LAMP_COLOR = np.array([1.80, 1.62, 1.36])
 _LAMP_SPREAD = 0.16  # half-angle of the lamp, radians
 _LIFT = 2e-3  # wu, shadow rays start this far above the surface
 
@@ -105,7 +105,9 @@ def shade(scene: ToyScene, light: BakedLight, hits: Hits, eye: np.ndarray) -> np
 
     uv, part = at_hit(scene.patch.uvs), scene.part_of_face[face]
     lamp = at_hit(light.lamp)
-    shaded = _albedo(scene, uv, part) * (at_hit(light.sky) * 0.62 + lamp[:, None] * _LAMP_COLOR.astype(np.float32) * 0.62)
+    shaded = _albedo(scene, uv, part) * (
+        at_hit(light.sky) * 0.56 + lamp[:, None] * _LAMP_COLOR.astype(np.float32) * 0.62
+    )
 
     gloss = np.array([p.gloss for p in scene.parts], dtype=np.float32)[part]
     position, normal = at_hit(scene.patch.vertices), at_hit(scene.patch.normals)

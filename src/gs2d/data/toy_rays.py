@@ -14,7 +14,7 @@ import numpy as np
 
 from gs2d.camera import Camera
 
-_PAIRS_PER_CHUNK = 1_500_000  # bounds the memory of one vectorised step to about 100 MB
+_PAIRS_PER_CHUNK = 60_000  # a step of one chunk stays in the cache of a core
 _CLOSEST = 1e-3  # wu, hits nearer than this to the camera are ignored
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
 

@@ -28,7 +28,7 @@ class Patch:
     uvs: np.ndarray
     faces: np.ndarray
 
-    def moved(self, *, offset: Sequence[float] = (0, 0, 0), turn: float = 0.0) -> Patch:
+    def moved(self, *, offset: Sequence[float] | np.ndarray = (0, 0, 0), turn: float = 0.0) -> Patch:
         """The patch turned about z by ``turn`` radians, then moved by ``offset`` wu."""
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
@@ -101,9 +101,7 @@ def lathe(profile: np.ndarray, texture_v: np.ndarray, around: int) -> Patch:
     return grid(points, np.stack([u, v], axis=-1))
 
 
-def vase(
-    outline: np.ndarray, *, wall: float, rows: int = 44, around: int = 72, painted: float = 0.8
-) -> Patch:
+def vase(outline: np.ndarray, *, wall: float, rows: int = 44, around: int = 72, painted: float = 0.8) -> Patch:
     """A vase with a hollow inside: a smooth outer wall through ``outline`` [k, 2] (radius, height), bottom first.
 
     Texture v runs from 0 at the foot to ``painted`` at the lip of the outer wall and from there to 1 inside.
@@ -132,7 +130,7 @@ def plinth(radius: float, thickness: float, *, rings: int = 46, around: int = 12
     profile = [[x, -thickness] for x in under[:-1]]
     profile += [[radius - bevel, -thickness], [radius, -thickness + bevel]]
     profile += [[radius, z] for z in side_z[2:]] + [[radius - bevel, 0.0]]
-    v = np.linspace(0, 1, len(profile))
+    v = np.concatenate([np.linspace(0, 0.5, len(under)), np.linspace(0.5, 1, len(profile) - len(under))])
     return upper, lathe(np.array(profile), v, around)
 
 

@@ -32,11 +32,16 @@ def linear_to_srgb(color: np.ndarray) -> np.ndarray:
     return np.where(color <= 0.0031308, 12.92 * color, 1.055 * np.maximum(color, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def noise(rng: np.random.Generator, rows: int, columns: int, low: float, high: float) -> np.ndarray:
-    """Periodic noise of mean 0 and deviation 1, with ``low`` to ``high`` waves across the image."""
+def noise(
+    rng: np.random.Generator, rows: int, columns: int, low: float, high: float, *, aspect: float = 1.0
+) -> np.ndarray:
+    """Periodic noise of mean 0 and deviation 1, with ``low`` to ``high`` waves along a row of the image.
+
+    ``aspect`` is the length of a row over the length of a column on the surface, so that grains are round there.
+    """
     spectrum = np.fft.rfft2(rng.standard_normal((rows, columns)))
     fy, fx = np.meshgrid(np.fft.fftfreq(rows) * rows, np.fft.rfftfreq(columns) * columns, indexing="ij")
-    waves = np.hypot(fx, fy)
+    waves = np.hypot(fx, fy * aspect)
     field = np.fft.irfft2(spectrum * ((waves >= low) & (waves <= high)), s=(rows, columns))
     return np.asarray(field / field.std())
 
@@ -89,18 +94,24 @@ def _terrazzo_ring(image: np.ndarray, radius: np.ndarray, rng: np.random.Generat
     size = len(image)
     ring = radius > 0.86
     _paint(image, ring, (0.87, 0.83, 0.77))
-    for color, level in (((0.35, 0.33, 0.33), 1.45), ((0.74, 0.42, 0.32), 1.5), ((0.97, 0.95, 0.92), 1.3), (OCHRE, 1.7)):
+    for color, level in (
+        ((0.35, 0.33, 0.33), 1.45),
+        ((0.74, 0.42, 0.32), 1.5),
+        ((0.97, 0.95, 0.92), 1.3),
+        (OCHRE, 1.7),
+    ):
         _paint(image, ring & (noise(rng, size, size, 30, 75) > level), color)
     _paint(image, ring & (radius < 0.875), COBALT)
 
 
-def plinth_side(rng: np.random.Generator) -> np.ndarray:
-    """Terrazzo for the rim and the underside of the plinth."""
-    image = np.empty((256, 1024, 3))
+def plinth_side(rng: np.random.Generator, *, aspect: float) -> np.ndarray:
+    """Terrazzo for the rim of the plinth (upper half of the rows) and its underside (lower half)."""
+    rows, columns = 64, 2048
+    image = np.empty((rows, columns, 3))
     image[:] = (0.87, 0.83, 0.77)
-    for color, level in (((0.35, 0.33, 0.33), 1.4), ((0.74, 0.42, 0.32), 1.5), ((0.97, 0.95, 0.92), 1.3)):
-        _paint(image, noise(rng, 256, 1024, 25, 60) > level, color)
-    return _finish(image, 0.04 * noise(rng, 256, 1024, 4, 60))
+    for color, level in (((0.35, 0.33, 0.33), 1.45), ((0.74, 0.42, 0.32), 1.5), ((0.97, 0.95, 0.92), 1.3)):
+        _paint(image, noise(rng, rows, columns, 90, 230, aspect=aspect) > level, color)
+    return _finish(image, 0.04 * noise(rng, rows, columns, 10, 120, aspect=aspect))
 
 
 def vase(rng: np.random.Generator, *, painted: float = 0.8) -> np.ndarray:
@@ -136,8 +147,9 @@ def vase(rng: np.random.Generator, *, painted: float = 0.8) -> np.ndarray:
 
 def _meander(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """A Greek key of period 1 in x, between y = 0 and 1, drawn on a 7 x 7 raster."""
-    key = np.array([[int(c) for c in row] for row in
-                    ("1111111", "0000000", "1111110", "1000010", "1011010", "1001010", "1111011")])
+    key = np.array(
+        [[int(c) for c in row] for row in ("1111111", "0000000", "1111110", "1000010", "1011010", "1001010", "1111011")]
+    )
     return np.asarray(key[np.clip((y * 7).astype(int), 0, 6), ((x % 1) * 7).astype(int)] == 1)
 
 
@@ -162,12 +174,12 @@ def tin(rng: np.random.Generator) -> np.ndarray:
         _paint(face, (v < 0.125) & checker, CREAM)
         _paint(face, (v > 0.875) & checker, OCHRE)
         _paint(face, (np.abs(v - 0.145) < 0.012) | (np.abs(v - 0.855) < 0.012), OCHRE)
-    oval = np.hypot((u - 0.5) / 0.46, (v - 0.56) / 0.20)
+    oval = np.hypot((u - 0.5) / 0.49, (v - 0.56) / 0.23)
     _paint(front, oval < 1, CREAM)
     _paint(front, np.abs(oval - 0.9) < 0.025, RUST)
-    _write(front, "2DGS-R", left=53, top=93, scale=4, color=SOOT)
+    _write(front, "2DGS-R", left=23, top=91, scale=6, color=SOOT)
     for row in range(3):  # lines of small print
-        line = (np.abs(v - 0.32 + 0.05 * row) < 0.012) & (u > 0.15) & (u < 0.85)
+        line = (np.abs(v - 0.29 + 0.05 * row) < 0.012) & (u > 0.15) & (u < 0.85)
         _paint(front, line & (rng.random(64)[(u * 64).astype(int)] < 0.75), CREAM)
     leaf = np.minimum(np.hypot(u - 0.32, v - 0.5), np.hypot(u - 0.68, v - 0.5))
     _paint(side, leaf < 0.42, (0.16, 0.50, 0.44))
