@@ -1,0 +1,160 @@
+"""Densification by screen gradients: clone, split, prune, opacity reset (official 2DGS), and its AbsGS form.
+
+The official screen-size prune is dead code there (its statistic is zeroed just before the test), and stays dead here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gs2d.errors import DivergedError
+from gs2d.geometry import quats_to_matrices
+from gs2d.recipe import GradDensify
+from gs2d.splats import Splats
+from gs2d.train.rows import append_rows, keep_rows
+from gs2d.train.state import Moments, Statistics, TrainState
+
+
+@dataclass(frozen=True)
+class DensifyCounts:
+    """What a densification did: splats cloned, split, pruned for opacity and pruned for size."""
+
+    cloned: int
+    split: int
+    pruned_faint: int
+    pruned_large: int
+
+
+@torch.no_grad()
+def accumulate(statistics: Statistics, signal: Tensor, radii: Tensor) -> None:
+    """Add one view.
+
+    Parameters
+    ----------
+    statistics : Statistics
+        Of N splats; changed in place.
+    signal : Tensor [N, 2] or [N, 4]
+        Gradient of the screen probe: signed in columns 0:2, absolute in 2:4.
+    radii : Tensor [N] px
+        Splats with radius 0 are not counted.
+    """
+    seen = radii > 0
+    zero = torch.zeros_like(statistics.signed)
+    statistics.signed += torch.where(seen, torch.linalg.vector_norm(signal[:, :2], dim=1), zero)
+    if signal.shape[1] == 4:
+        statistics.absolute += torch.where(seen, torch.linalg.vector_norm(signal[:, 2:], dim=1), zero)
+    statistics.count += seen
+
+
+@torch.no_grad()
+def densify_and_prune(
+    state: TrainState, densify: GradDensify, *, iteration: int, extent: float, white: bool
+) -> DensifyCounts:
+    """Clone small splats and split large ones where the mean screen gradient is high, then prune; N changes.
+
+    Parameters
+    ----------
+    state : TrainState
+        With statistics, which are zeroed.
+    densify : GradDensify
+    iteration : int
+        1-based, of the stage.
+    extent : float, wu
+        Scale of the scene: sizes are compared with it.
+    white : bool
+        Whether the background is white (there is one more reset then, with its grace).
+
+    Raises
+    ------
+    DivergedError
+        If no splat would be left.
+    """
+    to_clone, to_split = _select(state, densify, extent)
+    _append_clones(state, to_clone)
+    _append_children(state, to_split, densify)
+    grown = len(state.splats) - len(to_split)
+    parents = torch.zeros(len(state.splats), dtype=torch.bool, device=state.splats.device)
+    parents[: len(to_split)] = to_split
+    faint, large = _prunable(state.splats, densify, iteration=iteration, extent=extent, white=white)
+    faint &= ~parents
+    large &= ~parents & ~faint
+    keep = ~(parents | faint | large)
+    if not bool(keep.any()):
+        raise DivergedError(
+            f"all {grown} splats were pruned at iteration {iteration}: none has opacity >= {densify.opacity_cull} and "
+            f"size <= {densify.scale_cull * extent:g}; check the cameras, or lower opacity_cull"
+        )
+    keep_rows(state, keep)
+    state.statistics = Statistics.zeros(state.splats)
+    return DensifyCounts(int(to_clone.sum()), int(to_split.sum()), int(faint.sum()), int(large.sum()))
+
+
+@torch.no_grad()
+def limit_opacity(state: TrainState, ceiling: float) -> None:
+    """Opacity = min(opacity, ceiling) for all splats, and no memory of its gradients (Adam's step count stays)."""
+    state.splats.opacity_logits.clamp_(max=math.log(ceiling / (1.0 - ceiling)))
+    moments = state.moments.get("opacity_logits")
+    if moments is not None:
+        state.moments["opacity_logits"] = Moments(
+            torch.zeros_like(moments.mean), torch.zeros_like(moments.square), moments.steps
+        )
+
+
+def _select(state: TrainState, densify: GradDensify, extent: float) -> tuple[Tensor, Tensor]:
+    """Rows to clone and rows to split, bool [N] each."""
+    statistics = state.statistics
+    assert statistics is not None
+    count = statistics.count.clamp(min=1.0)  # never seen: sum 0, mean 0
+    signed, absolute = statistics.signed / count, statistics.absolute / count
+    small = state.splats.scales.amax(dim=1) <= densify.percent_dense * extent
+    for_split, split_threshold = (
+        (absolute, densify.abs_threshold) if densify.absolute else (signed, densify.grad_threshold)
+    )
+    to_clone = small & (signed >= densify.grad_threshold)
+    to_split = ~small & (for_split >= split_threshold)
+    if densify.max_splats is not None:
+        urgency = torch.where(small, signed / densify.grad_threshold, for_split / split_threshold)
+        growth = torch.where(to_split, densify.split_count - 1, to_clone.long())  # [N] rows gained
+        order = torch.sort(urgency.where(growth > 0, -torch.ones_like(urgency)), descending=True, stable=True).indices
+        room = densify.max_splats - len(state.splats)
+        allowed = torch.zeros_like(to_clone)
+        allowed[order] = growth[order].cumsum(0) <= room
+        to_clone, to_split = to_clone & allowed, to_split & allowed
+    return to_clone, to_split
+
+
+def _append_clones(state: TrainState, mask: Tensor) -> None:
+    """Exact copies with the memberships of the originals."""
+    append_rows(state, state.splats.rows(mask), {name: group[mask] for name, group in state.groups.items()})
+
+
+def _append_children(state: TrainState, mask: Tensor, densify: GradDensify) -> None:
+    """Children of each marked splat (bool [<= N]), drawn from its Gaussian in its plane; the parents stay for now."""
+    parents = mask.nonzero().squeeze(1)
+    if len(parents) == 0:
+        return
+    rows = parents.repeat(densify.split_count)
+    children = state.splats.rows(rows)
+    draws = torch.randn(len(rows), 2, generator=state.generator, dtype=children.dtype).to(children.device)
+    in_plane = draws * children.scales  # [M, 2] wu
+    frames = quats_to_matrices(children.quats)[:, :, :2]  # [M, 3, 2] columns t_u, t_v
+    children.means += (frames * in_plane[:, None, :]).sum(dim=2)
+    children.log_scales -= math.log(densify.split_shrink)
+    append_rows(state, children, {name: group[rows] for name, group in state.groups.items()})
+
+
+def _prunable(
+    splats: Splats, densify: GradDensify, *, iteration: int, extent: float, white: bool
+) -> tuple[Tensor, Tensor]:
+    """Splats that are too faint, and splats that are too large, bool [N] each."""
+    faint = splats.opacities < densify.opacity_cull
+    if densify.spares_faint(iteration, white=white):
+        faint = torch.zeros_like(faint)
+    large = splats.scales.amax(dim=1) > densify.scale_cull * extent
+    if iteration <= densify.reset_every:
+        large = torch.zeros_like(large)
+    return faint, large

@@ -1,0 +1,121 @@
+"""What training tells the outside, as small frozen values. Whenever one is sent the state is whole and can be saved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Initialised:
+    """The start: ``source`` is "points" (the scene's) or "random"; ``dropped`` points were not usable."""
+
+    splats: int
+    source: str
+    dropped: int
+
+
+@dataclass(frozen=True)
+class StageEntering:
+    """A stage is about to run its entry actions; the splats are still those of the stage before."""
+
+    stage: str
+    index: int
+    splats: int
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """Splats were ranked by colour error: the group's smallest E_i, and its share of the sum of all."""
+
+    stage: str
+    group: str
+    count: int
+    threshold: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Cloned:
+    """Splats were cloned in place."""
+
+    stage: str
+    group: str
+    count: int
+    opacity: str
+    splats: int
+
+
+@dataclass(frozen=True)
+class StageStarted:
+    """The entry actions of a stage are done; its first iteration comes next."""
+
+    stage: str
+    index: int
+    iterations: int
+    splats: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Figures of one iteration.
+
+    Attributes
+    ----------
+    losses : weighted value of each active term
+    loss : their sum
+    mean_opacity : mean of o
+    mean_k_a : mean of K_a = s_u s_v (the paper's Eq. 7), wu^2
+    rates : learning rate of each trained attribute (means: wu)
+    sh_degree : degree in training
+    """
+
+    stage: str
+    index: int
+    iteration: int
+    iterations: int
+    losses: Mapping[str, float]
+    loss: float
+    splats: int
+    mean_opacity: float
+    mean_k_a: float
+    rates: Mapping[str, float]
+    sh_degree: int
+
+
+@dataclass(frozen=True)
+class Densified:
+    """Splats were cloned, split and pruned."""
+
+    stage: str
+    iteration: int
+    cloned: int
+    split: int
+    pruned_faint: int
+    pruned_large: int
+    splats: int
+
+
+@dataclass(frozen=True)
+class OpacityLimited:
+    """Opacity was limited from above: a reset, or AbsGS's cap."""
+
+    stage: str
+    iteration: int
+    ceiling: float
+    reset: bool
+
+
+@dataclass(frozen=True)
+class StageFinished:
+    """A stage is done; the state already points at the next one."""
+
+    stage: str
+    index: int
+    iterations: int
+    splats: int
+
+
+Event = (
+    Initialised | StageEntering | Ranked | Cloned | StageStarted | Progress | Densified | OpacityLimited | StageFinished
+)

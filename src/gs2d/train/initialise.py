@@ -1,0 +1,125 @@
+"""The first splats: from the scene's points, or random in its bounds (official 2DGS values)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.data.scene import Scene
+from gs2d.errors import DataError, ProtocolError
+from gs2d.geometry import nearest_distances
+from gs2d.sh import num_coefficients, rgb_to_sh0
+from gs2d.splats import Splats
+
+INITIAL_OPACITY = 0.1
+SCALE_FLOOR = math.sqrt(1e-7)  # wu; the official floor of the squared distance is 1e-7
+RELATIVE_SCALE_FLOOR = 1e-4  # of the extent, where that is smaller: a scene may be small
+
+
+@dataclass(frozen=True, eq=False)
+class Initial:
+    """The first splats, whether they are the scene's "points" or "random", and how many points were not usable."""
+
+    splats: Splats
+    source: str
+    dropped: int
+
+
+def initial_splats(
+    scene: Scene,
+    *,
+    sh_degree: int,
+    random_points: int,
+    near: float,
+    generator: torch.Generator,
+    dtype: torch.dtype = torch.float32,
+) -> Initial:
+    """Splats on the scene's points, or on random points in its bounds where it has none.
+
+    Parameters
+    ----------
+    scene : Scene
+    sh_degree : int
+    random_points : int
+        How many where the scene has no points.
+    near : float, wu
+        Points that no training camera sees beyond this depth, or that lie within this distance of one, are dropped.
+    generator : torch.Generator
+        On the CPU; random points and rotations come from it.
+    dtype : torch.dtype
+
+    Raises
+    ------
+    DataError, ProtocolError
+        If fewer than two points are usable: the points are broken, or ``near`` is too large for the scene.
+    """
+    cloud = scene.points
+    if cloud is not None and len(cloud) > 0:
+        points = np.asarray(cloud.points, dtype=np.float64)
+        colors = np.full((len(points), 3), 0.5) if cloud.colors is None else cloud.colors / 255.0
+        source = "points"
+    else:
+        unit = torch.rand(random_points, 3, generator=generator, dtype=torch.float64).numpy()
+        points = scene.bounds[0] + unit * (scene.bounds[1] - scene.bounds[0])
+        colors, source = np.full((random_points, 3), 0.5), "random"
+    usable = usable_points(points, scene, near)
+    kept = points[usable]
+    if len(kept) < 2:
+        raise _no_points(points, scene, near)
+    floor = min(SCALE_FLOOR, RELATIVE_SCALE_FLOOR * scene.extent)
+    scales = np.maximum(nearest_distances(kept, k=3), floor)
+    splats = Splats(
+        means=torch.as_tensor(kept).to(dtype),
+        quats=random_rotations(len(kept), generator).to(dtype),
+        log_scales=torch.as_tensor(np.log(scales)).to(dtype)[:, None].repeat(1, 2),
+        opacity_logits=torch.full((len(kept),), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), dtype=dtype),
+        sh0=rgb_to_sh0(torch.as_tensor(colors[usable]).to(dtype)),
+        shN=torch.zeros(len(kept), num_coefficients(sh_degree) - 1, 3, dtype=dtype),
+    )
+    return Initial(splats, source, len(points) - len(kept))
+
+
+def usable_points(points: np.ndarray, scene: Scene, near: float) -> np.ndarray:
+    """Which points are finite, in front of a training camera (depth > near) and not within ``near`` of one.
+
+    Parameters
+    ----------
+    points : ndarray [P, 3] wu
+    scene : Scene
+    near : float, wu
+
+    Returns
+    -------
+    ndarray [P] bool
+    """
+    finite = np.isfinite(points).all(axis=1)
+    safe = np.where(finite[:, None], points, 0.0)
+    seen = np.zeros(len(points), dtype=bool)
+    too_close = np.zeros(len(points), dtype=bool)
+    for view in scene.train:
+        seen |= view.camera.project(safe)[1] > near
+        too_close |= np.linalg.norm(safe - view.camera.center, axis=1) < near
+    return np.asarray(finite & seen & ~too_close)
+
+
+def random_rotations(count: int, generator: torch.Generator) -> Tensor:
+    """Unit quaternions [count, 4] float64, uniform over rotations (normalised Gaussian 4-vectors)."""
+    quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
+    return quats / quats.norm(dim=1, keepdim=True)
+
+
+def _no_points(points: np.ndarray, scene: Scene, near: float) -> Exception:
+    """Why fewer than two points are usable."""
+    if int(usable_points(points, scene, 0.0).sum()) >= 2:
+        return ProtocolError(
+            f"near = {near:g} leaves none of the {len(points)} points of scene {scene.name} (extent {scene.extent:g}); "
+            "take a protocol whose near fits, such as --protocol generic"
+        )
+    return DataError(
+        f"scene {scene.name} has {len(points)} points, but fewer than 2 are finite and in front of a camera; "
+        "check the camera convention, or remove the point file to start from random points"
+    )

@@ -1,0 +1,333 @@
+"""The training loop: stages in order, each iteration in the order of the official 2DGS code.
+
+loss, backward, statistics, densify and prune, opacity reset, Adam. So on an iteration that densifies nothing is updated
+(its rows are new), and on one that resets opacity every other attribute is. No prints, no paths: events go out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gs2d.camera import Camera
+from gs2d.data.scene import Scene
+from gs2d.errors import DataError, DivergedError, RunError
+from gs2d.losses import compute_losses
+from gs2d.protocols import Protocol
+from gs2d.recipe import CloneInPlace, RankByError, Recipe, Stage, validate
+from gs2d.render.api import rasterize, splat_errors
+from gs2d.render.backend import Backend, get_backend
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+from gs2d.train import events
+from gs2d.train.actions import clone_in_place, rank_by_error
+from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
+from gs2d.train.initialise import initial_splats
+from gs2d.train.optimizer import adam_step, begin_stage, rates_at
+from gs2d.train.state import Statistics, TrainState
+from gs2d.train.targets import Target, Targets
+
+OnEvent = Callable[[events.Event], None]
+
+
+def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
+    """The rasterizer's constants for a scene of this extent (wu) under a protocol."""
+    return RasterSettings(near=protocol.near_for(extent), background=protocol.background, sh_degree=sh_degree)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """Loss terms of one iteration with the gradients of the trained attributes and, if gathered, screen gradients."""
+
+    losses: Mapping[str, float]
+    gradients: Mapping[str, Tensor]
+    signal: Tensor | None
+    radii: Tensor
+
+
+class Trainer:
+    """Trains the splats of a scene by a recipe under a protocol.
+
+    Parameters
+    ----------
+    scene : Scene
+    recipe : Recipe
+    protocol : Protocol
+    backend : str or Backend
+        Rasterizer: "auto", "cpu" or "reference".
+    on_event : callable
+        Gets every event; the state is whole then, so ``state.state_dict()`` may be saved. What it raises stops the run.
+    state : TrainState, optional
+        To go on from; without it training starts anew from ``recipe.seed``.
+    progress_every : int
+        Iterations between Progress events (the last of a stage always sends one).
+    target_bytes : int
+        Memory for photographs as float tensors.
+    dtype : torch.dtype
+        Of a new start.
+
+    Raises
+    ------
+    RecipeError, DataError, ProtocolError, BackendError, RunError
+        From the constructor, before anything is trained.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        protocol: Protocol,
+        *,
+        backend: str | Backend = "auto",
+        on_event: OnEvent = lambda event: None,
+        state: TrainState | None = None,
+        progress_every: int = 10,
+        target_bytes: int = 1 << 29,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        if not scene.train:
+            raise DataError(f"scene {scene.name} has no training views")
+        self.scene, self.recipe, self.protocol = scene, validate(recipe), protocol
+        self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
+        self._on_event, self._progress_every = on_event, progress_every
+        self.state = self._new_state(dtype) if state is None else self._checked(state)
+        self._targets = Targets(
+            scene.train,
+            protocol.background,
+            use_masks=protocol.use_mask_in_training,
+            with_maps=self.backend.name == "cpu",
+            dtype=self.state.splats.dtype,
+            device=self.state.splats.device,
+            limit_bytes=target_bytes,
+        )
+
+    @property
+    def splats(self) -> Splats:
+        """The splats as they are now."""
+        return self.state.splats
+
+    @property
+    def settings(self) -> RasterSettings:
+        """The rasterizer's constants at the full SH degree, for evaluation and fusion."""
+        return raster_settings(self.protocol, self.scene.extent, self.recipe.sh_degree)
+
+    @property
+    def done(self) -> bool:
+        """Whether every stage is finished."""
+        return self.state.stage >= len(self.recipe.stages)
+
+    def run(self) -> Splats:
+        """Train from where the state is to the end of the last stage."""
+        while not self.done:
+            if not self.state.entered:
+                self.enter(self.state.stage)
+            stage = self.recipe.stages[self.state.stage]
+            while self.state.step < stage.iterations:
+                self.step()
+            self._finish(stage)
+        return self.state.splats
+
+    def enter(self, index: int) -> None:
+        """Run the entry actions of a stage and prepare its first iteration."""
+        state, stage = self.state, self.recipe.stages[index]
+        state.stage, state.step, state.entered = index, 0, False
+        self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
+        happened = [self._act(stage, action) for action in stage.on_enter]
+        begin_stage(state, stage)
+        state.statistics = None if stage.densify is None else Statistics.zeros(state.splats)
+        self._check_parameters(stage, tuple(name for name, _ in state.splats.items()))
+        state.entered = True
+        for event in happened:
+            self._on_event(event)
+        self._on_event(events.StageStarted(stage.name, index, stage.iterations, len(state.splats)))
+
+    def step(self) -> None:
+        """One iteration of the stage that was entered.
+
+        Raises
+        ------
+        DivergedError
+            NaN or infinity in the loss, a gradient or a parameter; names the iteration, the stage and the attribute.
+        """
+        state = self.state
+        stage, iteration = self.recipe.stages[state.stage], state.step + 1
+        index = state.next_view(len(self.scene.train))
+        result = self._evaluate(stage, iteration, self.scene.train[index].camera, self._targets[index])
+        rates = rates_at(stage.rates, iteration, self.scene.extent)
+        happened = self._densify(stage, iteration, result)
+        rebuilt = any(isinstance(event, events.Densified) for event in happened)
+        if not rebuilt:
+            limited = any(isinstance(event, events.OpacityLimited) for event in happened)
+            adam_step(state, stage, result.gradients, rates, skip=("opacity_logits",) if limited else ())
+            self._check_parameters(stage, tuple(stage.train))
+        state.step = iteration
+        for event in happened:
+            self._on_event(event)
+        if iteration % self._progress_every == 0 or iteration == stage.iterations:
+            self._on_event(self._progress(stage, iteration, result.losses, rates))
+
+    def _new_state(self, dtype: torch.dtype) -> TrainState:
+        generator = torch.Generator().manual_seed(self.recipe.seed)
+        initial = initial_splats(
+            self.scene,
+            sh_degree=self.recipe.sh_degree,
+            random_points=self.recipe.init_points,
+            near=self.protocol.near_for(self.scene.extent),
+            generator=generator,
+            dtype=dtype,
+        )
+        self._on_event(events.Initialised(len(initial.splats), initial.source, initial.dropped))
+        return TrainState(initial.splats, generator)
+
+    def _checked(self, state: TrainState) -> TrainState:
+        """A state from outside, if it is of this recipe."""
+        state.check()
+        stages = self.recipe.stages
+        if state.splats.sh_degree != self.recipe.sh_degree:
+            raise RunError(
+                f"the checkpoint has SH degree {state.splats.sh_degree}, but recipe {self.recipe.name!r} trains "
+                f"{self.recipe.sh_degree}; start a new run"
+            )
+        inside = state.stage < len(stages) and state.step <= stages[state.stage].iterations
+        if not inside and not (state.stage == len(stages) and state.step == 0):
+            raise RunError(
+                f"the checkpoint is at stage {state.stage}, iteration {state.step}, which recipe {self.recipe.name!r} "
+                "does not have; start a new run"
+            )
+        last = max(state.queue, default=0)
+        if last >= len(self.scene.train):
+            raise RunError(
+                f"the checkpoint waits for training view {last}, but the scene has {len(self.scene.train)}; "
+                "is it of another scene?"
+            )
+        return state
+
+    def _evaluate(self, stage: Stage, iteration: int, camera: Camera, target: Target) -> Evaluated:
+        """Render one view; loss and gradients, checked to be finite."""
+        splats, densify = self.state.splats, stage.densify
+        leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
+        gather = densify is not None and iteration < densify.stop
+        probe = None
+        if gather:
+            columns = 4 if densify is not None and densify.absolute else 2
+            probe = splats.means.new_zeros(len(splats), columns, requires_grad=True)
+        degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
+        settings = raster_settings(self.protocol, self.scene.extent, degree)
+        output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe)
+        terms = compute_losses(
+            output,
+            target.image,
+            target.mask,
+            camera,
+            self.protocol.resolve(stage.losses),
+            iteration=iteration,
+            depth_kind=self.protocol.depth,
+            backend_name=self.backend.name,
+            target_cache=target.maps,
+        )
+        loss = torch.stack(list(terms.values())).sum()
+        values = {kind: float(value.detach()) for kind, value in terms.items()}
+        if not bool(torch.isfinite(loss)):
+            raise self._diverged(stage, iteration, f"the loss ({', '.join(f'{k} {v:g}' for k, v in values.items())})")
+        if loss.requires_grad:  # not where no splat is in the picture
+            loss.backward()
+        gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
+        for name, gradient in gradients.items():
+            if not _finite(gradient):
+                raise self._diverged(stage, iteration, f"the gradient of {name}")
+        return Evaluated(values, gradients, None if probe is None else _gradient(probe), output.radii)
+
+    def _densify(self, stage: Stage, iteration: int, result: Evaluated) -> list[events.Event]:
+        """Statistics, densification and opacity resets of one iteration."""
+        state, densify, white = self.state, stage.densify, self.protocol.white
+        happened: list[events.Event] = []
+        if densify is None or iteration >= densify.stop:
+            return happened
+        assert state.statistics is not None
+        assert result.signal is not None
+        accumulate(state.statistics, result.signal, result.radii)
+        if densify.densifies(iteration):
+            try:
+                counts = densify_and_prune(state, densify, iteration=iteration, extent=self.scene.extent, white=white)
+            except DivergedError as error:
+                raise DivergedError(f"stage {stage.name!r}: {error}") from error
+            happened.append(events.Densified(stage.name, iteration, **vars(counts), splats=len(state.splats)))
+        reset = densify.resets(iteration, white=white)
+        if reset or (densify.cap_every > 0 and iteration % densify.cap_every == 0):
+            ceiling = densify.reset_opacity if reset else densify.opacity_cap
+            limit_opacity(state, ceiling)
+            happened.append(events.OpacityLimited(stage.name, iteration, ceiling, reset))
+        return happened
+
+    def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
+        """Run an entry action."""
+        if isinstance(action, CloneInPlace):
+            count = clone_in_place(self.state, action)
+            return events.Cloned(stage.name, action.writes, count, action.opacity, len(self.state.splats))
+        errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion))
+        group = self.state.groups[action.writes]
+        share = float(errors[group].sum() / errors.sum().clamp(min=1e-300))
+        return events.Ranked(stage.name, action.writes, int(group.sum()), float(errors[group].min()), share)
+
+    def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
+        """The inner sum of E_i [N] for each training view."""
+        for index, view in enumerate(self.scene.train):
+            target = self._targets[index]
+            yield splat_errors(
+                self.state.splats,
+                view.camera,
+                target.image,
+                self.settings,
+                backend=self.backend,
+                mask=target.mask,
+                occlusion=occlusion,
+            )
+
+    def _finish(self, stage: Stage) -> None:
+        """Point the state at the next stage and say that this one is done."""
+        state, index = self.state, self.state.stage
+        state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
+        self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats)))
+
+    def _progress(
+        self, stage: Stage, iteration: int, losses: Mapping[str, float], rates: Mapping[str, float]
+    ) -> events.Progress:
+        splats = self.state.splats
+        return events.Progress(
+            stage=stage.name,
+            index=self.state.stage,
+            iteration=iteration,
+            iterations=stage.iterations,
+            losses=losses,
+            loss=sum(losses.values()),
+            splats=len(splats),
+            mean_opacity=float(splats.opacities.mean()),
+            mean_k_a=float(splats.scales.prod(dim=1).mean()),
+            rates={name: rates[name] for name in stage.train},
+            sh_degree=stage.active_sh_degree(iteration, self.recipe.sh_degree),
+        )
+
+    def _check_parameters(self, stage: Stage, names: tuple[str, ...]) -> None:
+        """Raise DivergedError if a parameter is not finite: the rasterizer would quietly leave such a splat out."""
+        for name, tensor in self.state.splats.items():
+            if name in names and not _finite(tensor):
+                raise self._diverged(stage, self.state.step + 1, name)
+
+    def _diverged(self, stage: Stage, iteration: int, what: str) -> DivergedError:
+        return DivergedError(
+            f"training diverged at iteration {iteration} of stage {stage.name!r}: {what} is NaN or infinite; "
+            f"lower a rate (--set {stage.name}.rates.means=...) or check the cameras and photographs"
+        )
+
+
+def _gradient(leaf: Tensor) -> Tensor:
+    """The gradient of a leaf; zero where nothing depends on it."""
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+
+def _finite(tensor: Tensor) -> bool:
+    """Whether all of a tensor is finite: a sum costs one pass, and cannot be finite if a term is not."""
+    return bool(torch.isfinite(tensor.detach().sum()))

@@ -1,0 +1,92 @@
+"""Adam over the six attributes, for all rows or for a row group; rows that are not trained are never written.
+
+The arithmetic is torch's fused Adam; moments live in the TrainState, so that rows can come and go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import torch
+from torch import Tensor
+from torch.optim.adam import adam
+
+from gs2d.recipe import Rates, Stage
+from gs2d.splats import ATTRIBUTES
+from gs2d.train.state import Moments, TrainState
+
+
+def begin_stage(state: TrainState, stage: Stage) -> None:
+    """Moments for the attributes that the stage trains: all zero, or ("kept") only those that are missing."""
+    parameters = dict(state.splats.items())
+    kept = state.moments if stage.moments == "kept" else {}
+    trained = {
+        name: kept.get(name) or Moments.zeros_like(parameters[name]) for name in ATTRIBUTES if name in stage.train
+    }
+    state.moments = kept | trained
+
+
+def rates_at(rates: Rates, iteration: int, extent: float) -> dict[str, float]:
+    """Learning rate of each attribute at an iteration (1-based); that of the means is in wu, times the extent."""
+    fixed = {name: float(getattr(rates, name)) for name in ATTRIBUTES}
+    return fixed | {"means": rates.means_at(iteration) * extent}
+
+
+@torch.no_grad()
+def adam_step(
+    state: TrainState,
+    stage: Stage,
+    gradients: Mapping[str, Tensor],
+    rates: Mapping[str, float],
+    *,
+    skip: Collection[str] = (),
+) -> None:
+    """One Adam update, in place, of the rows and attributes that the stage trains.
+
+    Parameters
+    ----------
+    state : TrainState
+    stage : Stage
+    gradients : mapping of attribute to Tensor
+        Like the attributes; rows outside a row group are not read.
+    rates : mapping of attribute to float
+    skip : attributes that are left alone this time
+    """
+    for name, parameter in state.splats.items():
+        if name not in stage.train or name in skip or parameter.numel() == 0:
+            continue
+        moments, group = state.moments[name], stage.train[name]
+        moments.steps += 1
+        if group == "all":
+            _update(parameter, gradients[name], moments.mean, moments.square, moments.steps, rates[name], stage.rates)
+            continue
+        rows = state.groups[group].nonzero().squeeze(1)  # [M]
+        if len(rows) == 0:
+            continue
+        compact = [tensor[rows] for tensor in (parameter, gradients[name], moments.mean, moments.square)]
+        _update(compact[0], compact[1], compact[2], compact[3], moments.steps, rates[name], stage.rates)
+        for whole, part in zip((parameter, moments.mean, moments.square), (compact[0], *compact[2:]), strict=True):
+            whole[rows] = part
+
+
+def _update(
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, steps: int, rate: float, settings: Rates
+) -> None:
+    """Adam with bias correction, in place (``steps`` counts this update)."""
+    step = torch.tensor(float(steps - 1), device=parameter.device)  # adam() adds one
+    adam(
+        [parameter],
+        [gradient.contiguous()],
+        [mean],
+        [square],
+        [],
+        [step],
+        fused=True,
+        amsgrad=False,
+        beta1=settings.beta1,
+        beta2=settings.beta2,
+        lr=rate,
+        weight_decay=0.0,
+        eps=settings.eps,
+        maximize=False,
+    )

@@ -1,0 +1,169 @@
+"""All that training is at a moment: enough to go on from, byte for byte."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gs2d.check import check_shapes
+from gs2d.errors import RunError
+from gs2d.splats import ATTRIBUTES, Splats
+
+FORMAT = 1  # of the state dict
+
+
+@dataclass(eq=False)
+class Moments:
+    """Adam's memory of one attribute.
+
+    Attributes
+    ----------
+    mean, square : Tensor, like the attribute
+        Running means of the gradient and of its square.
+    steps : int
+        Updates so far; kept when rows are appended or zeroed, as in the official code.
+    """
+
+    mean: Tensor
+    square: Tensor
+    steps: int = 0
+
+    @classmethod
+    def zeros_like(cls, parameter: Tensor) -> Moments:
+        """No memory."""
+        return cls(torch.zeros_like(parameter), torch.zeros_like(parameter))
+
+
+@dataclass(eq=False)
+class Statistics:
+    """Screen gradients gathered since the last densification.
+
+    Attributes
+    ----------
+    signed, absolute : Tensor [N]
+        Sums over views of the norm of the signed and of the absolute screen gradient.
+    count : Tensor [N]
+        Views in which the splat had a radius.
+    """
+
+    signed: Tensor
+    absolute: Tensor
+    count: Tensor
+
+    @classmethod
+    def zeros(cls, splats: Splats) -> Statistics:
+        """Nothing gathered yet, for N splats."""
+        return cls(*(torch.zeros_like(splats.opacity_logits, requires_grad=False) for _ in range(3)))
+
+
+@dataclass(eq=False)
+class TrainState:
+    """Mutable state of a training run. Only ``rows.keep_rows`` and ``rows.append_rows`` change N.
+
+    Attributes
+    ----------
+    splats : Splats
+        Plain tensors without autograd history.
+    generator : torch.Generator
+        On the CPU; every random choice of training comes from it.
+    moments : dict of attribute to Moments
+        Of the attributes that the stage trains.
+    groups : dict of name to bool Tensor [N]
+        Row groups that entry actions wrote.
+    statistics : Statistics or None
+        None in stages without densification.
+    stage, step : int
+        Index of the stage, and its iterations that are done.
+    entered : bool
+        Whether the entry actions of the stage are done.
+    queue : list of int
+        Training views that are still to come in this epoch; the next is the last.
+    """
+
+    splats: Splats
+    generator: torch.Generator
+    moments: dict[str, Moments] = field(default_factory=dict)
+    groups: dict[str, Tensor] = field(default_factory=dict)
+    statistics: Statistics | None = None
+    stage: int = 0
+    step: int = 0
+    entered: bool = False
+    queue: list[int] = field(default_factory=list)
+
+    def next_view(self, count: int) -> int:
+        """Index of the next training view: shuffled epochs, without replacement."""
+        if not self.queue:
+            self.queue = torch.randperm(count, generator=self.generator).tolist()
+        return self.queue.pop()
+
+    def state_dict(self) -> dict[str, Any]:
+        """A deep copy in tensors and plain Python (``torch.load(..., weights_only=True)`` reads it)."""
+        return {
+            "format": FORMAT,
+            "splats": {name: tensor.detach().clone() for name, tensor in self.splats.items()},
+            "moments": {
+                name: {"mean": m.mean.clone(), "square": m.square.clone(), "steps": m.steps}
+                for name, m in self.moments.items()
+            },
+            "groups": {name: mask.clone() for name, mask in self.groups.items()},
+            "statistics": None
+            if self.statistics is None
+            else {name: tensor.clone() for name, tensor in vars(self.statistics).items()},
+            "stage": self.stage,
+            "step": self.step,
+            "entered": self.entered,
+            "queue": list(self.queue),
+            "generator": self.generator.get_state(),
+        }
+
+    @classmethod
+    def from_state_dict(cls, data: Mapping[str, Any]) -> TrainState:
+        """The state that :meth:`state_dict` described (tensors are copied).
+
+        Raises
+        ------
+        RunError
+            If it is of another format, incomplete, or its tensors do not fit together.
+        """
+        if data.get("format") != FORMAT:
+            raise RunError(f"checkpoint must be of format {FORMAT}, got {data.get('format')!r}; train again")
+        try:
+            splats = Splats(**{name: data["splats"][name].clone() for name in ATTRIBUTES})
+            generator = torch.Generator()
+            generator.set_state(data["generator"])
+            statistics = data["statistics"]
+            state = cls(
+                splats,
+                generator,
+                {
+                    k: Moments(m["mean"].clone(), m["square"].clone(), int(m["steps"]))
+                    for k, m in data["moments"].items()
+                },
+                {name: mask.clone() for name, mask in data["groups"].items()},
+                None if statistics is None else Statistics(**{k: v.clone() for k, v in statistics.items()}),
+                int(data["stage"]),
+                int(data["step"]),
+                bool(data["entered"]),
+                [int(index) for index in data["queue"]],
+            )
+        except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+            raise RunError(f"checkpoint is broken ({type(error).__name__}: {error}); train again") from error
+        state.check()
+        return state
+
+    def check(self) -> None:
+        """Raise ShapeError unless everything has the same N."""
+        parameters = dict(self.splats.items())
+        arrays: dict[str, tuple[Tensor, str]] = {"means": (self.splats.means, "N 3")}
+        for name, moments in self.moments.items():
+            tail = " ".join(str(size) for size in parameters[name].shape[1:])
+            arrays[f"moments of {name}"] = (moments.mean, f"N {tail}")
+            arrays[f"squared moments of {name}"] = (moments.square, f"N {tail}")
+        arrays |= {f"group {name}": (mask, "N") for name, mask in self.groups.items()}
+        if self.statistics is not None:
+            arrays |= {f"statistics {name}": (tensor, "N") for name, tensor in vars(self.statistics).items()}
+        check_shapes(arrays)
