@@ -116,9 +116,7 @@ def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tens
     if 1 + shN.shape[1] < K:
         raise ShapeError(f"shN must hold at least {K - 1} coefficients for degree {degree}, got {shN.shape[1]}")
     basis = sh_basis(directions, degree)  # [N, K]
-    rgb = basis[:, :1] * sh0[:, 0]
-    if degree > 0:
-        rgb = rgb + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, : K - 1])
+    rgb = basis[:, :1] * sh0[:, 0] + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, : K - 1])
     return (rgb + 0.5).clamp(min=0.0)
 
 

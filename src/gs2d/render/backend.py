@@ -17,10 +17,6 @@ __all__ = ["BACKENDS", "Backend", "BackendStatus", "backend_report", "get_backen
 
 BACKENDS = ("cpu", "cuda", "reference")
 
-NO_LIBRARY_REMEDY = (
-    "install a C++20 compiler and CMake and reinstall gs2d (pip install --force-reinstall --no-deps 2dgs-r), "
-    "or use --backend reference (slow)"
-)
 NO_CUDA = "this version has no CUDA backend yet"
 
 
@@ -81,9 +77,9 @@ def _reference() -> Backend:
 
 
 def _cpu() -> Backend:
-    from gs2d.kernels.library import load_library
+    from gs2d.kernels.library import load
 
-    load_library()  # BackendError with the reason if it is not there or does not load
+    load()  # BackendError with the reason and the remedy if it is not there or does not load
     from gs2d.render import cpu
 
     return Backend("cpu", cpu.rasterize, cpu.splat_errors)
@@ -122,13 +118,14 @@ def get_backend(name: str) -> Backend:
 
 def backend_report() -> tuple[BackendStatus, ...]:
     """What this machine can run and why not, in the order of preference."""
-    from gs2d.kernels.library import describe_library
+    from gs2d.kernels.library import REMEDY, available_variants, load
 
     try:
-        _cpu()
-        cpu = BackendStatus("cpu", True, "", "", describe_library())
+        library = load()
+        details = f"{library.instruction_set}; {library.threads} threads; built: {', '.join(available_variants())}"
+        cpu = BackendStatus("cpu", True, "", "", details)
     except BackendError as error:
-        cpu = BackendStatus("cpu", False, str(error), NO_LIBRARY_REMEDY, "")
+        cpu = BackendStatus("cpu", False, str(error).partition(";")[0], REMEDY, "")
     cuda = BackendStatus("cuda", False, NO_CUDA, "use --backend cpu", "")
     reference = BackendStatus("reference", True, "", "", "plain torch, slow; float32 and float64, any device")
     return cpu, cuda, reference

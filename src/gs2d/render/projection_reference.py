@@ -63,7 +63,7 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
     keep = used.quats.norm(dim=1) > 0
     shN = used.shN[:, : num_coefficients(settings.sh_degree) - 1]
     for tensor in (used.means, used.quats, used.scales, used.log_scales, used.opacity_logits, used.sh0, shN):
-        keep &= tensor.isfinite().reshape(len(splats), -1).all(dim=1)
+        keep &= tensor.isfinite().flatten(1).all(dim=1) if tensor.dim() > 1 else tensor.isfinite()
     depth = _to_camera(used.means, camera)[:, 2]
     keep &= depth > settings.near
     if not for_errors:
