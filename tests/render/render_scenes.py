@@ -8,13 +8,22 @@ from dataclasses import fields
 import numpy as np
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 from gs2d.camera import Camera
 from gs2d.render.types import RenderOutput
 from gs2d.splats import Splats
 
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
+RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+Y_AXIS = (0.0, 1.0, 0.0)  # a turn by d degrees about y: t_u = (cos d, 0, -sin d), t_w = (sin d, 0, cos d)
 C0 = 0.5 / math.sqrt(math.pi)  # value of the degree-0 spherical harmonic
+
+
+def equal(actual: Tensor | float | list[float], expected: Tensor | float | list[float] | list[list[float]]) -> None:
+    """Equal up to float32 rounding."""
+    actual, expected = torch.as_tensor(actual).detach().double(), torch.as_tensor(expected).double()
+    assert_close(actual, expected, rtol=2e-5, atol=2e-6)
 
 
 def front_camera(width: int = 9, height: int = 9, focal: float = 10.0, **change: float) -> Camera:

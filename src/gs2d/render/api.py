@@ -2,7 +2,7 @@
 
 The contract
 ============
-Each number has a test in ``tests/render/test_contract.py`` that runs on every available backend.
+Each number has tests in ``tests/render/test_contract_*.py`` that run on every available backend.
 Notation: a splat has centre p (camera frame, depth z_c = p.z), tangents t_u, t_v, normal t_w, scales s_u, s_v,
 opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_min).
 
