@@ -1,0 +1,137 @@
+"""How renderings become pictures: the colours of normals, depths, errors and of the high-error splats."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gs2d.check import check_shapes
+
+ERROR_TOP = 0.2  # mean absolute error over channels, on colours in [0, 1], that gets the last colour of its scale
+HIGHLIGHT = (0.93, 0.11, 0.62)  # of the high-error splats
+IGNORED = (0.82, 0.82, 0.84)  # of pixels that the view's mask leaves out
+
+_ERROR_SCALE = np.array(
+    [[0.03, 0.03, 0.09], [0.33, 0.08, 0.42], [0.75, 0.20, 0.38], [0.97, 0.53, 0.22], [1.00, 0.96, 0.72]]
+)
+_DEPTH_SCALE = np.array(
+    [[0.99, 0.91, 0.60], [0.60, 0.81, 0.47], [0.16, 0.60, 0.56], [0.17, 0.36, 0.56], [0.19, 0.11, 0.36]]
+)
+
+
+def _scale(anchors: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Colours [..., 3] at positions ``t`` in [0, 1] (clipped) on a piecewise linear scale."""
+    position = np.clip(t, 0.0, 1.0)
+    knots = np.linspace(0.0, 1.0, len(anchors))
+    return np.stack([np.interp(position, knots, anchors[:, k]) for k in range(3)], axis=-1).astype(np.float32)
+
+
+def error_scale(steps: int) -> np.ndarray:
+    """The colours of errors from 0 to :data:`ERROR_TOP`, float32 [steps, 3]."""
+    return _scale(_ERROR_SCALE, np.linspace(0, 1, steps))
+
+
+def depth_scale(steps: int) -> np.ndarray:
+    """The colours of depths from near to far, float32 [steps, 3]."""
+    return _scale(_DEPTH_SCALE, np.linspace(0, 1, steps))
+
+
+def normal_picture(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """World normals as colours, (n + 1) / 2, over white.
+
+    Parameters
+    ----------
+    normal : ndarray [H, W, 3]
+        Of any length, as ``RenderOutput.normal``; a zero vector shows as white.
+    alpha : ndarray [H, W]
+
+    Returns
+    -------
+    ndarray float32 [H, W, 3] in [0, 1]
+
+    Raises
+    ------
+    ShapeError
+    """
+    check_shapes({"normal": (normal, "H W 3"), "alpha": (alpha, "H W")})
+    length = np.linalg.norm(normal, axis=2, keepdims=True)
+    unit = normal / np.maximum(length, 1e-12)
+    cover = np.where(length > 1e-12, np.clip(alpha, 0, 1)[..., None], 0.0)
+    return np.asarray(cover * (unit + 1) / 2 + (1 - cover), dtype=np.float32)
+
+
+def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
+    """Nearest and farthest depth worth a colour, wu: the 1st and 99th percentile where alpha is at least 0.5.
+
+    Use the limits of one stage for the pictures of all, so that they compare. (0, 1) where nothing was hit.
+    """
+    check_shapes({"depth": (depth, "H W"), "alpha": (alpha, "H W")})
+    covered = depth[(alpha >= 0.5) & (depth > 0) & np.isfinite(depth)]
+    if not covered.size:
+        return 0.0, 1.0
+    near, far = (float(value) for value in np.percentile(covered, [1, 99]))
+    return near, max(far, near * (1 + 1e-6) + 1e-12)
+
+
+def depth_picture(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
+    """Depth from near (light) to far (dark) over white.
+
+    Parameters
+    ----------
+    depth : ndarray [H, W] wu
+        0 where nothing was hit.
+    alpha : ndarray [H, W]
+    limits : (near, far) wu, optional
+        Default: :func:`depth_limits` of this picture.
+
+    Returns
+    -------
+    ndarray float32 [H, W, 3] in [0, 1]
+    """
+    near, far = depth_limits(depth, alpha) if limits is None else limits
+    cover = np.where((depth > 0) & np.isfinite(depth), np.clip(alpha, 0, 1), 0.0)[..., None]
+    position = np.where(np.isfinite(depth), (depth - near) / (far - near), 0.0)
+    return np.asarray(cover * _scale(_DEPTH_SCALE, position) + (1 - cover), dtype=np.float32)
+
+
+def error_picture(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Mean absolute error over channels, from black at 0 to pale yellow at :data:`ERROR_TOP` and above.
+
+    Parameters
+    ----------
+    color, photo : ndarray [H, W, 3] in [0, 1]
+        The rendering is clipped to [0, 1].
+    mask : ndarray [H, W] bool, optional
+        False = this pixel is ignored: it shows grey.
+
+    Returns
+    -------
+    ndarray float32 [H, W, 3] in [0, 1]
+    """
+    check_shapes({"photo": (photo, "H W 3"), "color": (color, "H W 3")})
+    error = np.abs(np.clip(color, 0, 1) - photo).mean(axis=2)
+    picture = _scale(_ERROR_SCALE, error / ERROR_TOP)
+    if mask is not None:
+        check_shapes({"photo": (photo, "H W 3"), "mask": (mask, "H W")})
+        picture[~mask] = IGNORED
+    return picture
+
+
+def highlight_picture(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The high-error splats in magenta over the faded grey picture.
+
+    Parameters
+    ----------
+    color : ndarray [H, W, 3] in [0, 1]
+        The rendering.
+    weight : ndarray [H, W] in [0, 1]
+        Their share in each pixel: the blending weights of these splats, summed.
+
+    Returns
+    -------
+    ndarray float32 [H, W, 3] in [0, 1]
+    """
+    check_shapes({"color": (color, "H W 3"), "weight": (weight, "H W")})
+    grey = np.clip(color, 0, 1) @ np.array([0.2126, 0.7152, 0.0722])
+    base = (0.30 + 0.70 * grey)[..., None]
+    share = np.clip(weight, 0, 1)[..., None]
+    return np.asarray(share * np.array(HIGHLIGHT) * (0.55 + 0.45 * base) + (1 - share) * base, dtype=np.float32)
