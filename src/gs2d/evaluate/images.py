@@ -1,0 +1,181 @@
+"""PSNR, SSIM and LPIPS of rendered images.
+
+Two numbers of each of PSNR and SSIM, both named: ``psnr`` and ``ssim`` are taken from the 8-bit image, as the official
+2DGS evaluation does (it reads the PNGs it saved), ``psnr_float`` and ``ssim_float`` from the floats clamped to [0, 1].
+Masked-out pixels count nowhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+
+import torch
+from torch import Tensor
+
+from gs2d import losses
+from gs2d.check import check_shapes
+from gs2d.evaluate.lpips import MIN_SIZE, REMEDY, Lpips
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number, or None with the reason why there is none."""
+
+    value: float | None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class ImageMetrics:
+    """How close a rendered image is to its photograph.
+
+    Attributes
+    ----------
+    psnr, ssim : Metric
+        dB and [-1, 1], of the image quantised to 8 bit (the official evaluation).
+    psnr_float, ssim_float : Metric
+        The same of the float image.
+    lpips : Metric
+        VGG LPIPS of the 8-bit image fed as [0, 1] (what 3DGS and 2DGS report).
+    lpips_signed : Metric
+        The same fed as [-1, 1] (the authors' convention).
+    """
+
+    psnr: Metric
+    ssim: Metric
+    psnr_float: Metric
+    ssim_float: Metric
+    lpips: Metric
+    lpips_signed: Metric
+
+    def to_json(self) -> dict[str, float | str | None]:
+        """Each value by its name, and ``<name>_reason`` beside every one that is null or partial."""
+        row: dict[str, float | str | None] = {}
+        for name, metric in asdict(self).items():
+            row[name] = metric["value"]
+            if metric["reason"] is not None:
+                row[f"{name}_reason"] = metric["reason"]
+        return row
+
+
+def quantise(image: Tensor) -> Tensor:
+    """Round a float image in [0, 1] to 8 bit, half up, clamping what is outside; uint8, same shape."""
+    return (image * 255 + 0.5).clamp(0, 255).to(torch.uint8)
+
+
+def _as_8bit(image: Tensor) -> Tensor:
+    return quantise(image).to(image.dtype) / 255
+
+
+def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio, dB: -10 log10 of the mean squared error over valid pixels and channels.
+
+    Parameters
+    ----------
+    image, target : Tensor [H, W, 3]
+        In [0, 1]; the image is clamped to it.
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+
+    Returns
+    -------
+    float
+        ``inf`` for equal images, ``nan`` when no pixel is valid.
+    """
+    check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
+    squared = (image.clamp(0, 1).double() - target.double()).square()  # [H, W, 3]
+    if mask is not None:
+        check_shapes({"target": (target, "H W 3"), "mask": (mask, "H W")})
+        squared = squared[mask]
+    if squared.numel() == 0:
+        return math.nan
+    error = float(squared.mean())
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def psnr_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
+    """``psnr_float`` after quantising both images to 8 bit."""
+    return psnr_float(_as_8bit(image), _as_8bit(target), mask)
+
+
+def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend_name: str) -> float:
+    """Mean SSIM over valid pixels (11x11 Gaussian window, zero padding: the SSIM of the loss); image clamped to [0, 1].
+
+    ``nan`` when no pixel is valid. ``backend_name`` is "cpu" (native) or "reference" (torch).
+    """
+    check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
+    if target.numel() == 0 or (mask is not None and not bool(mask.any())):
+        return math.nan
+    with torch.no_grad():
+        return float(losses.ssim(image.clamp(0, 1), target, mask, backend_name=backend_name))
+
+
+def ssim_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend_name: str) -> float:
+    """``ssim_float`` after quantising both images to 8 bit."""
+    return ssim_float(_as_8bit(image), _as_8bit(target), mask, backend_name=backend_name)
+
+
+def _metric(value: float) -> Metric:
+    if math.isnan(value):
+        return Metric(None, "no valid pixel")
+    return Metric(None, "the images are equal: infinite") if math.isinf(value) else Metric(value)
+
+
+def _lpips(network: Lpips | None, image: Tensor, target: Tensor, mask: Tensor | None, convention: str) -> Metric:
+    if network is None:
+        return Metric(None, f"no LPIPS weights: {REMEDY}")
+    if min(image.shape[:2]) < MIN_SIZE:
+        return Metric(None, f"the image is smaller than {MIN_SIZE} px")
+    if mask is not None:
+        if not bool(mask.any()):
+            return Metric(None, "no valid pixel")
+        image = torch.where(mask[..., None], image, target)
+    with torch.no_grad():
+        return _metric(float(network(_as_8bit(image).float(), _as_8bit(target).float(), convention=convention)))
+
+
+def image_metrics(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    *,
+    backend_name: str,
+    lpips: Lpips | None = None,
+) -> ImageMetrics:
+    """Every image metric of one view.
+
+    Parameters
+    ----------
+    image, target : Tensor [H, W, 3]
+        In [0, 1]; the image is clamped to it.
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel. LPIPS sees the target there and still averages over the whole image.
+    backend_name : "cpu" or "reference"
+    lpips : Lpips, optional
+        From ``evaluate.lpips.load_lpips``; without it LPIPS is null with the remedy as reason.
+    """
+    return ImageMetrics(
+        psnr=_metric(psnr_8bit(image, target, mask)),
+        ssim=_metric(ssim_8bit(image, target, mask, backend_name=backend_name)),
+        psnr_float=_metric(psnr_float(image, target, mask)),
+        ssim_float=_metric(ssim_float(image, target, mask, backend_name=backend_name)),
+        lpips=_lpips(lpips, image, target, mask, "0..1"),
+        lpips_signed=_lpips(lpips, image, target, mask, "-1..1"),
+    )
+
+
+def mean_metrics(views: Sequence[ImageMetrics]) -> ImageMetrics:
+    """Mean of each metric over the views that have it; the reason says how many do not, and why."""
+
+    def mean(name: str) -> Metric:
+        metrics = [getattr(view, name) for view in views]
+        values = [metric.value for metric in metrics if metric.value is not None]
+        reasons = [metric.reason for metric in metrics if metric.value is None]
+        if not values:
+            return Metric(None, reasons[0] if reasons else "no views")
+        reason = f"{len(reasons)} of {len(views)} views left out: {reasons[0]}" if reasons else None
+        return Metric(sum(values) / len(values), reason)
+
+    return ImageMetrics(**{field.name: mean(field.name) for field in fields(ImageMetrics)})

@@ -1,0 +1,120 @@
+"""LPIPS (Zhang et al. 2018) with a VGG-16 and five 1x1 heads, from weight files that the user supplies.
+
+Two conventions are in use, and their numbers differ: ``"-1..1"`` scales images to [-1, 1] first, as the authors' package
+does; ``"0..1"`` feeds [0, 1], as the evaluation scripts of 3DGS and 2DGS do. A number must say which it is.
+
+Nothing is downloaded. The files are torchvision's VGG-16 state dict (keys ``features.0.weight`` ...) and the heads of the
+``lpips`` package, version 0.1 (keys ``lin0.model.1.weight`` ...).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gs2d.errors import DataError, ShapeError
+
+CONVENTIONS = ("0..1", "-1..1")
+BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's `features` indices of the convolutions
+WIDTHS = (64, 128, 256, 512, 512)
+SHIFT = (-0.030, -0.088, -0.188)  # of the LPIPS scaling layer, on [-1, 1]
+SCALE = (0.458, 0.448, 0.450)
+MIN_SIZE = 16  # px: four poolings leave one
+REMEDY = (
+    "pass --lpips-weights with torchvision's vgg16-397923af.pth and the lpips package's weights/v0.1/vgg.pth, "
+    "or the folder that holds both"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Lpips:
+    """The network: VGG-16 convolutions and heads.
+
+    Attributes
+    ----------
+    weights : mapping of str to Tensor
+        ``features.{i}.weight`` [out, in, 3, 3], ``features.{i}.bias`` [out] and ``lin{b}.model.1.weight`` [1, C, 1, 1].
+    """
+
+    weights: Mapping[str, Tensor]
+
+    def __call__(self, image: Tensor, target: Tensor, *, convention: str = "0..1") -> Tensor:
+        """Distance [] of two images [H, W, 3] with values in [0, 1].
+
+        Raises
+        ------
+        ShapeError
+            Images of different or too small sizes, or an unknown convention.
+        """
+        if convention not in CONVENTIONS:
+            raise ShapeError(f"LPIPS convention must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
+        if image.shape != target.shape or image.dim() != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIZE:
+            raise ShapeError(
+                f"LPIPS needs two images [H, W, 3] of one size, at least {MIN_SIZE} px, "
+                f"got {list(image.shape)} and {list(target.shape)}"
+            )
+        pair = torch.stack([image, target]).permute(0, 3, 1, 2)  # [2, 3, H, W]
+        if convention == "-1..1":
+            pair = 2 * pair - 1
+        shift, scale = (pair.new_tensor(v).view(1, 3, 1, 1) for v in (SHIFT, SCALE))
+        x = (pair - shift) / scale
+        total = pair.new_zeros(())
+        for block, layers in enumerate(BLOCKS):
+            if block > 0:
+                x = F.max_pool2d(x, 2)
+            for i in layers:
+                x = F.relu(F.conv2d(x, self.weights[f"features.{i}.weight"], self.weights[f"features.{i}.bias"], padding=1))
+            unit = x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)  # [2, C, h, w]
+            difference = (unit[:1] - unit[1:]).square()
+            total = total + F.conv2d(difference, self.weights[f"lin{block}.model.1.weight"]).mean()
+        return total
+
+
+def _expected() -> dict[str, tuple[int, ...]]:
+    shapes: dict[str, tuple[int, ...]] = {}
+    width_in = 3
+    for block, (layers, width) in enumerate(zip(BLOCKS, WIDTHS, strict=True)):
+        for i in layers:
+            shapes[f"features.{i}.weight"] = (width, width_in, 3, 3)
+            shapes[f"features.{i}.bias"] = (width,)
+            width_in = width
+        shapes[f"lin{block}.model.1.weight"] = (1, width, 1, 1)
+    return shapes
+
+
+def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu") -> Lpips:
+    """Read the weights from a folder (its .pth and .pt files) or from the files themselves.
+
+    Raises
+    ------
+    DataError
+        A path that is missing or not a state dict, or weights that are missing or of another shape.
+    """
+    given = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
+    files: list[Path] = []
+    for path in given:
+        if not path.exists():
+            raise DataError(f"LPIPS weights not found: {path}; {REMEDY}")
+        files += sorted([*path.glob("*.pth"), *path.glob("*.pt")]) if path.is_dir() else [path]
+    expected, weights = _expected(), dict[str, Tensor]()
+    for file in files:
+        try:
+            state = torch.load(file, map_location=device, weights_only=True)
+        except (OSError, RuntimeError, UnpicklingError, EOFError, ValueError) as error:
+            raise DataError(f"{file} is not a readable PyTorch state dict ({str(error).splitlines()[0]}); {REMEDY}") from error
+        if not isinstance(state, Mapping):
+            raise DataError(f"{file} must hold a state dict, got {type(state).__name__}; {REMEDY}")
+        weights |= {key: value.float() for key, value in state.items() if key in expected}
+    for key, shape in expected.items():
+        if key not in weights:
+            where = ", ".join(map(str, files)) or f"no .pth file in {', '.join(map(str, given))}"
+            raise DataError(f"LPIPS weights lack {key} (looked in {where}); {REMEDY}")
+        if tuple(weights[key].shape) != shape:
+            raise DataError(f"LPIPS weight {key} must be {list(shape)}, got {list(weights[key].shape)}; {REMEDY}")
+    return Lpips(weights)

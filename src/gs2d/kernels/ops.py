@@ -1,0 +1,278 @@
+"""Native image losses for autograd: fused value and gradient, the same bits for any number of threads.
+
+Each function computes the gradient in its forward pass, for the cotangent that the caller expects (the weights of the
+loss terms), and hands it out in the backward pass. Another cotangent gives the right gradient too, at the price of a
+second pass. The formulas are in ``kernels/core/losses.h``; ``losses_reference`` has the same in torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.errors import ShapeError
+from gs2d.kernels.library import Library, prepare
+
+POINTER, INT64, DOUBLE, INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_int
+SIGNATURES: dict[str, list[Any]] = {
+    "gs2d_photometric": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] * 2 + [POINTER] * 2,
+    "gs2d_blur": [POINTER] + [INT64] * 2 + [POINTER],
+    "gs2d_masked_mean": [POINTER] * 2 + [INT64] * 2 + [POINTER],
+    "gs2d_normal_consistency": [POINTER] * 6 + [INT64] * 2 + [INT, DOUBLE] + [POINTER] * 4,
+}
+
+
+def _call(library: Library, name: str, *arguments: Any) -> None:
+    """Call an exported function; tensors pass their addresses, None passes null."""
+    pointers = [x.data_ptr() if isinstance(x, Tensor) else x for x in arguments]
+    if library.function(name, INT, SIGNATURES[name])(*pointers) != 0:
+        raise MemoryError(f"{name} could not allocate its scratch rows")
+
+
+def _arrays(library: Library, **tensors: Tensor) -> list[Tensor]:
+    """The tensors, contiguous, or ShapeError if one is on another device or of another dtype than the library takes."""
+    for name, tensor in tensors.items():
+        if tensor.dtype != library.dtype or tensor.device.type != "cpu":
+            raise ShapeError(
+                f"{name} must be {library.dtype} on the cpu for the native losses, got {tensor.dtype} on "
+                f"{tensor.device}; convert it, or use the reference backend"
+            )
+    return [tensor.detach().contiguous() for tensor in tensors.values()]
+
+
+def _mask_bytes(mask: Tensor | None) -> Tensor | None:
+    if mask is None:
+        return None
+    if mask.dtype != torch.bool or mask.device.type != "cpu":
+        raise ShapeError(f"mask must be bool on the cpu, got {mask.dtype} on {mask.device}")
+    return mask.contiguous()
+
+
+def blur(image: Tensor, *, library: Library | None = None) -> Tensor:
+    """The SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
+
+    Of a target this is the ``target_mean`` that ``photometric`` takes.
+
+    Raises
+    ------
+    ShapeError
+        Another shape, dtype or device.
+    """
+    library = library or prepare()
+    sizes = check_shapes({"image": (image, "H W 3")})
+    (source,) = _arrays(library, image=image)
+    out = torch.empty_like(source)
+    _call(library, "gs2d_blur", source, sizes["H"], sizes["W"], out)
+    return out
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rendered: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        mean: Tensor | None,
+        expected: tuple[float, float],
+        library: Library,
+    ) -> tuple[Tensor, Tensor]:
+        ctx.arguments = (target, mask, mean, library)
+        ctx.expected = torch.tensor(expected, dtype=torch.float64).to(rendered.dtype)  # rounded as the cotangents are
+        gradient = torch.empty_like(rendered) if ctx.needs_input_grad[0] else None
+        values = _photometric(rendered, *ctx.arguments, expected, gradient)
+        ctx.save_for_backward(rendered, gradient)
+        return values[0], values[1]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, l1_cotangent: Tensor, ssim_cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        rendered, gradient = ctx.saved_tensors
+        cotangents = torch.stack([l1_cotangent, ssim_cotangent])
+        if not torch.equal(cotangents, ctx.expected):
+            gradient = torch.empty_like(rendered)
+            _photometric(rendered, *ctx.arguments, tuple(cotangents.tolist()), gradient)
+        return gradient, None, None, None, None, None
+
+
+def _photometric(
+    rendered: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    mean: Tensor | None,
+    library: Library,
+    cotangents: tuple[float, float],
+    gradient: Tensor | None,
+) -> Tensor:
+    values = torch.empty(2, dtype=torch.float64)
+    height, width = rendered.shape[:2]
+    _call(library, "gs2d_photometric", rendered, target, mask, mean, height, width, *cotangents, gradient, values)
+    return values.to(rendered.dtype)
+
+
+def photometric(
+    rendered: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    target_mean: Tensor | None = None,
+    *,
+    expected: tuple[float, float] = (0.8, -0.2),
+    library: Library | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Mean L1 and mean SSIM of an image, both differentiable in ``rendered``, in one fused pass.
+
+    Parameters
+    ----------
+    rendered, target : Tensor [H, W, 3]
+        In [0, 1].
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+    target_mean : Tensor [H, W, 3], optional
+        ``blur(target)``, if at hand. Changes no bit of the result.
+    expected : (float, float)
+        Cotangents of the two values that the backward pass will probably see; any other costs a second pass.
+    library : Library, optional
+        By default this machine's best, on as many threads as torch uses.
+
+    Returns
+    -------
+    l1, ssim : Tensor []
+        Means over valid pixels and channels; 0 when no pixel is valid.
+
+    Raises
+    ------
+    ShapeError
+        Shapes that differ, or another dtype or device than the library takes.
+    """
+    library = library or prepare()
+    shapes = {"target": (target, "H W 3"), "rendered": (rendered, "H W 3")}
+    if target_mean is not None:
+        shapes["target_mean"] = (target_mean, "H W 3")
+    if mask is not None:
+        shapes["mask"] = (mask, "H W")
+    check_shapes(shapes)
+    _arrays(library, rendered=rendered)
+    (target,) = _arrays(library, target=target)
+    if target_mean is not None:
+        (target_mean,) = _arrays(library, target_mean=target_mean)
+    l1, ssim = _Photometric.apply(rendered.contiguous(), target, _mask_bytes(mask), target_mean, expected, library)
+    return l1, ssim
+
+
+class _NormalConsistency(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        normal: Tensor,
+        depth: Tensor,
+        alpha: Tensor,
+        mask: Tensor | None,
+        camera: Camera,
+        per_splat: bool,
+        expected: float,
+        library: Library,
+    ) -> Tensor:
+        wanted = any(ctx.needs_input_grad[:3])
+        gradients = [torch.empty_like(x) if wanted else None for x in (normal, depth)]
+        gradients.append(torch.empty_like(alpha) if wanted and per_splat else None)
+        intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+        rotation = torch.tensor(camera.rotation, dtype=torch.float64).contiguous()
+        value = torch.empty(1, dtype=torch.float64)
+        ctx.expected = expected if expected != 0 else 1.0
+        inputs = (normal, depth, alpha, mask, intrinsics, rotation)
+        sizes = (camera.height, camera.width, int(per_splat), ctx.expected)
+        _call(library, "gs2d_normal_consistency", *inputs, *sizes, *gradients, value)
+        ctx.save_for_backward(*gradients)
+        return value[0].to(normal.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = ctx.saved_tensors
+        if not torch.equal(cotangent, torch.tensor(ctx.expected, dtype=torch.float64).to(cotangent.dtype)):
+            gradients = tuple(None if g is None else g * (cotangent / ctx.expected) for g in gradients)
+        return (*gradients, None, None, None, None, None)
+
+
+def normal_consistency(
+    normal: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    camera: Camera,
+    mask: Tensor | None = None,
+    *,
+    per_splat: bool = False,
+    expected: float = 0.05,
+    library: Library | None = None,
+) -> Tensor:
+    """Normal consistency [], the native form of the functions of the same name in ``losses_reference``.
+
+    Parameters
+    ----------
+    normal : Tensor [H, W, 3]
+        sum w n, world frame.
+    depth : Tensor [H, W] wu
+        0 where nothing was hit.
+    alpha : Tensor [H, W]
+    camera : Camera
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+    per_splat : bool
+        The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
+    expected : float
+        Cotangent that the backward pass will probably see; another costs a multiplication of the gradients.
+    library : Library, optional
+
+    Raises
+    ------
+    ShapeError
+        Shapes that differ, or another dtype or device than the library takes.
+    """
+    library = library or prepare()
+    shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
+    if mask is not None:
+        shapes["mask"] = (mask, "H W")
+    sizes = check_shapes(shapes)
+    if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
+        raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
+    _arrays(library, normal=normal, depth=depth, alpha=alpha)
+    images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
+    value: Tensor = _NormalConsistency.apply(*images, _mask_bytes(mask), camera, per_splat, expected, library)
+    return value
+
+
+class _MaskedMean(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, mask: Tensor | None, library: Library) -> Tensor:
+        ctx.mask, ctx.like = mask, values
+        mean = torch.empty(1, dtype=torch.float64)
+        _call(library, "gs2d_masked_mean", values, mask, *values.shape, mean)
+        return mean[0].to(values.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        if ctx.mask is None:
+            return (cotangent / max(ctx.like.numel(), 1)).expand_as(ctx.like), None, None
+        return ctx.mask.to(cotangent.dtype) * (cotangent / max(int(ctx.mask.sum()), 1)), None, None
+
+
+def masked_mean(values: Tensor, mask: Tensor | None = None, *, library: Library | None = None) -> Tensor:
+    """Mean [] of a map [H, W] over the pixels where ``mask`` is True, summed in a fixed order; 0 when there are none.
+
+    Raises
+    ------
+    ShapeError
+        Shapes that differ, or another dtype or device than the library takes.
+    """
+    library = library or prepare()
+    check_shapes({"values": (values, "H W")} | ({"mask": (mask, "H W")} if mask is not None else {}))
+    _arrays(library, values=values)
+    mean: Tensor = _MaskedMean.apply(values.contiguous(), _mask_bytes(mask), library)
+    return mean

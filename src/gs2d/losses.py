@@ -1,0 +1,237 @@
+"""The terms of the training loss: kind -> function, and the weighted values of the terms of a stage.
+
+The total of official 2DGS is 0.8 L1 + 0.2 (1 - SSIM) + lambda_n mean(1 - alpha <n, N>) + lambda_d mean(distortion): the
+weights are the :class:`~gs2d.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math_losses.md``.
+
+There are two implementations of each kind: plain torch (``losses_reference``), used by the reference backend, and native
+fused operations (``kernels.ops``), used by the cpu backend. The name of the backend chooses; nothing falls back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+
+from torch import Tensor
+
+from gs2d import losses_reference as reference
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.errors import BackendError, RecipeError, ShapeError
+from gs2d.kernels import ops
+from gs2d.losses_reference import normals_from_depth
+from gs2d.recipe import LossTerm
+from gs2d.render.types import RenderOutput
+
+__all__ = ["LOSSES", "LossInputs", "TargetMaps", "compute_losses", "normals_from_depth", "target_maps"]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetMaps:
+    """What the SSIM needs of a target alone, worth keeping per view when its target does not change.
+
+    Attributes
+    ----------
+    target : Tensor [H, W, 3]
+        The very tensor the maps were made of.
+    mean : Tensor [H, W, 3]
+        Its local Gaussian mean.
+    version : int
+        The target's in-place version when the maps were made.
+    """
+
+    target: Tensor
+    mean: Tensor
+    version: int
+
+    def check(self, target: Tensor) -> None:
+        """Raise ShapeError unless the maps were made of this tensor, unchanged since."""
+        same = self.target is target or (
+            self.target.data_ptr() == target.data_ptr() and self.target.shape == target.shape
+        )
+        if not same or target._version != self.version:
+            raise ShapeError(
+                "target_cache belongs to another target (or the target changed in place); make one with "
+                "target_maps(target) for each view and pass the same tensor"
+            )
+
+
+def target_maps(target: Tensor) -> TargetMaps:
+    """The maps of a target [H, W, 3] for ``compute_losses(..., target_cache=...)`` on the cpu backend."""
+    check_shapes({"target": (target, "H W 3")})
+    return TargetMaps(target, ops.blur(target), target._version)
+
+
+@dataclass(frozen=True, eq=False)
+class LossInputs:
+    """One rendered view and what it should look like.
+
+    Attributes
+    ----------
+    output : RenderOutput
+    target : Tensor [H, W, 3]
+        In [0, 1].
+    mask : Tensor [H, W] bool or None
+        False = ignore this pixel.
+    camera : Camera
+    target_mean : Tensor [H, W, 3] or None
+        Local mean of the target when known (native SSIM only).
+    weights : mapping of kind to float
+        Of the active terms. Not applied here: the native operations prepare their gradients for them.
+    """
+
+    output: RenderOutput
+    target: Tensor
+    mask: Tensor | None
+    camera: Camera
+    target_mean: Tensor | None = None
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def native_photometric(self) -> tuple[Tensor, Tensor]:
+        """(L1, SSIM) by one fused native pass, shared by both terms."""
+        expected = (self.weights.get("l1", 0.0), -self.weights.get("ssim", 0.0))
+        return ops.photometric(self.output.color, self.target, self.mask, self.target_mean, expected=expected)
+
+
+LossFunction = Callable[[LossInputs, str], Tensor]
+"""(inputs, "mean" or "median" depth) -> unweighted scalar."""
+
+
+def _normals(inputs: LossInputs, depth_kind: str) -> tuple[Tensor, Tensor, Tensor, Camera, Tensor | None]:
+    output = inputs.output
+    return output.normal, output.depth(depth_kind), output.alpha, inputs.camera, inputs.mask
+
+
+def _native_normals(inputs: LossInputs, depth_kind: str, kind: str) -> Tensor:
+    per_splat = kind == "normal_consistency_per_splat"
+    weight = inputs.weights.get(kind, 1.0)
+    return ops.normal_consistency(*_normals(inputs, depth_kind), per_splat=per_splat, expected=weight)
+
+
+LOSSES: Mapping[str, LossFunction] = MappingProxyType(
+    {
+        "l1": lambda x, _: reference.l1(x.output.color, x.target, x.mask),
+        "ssim": lambda x, _: 1 - reference.ssim(x.output.color, x.target, x.mask),
+        "normal_consistency": lambda x, depth: reference.normal_consistency(*_normals(x, depth)),
+        "normal_consistency_per_splat": lambda x, depth: reference.normal_consistency_per_splat(*_normals(x, depth)),
+        "distortion": lambda x, _: reference.distortion(x.output.distortion, x.mask),
+    }
+)
+"""Every kind of loss in plain torch, unweighted."""
+
+NATIVE_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
+    {
+        "l1": lambda x, _: x.native_photometric[0],
+        "ssim": lambda x, _: 1 - x.native_photometric[1],
+        "normal_consistency": lambda x, depth: _native_normals(x, depth, "normal_consistency"),
+        "normal_consistency_per_splat": lambda x, depth: _native_normals(x, depth, "normal_consistency_per_splat"),
+        "distortion": lambda x, _: ops.masked_mean(x.output.distortion, x.mask),
+    }
+)
+"""The same kinds as fused native operations."""
+
+_BY_BACKEND: Mapping[str, Mapping[str, LossFunction]] = MappingProxyType(
+    {"reference": LOSSES, "cpu": NATIVE_LOSSES}
+)
+
+
+def compute_losses(
+    output: RenderOutput,
+    target: Tensor,
+    mask: Tensor | None,
+    camera: Camera,
+    terms: Sequence[LossTerm],
+    *,
+    iteration: int,
+    depth_kind: str,
+    backend_name: str,
+    target_cache: TargetMaps | None = None,
+) -> dict[str, Tensor]:
+    """Weighted values of the active terms; their sum is the loss.
+
+    Parameters
+    ----------
+    output : RenderOutput
+    target : Tensor [H, W, 3]
+        In [0, 1], same dtype and device as the output.
+    mask : Tensor [H, W] bool or None
+        False = ignore this pixel.
+    camera : Camera
+    terms : sequence of LossTerm
+        A term is active when ``iteration > term.start``. Terms of one kind add up.
+    iteration : int
+        Counted from 1 within the stage.
+    depth_kind : "mean" or "median"
+        The protocol's depth, for terms that name none.
+    backend_name : "cpu" or "reference"
+        Resolved name of the backend that rendered ``output`` (not "auto").
+    target_cache : TargetMaps, optional
+        Of this target: spares the native SSIM one blur of four. It never changes the value.
+
+    Returns
+    -------
+    dict of kind to Tensor []
+        weight * LOSSES[kind], in the order of ``terms``.
+
+    Raises
+    ------
+    ShapeError
+        Target, mask or camera of another size than the image, or a cache of another target.
+    RecipeError
+        A kind that is not in LOSSES.
+    BackendError
+        A backend without losses.
+    """
+    sizes = check_shapes({"color": (output.color, "H W 3"), "target": (target, "H W 3")})
+    if mask is not None:
+        check_shapes({"target": (target, "H W 3"), "mask": (mask, "H W")})
+    if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
+        raise ShapeError(f"camera is {camera.width}x{camera.height}, but the image is {sizes['W']}x{sizes['H']}")
+    if backend_name not in _BY_BACKEND:
+        raise BackendError(f"losses run on backend {' or '.join(map(repr, _BY_BACKEND))}, got {backend_name!r}")
+    functions = _BY_BACKEND[backend_name]
+    if target_cache is not None:
+        target_cache.check(target)
+    weights: dict[str, float] = {}
+    active = [term for term in terms if iteration > term.start]
+    for term in terms:
+        if term.kind not in functions:
+            raise RecipeError(f"loss kind must be one of {', '.join(LOSSES)}, got {term.kind!r}")
+    for term in active:
+        weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
+    mean = target_cache.mean if target_cache is not None else None
+    inputs = LossInputs(output, target, mask, camera, mean, weights)
+    values: dict[str, Tensor] = {}
+    for term in active:
+        value = term.weight * functions[term.kind](inputs, term.depth or depth_kind)
+        values[term.kind] = values[term.kind] + value if term.kind in values else value
+    return values
+
+
+def ssim(
+    image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend_name: str, target_mean: Tensor | None = None
+) -> Tensor:
+    """Mean SSIM [] over valid pixels, for evaluation (``LOSSES["ssim"]`` is 1 minus this).
+
+    Parameters
+    ----------
+    image, target : Tensor [H, W, 3]
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+    backend_name : "cpu" or "reference"
+    target_mean : Tensor [H, W, 3], optional
+        ``target_maps(target).mean``.
+
+    Raises
+    ------
+    BackendError
+        A backend without losses.
+    """
+    if backend_name not in _BY_BACKEND:
+        raise BackendError(f"losses run on backend {' or '.join(map(repr, _BY_BACKEND))}, got {backend_name!r}")
+    if backend_name == "cpu":
+        return ops.photometric(image, target, mask, target_mean)[1]
+    return reference.ssim(image, target, mask)

@@ -1,0 +1,142 @@
+"""The training losses in plain torch: any dtype, any device, written to be read beside the docs, judge of the native ops.
+
+Conventions (``docs/math_losses.md``): images are [H, W, C]; a mask is bool [H, W] with False = ignore this pixel. Means
+run over the valid pixels only (the mean over no pixel at all is 0). What was rendered at an ignored pixel has no influence
+on any value and receives no gradient.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gs2d.camera import Camera
+
+WINDOW_RADIUS = 5  # px: 11 taps
+WINDOW_SIGMA = 1.5  # px
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+
+
+def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean of ``values`` [H, W] or [H, W, C] over the pixels where ``mask`` [H, W] is True (all pixels for None)."""
+    if mask is None:
+        return values.mean()
+    valid = mask if values.dim() == 2 else mask[..., None]
+    channels = values.numel() // max(mask.numel(), 1)
+    count = torch.clamp(mask.sum() * channels, min=1)
+    return torch.where(valid, values, torch.zeros_like(values)).sum() / count
+
+
+def fill_ignored(rendered: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """``rendered`` [H, W, C] with the target's value at ignored pixels."""
+    return rendered if mask is None else torch.where(mask[..., None], rendered, target)
+
+
+def l1(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean absolute difference over valid pixels and channels."""
+    return masked_mean((fill_ignored(rendered, target, mask) - target).abs(), mask)
+
+
+def gaussian_window(dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Tensor:
+    """The 11 normalised weights of the SSIM window: exp(-k^2 / (2 sigma^2)), k = -5..5."""
+    k = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)
+    weights = torch.exp(-(k**2) / (2 * WINDOW_SIGMA**2))
+    return (weights / weights.sum()).to(dtype=dtype, device=device)
+
+
+def blur(image: Tensor) -> Tensor:
+    """The separable Gaussian window over [H, W, C], zero outside the image."""
+    channels = image.shape[2]
+    window = gaussian_window(image.dtype, image.device)
+    planes = image.permute(2, 0, 1)[None]  # [1, C, H, W]
+    rows = window.view(1, 1, 1, -1).expand(channels, 1, 1, -1)
+    columns = window.view(1, 1, -1, 1).expand(channels, 1, -1, 1)
+    planes = F.conv2d(planes, rows, padding=(0, WINDOW_RADIUS), groups=channels)
+    planes = F.conv2d(planes, columns, padding=(WINDOW_RADIUS, 0), groups=channels)
+    return planes[0].permute(1, 2, 0)
+
+
+def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
+    """SSIM of every pixel and channel [H, W, C] (Wang et al. 2004; window, padding and constants of the official 2DGS)."""
+    mu_x, mu_y = blur(rendered), blur(target)
+    var_x = blur(rendered * rendered) - mu_x * mu_x
+    var_y = blur(target * target) - mu_y * mu_y
+    cov = blur(rendered * target) - mu_x * mu_y
+    numerator = (2 * mu_x * mu_y + SSIM_C1) * (2 * cov + SSIM_C2)
+    return numerator / ((mu_x * mu_x + mu_y * mu_y + SSIM_C1) * (var_x + var_y + SSIM_C2))
+
+
+def ssim(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean SSIM over valid pixels and channels; ignored pixels hold the target's value."""
+    return masked_mean(ssim_map(fill_ignored(rendered, target, mask), target), mask)
+
+
+def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None) -> Tensor:
+    """Surface normals of a depth image, by central differences of back-projected points.
+
+    N = normalise((P[y+1] - P[y-1]) x (P[x+1] - P[x-1])), with P the world point of each pixel centre. For positive
+    depths this always faces the camera: its dot product with the pixel's own ray is
+    -(z[x+1] + z[x-1]) (z[y+1] + z[y-1]) / (fx fy) before normalising, so no flip is needed.
+
+    Parameters
+    ----------
+    depth : Tensor [H, W] wu
+        Depth along the optical axis; 0 where nothing was hit.
+    camera : Camera
+    mask : Tensor [H, W] bool, optional
+        False = treat the pixel as not hit.
+
+    Returns
+    -------
+    Tensor [H, W, 3]
+        Unit normals in the world frame; 0 on the one-pixel border and wherever one of the four neighbours was not hit.
+        Differentiable in ``depth``.
+    """
+    height, width = depth.shape
+    if min(height, width) < 3:
+        return torch.zeros_like(depth)[..., None].expand(-1, -1, 3)
+    hit = depth > 0 if mask is None else (depth > 0) & mask
+    z = torch.where(hit, depth, torch.ones_like(depth))  # keeps the undefined pixels' gradients finite
+    i = torch.arange(width, dtype=depth.dtype, device=depth.device)
+    j = torch.arange(height, dtype=depth.dtype, device=depth.device)
+    x = ((i + 0.5 - camera.cx) / camera.fx).expand(height, width)
+    y = ((j + 0.5 - camera.cy) / camera.fy)[:, None].expand(height, width)
+    points = torch.stack([x * z, y * z, z], dim=-1)  # camera frame; the rotation to the world is applied last
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    right = points[1:-1, 2:] - points[1:-1, :-2]
+    normals = F.normalize(torch.linalg.cross(down, right), dim=-1, eps=0.0)
+    defined = hit[2:, 1:-1] & hit[:-2, 1:-1] & hit[1:-1, 2:] & hit[1:-1, :-2]
+    normals = torch.where(defined[..., None], normals, torch.zeros_like(normals))
+    rotation = torch.as_tensor(camera.rotation, dtype=depth.dtype, device=depth.device)
+    return F.pad(normals @ rotation, (0, 0, 1, 1, 1, 1))  # rows n^T R = (R^T n)^T
+
+
+def normal_consistency(
+    normal: Tensor, depth: Tensor, alpha: Tensor, camera: Camera, mask: Tensor | None = None
+) -> Tensor:
+    """Mean of 1 - alpha <normal, N>, alpha detached, N from ``depth`` (the form of the official 2DGS code).
+
+    Where N is undefined (border, not hit, ignored neighbour) the pixel contributes the constant 1.
+    """
+    surface = normals_from_depth(depth, camera, mask)
+    return masked_mean(1 - alpha.detach() * (normal * surface).sum(dim=-1), mask)
+
+
+def normal_consistency_per_splat(
+    normal: Tensor, depth: Tensor, alpha: Tensor, camera: Camera, mask: Tensor | None = None
+) -> Tensor:
+    """Mean of sum_i w_i (1 - <n_i, N>) = alpha - <normal, N>, nothing detached (the paper's Eq. 7).
+
+    Where N is undefined the pixel contributes 0: there is nothing to be consistent with.
+    """
+    surface = normals_from_depth(depth, camera, mask)
+    defined = (surface.detach() != 0).any(dim=-1)
+    value = alpha - (normal * surface).sum(dim=-1)
+    return masked_mean(torch.where(defined, value, torch.zeros_like(value)), mask)
+
+
+def distortion(distortion_map: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean of the rendered distortion map over valid pixels."""
+    return masked_mean(distortion_map, mask)
