@@ -100,6 +100,7 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
 
     to_splat = means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
     directions = to_splat / to_splat.norm(dim=1, keepdim=True)
+    degree = min(settings.sh_degree, splats.sh_degree)
     normal = frames[:, :, 2]
     away = (normal * to_splat).sum(dim=1).detach() > 0  # rule 8
     return ScreenSplats(
@@ -108,7 +109,7 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
         Av=Av * third,
         Tw=Tw,
         opacity=splats.opacity_logits[rows].sigmoid(),
-        color=sh_to_rgb(splats.sh0[rows], splats.shN[rows], directions, settings.sh_degree),
+        color=sh_to_rgb(splats.sh0[rows], splats.shN[rows], directions, degree),
         normal=torch.where(away[:, None], -normal, normal),
     )
 
