@@ -127,13 +127,12 @@ def composite(image: np.ndarray, background: Sequence[float] | np.ndarray) -> np
     -------
     ndarray float32 [H, W, 3] in [0, 1]
     """
-    scale = np.float32(1 / 255)
-    rgb = image[:, :, :3] * scale
+    rgb = np.divide(image[:, :, :3], np.float32(255), dtype=np.float32)
     if image.shape[2] == 3:
         return np.asarray(rgb)
     back = np.asarray(background, dtype=np.float32)
     check_shapes({"background": (back, "3")})
-    alpha = image[:, :, 3:] * scale
+    alpha = np.divide(image[:, :, 3:], np.float32(255), dtype=np.float32)
     rgb -= back
     rgb *= alpha
     rgb += back

@@ -110,7 +110,7 @@ def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float
 def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
     """world_mat and scale_mat [4, 4] of each view."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {
                 key: np.asarray(file[key], dtype=np.float64)
                 for key in file.files

@@ -195,7 +195,7 @@ def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     -------
     positions : ndarray float32 [H, W, 2] px, corner origin
     valid : ndarray bool [H, W]
-        True where the position lies inside the distorted image and the lens model is still one to one.
+        True where the position lies between pixel centres of the distorted image and the lens model is still one to one.
     """
     k, lens = intrinsics, intrinsics.lens
     x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
@@ -208,7 +208,9 @@ def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
             bent = lens.distort(ideal)
         valid = np.hypot(ideal[..., 0], ideal[..., 1]) < lens.largest_radius()
     positions = bent * (k.fx, k.fy) + (k.cx, k.cy)
-    inside = (positions >= 0).all(axis=-1) & (positions[..., 0] <= k.width) & (positions[..., 1] <= k.height)
+    # Between the outer pixel centres every sample is an interpolation; a thousandth of a pixel is rounding.
+    low, high = 0.499, np.array((k.width, k.height)) - 0.499
+    inside = ((positions >= low) & (positions <= high)).all(axis=-1)
     valid &= inside  # comparisons with NaN are False
     return np.where(valid[..., None], positions, 0.0).astype(np.float32), valid
 

@@ -82,7 +82,7 @@ class View:
     def alpha(self) -> np.ndarray | None:
         """The alpha channel, float32 [H, W] in [0, 1], or None if the photograph has none."""
         image = self._picture().image
-        return image[:, :, 3] * np.float32(1 / 255) if image.shape[2] == 4 else None
+        return np.divide(image[:, :, 3], np.float32(255), dtype=np.float32) if image.shape[2] == 4 else None
 
     def target(self, background: Sequence[float] | np.ndarray) -> np.ndarray:
         """What a rendering over ``background`` (3 floats in [0, 1]) should look like, float32 [H, W, 3] in [0, 1]."""

@@ -1,0 +1,266 @@
+"""COLMAP data sets."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_writers import ColmapModel, ring, small_colmap, write_picture
+from PIL import Image
+
+from gs2d.data import load_scene
+from gs2d.data.colmap_model import read_cameras, read_images, read_points
+from gs2d.errors import DataError
+from gs2d.images import read_image
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_cameras_points_and_pictures_are_what_the_model_says(tmp_path: Path, kind: str) -> None:
+    model = small_colmap(tmp_path, kind=kind)
+    scene = load_scene(tmp_path, test_every=0)
+    assert scene.format == "colmap"
+    assert [view.name for view in scene.train] == [f"{i}.png" for i in range(9)]
+    for view, (index, camera) in zip(scene.train, reversed(list(enumerate(ring(9)))), strict=True):
+        c = view.camera
+        assert (c.width, c.height, c.fx, c.fy, c.cx, c.cy) == (40, 30, 35.0, 36.0, 18.5, 16.25)
+        np.testing.assert_allclose(c.T_cam_world, camera.T_cam_world, atol=1e-12)
+        np.testing.assert_array_equal(view.image(), read_image(tmp_path / "images" / view.name))
+        assert f"{8 - index}.png" == view.name
+    assert scene.points is not None
+    np.testing.assert_array_equal(scene.points.points, [p[1] for p in model.points])
+    np.testing.assert_array_equal(scene.points.colors, [p[2] for p in model.points])
+    assert scene.points.points.dtype == np.float64
+    assert scene.points.colors.dtype == np.uint8
+
+
+@pytest.mark.parametrize("where", ["sparse/0", "sparse"])
+def test_the_model_may_be_in_sparse_0_or_sparse(tmp_path: Path, where: str) -> None:
+    small_colmap(tmp_path, where=where)
+    assert len(load_scene(tmp_path).views) == 9
+
+
+def test_the_model_folder_itself_can_be_loaded(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    assert len(load_scene(tmp_path / "sparse" / "0").views) == 9
+    small_colmap(tmp_path / "flat", where=".")
+    assert len(load_scene(tmp_path / "flat").views) == 9
+
+
+def test_a_binary_model_is_preferred_to_a_text_model_beside_it(tmp_path: Path) -> None:
+    small_colmap(tmp_path, kind="bin")
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / "sparse/0" / f"{name}.txt").write_text("no model\n")
+    assert len(load_scene(tmp_path).views) == 9
+
+
+def test_rigs_and_frames_files_are_ignored_and_other_models_are_reported(tmp_path: Path) -> None:
+    model = small_colmap(tmp_path)
+    for name in ("rigs.bin", "frames.bin"):
+        (tmp_path / "sparse/0" / name).write_bytes(b"\x01 not ours")
+    model.write(tmp_path / "sparse/1")
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 9
+    assert any("others are there: 1" in note for note in scene.notes)
+
+
+def test_images_in_sub_folders_keep_their_whole_name(tmp_path: Path) -> None:
+    cameras = ring(4)
+    model = ColmapModel(cameras={1: ("SIMPLE_PINHOLE", 40, 30, (35.0, 20.0, 15.0))})
+    names = ["left/a.png", "left/b c.png", "right/a.png", "right/b c.png"]
+    for index, name in enumerate(names):
+        model.images.append((index + 1, cameras[index].T_cam_world, 1, name, []))
+        write_picture(tmp_path / "images" / name, seed=index)
+    for kind in ("bin", "txt"):
+        model.write(tmp_path / kind / "sparse", kind)
+        (tmp_path / kind / "images").symlink_to(tmp_path / "images")
+        scene = load_scene(tmp_path / kind, test_every=0)
+        assert [view.name for view in scene.train] == names
+        assert not np.array_equal(scene.train[0].image(), scene.train[2].image())
+        assert scene.points is None
+
+
+def test_images_missing_on_disk_are_skipped_and_reported(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    (tmp_path / "images/3.png").unlink()
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 8
+    assert scene.skipped == ("3.png: no such file in images",)
+
+
+def test_every_eighth_view_by_name_is_test(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    assert [v.name for v in load_scene(tmp_path).test] == ["0.png", "8.png"]
+    assert [v.name for v in load_scene(tmp_path, test_every=3).test] == ["0.png", "3.png", "6.png"]
+    assert load_scene(tmp_path, test_every=0).test == ()
+    with pytest.raises(DataError, match="must have a training view"):
+        load_scene(tmp_path, test_every=1)
+
+
+def test_downscale_filters_the_picture_and_keeps_rays(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    full, half = load_scene(tmp_path, test_every=0), load_scene(tmp_path, test_every=0, downscale=4)
+    a, b = full.train[2], half.train[2]
+    assert (b.camera.width, b.camera.height) == (10, 7)  # 40 / 4; 30 / 4 = 7, two rows are cut
+    assert (b.camera.fx, b.camera.cx, b.camera.cy) == (35 / 4, 18.5 / 4, 16.25 / 4)
+    block = a.image()[4:8, 8:12].reshape(-1, 3).mean(axis=0)
+    np.testing.assert_allclose(b.image()[1, 2], block, atol=0.5)
+
+
+def test_images_n_is_used_for_downscale_n_with_its_own_size(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    # 30 / 4 = 7.5: whoever made images_4 rounded up, so fy scales by 8/30 while fx scales by 10/40.
+    pictures = [write_picture(tmp_path / "images_4" / f"{i}.png", 10, 8, seed=50 + i) for i in range(9)]
+    scene = load_scene(tmp_path, downscale=4, test_every=0)
+    view = scene.train[3]
+    np.testing.assert_array_equal(view.image(), pictures[3])
+    c = view.camera
+    np.testing.assert_allclose((c.width, c.height, c.fx, c.fy), (10, 8, 35 / 4, 36 * 8 / 30))
+    np.testing.assert_allclose((c.cx, c.cy), (18.5 / 4, 16.25 * 8 / 30))
+    assert any("images_4" in note for note in scene.notes)
+
+
+def test_images_n_of_a_wrong_size_is_an_error(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    for i in range(9):
+        write_picture(tmp_path / "images_4" / f"{i}.png", 20, 15)
+    with pytest.raises(DataError, match=r"must be 1/4 of its camera's 40x30, got 20x15"):
+        load_scene(tmp_path, downscale=4)
+
+
+def test_a_picture_of_another_size_rescales_the_camera_and_of_another_shape_is_an_error(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    write_picture(tmp_path / "images/2.png", 80, 60)
+    c = load_scene(tmp_path, test_every=0).train[2].camera
+    assert (c.width, c.height, c.fx, c.fy, c.cx, c.cy) == (80, 60, 70.0, 72.0, 37.0, 32.5)
+    write_picture(tmp_path / "images/2.png", 30, 40)
+    with pytest.raises(DataError, match=r"2\.png.*40x30, got 30x40; was it rotated"):
+        load_scene(tmp_path)
+
+
+def test_exif_orientation_is_ignored_as_colmap_ignores_it(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # "rotate by 90 degrees to view"
+    stored = np.zeros((30, 40, 3), np.uint8)
+    stored[:, :20] = 255
+    Image.fromarray(stored).save(tmp_path / "images/4.png", exif=exif)
+    view = load_scene(tmp_path, test_every=0).train[4]
+    with Image.open(tmp_path / "images/4.png") as file:
+        assert file.getexif()[0x0112] == 6
+    np.testing.assert_array_equal(view.image(), stored)
+
+
+def test_masks_beside_the_images_say_which_pixels_count(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    mask = np.zeros((30, 40), np.uint8)
+    mask[8:, :] = 255
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks/1.png.png")
+    Image.fromarray(mask).save(tmp_path / "masks/2.png")
+    Image.fromarray(mask).resize((80, 60), Image.Resampling.NEAREST).save(tmp_path / "masks/3.png")
+    scene = load_scene(tmp_path, test_every=0)
+    assert scene.train[0].mask() is None
+    for index in (1, 2, 3):
+        np.testing.assert_array_equal(scene.train[index].mask(), mask > 0)
+    # Rows 6 to 8 of the full size make row 2 of a third: a pixel counts only where all of it counts.
+    third = load_scene(tmp_path, test_every=0, downscale=3).train[1].mask()
+    np.testing.assert_array_equal(third[:, 0], [False] * 3 + [True] * 7)
+
+
+def test_a_mask_of_another_shape_is_an_error(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    write_picture(tmp_path / "masks/1.png", 30, 40)
+    with pytest.raises(DataError, match="mask .*1.png must have the size"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_binary_file_cut_anywhere_is_an_error_that_names_it_and_its_size(tmp_path: Path, name: str) -> None:
+    small_colmap(tmp_path, count=3)
+    folder = tmp_path / "sparse/0"
+    whole = (folder / f"{name}.bin").read_bytes()
+    read = {"cameras": read_cameras, "images": read_images, "points3D": read_points}[name]
+    for size in range(len(whole)):
+        (folder / f"{name}.bin").write_bytes(whole[:size])
+        with pytest.raises(DataError, match=rf"{name}\.bin is truncated .*got .*{size}"):
+            read(folder, "bin")
+    (folder / f"{name}.bin").write_bytes(whole + b"\0")
+    with pytest.raises(DataError, match="must end after its last"):
+        read(folder, "bin")
+
+
+def test_an_absurd_count_is_an_error_and_not_a_huge_allocation(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    path = tmp_path / "sparse/0/points3D.bin"
+    path.write_bytes(struct.pack("<Q", 1 << 60) + path.read_bytes()[8:])
+    with pytest.raises(DataError, match="1152921504606846976 points need at least"):
+        load_scene(tmp_path)
+    huge_track = struct.pack("<QQ3d3BdQ", 1, 1, 0, 0, 0, 0, 0, 0, 0, 1 << 63)
+    path.write_bytes(huge_track)
+    with pytest.raises(DataError, match="truncated"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "expected"),
+    [
+        ("cameras", "1 PINHOLE 40 thirty 1 1 1 1", "cameras.txt line 1 must be `CAMERA_ID MODEL"),
+        ("images", "1 1 0 0 0 0 0 0 7", "images.txt line 1 must be `IMAGE_ID QW"),
+        ("points3D", "1 0 0", "points3D.txt line 1 must be `POINT3D_ID X Y Z"),
+    ],
+)
+def test_a_wrong_line_of_a_text_model_is_named(tmp_path: Path, name: str, line: str, expected: str) -> None:
+    small_colmap(tmp_path, kind="txt")
+    (tmp_path / "sparse/0" / f"{name}.txt").write_text(line + "\n")
+    with pytest.raises(DataError, match=expected):
+        load_scene(tmp_path)
+
+
+def test_a_pose_of_nan_is_an_error_that_names_the_image(tmp_path: Path) -> None:
+    model = small_colmap(tmp_path, kind="txt")
+    path = tmp_path / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace(repr(float(model.images[0][1][0, 3])), "nan"))
+    with pytest.raises(DataError, match=r"image 8\.png must have a finite pose"):
+        load_scene(tmp_path)
+
+
+def test_a_camera_model_that_cannot_be_undistorted_names_camera_model_and_remedy(tmp_path: Path) -> None:
+    cameras = {7: ("RAD_TAN_THIN_PRISM_FISHEYE", 40, 30, tuple([35.0, 36.0, 20.0, 15.0] + [0.01] * 12))}
+    small_colmap(tmp_path, cameras=cameras)
+    with pytest.raises(DataError, match=r"camera 7 has the model RAD_TAN_THIN_PRISM_FISHEYE.*image_undistorter"):
+        load_scene(tmp_path)
+    path = tmp_path / "sparse/0/cameras.bin"
+    raw = bytearray(path.read_bytes())
+    raw[12:16] = struct.pack("<i", 99)
+    path.write_bytes(bytes(raw))
+    with pytest.raises(DataError, match=r"camera 7 has the model id 99.*image_undistorter"):
+        load_scene(tmp_path)
+
+
+def test_an_image_of_a_camera_that_is_not_listed_is_an_error(tmp_path: Path) -> None:
+    small_colmap(tmp_path, cameras={3: ("PINHOLE", 40, 30, (35.0, 36.0, 18.5, 16.25))})
+    with pytest.raises(DataError, match=r"must hold camera 7 of image .*got \[3\]"):
+        load_scene(tmp_path)
+
+
+def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        path.unlink()
+    with pytest.raises(DataError, match=r"at least one view, got none \(9 skipped"):
+        load_scene(tmp_path)
+    (tmp_path / "images").rmdir()
+    with pytest.raises(DataError, match="photographs in the folder images"):
+        load_scene(tmp_path)
+
+
+def test_points_that_are_not_finite_are_left_out_and_reported(tmp_path: Path) -> None:
+    model = small_colmap(tmp_path)
+    model.points[3] = (4, (np.nan, 0, 0), (1, 2, 3), 0.5, [])
+    model.write(tmp_path / "sparse/0")
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 19
+    assert np.isfinite(scene.points.points).all()
+    assert any("1 of 20 sparse points" in note for note in scene.notes)

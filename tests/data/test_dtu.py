@@ -1,0 +1,104 @@
+"""DTU scans in the layout of IDR and NeuS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_writers import SCALE_MAT, ColmapModel, ring, small_dtu, write_picture
+
+from gs2d.data import load_scene
+from gs2d.data.dtu import decompose_projection
+from gs2d.errors import DataError
+
+
+@pytest.mark.parametrize(
+    ("digits", "images", "archive"), [(3, "image", "cameras_sphere.npz"), (6, "images", "cameras.npz")]
+)
+def test_cameras_masks_and_metric_frame(tmp_path: Path, digits: int, images: str, archive: str) -> None:
+    """The writer takes half a pixel from cx, cy (centres at whole numbers) and flips the sign of view 1."""
+    cameras = small_dtu(tmp_path, digits=digits, images=images, archive=archive)
+    scene = load_scene(tmp_path)
+    assert scene.format == "dtu"
+    assert (len(scene.train), len(scene.test)) == (5, 0)  # the protocol trains on all views
+    for index, (view, camera) in enumerate(zip(scene.train, cameras, strict=True)):
+        np.testing.assert_allclose(view.camera.T_cam_world, camera.T_cam_world, atol=1e-9)
+        np.testing.assert_allclose(view.camera.K, camera.K, atol=1e-8)
+        expected = np.zeros((30, 40), bool)
+        expected[10:20, 5 : 20 + index] = True
+        np.testing.assert_array_equal(view.object_mask(), expected)
+        assert view.mask() is None  # the background is trained
+    np.testing.assert_array_equal(scene.T_metric_scene, SCALE_MAT)
+    assert len(load_scene(tmp_path, test_every=2).test) == 3
+
+
+def test_a_projection_matrix_of_any_scale_and_sign_gives_the_camera() -> None:
+    camera = ring(3)[1]
+    P = camera.K @ camera.T_cam_world[:3]
+    for scale in (1.0, -1.0, 1e-4, -3e5):
+        fx, fy, cx, cy, T = decompose_projection(scale * P, "view")
+        np.testing.assert_allclose((fx, fy, cx, cy), (35, 35, 20, 15), rtol=1e-10)
+        np.testing.assert_allclose(T, camera.T_cam_world, atol=1e-10)
+
+
+def test_a_singular_matrix_or_one_with_skew_is_an_error() -> None:
+    camera = ring(3)[1]
+    with pytest.raises(DataError, match="full rank"):
+        decompose_projection(np.zeros((4, 4)), "view 0")
+    with pytest.raises(DataError, match="full rank"):
+        decompose_projection(np.full((4, 4), np.nan), "view 0")
+    K = camera.K
+    K[0, 1] = 2.0
+    with pytest.raises(DataError, match="no skew, got 2 px"):
+        decompose_projection(K @ camera.T_cam_world[:3], "view 0")
+
+
+def test_sparse_points_are_used_only_if_their_cameras_stand_where_the_scene_s_do(tmp_path: Path) -> None:
+    cameras = small_dtu(tmp_path)
+    model = ColmapModel(cameras={1: ("PINHOLE", 40, 30, (35.0, 35.0, 20.0, 15.0))})
+    model.images = [(i + 1, c.T_cam_world, 1, f"{i:06d}.png", []) for i, c in enumerate(cameras)]
+    model.points = [(1, (0.1, 0.2, 0.3), (1, 2, 3), 0.1, [])]
+    model.write(tmp_path / "sparse/0")
+    np.testing.assert_array_equal(load_scene(tmp_path).points.points, [[0.1, 0.2, 0.3]])
+    moved = [(i, T + np.array([[0, 0, 0, 0.5]] * 3 + [[0] * 4]), k, n, o) for i, T, k, n, o in model.images]
+    ColmapModel(model.cameras, moved, model.points).write(tmp_path / "sparse/0")
+    scene = load_scene(tmp_path)
+    assert scene.points is None
+    assert any("another frame" in note for note in scene.notes)
+
+
+def test_numbered_images_keep_their_camera_when_one_is_missing(tmp_path: Path) -> None:
+    cameras = small_dtu(tmp_path)
+    (tmp_path / "image/000002.png").unlink()
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.train] == ["000000.png", "000001.png", "000003.png", "000004.png"]
+    np.testing.assert_allclose(scene.train[2].camera.center, cameras[3].center, atol=1e-9)
+    assert scene.train[2].object_mask()[15].sum() == 18  # columns 5 to 22 of view 3
+    assert scene.skipped == ("view 2: no photograph",)
+
+
+def test_wrong_archives_are_errors(tmp_path: Path) -> None:
+    small_dtu(tmp_path)
+    path = tmp_path / "cameras_sphere.npz"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:300])
+    with pytest.raises(DataError, match=r"cameras_sphere\.npz must be a numpy archive"):
+        load_scene(tmp_path)
+    np.savez(path, world_mat_0=np.eye(4))
+    with pytest.raises(DataError, match="world_mat_i and scale_mat_i of every view, got 1 and 0"):
+        load_scene(tmp_path)
+    np.savez(path, world_mat_0=np.eye(3), scale_mat_0=np.eye(4))
+    with pytest.raises(DataError, match="world_mat_0 must be a 4x4 matrix"):
+        load_scene(tmp_path)
+    matrices = {f"{k}_mat_{i}": np.eye(4) for k in ("world", "scale") for i in (0, 1)}
+    np.savez(path, **{**matrices, "scale_mat_1": 2 * np.eye(4)})
+    with pytest.raises(DataError, match="must be the same finite matrix"):
+        load_scene(tmp_path)
+
+
+def test_another_number_of_images_than_cameras_without_numbers_is_an_error(tmp_path: Path) -> None:
+    small_dtu(tmp_path)
+    write_picture(tmp_path / "image/extra.png")
+    with pytest.raises(DataError, match=r"as many images as cameras_sphere\.npz has views, 5, or be numbered; got 6"):
+        load_scene(tmp_path)

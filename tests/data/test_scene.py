@@ -1,0 +1,191 @@
+"""Views, the cache, detection, and what loading never does."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_writers import ring, small_blender, small_colmap, small_dtu, small_nerfstudio, tree_hash
+
+from gs2d.data import ImageCache, Picture, PointCloud, View, detect_format, load_scene
+from gs2d.errors import DataError, ShapeError
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "blender": small_blender,
+    "nerfstudio": small_nerfstudio,
+    "dtu": small_dtu,
+    "colmap": small_colmap,
+}
+
+
+def picture(value: int) -> Picture:
+    return Picture(np.full((10, 10, 3), value, np.uint8))
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_the_format_is_detected_and_nothing_is_written(tmp_path: Path, format: str) -> None:
+    WRITERS[format](tmp_path)
+    before = tree_hash(tmp_path)
+    assert detect_format(tmp_path) == format
+    scene = load_scene(tmp_path, downscale=2)
+    for view in scene.views:
+        view.image(), view.mask(), view.alpha(), view.object_mask()
+    assert scene.format == format
+    assert scene.name == tmp_path.name
+    assert tree_hash(tmp_path) == before
+
+
+def test_formats_are_looked_for_in_the_documented_order_and_can_be_named(tmp_path: Path) -> None:
+    for format in ("colmap", "dtu", "nerfstudio", "blender"):
+        WRITERS[format](tmp_path)
+        assert detect_format(tmp_path) == format
+    assert load_scene(tmp_path, format="colmap").format == "colmap"
+    with pytest.raises(DataError, match="format must be auto or one of blender, nerfstudio, dtu, colmap, got nerf"):
+        load_scene(tmp_path, format="nerf")
+
+
+@pytest.mark.parametrize("format", WRITERS)
+def test_a_named_format_that_is_not_there_is_an_error(tmp_path: Path, format: str) -> None:
+    (tmp_path / "readme.txt").write_text("hello")
+    with pytest.raises(DataError):
+        load_scene(tmp_path, format=format)
+
+
+def test_a_missing_folder_a_file_an_empty_folder_and_an_unknown_layout_are_errors(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="nowhere must be the folder of a capture, got no such folder"):
+        load_scene(tmp_path / "nowhere")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(DataError, match="empty must hold a capture, got an empty folder"):
+        load_scene(empty)
+    (tmp_path / "note.txt").write_text("hello")
+    with pytest.raises(DataError, match="got a file; give its folder"):
+        load_scene(tmp_path / "note.txt")
+    with pytest.raises(DataError, match=r"transforms_train\.json .*sparse/0, sparse, .*got empty/, note\.txt"):
+        load_scene(tmp_path)
+
+
+def test_pictures_are_decoded_when_asked_for_and_a_broken_one_is_named(tmp_path: Path) -> None:
+    small_blender(tmp_path)
+    path = tmp_path / "train/r_2.png"
+    path.write_bytes(path.read_bytes()[:400])  # the header is whole, the pixels are not
+    scene = load_scene(tmp_path)
+    scene.train[0].image()
+    with pytest.raises(DataError, match=r"r_2\.png does not decode"):
+        scene.train[2].image()
+    with pytest.raises(DataError, match=r"r_2\.png does not decode"):
+        list(scene.preload())
+    path.write_bytes(b"no picture")
+    with pytest.raises(DataError, match=r"r_2\.png must be an image"):
+        load_scene(tmp_path)
+
+
+def test_preload_decodes_every_view_once_in_order(tmp_path: Path) -> None:
+    small_blender(tmp_path)
+    scene = load_scene(tmp_path)
+    assert list(scene.preload(threads=3)) == list(scene.views)
+    assert len(scene.train[0].cache) == 6
+    for path in (tmp_path / "train").iterdir():
+        path.unlink()
+    scene.train[0].image()  # from memory
+
+
+def test_a_picture_that_changed_its_size_since_loading_is_an_error(tmp_path: Path) -> None:
+    small_blender(tmp_path)
+    scene = load_scene(tmp_path)
+    small_blender(tmp_path, width=80, height=60)
+    with pytest.raises(DataError, match="must be 40x30, got 80x60; did the file change"):
+        scene.train[0].image()
+
+
+def test_the_cache_drops_the_least_recently_used_and_never_exceeds_its_bound() -> None:
+    cache = ImageCache(650)  # two pictures of 300 bytes
+    made: list[int] = []
+
+    def get(value: int) -> int:
+        def decode() -> Picture:
+            made.append(value)
+            return picture(value)
+
+        return int(cache.get(value, decode).image[0, 0, 0])
+
+    assert [get(v) for v in (1, 2, 1, 3, 1, 2)] == [1, 2, 1, 3, 1, 2]
+    assert made == [1, 2, 3, 2]  # 2 was older than 1 when 3 came
+    assert (cache.nbytes, len(cache)) == (600, 2)
+    tiny = ImageCache(299)
+    tiny.get(1, lambda: picture(1))
+    assert (tiny.nbytes, len(tiny)) == (0, 0)
+
+
+def test_the_cache_is_safe_for_threads() -> None:
+    cache = ImageCache(300 * 5)
+    wrong: list[int] = []
+
+    def work(seed: int) -> None:
+        for value in np.random.default_rng(seed).integers(0, 20, 500).tolist():
+            if cache.get(value, lambda v=value: picture(v)).image[0, 0, 0] != value:
+                wrong.append(value)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+    assert not wrong
+    assert cache.nbytes == 300 * len(cache) <= cache.max_bytes
+
+
+def test_cache_bytes_bounds_what_a_scene_holds(tmp_path: Path) -> None:
+    small_blender(tmp_path)
+    one = 40 * 30 * 4
+    scene = load_scene(tmp_path, cache_bytes=2 * one + 10)
+    list(scene.preload())
+    assert scene.train[0].cache.nbytes == 2 * one
+
+
+def test_a_shared_picture_cannot_be_changed_by_a_caller() -> None:
+    image, mask = np.zeros((30, 40, 3), np.uint8), np.ones((30, 40), bool)
+    view = View.from_arrays("a", ring(2)[0], image, mask)
+    with pytest.raises(ValueError, match="read-only"):
+        view.image()[0, 0] = 1
+    view.mask()[:] = False
+    assert view.mask().all()
+    image[0, 0] = 9  # the caller's own array stays his
+
+
+def test_target_composites_straight_alpha_over_the_background() -> None:
+    """Alpha 51/255 = 0.2 of red over blue: (0.2, 0, 0.8)."""
+    image = np.zeros((30, 40, 4), np.uint8)
+    image[..., 0], image[..., 3] = 255, 51
+    target = View.from_arrays("a", ring(2)[0], image).target((0.0, 0.0, 1.0))
+    assert target.dtype == np.float32
+    np.testing.assert_allclose(target[3, 4], (0.2, 0.0, 0.8), atol=1e-6)
+    opaque = View.from_arrays("a", ring(2)[0], image[..., :3])
+    np.testing.assert_array_equal(opaque.target((0, 0, 1))[0, 0], (1, 0, 0))
+    assert opaque.alpha() is None
+    assert opaque.object_mask() is None
+
+
+def test_a_picture_of_another_size_than_its_camera_is_an_error() -> None:
+    view = View.from_arrays("a", ring(2)[0], np.zeros((40, 30, 3), np.uint8))
+    with pytest.raises(DataError, match="image of view a must be 40x30 like its camera, got 30x40"):
+        view.image()
+
+
+def test_points_and_colours_must_have_the_same_count() -> None:
+    with pytest.raises(ShapeError, match="colors"):
+        PointCloud(np.zeros((3, 3)), np.zeros((2, 3), np.uint8))
+
+
+def test_extent_is_1_1_times_the_largest_distance_of_a_training_camera(tmp_path: Path) -> None:
+    """A full ring of radius 4 has its mean on the axis: every camera is 4 away."""
+    small_nerfstudio(tmp_path, count=8)
+    assert load_scene(tmp_path, test_every=0).extent == pytest.approx(4.4)
+
+
+def test_a_downscale_that_leaves_nothing_or_is_no_factor_is_an_error(tmp_path: Path) -> None:
+    small_blender(tmp_path)
+    for factor, message in ((31, "at least one pixel of 40x30, got 31"), (0, "whole number >= 1, got 0")):
+        with pytest.raises(DataError, match=message):
+            load_scene(tmp_path, downscale=factor)
