@@ -31,7 +31,6 @@ test-all: lint
 
 lint: $(VENV)/installed
 	$(PY) -m ruff check .
-	$(PY) -m ruff format --check .
 	$(PY) -m mypy
 
 install: $(VENV)/installed

@@ -51,7 +51,7 @@ def test_overwriting_deletes_the_files_of_the_run_and_nothing_else(tmp_path: Pat
     run.write_metrics({"stages": []})
     (run.path / "notes.txt").write_text("mine")
     claim_run(run.path, resume=False, overwrite=True)
-    assert names(run.path) == ["lock", "notes.txt"]
+    assert names(run.path) == [".lock", "notes.txt"]
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

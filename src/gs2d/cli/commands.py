@@ -131,7 +131,7 @@ class Evaluate(Common):
     ground_truth: Annotated[Path | None, arg(metavar="MESH_OR_POINTS")] = None
     """PLY file of the true surface, in the frame of the capture."""
     thresholds: tuple[float, ...] = ()
-    """Distances at which precision and recall are taken, world units (default: fractions of the true surface's size)."""
+    """Distances at which precision and recall are taken, world units (default: fractions of the surface's size)."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights for the LPIPS metric."""
     threads: int | None = None
@@ -159,30 +159,17 @@ class Report(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecipesList(Common):
-    """All recipes."""
+class Recipes(Common):
+    """List the recipes, or show one: `gs2d recipes show NAME`."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class RecipesShow(Common):
-    """One recipe in full."""
-
-    name: Positional[str]
-    """Name of the recipe."""
+    action: Positional[Literal["list", "show"]] = "list"
+    """What to do."""
+    name: Positional[str] = ""
+    """Name of the recipe to show."""
     schedule_scale: float = 1.0
     """As in `gs2d train`."""
     overrides: Overrides = ()
     """As in `gs2d train`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recipes:
-    """List the recipes, or show one."""
-
-    action: (
-        Annotated[RecipesList, subcommand("list", prefix_name=False)]
-        | Annotated[RecipesShow, subcommand("show", prefix_name=False)]
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,7 +193,7 @@ Command = (
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Report, subcommand("report")]
-    | Annotated[RecipesList, subcommand("recipes")]
+    | Annotated[Recipes, subcommand("recipes")]
     | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Info, subcommand("info")]
 )

@@ -7,10 +7,10 @@
       events.jsonl   one JSON object a line; after a resume it reads as if the run had never stopped
       checkpoints/   <stage number>-<stage>-<iteration>.pt (the last two), <stage number>-<stage>-end.pt (all)
       metrics.json  splats.ply  mesh.ply  renders/  report.html
-      lock           held by the process that trains; the kernel frees it when that process dies
+      .lock          held by the process that trains; the kernel frees it when that process dies
 
-Every file is written to a temporary name and renamed, except the log, which only grows: each checkpoint holds the length
-of the log at its iteration, and a resume cuts the log there.
+Every file is written to a temporary name and renamed, except the log, which only grows: each checkpoint holds the
+length of the log at its iteration, and a resume cuts the log there.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from gs2d.disk import atomic_write, disk_error
 from gs2d.errors import RunError
 from gs2d.io.files import read_json, write_json
 
-RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", "lock"
+RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS = "checkpoints", "renders"
 SPLATS, MESH, REPORT = "splats.ply", "mesh.ply", "report.html"
 FORMAT = 1

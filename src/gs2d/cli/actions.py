@@ -1,0 +1,272 @@
+"""What each command does: call the pipeline, show the result. Imported only when a command runs (it loads torch)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gs2d.cli import commands as c
+from gs2d.cli.console import Console, figure
+from gs2d.errors import DataError, RecipeError
+
+
+def execute(command: c.Common, console: Console) -> None:
+    """Run a parsed command."""
+    actions: dict[type, Callable[[Any, Console], None]] = {
+        c.Demo: demo,
+        c.Train: train,
+        c.Mesh: mesh,
+        c.Render: render,
+        c.Evaluate: evaluate,
+        c.Export: export,
+        c.Report: report,
+        c.Recipes: recipes,
+        c.Doctor: doctor,
+        c.Info: info,
+    }
+    try:
+        actions[type(command)](command, console)
+    finally:
+        console.close()
+
+
+def _train_options(command: c.Train) -> Any:
+    from gs2d.pipeline.options import TrainOptions
+
+    return TrainOptions(
+        scene=command.scene,
+        out=command.out,
+        recipe=command.recipe,
+        protocol=command.protocol,
+        backend=command.backend,
+        format=command.format,
+        downscale=command.downscale,
+        schedule_scale=command.schedule_scale,
+        overrides=command.overrides,
+        seed=command.seed,
+        resume=command.resume,
+        overwrite=command.overwrite,
+        start_from=command.start_from,
+        cache=command.cache,
+        threads=command.threads,
+        checkpoint_every=command.checkpoint_every,
+        checkpoint_seconds=command.checkpoint_seconds,
+    )
+
+
+def train(command: c.Train, console: Console) -> None:
+    """``gs2d train``."""
+    from gs2d.pipeline.train import train as run_training
+
+    run = run_training(_train_options(command), console.on_event)
+    console.close()
+    show_run(run.path, run.metrics(), console)
+
+
+def demo(command: c.Demo, console: Console) -> None:
+    """``gs2d demo``."""
+    from gs2d.pipeline.demo import DemoOptions
+    from gs2d.pipeline.demo import demo as run_demo
+
+    options = DemoOptions(
+        out=command.out,
+        backend=command.backend,
+        seed=command.seed,
+        threads=command.threads,
+        resume=command.resume,
+        overwrite=command.overwrite,
+        schedule_scale=command.schedule_scale,
+    )
+    run = run_demo(options, console.on_event)
+    console.close()
+    show_run(run.path, run.metrics(), console)
+
+
+def mesh(command: c.Mesh, console: Console) -> None:
+    """``gs2d mesh``."""
+    from gs2d.pipeline.jobs import mesh_run
+    from gs2d.pipeline.options import MeshOptions
+
+    options = MeshOptions(
+        voxel=command.voxel,
+        truncation=command.truncation,
+        depth_limit=command.depth_limit,
+        bbox=command.bbox,
+        depth=command.depth,
+        keep_components=command.keep_components,
+    )
+    result = mesh_run(command.run, options, console.on_event, out=command.out, threads=command.threads)
+    console.close()
+    console.say(f"{result['file']}: {result['vertices']:,} vertices, {result['faces']:,} triangles")
+    console.say(f"voxel {result['voxel']:.4g}, truncation {result['truncation']:.4g}, depth {result['depth']}")
+    console.result(result)
+
+
+def render(command: c.Render, console: Console) -> None:
+    """``gs2d render``."""
+    from gs2d.pipeline.jobs import render_run
+
+    result = render_run(
+        command.run,
+        console.on_event,
+        split=command.split,
+        orbit=command.orbit,
+        out=command.out,
+        threads=command.threads,
+    )
+    console.close()
+    console.say(f"{result['images']} images in {result['folder']}")
+    console.result(result)
+
+
+def evaluate(command: c.Evaluate, console: Console) -> None:
+    """``gs2d evaluate``."""
+    from gs2d.pipeline.jobs import evaluate_run
+    from gs2d.pipeline.options import EvaluateOptions
+
+    options = EvaluateOptions(
+        ground_truth=command.ground_truth, thresholds=command.thresholds, lpips_weights=command.lpips_weights
+    )
+    result = evaluate_run(command.run, options, console.on_event, threads=command.threads)
+    console.close()
+    rows = [[split, *_scores(result.get(split))] for split in ("train", "test")]
+    console.table("", ["views", "PSNR dB", "SSIM", "LPIPS"], rows)
+    for split in ("train", "test"):
+        reason = (result.get(split) or {}).get("lpips_reason") or result.get(f"{split}_reason")
+        if reason:
+            console.say(f"{split}: {reason}")
+    _surface_table(result.get("surface"), console)
+    console.result(result)
+
+
+def export(command: c.Export, console: Console) -> None:
+    """``gs2d export``."""
+    from gs2d.pipeline.jobs import export_run
+
+    result = export_run(command.run, command.out, command.layout)
+    console.say(
+        f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, layout {command.layout}"
+    )
+    console.result(result)
+
+
+def report(command: c.Report, console: Console) -> None:
+    """``gs2d report``."""
+    from gs2d.pipeline.jobs import report_run
+
+    path = report_run(command.run)
+    console.say(str(path))
+    console.result({"file": str(path)})
+
+
+def recipes(command: c.Recipes, console: Console) -> None:
+    """``gs2d recipes``."""
+    from gs2d.pipeline.recipe_text import describe_recipe
+    from gs2d.recipe_json import apply_overrides, to_json
+    from gs2d.recipes import RECIPES, get_recipe
+    from gs2d.schedule import scale_schedule
+
+    if command.action == "list":
+        if command.name:
+            raise RecipeError(f"`gs2d recipes list` takes no name, got {command.name!r}; use `gs2d recipes show NAME`")
+        names = {name: RECIPES[name].about for name in RECIPES}
+        width = max(map(len, names))
+        for name, about in names.items():
+            console.say(f"{name:<{width}}  {about}")
+        console.result(names)
+        return
+    if not command.name:
+        raise RecipeError("`gs2d recipes show` needs the name of a recipe; `gs2d recipes` lists them")
+    recipe = apply_overrides(scale_schedule(get_recipe(command.name), command.schedule_scale), command.overrides)
+    for line in describe_recipe(recipe):
+        console.say(line)
+    console.result(to_json(recipe))
+
+
+def doctor(_command: c.Doctor, console: Console) -> None:
+    """``gs2d doctor``."""
+    from gs2d.io.run import machine, versions
+    from gs2d.render.backend import backend_report
+
+    host, installed, backends = machine(), versions(), backend_report()
+    console.say(f"{host['processor']}, {host['cores']} cores, {host['system']}")
+    console.say(", ".join(f"{name} {version}" for name, version in installed.items()))
+    for status in backends:
+        if status.available:
+            console.say(f"  yes  {status.name}: {status.details}")
+        else:
+            console.say(f"  no   {status.name}: {status.reason}")
+            if status.remedy:
+                console.say(f"         to get it: {status.remedy}")
+    chosen = next((status.name for status in backends if status.available), "none")
+    console.say(f"--backend auto takes: {chosen}")
+    fields = ("name", "available", "reason", "remedy", "details")
+    found = [{field: getattr(status, field) for field in fields} for status in backends]
+    console.result({"machine": host, "versions": installed, "backends": found, "auto": chosen})
+
+
+def info(command: c.Info, console: Console) -> None:
+    """``gs2d info``."""
+    from gs2d.io.run import is_run, open_run
+    from gs2d.pipeline.describe import describe_capture, describe_ply
+
+    path: Path = command.path
+    if is_run(path):
+        run = open_run(path)
+        show_run(path, run.metrics(), console, definition=run.definition())
+        return
+    if not path.exists():
+        raise DataError(f"expected a run folder, a capture or a PLY file at {path}, found nothing; check the path")
+    facts = describe_capture(path) if path.is_dir() else describe_ply(path)
+    for name, value in facts.items():
+        console.say(f"{name}: {value}")
+    console.result(facts)
+
+
+# -- tables --------------------------------------------------------------------------------------------------------------
+def show_run(path: Path, metrics: dict[str, Any], console: Console, definition: dict[str, Any] | None = None) -> None:
+    """The metrics of a run as a table, and where its files are."""
+    if definition is not None:
+        recipe, scene = definition["recipe"]["name"], definition["scene"]
+        console.say(f"{recipe} on {scene['name']} ({scene['format']}, {scene['train']} + {scene['test']} views)")
+    rows = []
+    for stage in metrics["stages"]:
+        seen = stage.get("test") or stage.get("train") or {}
+        rows.append(
+            [
+                stage["name"],
+                f"{stage['iterations']:,}",
+                figure(stage["seconds"], 0),
+                f"{stage['splats']:,}",
+                figure(stage["bytes"] / 1e6, 1),
+                figure((stage.get("train") or {}).get("psnr"), 2),
+                figure((stage.get("test") or {}).get("psnr"), 2),
+                figure(seen.get("ssim"), 4),
+            ]
+        )
+    columns = ["stage", "iterations", "seconds", "splats", "MB", "train PSNR", "test PSNR", "SSIM"]
+    console.table("", columns, rows)
+    _surface_table(metrics.get("surface"), console)
+    for name in ("report.html", "mesh.ply", "splats.ply"):
+        if (path / name).exists():
+            console.say(f"{path / name}")
+    extra = {} if definition is None else {"definition": definition}
+    console.result({"run": str(path), **metrics, **extra})
+
+
+def _scores(metrics: dict[str, Any] | None) -> list[str]:
+    scores = metrics or {}
+    return [figure(scores.get("psnr"), 2), figure(scores.get("ssim"), 4), figure(scores.get("lpips"), 4)]
+
+
+def _surface_table(surface: dict[str, Any] | None, console: Console) -> None:
+    if not surface:
+        return
+    rows = [
+        [f"{row['threshold']:.4g}", *(figure(row[name], 4) for name in ("precision", "recall", "f_score"))]
+        for row in surface.get("thresholds") or []
+    ]
+    console.table("", ["surface within", "precision", "recall", "F-score"], rows)
+    if surface.get("chamfer") is not None:
+        console.say(f"Chamfer distance {surface['chamfer']:.5g} (world units)")

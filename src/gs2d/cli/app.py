@@ -1,0 +1,165 @@
+"""From arguments to an exit code: 0 done, 2 the user can mend it (one line), 1 a fault of ours, 130 interrupted."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib
+import io
+import os
+import shlex
+import signal
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from types import FrameType
+from typing import NoReturn
+
+import gs2d
+from gs2d.cli.commands import Command, Common, Demo, Train
+from gs2d.cli.console import Console
+from gs2d.errors import Gs2dError
+
+OK, OURS, USERS, INTERRUPTED = 0, 1, 2, 130
+_MENDABLE = {
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.EMFILE,
+    errno.ENOMEM,
+}
+_BOX = str.maketrans(dict.fromkeys("╭╮╰╯│─", " "))
+
+
+def main(argv: Sequence[str] | None = None) -> NoReturn:
+    """Entry point of the command."""
+    sys.exit(run(sys.argv[1:] if argv is None else argv))
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run one command line and return its exit code; prints every error on stderr."""
+    if list(argv) == ["--version"]:
+        print(f"gs2d {gs2d.__version__}")
+        return OK
+    if not argv:
+        argv = ["--help"]
+    try:
+        command = parse(argv)
+    except SystemExit as exit_:
+        return exit_.code if isinstance(exit_.code, int) else USERS
+    except UsageError as error:
+        return _fail(str(error))
+    console = Console(quiet=command.quiet, as_json=command.json)
+    try:
+        with _terminated_like_ctrl_c():
+            importlib.import_module("gs2d.cli.actions").execute(command, console)
+        return OK
+    except KeyboardInterrupt:
+        console.close()
+        return _interrupted(argv, command)
+    except BrokenPipeError:  # `gs2d ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OURS
+    except Exception as error:
+        console.close()
+        return _report(error, command.debug)
+
+
+class UsageError(Exception):
+    """A command line that does not parse."""
+
+
+def parse(argv: Sequence[str]) -> Common:
+    """The command that the arguments ask for.
+
+    Raises
+    ------
+    UsageError
+        In one line.
+    SystemExit
+        After ``--help``, with code 0.
+    """
+    import tyro
+
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            command = tyro.cli(
+                Command,  # type: ignore[arg-type]  # a union of annotated dataclasses
+                prog="gs2d",
+                description="Posed photographs in; a surface mesh and a scene of 2D Gaussian splats out.",
+                args=list(argv),
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as exit_:
+        if not exit_.code:
+            raise
+        raise UsageError(_one_line(complaint.getvalue(), argv)) from None
+    if isinstance(command, Train | Demo) and command.resume and command.overwrite:
+        raise UsageError("--resume and --overwrite exclude each other; give one")
+    return command
+
+
+def _one_line(box: str, argv: Sequence[str]) -> str:
+    """The first message of tyro's box, without the frame, the help texts and the advice."""
+    lines = [line.translate(_BOX).rstrip() for line in box.splitlines()]
+    body = [line.strip() for line in lines[1:] if line.strip()]
+    for stop in ("For full helptext", "Argument helptext", "Are you looking"):
+        for i, line in enumerate(body):
+            if line.startswith(stop):
+                body = body[:i]
+                break
+    words = " ".join(body) or "the arguments do not parse"
+    topic = next((word for word in argv if not word.startswith("-")), "")
+    return f"{words}; see `gs2d {topic + ' ' if topic else ''}--help`".replace(" (required)", "")
+
+
+def _fail(message: str) -> int:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return USERS
+
+
+def _report(error: Exception, debug: bool) -> int:
+    """Print an error; the exit code says whose it is."""
+    if debug:
+        traceback.print_exception(error)
+    if isinstance(error, Gs2dError):
+        return _fail(str(error))
+    if isinstance(error, OSError) and error.errno in _MENDABLE:
+        return _fail(f"{error.strerror}: {error.filename or 'no file named'}; mend that and run the command again")
+    if isinstance(error, MemoryError):
+        return _fail("out of memory; use a larger --downscale, or fewer splats (--set surface.densify.max_splats=N)")
+    text = " ".join(str(error).split()) or "no message"
+    hint = "" if debug else "; run again with --debug and report it with the traceback"
+    print(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}", file=sys.stderr)
+    return OURS
+
+
+def _interrupted(argv: Sequence[str], command: Common) -> int:
+    line = "interrupted"
+    if isinstance(command, Train | Demo) and any((command.out / "checkpoints").glob("*.pt")):
+        words = [word for word in argv if word not in ("--resume", "--overwrite")]
+        line += f"; resume with: gs2d {shlex.join([*words, '--resume'])}"
+    print(line, file=sys.stderr)
+    return INTERRUPTED
+
+
+@contextlib.contextmanager
+def _terminated_like_ctrl_c() -> Iterator[None]:
+    """SIGTERM (a scheduler, `timeout`) ends a command as Ctrl-C does."""
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        previous = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:  # not the main thread: whoever runs us there has the signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)

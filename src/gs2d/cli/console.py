@@ -1,0 +1,114 @@
+"""Everything a person sees: progress on stderr, tables or JSON on stdout."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console as RichConsole
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from gs2d.pipeline.events import Event, Notice, Phase, StageDone, Step
+
+
+class Console:
+    """The screen. With ``quiet`` nothing but results asked for as JSON; with ``as_json`` stdout carries only JSON."""
+
+    def __init__(self, *, quiet: bool, as_json: bool) -> None:
+        self.quiet = quiet
+        self.as_json = as_json
+        self._out = RichConsole(file=sys.stdout, highlight=False, soft_wrap=True)
+        self._err = RichConsole(file=sys.stderr, highlight=False)
+        self._progress: Progress | None = None
+        self._task: TaskID | None = None
+
+    def on_event(self, event: Event) -> None:
+        """Draw an event of the pipeline."""
+        if self.quiet:
+            return
+        if isinstance(event, Phase):
+            self._begin(event)
+        elif isinstance(event, Step):
+            if self._progress is not None and self._task is not None:
+                self._progress.update(self._task, completed=event.done, detail=escape(event.detail))
+        elif isinstance(event, Notice):
+            self._err.print(f"[yellow]note[/yellow] {escape(event.text)}", soft_wrap=True)
+        elif isinstance(event, StageDone):
+            self._err.print(escape(stage_line(event.metrics)), soft_wrap=True)
+
+    def _begin(self, phase: Phase) -> None:
+        if not self._err.is_terminal:  # a log file: one line a phase, no bars
+            self._err.print(f"{phase.name} ({phase.total})")
+            return
+        if self._progress is None:
+            self._progress = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=24),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TextColumn("left"),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[detail]}"),
+                console=self._err,
+                transient=True,
+                speed_estimate_period=20,
+            )
+            self._progress.start()
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+        self._task = self._progress.add_task(escape(phase.name), total=phase.total, completed=phase.done, detail="")
+
+    def close(self) -> None:
+        """Take the progress bar off the screen."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = self._task = None
+
+    def say(self, text: str) -> None:
+        """A line for people, on stdout."""
+        if not (self.quiet or self.as_json):
+            self._out.print(escape(text))
+
+    def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """A table for people, on stdout; the first column is text, the others are figures."""
+        if self.quiet or self.as_json:
+            return
+        table = Table(title=escape(title) or None, title_justify="left")
+        for i, column in enumerate(columns):
+            table.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=i == 0)
+        for row in rows:
+            table.add_row(*(escape(cell) for cell in row))
+        self._out.print(table, soft_wrap=False)
+
+    def result(self, value: Any) -> None:
+        """The result of the command, for programs: JSON on stdout, if it was asked for."""
+        if self.as_json:
+            print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def stage_line(metrics: dict[str, Any]) -> str:
+    """One line about a finished stage."""
+    words = [f"{metrics['name']}: {metrics['iterations']} iterations in {metrics['seconds']:.0f} s"]
+    words.append(f"{metrics['splats']:,} splats")
+    for split in ("train", "test"):
+        scores = metrics.get(split)
+        if scores and scores.get("psnr") is not None:
+            words.append(f"{split} PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
+    return "; ".join(words) + (" (from a cache)" if metrics.get("reused_from") else "")
+
+
+def figure(value: float | None, digits: int, unit: str = "") -> str:
+    """A number for a table; a dash where there is none."""
+    return "–" if value is None else f"{value:,.{digits}f}{unit}"

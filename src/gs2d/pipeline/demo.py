@@ -1,0 +1,82 @@
+"""The demo: a synthetic capture with a known surface, trained, meshed, scored and reported in one folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gs2d.data.toy import write_demo_capture
+from gs2d.errors import RunError
+from gs2d.io.run import RunFolder, is_run, open_run
+from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
+from gs2d.pipeline.jobs import evaluate_run, report_run
+from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.train import train, use_threads
+
+CAPTURE, TRUTH = "capture", "mesh_gt.ply"
+TRAIN_VIEWS, TEST_VIEWS, SIZE = 40, 8, 256
+SCHEDULE_SCALE = 0.06
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """Where and how; see ``TrainOptions``. ``size`` is the width and height of the photographs, px."""
+
+    out: Path = Path("runs/demo")
+    backend: str = "auto"
+    seed: int = 0
+    threads: int | None = None
+    resume: bool = False
+    overwrite: bool = False
+    schedule_scale: float | None = None
+    train_views: int = TRAIN_VIEWS
+    test_views: int = TEST_VIEWS
+    size: int = SIZE
+
+
+def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> RunFolder:  # noqa: B008 (frozen)
+    """Run the demo. An earlier demo in the same folder is replaced, any other run there is not.
+
+    Raises
+    ------
+    Gs2dError
+    """
+    capture = options.out / CAPTURE
+    overwrite = options.overwrite
+    if is_run(options.out) and not options.resume and not overwrite:
+        where = open_run(options.out).definition()["scene"]["path"]
+        if Path(where) != capture.resolve():
+            raise RunError(
+                f"{options.out} holds a run that is not a demo; choose another --out or replace it with --overwrite"
+            )
+        overwrite = True
+    use_threads(options.threads)
+    if not (options.resume and (capture / "transforms_train.json").exists()):
+        total = options.train_views + options.test_views
+        on_event(Phase("photographing the demo scene", total))
+        write_demo_capture(
+            capture,
+            seed=0,
+            train_views=options.train_views,
+            test_views=options.test_views,
+            size=options.size,
+            on_progress=lambda done, _total: on_event(Step(done)),
+            threads=options.threads,
+        )
+    run = train(
+        TrainOptions(
+            scene=capture,
+            out=options.out,
+            backend=options.backend,
+            seed=options.seed,
+            threads=options.threads,
+            resume=options.resume,
+            overwrite=overwrite,
+            schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
+            allowed=(CAPTURE,),
+        ),
+        on_event,
+    )
+    evaluate_run(run.path, EvaluateOptions(ground_truth=capture / TRUTH), on_event)
+    report_run(run.path)
+    return run

@@ -1,0 +1,195 @@
+"""What can be done with a trained run: mesh, render, score, export, report again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.camera import Camera, look_at
+from gs2d.data import View
+from gs2d.errors import DataError, RunError
+from gs2d.evaluate.lpips import load_lpips
+from gs2d.geometry import focus_point
+from gs2d.images import write_image
+from gs2d.io.ply import read_mesh, read_splats, write_splats
+from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, RunFolder, make_folder, open_run
+from gs2d.pipeline.events import OnEvent, counted, ignore
+from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.pictures import file_name, render_view
+from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.scoring import score_views, split_metrics
+from gs2d.pipeline.surface import extract_mesh
+from gs2d.splats import Splats
+
+
+def finished_splats(run: RunFolder) -> Splats:
+    """The splats of a finished run.
+
+    Raises
+    ------
+    RunError
+        Not finished yet.
+    """
+    path = run.file(SPLATS)
+    if not path.exists():
+        raise RunError(f"{run.path} is not finished: no {SPLATS}; continue it with `gs2d train ... --resume`")
+    return read_splats(path)
+
+
+def _open(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Job, Splats]:
+    from gs2d.pipeline.train import use_threads
+
+    use_threads(threads)
+    run = open_run(path)
+    splats = finished_splats(run)
+    return run, reload_job(run, on_event), splats
+
+
+def mesh_run(
+    path: Path,
+    options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    out: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Extract the mesh of a finished run; returns its file, counts and limits.
+
+    Raises
+    ------
+    RunError, DataError, ProtocolError, DiskError
+    """
+    run, job, splats = _open(path, threads, on_event)
+    if out is not None:
+        return extract_mesh(job, splats, options, out, on_event)
+    with run.locked():
+        result = extract_mesh(job, splats, options, run.file(MESH), on_event)
+        metrics = run.metrics()
+        if metrics.get("surface"):  # was of the mesh before
+            run.write_metrics({**metrics, "surface": None})
+    return result
+
+
+def render_run(
+    path: Path,
+    on_event: OnEvent = ignore,
+    *,
+    split: str = "test",
+    orbit: int = 0,
+    out: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Render the views of a split, or ``orbit`` frames of a circle around the scene, to PNG files.
+
+    Raises
+    ------
+    RunError, DataError, DiskError
+    """
+    run, job, splats = _open(path, threads, on_event)
+    if orbit < 0:
+        raise RunError(f"--orbit must be a number of frames >= 1, got {orbit}")
+    views: list[tuple[str, View]]
+    if orbit:
+        image = np.zeros((1, 1, 3), np.uint8)
+        cameras = orbit_cameras([view.camera for view in job.scene.train], orbit)
+        views = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, image)) for i, camera in enumerate(cameras)]
+    else:
+        views = [(file_name(view), view) for view in (job.scene.test if split == "test" else job.scene.train)]
+    if not views:
+        raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
+    folder = out or run.file(RENDERS) / ("orbit" if orbit else split)
+    make_folder(folder)
+    for name, view in counted(views, "rendering", len(views), on_event):
+        color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
+        write_image(folder / f"{name}.png", color.numpy())
+    return {"folder": str(folder), "images": len(views)}
+
+
+def orbit_cameras(cameras: list[Camera], frames: int) -> list[Camera]:
+    """A circle through the middle of where the cameras are, around the point they look at.
+
+    The axis is the mean of the cameras' up vectors; radius and height are those of the median camera.
+    """
+    focus = focus_point(cameras)
+    up = np.mean([-camera.rotation[1] for camera in cameras], axis=0)
+    up /= np.linalg.norm(up)
+    arms = np.array([camera.center for camera in cameras]) - focus  # [V, 3]
+    heights = arms @ up
+    radii = np.linalg.norm(arms - heights[:, None] * up, axis=1)
+    radius, height = float(np.median(radii)), float(np.median(heights))
+    side = arms[0] - heights[0] * up
+    side /= np.linalg.norm(side)
+    other = np.cross(up, side)
+    like = cameras[0]
+    circle = []
+    for angle in np.linspace(0, 2 * np.pi, frames, endpoint=False):
+        eye = focus + height * up + radius * (np.cos(angle) * side + np.sin(angle) * other)
+        circle.append(look_at(eye, focus, up, width=like.width, height=like.height, fx=like.fx, fy=like.fy))
+    return circle
+
+
+def evaluate_run(
+    path: Path,
+    options: EvaluateOptions = EvaluateOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json``.
+
+    Raises
+    ------
+    RunError, DataError
+    """
+    from gs2d.pipeline.truth import read_truth, score_surface
+
+    truth = None if options.ground_truth is None else read_truth(options.ground_truth)
+    lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
+    run, job, splats = _open(path, threads, on_event)
+    result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
+    for split, views in (("train", job.scene.train), ("test", job.scene.test)):
+        name = f"scoring {split} views"
+        scores = score_views(splats, views, job.settings, job.backend, name=name, on_event=on_event, lpips=lpips)
+        result |= split_metrics(scores, split)
+        result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
+    if truth is not None:
+        if not run.file(MESH).exists():
+            raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
+        result["surface"] = score_surface(read_mesh(run.file(MESH)), truth, job, options, on_event)
+    with run.locked():
+        metrics = run.metrics()
+        last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}
+        stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
+        run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
+    return result
+
+
+def export_run(path: Path, out: Path, layout: str) -> dict[str, Any]:
+    """Write the splats of a run in another layout.
+
+    Raises
+    ------
+    RunError, DiskError
+    """
+    splats = finished_splats(open_run(path))
+    write_splats(out, splats, layout=layout)
+    return {"file": str(out), "splats": len(splats), "bytes": out.stat().st_size, "layout": layout}
+
+
+def report_run(path: Path) -> Path:
+    """Write the report of a run.
+
+    Raises
+    ------
+    RunError, DiskError
+    """
+    from gs2d.report import write_report
+
+    run = open_run(path)
+    write_report(run.path)
+    return run.file(REPORT)
+
+
+__all__ = ["evaluate_run", "export_run", "mesh_run", "render_run", "report_run"]

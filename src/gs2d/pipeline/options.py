@@ -1,0 +1,107 @@
+"""What the jobs of the pipeline are asked to do. Pure Python; never imports torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gs2d.recipe import Recipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """One training run.
+
+    Attributes
+    ----------
+    scene : Path
+        The capture.
+    out : Path
+        Run folder.
+    recipe : str or Recipe
+        A registered name, or the recipe itself.
+    protocol, backend, format : str
+        Names, or "auto".
+    downscale : int
+    schedule_scale : float
+        Fraction of the full schedule.
+    overrides : tuple of str
+        ``stage.field=value``; applied after the schedule is scaled, so that a number means what it says.
+    seed : int
+    resume, overwrite : bool
+        What to do with a run that is already in ``out``.
+    start_from : Path or None
+        Another run, whose stages are taken as far as they are the same.
+    cache : Path or None
+        Folder of finished stages, shared by runs.
+    threads : int or None
+        CPU threads; None = all that this process may use.
+    checkpoint_every, checkpoint_seconds : int, float
+        A checkpoint is written after so many iterations, or so many seconds, whichever comes first.
+    shown_views : int
+        Views that are rendered after each stage for the report.
+    allowed : tuple of str
+        Names that may already be in ``out`` (the demo's capture).
+    """
+
+    scene: Path
+    out: Path
+    recipe: str | Recipe = "2dgs-r"
+    protocol: str = "auto"
+    backend: str = "auto"
+    format: str = "auto"
+    downscale: int = 1
+    schedule_scale: float = 1.0
+    overrides: tuple[str, ...] = ()
+    seed: int = 0
+    resume: bool = False
+    overwrite: bool = False
+    start_from: Path | None = None
+    cache: Path | None = None
+    threads: int | None = None
+    checkpoint_every: int = 1000
+    checkpoint_seconds: float = 120.0
+    shown_views: int = 3
+    allowed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshOptions:
+    """How the surface is extracted; None is derived from the scene or taken from the run's protocol.
+
+    Attributes
+    ----------
+    voxel, truncation, depth_limit : float or None
+        wu.
+    bbox : six floats or None
+        Smallest and largest corner of the box that is kept, wu.
+    depth : str or None
+        "mean" or "median".
+    keep_components : int or None
+        The so many largest connected pieces; 0 = all; None = the protocol's.
+    """
+
+    voxel: float | None = None
+    truncation: float | None = None
+    depth_limit: float | None = None
+    bbox: tuple[float, float, float, float, float, float] | None = None
+    depth: str | None = None
+    keep_components: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateOptions:
+    """What is measured.
+
+    Attributes
+    ----------
+    ground_truth : Path or None
+        PLY file of the true surface: a mesh or points.
+    thresholds : tuple of float
+        Distances at which precision and recall are taken, wu; empty = 0.25, 0.5, 1 and 2 % of the true surface's diagonal.
+    lpips_weights : Path or None
+    """
+
+    ground_truth: Path | None = None
+    thresholds: tuple[float, ...] = field(default=())
+    lpips_weights: Path | None = None

@@ -1,0 +1,100 @@
+"""Pictures of a run: a few views after every stage, or any views as PNG files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.data import Scene, View
+from gs2d.images import write_image
+from gs2d.io.files import read_json, write_json
+from gs2d.io.run import RENDERS, RunFolder, make_folder
+from gs2d.pipeline.prepare import Job
+from gs2d.render.api import rasterize
+from gs2d.render.backend import Backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.report_images import depth_limits, depth_picture, error_picture, highlight_picture, normal_picture
+from gs2d.sh import rgb_to_sh0
+from gs2d.splats import Splats
+
+INDEX = "index.json"
+IMAGES = ("color", "normal", "depth", "error", "high_error")
+
+
+def choose_views(scene: Scene, count: int) -> list[tuple[str, View]]:
+    """(split, view) of the views to show: test views where there are any, spread evenly."""
+    split, views = ("test", scene.test) if scene.test else ("train", scene.train)
+    count = min(count, len(views))
+    return [(split, views[(2 * i + 1) * len(views) // (2 * count)]) for i in range(count)]
+
+
+def file_name(view: View) -> str:
+    """A view's name as the start of a file name."""
+    return Path(view.name.replace("/", "__")).stem
+
+
+def draw_stage(
+    run: RunFolder, job: Job, shown: Sequence[tuple[str, View]], stage: str, splats: Splats, group: Tensor | None
+) -> None:
+    """Write the pictures of one stage, the photographs, and the index of both.
+
+    Parameters
+    ----------
+    group : Tensor [N] bool or None
+        The high-error splats, once they are known.
+
+    Raises
+    ------
+    DiskError
+    """
+    folder = run.file(RENDERS)
+    for name in ("photos", stage):
+        make_folder(folder / name)
+    index_file = folder / INDEX
+    index: dict[str, Any] = read_json(index_file) if index_file.exists() else {"views": [], "stages": []}
+    limits = {entry["name"]: entry["depth_limits"] for entry in index["views"]}
+    views = []
+    for split, view in shown:
+        output = render_view(splats, view, job.settings, job.backend)
+        depth = output.depth(job.protocol.depth).numpy()
+        alpha = output.alpha.numpy()
+        near_far = limits.get(view.name) or list(depth_limits(depth, alpha))  # of the first stage: stages compare
+        color, photo = output.color.numpy(), view.target(job.settings.background)
+        pictures = {
+            "color": np.clip(color, 0, 1),
+            "normal": normal_picture(output.normal.numpy(), alpha),
+            "depth": depth_picture(depth, alpha, (near_far[0], near_far[1])),
+            "error": error_picture(color, photo, view.mask()),
+        }
+        if group is not None:
+            share = share_of_group(splats, group, view, job.settings, job.backend)
+            pictures["high_error"] = highlight_picture(color, share)
+        for what, picture in pictures.items():
+            write_image(folder / stage / f"{file_name(view)}.{what}.png", picture)
+        write_image(folder / "photos" / f"{file_name(view)}.png", photo)
+        views.append({"name": view.name, "file": file_name(view), "split": split, "depth_limits": near_far})
+    stages = [*(name for name in index["stages"] if name != stage), stage]
+    write_json(index_file, {"views": views, "stages": stages, "images": list(IMAGES)})
+
+
+def render_view(splats: Splats, view: View, settings: RasterSettings, backend: Backend) -> RenderOutput:
+    """All images of one view, without gradients."""
+    with torch.no_grad():
+        return rasterize(splats, view.camera, settings, backend=backend)
+
+
+def share_of_group(splats: Splats, group: Tensor, view: View, settings: RasterSettings, backend: Backend) -> np.ndarray:
+    """How much of each pixel the splats of a row group make up: their blending weights, summed; [H, W] in [0, 1].
+
+    Drawn as a scene in which they are white and all others black.
+    """
+    white = group.to(splats.dtype)[:, None].expand(-1, 3)
+    marked = Splats(**{**dict(splats.items()), "sh0": rgb_to_sh0(white), "shN": torch.zeros_like(splats.shN)})
+    settings = replace(settings, background=(0.0, 0.0, 0.0))
+    return np.asarray(render_view(marked, view, settings, backend).color[..., 0].numpy())

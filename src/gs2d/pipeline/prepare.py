@@ -1,0 +1,252 @@
+"""Before training: names become values, values are checked, the capture is read. Nothing is written here."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
+from gs2d.errors import RecipeError, RunError
+from gs2d.io.run import RunFolder, versions
+from gs2d.kernels.library import ABI_VERSION
+from gs2d.kernels.library import load as load_library
+from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.pipeline.options import TrainOptions
+from gs2d.protocols import FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
+from gs2d.recipe import Recipe, validate
+from gs2d.recipe_json import apply_overrides, from_json, to_json
+from gs2d.recipes import get_recipe
+from gs2d.render.backend import Backend, backend_report, get_backend
+from gs2d.render.types import RasterSettings
+from gs2d.schedule import scale_schedule
+from gs2d.train.loop import raster_settings
+
+DECODE_THREADS = 2
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that defines a run, ready to train.
+
+    Attributes
+    ----------
+    recipe, protocol, scene, backend, settings
+        Values, not names.
+    downscale : int
+    pictures_digest : str
+        Of every decoded photograph, mask and camera, and of the points: the scene as training sees it.
+    """
+
+    recipe: Recipe
+    protocol: Protocol
+    scene: Scene
+    backend: Backend
+    settings: RasterSettings
+    downscale: int
+    pictures_digest: str
+
+    def definition(self) -> dict[str, Any]:
+        """What ``run.json`` says and a resume compares."""
+        return {
+            "recipe": to_json(self.recipe),
+            "protocol": asdict(self.protocol),
+            "scene": {
+                "name": self.scene.name,
+                "path": str(Path(self.scene.root or ".").resolve()),
+                "format": self.scene.format,
+                "train": len(self.scene.train),
+                "test": len(self.scene.test),
+                "extent": self.scene.extent,
+                "skipped": list(self.scene.skipped),
+                "digest": self.pictures_digest,
+            },
+            "downscale": self.downscale,
+            "raster": asdict(self.settings),
+            "seed": self.recipe.seed,
+            "backend": backend_facts(self.backend.name),
+        }
+
+    def stage_key(self, index: int) -> str:
+        """Hash of all that decides the state at the end of stage ``index``: equal keys, equal bytes."""
+        recipe = to_json(self.recipe)
+        facts = {
+            "scene": self.pictures_digest,
+            "protocol": asdict(self.protocol),
+            "raster": asdict(self.settings),
+            "seed": self.recipe.seed,
+            "backend": backend_facts(self.backend.name),
+            "versions": {name: versions()[name] for name in ("2dgs-r", "torch")},
+            "start": [recipe["init_points"], recipe["sh_degree"]],
+            "stages": recipe["stages"][: index + 1],
+        }
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def build_recipe(recipe: str | Recipe, *, schedule_scale: float, seed: int, overrides: tuple[str, ...]) -> Recipe:
+    """The recipe as it will be trained: found, scaled, seeded, overridden, validated.
+
+    Raises
+    ------
+    RecipeError
+    """
+    value = get_recipe(recipe) if isinstance(recipe, str) else recipe
+    return validate(apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides))
+
+
+def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
+    """Check the options, cheapest first, then read the capture.
+
+    Raises
+    ------
+    RecipeError, ProtocolError, BackendError, DataError
+    """
+    recipe = build_recipe(
+        options.recipe, schedule_scale=options.schedule_scale, seed=options.seed, overrides=options.overrides
+    )
+    if options.downscale < 1:
+        raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
+    if options.checkpoint_every < 1:
+        raise RecipeError(f"--checkpoint-every must be a whole number >= 1, got {options.checkpoint_every}")
+    named = None if options.protocol == "auto" else get_protocol(options.protocol)
+    backend = choose_backend(options.backend, on_event)
+    scene_format = detect_format(options.scene) if options.format == "auto" else options.format
+    protocol = named or protocol_for(scene_format)
+    scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
+    digest = scene_digest(scene, on_event)
+    settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
+    return Job(recipe, protocol, scene, backend, settings, options.downscale, digest)
+
+
+def choose_backend(name: str, on_event: OnEvent) -> Backend:
+    """The backend of a name; says so when "auto" had to take the slow one."""
+    backend = get_backend(name)
+    if name == "auto" and backend.name == "reference":
+        reasons = "; ".join(f"{s.name}: {s.reason}, {s.remedy}" for s in backend_report() if not s.available)
+        on_event(Notice(f"training with the reference backend, which is slow ({reasons})"))
+    return backend
+
+
+def backend_facts(name: str) -> dict[str, Any]:
+    """What decides the bytes that a backend computes: its name, and of the native one instruction set and version."""
+    if name != "cpu":
+        return {"name": name}
+    library = load_library()
+    return {"name": name, "instruction_set": library.instruction_set, "kernels": ABI_VERSION}
+
+
+def read_scene(path: Path, scene_format: str, downscale: int, protocol: Protocol, on_event: OnEvent) -> Scene:
+    """Load a capture and tell what was decided or skipped."""
+    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=protocol.test_every)
+    for text in (*scene.notes, *scene.skipped):
+        on_event(Notice(text))
+    return scene
+
+
+def scene_digest(scene: Scene, on_event: OnEvent) -> str:
+    """Decode every photograph once (a broken one stops the run here) and hash what training will see.
+
+    Raises
+    ------
+    DataError
+        A photograph does not decode.
+    """
+    digest = hashlib.sha256()
+    train = set(map(id, scene.train))
+    on_event(Phase("reading photographs", len(scene.views)))
+    for done, view in enumerate(scene.preload(DECODE_THREADS), start=1):
+        digest.update(f"{view.name} {'train' if id(view) in train else 'test'}".encode())
+        for array in _arrays(view):
+            digest.update(f"{array.shape} {array.dtype}".encode())
+            digest.update(np.ascontiguousarray(array).data)
+        on_event(Step(done))
+    if scene.points is not None:
+        digest.update(np.ascontiguousarray(scene.points.points).tobytes())
+        if scene.points.colors is not None:
+            digest.update(np.ascontiguousarray(scene.points.colors).tobytes())
+    digest.update(np.float64(scene.extent).tobytes() + np.ascontiguousarray(scene.bounds, np.float64).tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(view: View) -> Iterator[np.ndarray]:
+    camera = view.camera
+    yield np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
+    yield camera.T_cam_world
+    yield view.image()
+    for mask in (view.mask(), view.object_mask()):
+        if mask is not None:
+            yield mask
+
+
+def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> Job:
+    """The job of a run on disk, to mesh, render or score it again.
+
+    Raises
+    ------
+    RunError, DataError
+        The capture has moved or changed.
+    """
+    data = run.definition()
+    where = Path(data["scene"]["path"])
+    if not where.exists():
+        raise RunError(f"the capture of {run.path} was at {where}, which is not there; put it back or link it there")
+    recipe, protocol = from_json(data["recipe"]), protocol_from_json(data["protocol"])
+    scene = read_scene(where, data["scene"]["format"], data["downscale"], protocol, on_event)
+    names = (len(scene.train), len(scene.test))
+    if names != (data["scene"]["train"], data["scene"]["test"]):
+        raise RunError(
+            f"the capture at {where} has {names[0]} + {names[1]} views, the run was made with "
+            f"{data['scene']['train']} + {data['scene']['test']}; restore it or train again"
+        )
+    raster = {**data["raster"], "background": tuple(data["raster"]["background"])}
+    chosen = get_backend(data["backend"]["name"] if backend == "auto" else backend)
+    return Job(recipe, protocol, scene, chosen, RasterSettings(**raster), data["downscale"], data["scene"]["digest"])
+
+
+def protocol_from_json(data: dict[str, Any]) -> Protocol:
+    """The protocol that ``asdict`` and JSON made of one."""
+    fusion, metrics = FusionLimits(**data["fusion"]), MetricConventions(**data["metrics"])
+    return Protocol(**{**data, "background": tuple(data["background"]), "fusion": fusion, "metrics": metrics})
+
+
+def check_same_run(run: RunFolder, job: Job) -> None:
+    """Refuse to resume a run with another definition.
+
+    Raises
+    ------
+    RunError
+        Names the first thing that differs.
+    """
+    before, after = run.definition(), json.loads(json.dumps(job.definition()))
+    for name, value in after.items():
+        old = before.get(name)
+        if name == "scene":
+            old, value = old and old.get("digest"), value["digest"]
+            name = "scene (its photographs, cameras or points)"
+        if old != value:
+            raise RunError(
+                f"{run.path} was made with another {name}{_difference(old, value)}; "
+                "resume with the same options, or choose another --out"
+            )
+
+
+def _difference(old: Any, new: Any, where: str = "") -> str:
+    """Where two JSON values first differ, in words."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in new:
+            if old.get(key) != new[key]:
+                return _difference(old.get(key), new[key], f"{where}.{key}" if where else key)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for i, (a, b) in enumerate(zip(old, new, strict=True)):
+            if a != b:
+                name = b.get("name", i) if isinstance(b, dict) else i
+                return _difference(a, b, f"{where}.{name}" if where else str(name))
+    return f" ({where + ': ' if where else ''}{str(old)[:60]}, now {str(new)[:60]})"
+
+
+__all__ = ["FORMATS", "Job", "build_recipe", "check_same_run", "prepare", "reload_job"]

@@ -1,0 +1,45 @@
+"""A recipe in words. Pure Python; never imports torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from gs2d.recipe import ALL, CloneInPlace, RankByError, Recipe, Stage
+
+
+def describe_recipe(recipe: Recipe) -> Iterator[str]:
+    """Lines that say what is trained."""
+    yield f"{recipe.name}: {recipe.iterations:,} iterations, SH degree {recipe.sh_degree}, seed {recipe.seed}"
+    for number, stage in enumerate(recipe.stages, start=1):
+        yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
+        for line in _describe_stage(stage):
+            yield f"     {line}"
+
+
+def _describe_stage(stage: Stage) -> Iterator[str]:
+    for action in stage.on_enter:
+        if isinstance(action, RankByError):
+            yield f"first: the {action.top_percent:g} % of splats with the largest colour error become '{action.writes}'"
+        elif isinstance(action, CloneInPlace):
+            yield f"first: clone '{action.rows}' in place (opacity: {action.opacity}); the clones are '{action.writes}'"
+    groups: dict[str, list[str]] = {}
+    for attribute, rows in stage.train.items():
+        groups.setdefault(rows, []).append(attribute)
+    for rows, attributes in groups.items():
+        yield f"trains {', '.join(attributes)} of {'all splats' if rows == 'all' else repr(rows)}"
+    frozen = [attribute for attribute in ALL if attribute not in stage.train]
+    if frozen:
+        yield f"frozen: {', '.join(frozen)}"
+    for term in stage.losses:
+        weight = "the protocol's weight" if term.weight is None else f"{term.weight:g}"
+        since = f" after iteration {term.start:,}" if term.start else ""
+        yield f"loss {term.kind}: {weight}{since}"
+    if stage.densify is not None:
+        d = stage.densify
+        signal = "absolute" if d.absolute else "signed"
+        yield (
+            f"densifies every {d.every} iterations from {d.start:,} to {d.stop:,} by {signal} gradients over "
+            f"{d.abs_threshold if d.absolute else d.grad_threshold:g}; opacity reset every {d.reset_every:,}"
+        )
+    else:
+        yield "no densification"

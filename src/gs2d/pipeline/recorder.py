@@ -1,0 +1,246 @@
+"""Listens to the trainer: log, checkpoints, scores and pictures of each stage, progress for the user."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any
+
+from gs2d.data import View
+from gs2d.errors import DivergedError
+from gs2d.evaluate.images import mean_metrics
+from gs2d.io.run import RunFolder, load_tensors
+from gs2d.pipeline.events import OnEvent, Phase, StageDone, Step
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.pictures import choose_views, draw_stage
+from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.restart import Start, put_in_cache
+from gs2d.pipeline.scoring import PeakMemory, score_views, split_metrics
+from gs2d.recipe import CloneInPlace, Stage
+from gs2d.splats import Splats
+from gs2d.train import events as train_events
+from gs2d.train.loop import Trainer
+from gs2d.train.state import TrainState
+
+LOG_LINES = 300  # step lines a stage
+PROBES = 30  # times a stage at which the probe views are scored for the PSNR curve
+PROBE_VIEWS = 4
+
+
+class Recorder:
+    """The memory of a training run. Nothing it does changes what is trained."""
+
+    def __init__(self, run: RunFolder, job: Job, options: TrainOptions, start: Start, on_event: OnEvent) -> None:
+        self._run, self._job, self._options, self._start, self._on_event = run, job, options, start, on_event
+        self.progress_every = max(1, min(10, options.checkpoint_every))
+        self._shown = choose_views(job.scene, options.shown_views)
+        self._probes = (job.scene.test or job.scene.train)[
+            :: max(1, len(job.scene.test or job.scene.train) // PROBE_VIEWS)
+        ]
+        self._probes = self._probes[:PROBE_VIEWS]
+        self._memory = PeakMemory()
+        self._stage_clock = 0.0  # perf_counter() at which the stage would have begun without breaks
+        self._seconds, self._peak = start.seconds, start.peak_memory
+        self._at_entry = dict(start.at_entry)
+        self._saved_at, self._saved_iteration = time.perf_counter(), 0
+        self._trainer: Trainer | None = None
+
+    # -- called by the pipeline ----------------------------------------------------------------------------------------
+    def begin(self, trainer: Trainer) -> None:
+        """Take up a state: score a finished stage that was not scored before the break, start the clocks."""
+        self._trainer = trainer
+        state = trainer.state
+        if state.step == 0 and not state.entered:
+            self._finish_reused(state)
+            self._seconds, self._peak, self._at_entry = 0.0, 0, {}
+        self._saved_iteration = state.step
+        self._phase()
+        self._start_clock()
+
+    @contextmanager
+    def naming_the_last_checkpoint(self) -> Iterator[None]:
+        """Say in a DivergedError from where training can go on."""
+        try:
+            yield
+        except DivergedError as error:
+            saved = self._run.checkpoints()
+            last = f"the last good checkpoint is {saved[-1].path}" if saved else "there is no checkpoint yet"
+            raise DivergedError(f"{error}; {last}") from error
+
+    def on_training_event(self, event: train_events.Event) -> None:
+        """Log an event, and do what is due."""
+        if isinstance(event, train_events.Progress):
+            self._on_progress(event)
+        elif isinstance(event, train_events.StageEntering):
+            self._seconds, self._peak, self._at_entry, self._saved_iteration = 0.0, 0, {}, 0
+            self._memory.reset()
+            self._start_clock()
+            self._log("stage_entering", event)
+        elif isinstance(event, train_events.StageStarted):
+            self._log("stage_start", event)
+            self._score_entry(event)
+        elif isinstance(event, train_events.StageFinished):
+            self._stop_clock()
+            self._log("stage_end", event)
+            self._finish_stage(event.index)
+        else:
+            self._log(_KINDS[type(event)], event)
+
+    # -- the log -------------------------------------------------------------------------------------------------------
+    def _log(self, kind: str, event: Any, **extra: Any) -> None:
+        facts = {name: value for name, value in asdict(event).items() if _storable(value)}
+        self._run.events.append({"kind": kind, **facts, **extra})
+
+    def _on_progress(self, event: train_events.Progress) -> None:
+        state = self._state
+        last = event.iteration == event.iterations
+        if last or _due(event.iteration, event.iterations, LOG_LINES, self.progress_every):
+            extra: dict[str, Any] = {"total_iteration": self._iterations_before(event.index) + event.iteration}
+            extra["mean_area"] = event.mean_k_a
+            if last or _due(event.iteration, event.iterations, PROBES, self.progress_every):
+                psnr = self._probe_psnr(state.splats)
+                if psnr is not None:
+                    extra["psnr"] = psnr
+            self._log("step", event, **extra)
+        detail = (
+            f"{event.stage} {event.iteration:,}/{event.iterations:,}  {event.splats:,} splats  loss {event.loss:.4f}"
+        )
+        self._on_event(Step(self._iterations_before(event.index) + event.iteration, detail))
+        due = event.iteration - self._saved_iteration >= self._options.checkpoint_every
+        late = time.perf_counter() - self._saved_at >= self._options.checkpoint_seconds
+        if (due or late) and not last:
+            self._stop_clock()
+            self._save(event.index, event.iteration)
+            self._start_clock()
+
+    def _probe_psnr(self, splats: Splats) -> float | None:
+        """Mean PSNR over a few fixed views (test views where there are any)."""
+        self._stop_clock()
+        scores = self._score(splats, self._probes, "", lambda _event: None)
+        self._start_clock()
+        return mean_metrics(list(scores.values())).psnr_float.value if scores else None
+
+    # -- checkpoints ---------------------------------------------------------------------------------------------------
+    def _payload(self, index: int) -> dict[str, Any]:
+        extra = {"seconds": self._seconds, "peak_memory": self._peak, "at_entry": self._at_entry}
+        return {"state": self._state.state_dict(), "extra": json.dumps(extra), "key": self._job.stage_key(index)}
+
+    def _save(self, index: int, iteration: int | None) -> None:
+        self._peak = max(self._peak, self._memory.read())
+        self._run.save_checkpoint(index, self._stage(index).name, iteration, self._payload(index))
+        self._saved_at, self._saved_iteration = time.perf_counter(), iteration or 0
+
+    # -- stages --------------------------------------------------------------------------------------------------------
+    def _score_entry(self, event: train_events.StageStarted) -> None:
+        """The price of the clone: scores just after the entry actions, to compare with the stage before."""
+        if not any(isinstance(action, CloneInPlace) for action in self._stage(event.index).on_enter):
+            return
+        self._stop_clock()
+        for split, views in (("train", self._job.scene.train), ("test", self._job.scene.test)):
+            scores = self._score(self._state.splats, views, f"scoring after the clone ({split})", self._on_event)
+            self._at_entry |= split_metrics(scores, split)
+        self._run.events.append({"kind": "after_clone", "stage": event.stage, **self._at_entry})
+        self._phase()
+        self._start_clock()
+
+    def _finish_stage(self, index: int) -> None:
+        self._save(index, None)
+        self._score_stage(index)
+        if index + 1 < len(self._job.recipe.stages):
+            self._phase()
+
+    def _finish_reused(self, state: TrainState) -> None:
+        """Pictures of the stages taken over, and the scores of one that was killed before it was scored."""
+        done = len(self._run.metrics()["stages"])
+        if 0 < state.stage and done < state.stage:
+            self._score_stage(state.stage - 1)
+        elif 0 < state.stage:
+            draw_stage(
+                self._run, self._job, self._shown, self._stage(state.stage - 1).name, state.splats, _group(state)
+            )
+
+    def _score_stage(self, index: int) -> None:
+        """Score a finished stage, draw it, write its entry of metrics.json, put it in the cache."""
+        state, stage = self._state, self._stage(index)
+        entry: dict[str, Any] = {
+            "name": stage.name,
+            "iterations": stage.iterations,
+            "seconds": round(self._seconds, 3),
+            "splats": len(state.splats),
+            "bytes": state.splats.nbytes,
+            "peak_memory_bytes": self._peak,
+        }
+        for split, views in (("train", self._job.scene.train), ("test", self._job.scene.test)):
+            scores = self._score(state.splats, views, f"scoring {split} views", self._on_event)
+            entry |= split_metrics(scores, split)
+        if self._at_entry:
+            entry["after_clone"] = self._at_entry
+        draw_stage(self._run, self._job, self._shown, stage.name, state.splats, _group(state))
+        metrics = self._run.metrics()
+        stages = [*metrics["stages"][:index], entry]
+        self._run.write_metrics({"stages": stages, "surface": None})
+        if self._options.cache is not None:
+            saved = next(c for c in self._run.checkpoints() if c.stage_index == index and c.iteration is None)
+            put_in_cache(self._options.cache, self._run, load_tensors(saved.path))
+        self._on_event(StageDone(entry))
+
+    def _score(self, splats: Splats, views: Any, name: str, on_event: OnEvent) -> Any:
+        return score_views(splats, views, self._settings, self._job.backend, name=name, on_event=on_event)
+
+    # -- small things --------------------------------------------------------------------------------------------------
+    @property
+    def _settings(self) -> Any:
+        return self._job.settings
+
+    @property
+    def _state(self) -> TrainState:
+        assert self._trainer is not None
+        return self._trainer.state
+
+    def _stage(self, index: int) -> Stage:
+        return self._job.recipe.stages[index]
+
+    def _iterations_before(self, index: int) -> int:
+        return sum(stage.iterations for stage in self._job.recipe.stages[:index])
+
+    def _phase(self) -> None:
+        state = self._state
+        done = self._iterations_before(state.stage) + state.step
+        self._on_event(Phase(f"training {self._job.recipe.name}", self._job.recipe.iterations, done))
+
+    def _start_clock(self) -> None:
+        self._stage_clock = time.perf_counter() - self._seconds
+
+    def _stop_clock(self) -> None:
+        self._seconds = time.perf_counter() - self._stage_clock
+
+
+_KINDS = {
+    train_events.Initialised: "initialised",
+    train_events.Ranked: "ranked",
+    train_events.Cloned: "cloned",
+    train_events.Densified: "densify",
+    train_events.OpacityLimited: "opacity_limited",
+}
+
+
+def _due(iteration: int, iterations: int, count: int, step: int) -> bool:
+    """Whether an iteration that is a multiple of ``step`` is one of about ``count`` of a stage."""
+    every = max(1, math.ceil(iterations / count / step)) * step
+    return iteration % every == 0
+
+
+def _storable(value: Any) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _group(state: TrainState) -> Any:
+    """The rows to highlight, once they are known."""
+    return state.groups.get("high_error")
+
+
+__all__ = ["Recorder", "View"]

@@ -1,0 +1,160 @@
+"""Where training starts: at a checkpoint, after the stages of another run or of a cache, or from nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gs2d.errors import RunError
+from gs2d.io.run import RunFolder, load_tensors, make_folder, open_run, save_tensors
+from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare import Job
+from gs2d.train.state import TrainState
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where training starts.
+
+    Attributes
+    ----------
+    state : TrainState or None
+        None = from nothing.
+    seconds : float
+        Training time already spent in the stage that is under way.
+    peak_memory : int
+        Bytes, of that stage so far.
+    at_entry : dict
+        Scores taken after the entry actions of that stage.
+    """
+
+    state: TrainState | None = None
+    seconds: float = 0.0
+    peak_memory: int = 0
+    at_entry: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedStage:
+    """The end of a stage that another run trained: its checkpoint, metrics and log up to there."""
+
+    index: int
+    payload: dict[str, Any]
+    metrics: list[dict[str, Any]]
+    log: bytes
+    source: str
+
+
+def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Start:
+    """The furthest valid start; the log and the metrics are cut to it.
+
+    Raises
+    ------
+    RunError
+        ``start_from`` has no stage in common with this run, or no checkpoint is readable.
+    """
+    if run.checkpoints():
+        return _resume(run, on_event)
+    run.events.cut(0)
+    found = [
+        stage
+        for stage in (
+            _from_run(job, options.start_from) if options.start_from else None,
+            _from_cache(job, options.cache) if options.cache else None,
+        )
+        if stage is not None
+    ]
+    if not found:
+        run.write_metrics({"stages": [], "surface": None})
+        return Start()
+    return _adopt(run, job, max(found, key=lambda stage: stage.index), on_event)
+
+
+def _resume(run: RunFolder, on_event: OnEvent) -> Start:
+    checkpoints = run.checkpoints()
+    for checkpoint in reversed(checkpoints):
+        try:
+            payload = load_tensors(checkpoint.path)
+            state = TrainState.from_state_dict(payload["state"])
+        except RunError as error:
+            on_event(Notice(f"{error}; going back to the checkpoint before it"))
+            continue
+        run.events.cut(payload["events_bytes"])
+        finished = checkpoint.stage_index + (checkpoint.iteration is None)
+        metrics = run.metrics()
+        run.write_metrics({"stages": metrics["stages"][:finished], "surface": None})
+        on_event(Notice(f"resuming after {checkpoint.path.stem}"))
+        extra = json.loads(payload["extra"])
+        return Start(state, extra["seconds"], extra["peak_memory"], extra["at_entry"])
+    raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
+
+
+def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) -> Start:
+    """Make another run's finished stages this run's own."""
+    name = job.recipe.stages[stage.index].name
+    run.events.append_text(stage.log)
+    run.write_metrics({"stages": [{**m, "reused_from": stage.source} for m in stage.metrics], "surface": None})
+    payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
+    run.save_checkpoint(stage.index, name, None, payload)
+    on_event(Notice(f"stages up to {name!r} are taken from {stage.source}"))
+    return Start(TrainState.from_state_dict(stage.payload["state"]))
+
+
+def _from_run(job: Job, path: Path) -> FinishedStage:
+    """The furthest stage that another run has in common with this one.
+
+    Raises
+    ------
+    RunError
+    """
+    other = open_run(path)
+    ends = [c for c in other.checkpoints() if c.iteration is None]
+    for checkpoint in reversed(ends):
+        index = checkpoint.stage_index
+        if index >= len(job.recipe.stages):
+            continue
+        payload = load_tensors(checkpoint.path)
+        metrics = other.metrics()["stages"]
+        if payload["key"] == job.stage_key(index) and len(metrics) > index:
+            log = other.events.path.read_bytes()[: payload["events_bytes"]]
+            return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
+    have = ", ".join(c.stage for c in ends) or "none"
+    raise RunError(
+        f"--from {path} has no finished stage in common with this run (its stages: {have}); scene, protocol, downscale, "
+        "seed, backend, versions and the stages' settings must be the same"
+    )
+
+
+# -- the stage cache -------------------------------------------------------------------------------------------------------
+def _cache_file(folder: Path, key: str) -> Path:
+    return folder / f"{key[:32]}.pt"
+
+
+def _from_cache(job: Job, folder: Path) -> FinishedStage | None:
+    for index in reversed(range(len(job.recipe.stages))):
+        key = job.stage_key(index)
+        path = _cache_file(folder, key)
+        if path.exists():
+            payload = load_tensors(path)
+            if payload["key"] == key:
+                metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
+                return FinishedStage(index, payload, metrics, log, str(path))
+    return None
+
+
+def put_in_cache(folder: Path, run: RunFolder, payload: dict[str, Any]) -> None:
+    """Keep a finished and scored stage for other runs.
+
+    Raises
+    ------
+    DiskError
+    """
+    make_folder(folder)
+    path = _cache_file(folder, payload["key"])
+    if not path.exists():
+        log = run.events.path.read_bytes()[: payload["events_bytes"]].decode()
+        stages = [{k: v for k, v in m.items() if k != "reused_from"} for m in run.metrics()["stages"]]
+        save_tensors(path, {**payload, "metrics": json.dumps(stages), "log": log})

@@ -1,0 +1,78 @@
+"""Image metrics of a scene of splats over many views, and how much memory it took."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gs2d.data import View
+from gs2d.evaluate.images import ImageMetrics, image_metrics, mean_metrics
+from gs2d.evaluate.lpips import Lpips
+from gs2d.pipeline.events import OnEvent, Phase, Step
+from gs2d.render.api import rasterize
+from gs2d.render.backend import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+
+def score_views(
+    splats: Splats,
+    views: Sequence[View],
+    settings: RasterSettings,
+    backend: Backend,
+    *,
+    name: str,
+    on_event: OnEvent,
+    lpips: Lpips | None = None,
+) -> dict[str, ImageMetrics]:
+    """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere."""
+    on_event(Phase(name, len(views)))
+    scores: dict[str, ImageMetrics] = {}
+    settings = replace(settings, sh_degree=splats.sh_degree)
+    with torch.no_grad():
+        for done, view in enumerate(views, start=1):
+            image = rasterize(splats, view.camera, settings, backend=backend).color
+            target = torch.from_numpy(view.target(settings.background)).to(image.dtype)
+            mask = view.mask()
+            scores[view.name] = image_metrics(
+                image,
+                target,
+                None if mask is None else torch.from_numpy(mask),
+                backend_name=backend.name,
+                lpips=lpips,
+            )
+            on_event(Step(done))
+    return scores
+
+
+def split_metrics(scores: dict[str, ImageMetrics], split: str) -> dict[str, Any]:
+    """``{split: means}``; null with the reason where the scene has no such views."""
+    if not scores:
+        return {split: None, f"{split}_reason": f"the scene has no {split} views"}
+    return {split: mean_metrics(list(scores.values())).to_json()}
+
+
+class PeakMemory:
+    """Peak resident memory of this process since :meth:`reset` (Linux), or since it started (elsewhere)."""
+
+    def reset(self) -> None:
+        """Start again from what is resident now."""
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")
+
+    def read(self) -> int:
+        """Bytes."""
+        with contextlib.suppress(OSError):
+            for line in Path("/proc/self/status").read_text().splitlines():
+                if line.startswith("VmHWM:"):
+                    return int(line.split()[1]) * 1024
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return int(peak if sys.platform == "darwin" else peak * 1024)

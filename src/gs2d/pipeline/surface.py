@@ -1,0 +1,107 @@
+"""The mesh of a run: depth maps of the training views, fused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.disk import disk_error
+from gs2d.errors import ProtocolError
+from gs2d.io.ply import write_mesh
+from gs2d.mesh.extract import Extraction, extract
+from gs2d.mesh.frames import Frame
+from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
+from gs2d.pipeline.options import MeshOptions
+from gs2d.pipeline.prepare import Job
+from gs2d.render.api import rasterize
+from gs2d.render.types import RenderOutput
+from gs2d.splats import Splats
+
+OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
+MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
+
+
+def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_event: OnEvent) -> dict[str, Any]:
+    """Render depth of all training views, fuse it, write the mesh.
+
+    Returns
+    -------
+    dict
+        File, counts and the limits that were used.
+
+    Raises
+    ------
+    ProtocolError, DiskError
+    """
+    if not len(splats):
+        raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
+    if not out.parent.is_dir():
+        raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
+    depth = options.depth or job.protocol.depth
+    result = _extract(job, splats, options, depth, on_event)
+    write_mesh(out, result.mesh)
+    if result.limits.cut_fraction > MOSTLY_CUT:
+        on_event(
+            Notice(
+                f"{result.limits.cut_fraction:.0%} of the depth lies outside the fused box: the scene has a background "
+                "that is not in the mesh; --bbox or --depth-limit widen it"
+            )
+        )
+    limits = asdict(result.limits)
+    return {
+        "file": str(out),
+        "vertices": len(result.mesh.vertices),
+        "faces": len(result.mesh.faces),
+        "depth": depth,
+        **limits,
+        "blocks": result.blocks,
+        "volume_bytes": result.volume_bytes,
+        "components": result.components,
+        "faces_removed": result.faces_removed,
+    }
+
+
+def _extract(job: Job, splats: Splats, options: MeshOptions, depth: str, on_event: OnEvent) -> Extraction:
+    fusion = job.protocol.fusion
+    keep = fusion.clusters if options.keep_components is None else options.keep_components
+    if keep < 0:
+        raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {keep}")
+    # A box or a voxel of the user's own makes the protocol's other limits meaningless.
+    own = options.bbox is not None
+    result = extract(
+        _frames(job, splats, depth, on_event),
+        bbox=None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3),
+        voxel=options.voxel if own else options.voxel or fusion.voxel,
+        truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
+        depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,
+        keep=keep or None,
+        threads=torch.get_num_threads(),
+    )
+    if not len(result.mesh.faces):
+        on_event(Notice("the mesh is empty: no surface was covered well enough"))
+    return result
+
+
+def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[Frame]:
+    views = job.scene.train
+    for view in counted(views, "rendering depth", len(views), on_event):
+        with torch.no_grad():
+            output = rasterize(splats, view.camera, job.settings, backend=job.backend)
+        valid = (output.alpha >= OPAQUE).numpy()
+        mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
+        if mask is not None:
+            valid = valid & mask
+        yield Frame(view.camera, output.depth(depth).numpy(), surface_color(output, job).numpy(), valid)
+    on_event(Phase("fusing", 1))
+
+
+def surface_color(output: RenderOutput, job: Job) -> torch.Tensor:
+    """Colour without the background that shows through, [H, W, 3] in [0, 1]."""
+    alpha = output.alpha[..., None]
+    background = output.color.new_tensor(job.settings.background)
+    return ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)

@@ -1,0 +1,112 @@
+"""Train a run: prepare, train stage by stage with checkpoints, score, render, mesh, report; resume exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from gs2d.errors import RecipeError
+from gs2d.io.ply import write_splats
+from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run
+from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.prepare import Job, check_same_run, prepare
+from gs2d.pipeline.recorder import Recorder
+from gs2d.pipeline.restart import Start, choose_start
+from gs2d.pipeline.surface import extract_mesh
+from gs2d.splats import Splats
+
+
+def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
+    """Train a run to its end: splats, mesh, metrics, report.
+
+    A run that fails before its first checkpoint leaves nothing behind; one that fails or is killed later can be resumed,
+    and then ends with the same ``splats.ply``, byte for byte, as if it had never stopped.
+
+    Parameters
+    ----------
+    options : TrainOptions
+    on_event : callable
+        Gets :mod:`gs2d.pipeline.events`.
+
+    Returns
+    -------
+    RunFolder
+        The finished run.
+
+    Raises
+    ------
+    Gs2dError
+        Anything that the user can mend.
+    """
+    claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": options.allowed}
+    check_claim(options.out, **claim)  # type: ignore[arg-type]
+    use_threads(options.threads)
+    job = prepare(options, on_event)
+    run = claim_run(options.out, **claim)  # type: ignore[arg-type]
+    with run.locked(), undone_if_worthless(run):
+        if is_run(run.path):
+            check_same_run(run, job)
+        else:
+            run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale})
+        start = choose_start(run, job, options, on_event)
+        splats = train_stages(run, job, options, start, on_event)
+        finish(run, job, splats, on_event)
+    return run
+
+
+def use_threads(threads: int | None) -> None:
+    """Set the CPU threads of torch and of the native kernels.
+
+    Raises
+    ------
+    RecipeError
+        Not a positive number.
+    """
+    if threads is not None:
+        if threads < 1:
+            raise RecipeError(f"--threads must be a whole number >= 1, got {threads}")
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def undone_if_worthless(run: RunFolder) -> Iterator[None]:
+    """Delete a run that fails before it has a checkpoint: there is nothing in it to go on from."""
+    try:
+        yield
+    except BaseException:
+        if not run.checkpoints():
+            run.discard()
+        raise
+
+
+def train_stages(run: RunFolder, job: Job, options: TrainOptions, start: Start, on_event: OnEvent) -> Splats:
+    """Train from where ``start`` is to the end of the last stage."""
+    from gs2d.train.loop import Trainer
+
+    recorder = Recorder(run, job, options, start, on_event)
+    trainer = Trainer(
+        job.scene,
+        job.recipe,
+        job.protocol,
+        backend=job.backend,
+        on_event=recorder.on_training_event,
+        state=start.state,
+        progress_every=recorder.progress_every,
+    )
+    recorder.begin(trainer)
+    with recorder.naming_the_last_checkpoint():
+        trainer.run()
+    return trainer.splats
+
+
+def finish(run: RunFolder, job: Job, splats: Splats, on_event: OnEvent) -> None:
+    """Write what the user came for."""
+    from gs2d.pipeline.jobs import report_run
+
+    write_splats(run.file(SPLATS), splats)
+    if not run.file(MESH).exists():
+        extract_mesh(job, splats, MeshOptions(), run.file(MESH), on_event)
+    on_event(Notice(f"report: {report_run(run.path)}"))
