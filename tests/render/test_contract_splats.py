@@ -109,14 +109,19 @@ def test_15_an_empty_scene_is_the_background(backend: Backend) -> None:
     for name in IMAGES[1:]:
         assert bool((getattr(out, name) == 0).all()), name
     assert out.radii.shape == (0,)
+    out.color.sum().backward()
+    assert empty.means.grad is not None
     errors = splat_errors(empty, front_camera(7, 5), torch.zeros(5, 7, 3), settings, backend=backend)
     assert errors.shape == (0,)
 
 
 def test_15_pixels_that_no_splat_reaches_are_the_background(backend: Backend) -> None:
     settings = RasterSettings(background=(0.25, 0.5, 0.75))
-    out = rasterize(splat((0, 0, -3)), front_camera(40, 40), settings, backend=backend)
+    behind = requiring_grad(splat((0, 0, -3)))
+    out = rasterize(behind, front_camera(40, 40), settings, backend=backend)
     equal(out.color, torch.tensor([0.25, 0.5, 0.75]).expand(40, 40, 3))
+    out.color.sum().backward()
+    assert all(tensor.grad is not None and bool((tensor.grad == 0).all()) for _, tensor in behind.items())
 
 
 # 16 --------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ evaluated as dense [n, P] matrices (splats x pixels), front to back along dimens
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -41,7 +41,7 @@ def rasterize(
     boxes = screen_boxes(screen, cutoff_squared(screen.opacity, settings), camera, settings)
     probe = None if screen_probe is None else screen_probe[rows]
 
-    values, pixels = [], []
+    values, pixels = [_no_pixels(screen, probe)], [rows[:0]]
     for block in blocks(boxes, camera, splats.dtype):
         # Checkpointing keeps only the inputs of a block for the backward pass, so memory does not grow with the image.
         values.append(
@@ -53,9 +53,7 @@ def rasterize(
 
     background = torch.tensor(settings.background, dtype=splats.dtype, device=splats.device)
     images = torch.cat([background, background.new_zeros(CHANNELS - 3)]).repeat(H * W, 1)  # [H W, CHANNELS]
-    if values:
-        images = images.index_put((torch.cat(pixels),), torch.cat(values))
-    images = images.reshape(H, W, CHANNELS)
+    images = images.index_put((torch.cat(pixels),), torch.cat(values)).reshape(H, W, CHANNELS)
 
     longer = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) / 2
     radii = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
@@ -176,6 +174,12 @@ def _blend_block(
     distortion = (w * (m * m * before[0] - 2 * m * before[1] + before[2])).sum(dim=0)  # rule 10
     channels = torch.stack([alpha, depth_mean, depth_median, distortion], dim=1)
     return torch.cat([color, normal, channels], dim=1)
+
+
+def _no_pixels(screen: ScreenSplats, probe: Tensor | None) -> Tensor:
+    """Values of no pixels [0, CHANNELS]: a view that no splat reaches still has gradients, all zero."""
+    parts = [getattr(screen, f.name) for f in fields(screen)] + ([] if probe is None else [probe])
+    return torch.cat([part.flatten()[:0] for part in parts]).reshape(0, CHANNELS)
 
 
 def _probe_shift(probe: Tensor, z_c: Tensor, pixels: int, camera: Camera) -> Tensor:

@@ -1,0 +1,128 @@
+"""The public face: arguments are checked before anything runs, backends are chosen by name and never silently."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from render_scenes import front_camera, splat
+
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels import library
+from gs2d.render.api import rasterize, splat_errors
+from gs2d.render.backend import backend_report, get_backend
+from gs2d.render.types import RasterSettings
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"near": 0.0}, "near must be positive, got 0.0"),
+        ({"near": float("nan")}, "near must be positive"),
+        ({"far": 0.1}, r"far must be larger than near \(0.2\), got 0.1"),
+        ({"alpha_min": 0.0}, "alpha_min must be in"),
+        ({"alpha_max": 1.0}, "alpha_max must be in"),
+        ({"transmittance_min": 0.7}, "transmittance_min must be in"),
+        ({"error_cutoff": -3.0}, "error_cutoff must be positive"),
+        ({"lowpass_px": 0.0}, "lowpass_px must be positive"),
+        ({"background": (0.0, 0.0, 2.0)}, "background must be 3 numbers in"),
+        ({"background": (0.0, 0.0)}, "background must be 3 numbers in"),
+        ({"sh_degree": 4}, "sh_degree must be 0 to 3, got 4"),
+        ({"lowpass_depth": "both"}, "lowpass_depth must be 'center' or 'plane'"),
+    ],
+)
+def test_settings_out_of_range_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ShapeError, match=message):
+        rasterize(splat(), front_camera(), RasterSettings(**change), backend="reference")
+
+
+def test_splats_whose_rows_do_not_agree_are_refused() -> None:
+    scene = splat()
+    scene.quats = torch.ones(2, 4)  # Splats checks at birth, but its tensors are mutable
+    with pytest.raises(ShapeError, match=r"quats must be \[N, 4\] with N=1 \(from means\), got \[2, 4\]"):
+        rasterize(scene, front_camera(), backend="reference")
+
+
+def test_mixed_or_unsupported_dtypes_are_refused() -> None:
+    with pytest.raises(ShapeError, match="sh0 must be float32 or float64 like means"):
+        rasterize(replace(splat(), sh0=splat().sh0.double()), front_camera(), backend="reference")
+    with pytest.raises(ShapeError, match="means must be float32 or float64"):
+        rasterize(splat(dtype=torch.float16), front_camera(), backend="reference")
+
+
+def test_incomplete_sh_degrees_are_refused() -> None:
+    with pytest.raises(ShapeError, match="K = 1, 4, 9 or 16 SH coefficients"):
+        rasterize(replace(splat(), shN=torch.zeros(1, 5, 3)), front_camera(), backend="reference")
+
+
+@pytest.mark.parametrize(
+    ("probe", "message"),
+    [
+        (torch.zeros(1, 3), r"screen_probe must be \[N, 2\] or \[N, 4\], got \[1, 3\]"),
+        (torch.zeros(2, 2), r"screen_probe must be \[N, 2\] with N=1 \(from means\), got \[2, 2\]"),
+        (torch.zeros(1, 2, dtype=torch.float64), "screen_probe must be torch.float32"),
+        (torch.ones(1, 2), "screen_probe must be all zeros"),
+    ],
+)
+def test_a_screen_probe_must_be_zeros_of_the_right_shape(probe: torch.Tensor, message: str) -> None:
+    with pytest.raises(ShapeError, match=message):
+        rasterize(splat(), front_camera(), backend="reference", screen_probe=probe)
+
+
+def test_splat_errors_checks_image_and_mask() -> None:
+    camera = front_camera(4, 3)
+    with pytest.raises(ShapeError, match=r"image must be \[3, 4, 3\], got \[4, 3, 3\]"):
+        splat_errors(splat(), camera, torch.zeros(4, 3, 3), backend="reference")
+    with pytest.raises(ShapeError, match=r"mask must be \[3, 4\]"):
+        splat_errors(splat(), camera, torch.zeros(3, 4, 3), backend="reference", mask=torch.ones(4, 3) > 0)
+    with pytest.raises(ShapeError, match="mask must be bool"):
+        splat_errors(splat(), camera, torch.zeros(3, 4, 3), backend="reference", mask=torch.ones(3, 4))
+    with pytest.raises(ShapeError, match=r"image must be torch.float32 like the splats, in \[0, 1\], got torch.uint8"):
+        splat_errors(splat(), camera, torch.zeros(3, 4, 3, dtype=torch.uint8), backend="reference")
+
+
+def test_unknown_backends_and_cuda_are_refused_with_a_remedy() -> None:
+    with pytest.raises(BackendError, match="backend must be one of auto, cpu, cuda, reference, got 'gpu'"):
+        get_backend("gpu")
+    with pytest.raises(BackendError, match="no CUDA backend yet; use --backend cpu"):
+        rasterize(splat(), front_camera(), backend="cuda")
+
+
+def test_auto_takes_the_kernels_if_they_load_and_says_so() -> None:
+    reports = {status.name: status for status in backend_report()}
+    assert get_backend("auto").name == ("cpu" if reports["cpu"].available else "reference")
+
+
+def test_without_the_native_library_cpu_is_an_error_and_auto_is_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(variant: str | None = None) -> library.Library:
+        raise BackendError("expected the native CPU library, found none; do this")
+
+    monkeypatch.setattr(library, "load", missing)
+    with pytest.raises(BackendError, match="found none; do this"):
+        get_backend("cpu")
+    assert get_backend("auto").name == "reference"
+    status = next(status for status in backend_report() if status.name == "cpu")
+    assert not status.available
+    assert "found none" in status.reason
+    assert status.remedy == library.REMEDY
+
+
+def test_the_report_names_every_backend_with_a_reason_or_details() -> None:
+    for status in backend_report():
+        assert status.available == (status.reason == "") == (status.remedy == "")
+        assert status.available == (status.details != "")
+    assert [status.name for status in backend_report()] == ["cpu", "cuda", "reference"]
+
+
+def test_the_ray_plane_depth_of_filtered_pairs_is_refused_by_the_kernels(cpu: Any) -> None:
+    with pytest.raises(BackendError, match="lowpass_depth='plane' is a setting of the reference backend"):
+        rasterize(splat(), front_camera(), RasterSettings(lowpass_depth="plane"), backend=cpu)
+
+
+def test_missing_coefficients_count_as_zero() -> None:
+    scene = splat()  # degree 0; the default settings ask for degree 3
+    padded = replace(scene, shN=torch.zeros(1, 15, 3))
+    a, b = (rasterize(s, front_camera(), backend="reference").color for s in (scene, padded))
+    assert torch.equal(a, b)
