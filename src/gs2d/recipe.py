@@ -169,7 +169,7 @@ class CloneInPlace:
     """Entry action: append an exact copy of the rows of a group.
 
     ``opacity="copy"`` keeps the opacity of both (the paper); ``"preserve"`` gives both 1 - sqrt(1 - o), so that the
-    image does not change at the clone.
+    pair transmits at its centre what one splat did (between centre and rim it is a little denser).
     """
 
     rows: str = "high_error"

@@ -52,7 +52,7 @@ def clone_in_place(state: TrainState, action: CloneInPlace) -> int:
     """Append a copy of the rows of a group, and return how many.
 
     Clones belong to every group of their originals, and to ``action.writes``. With ``opacity="preserve"`` originals and
-    clones get 1 - sqrt(1 - o): two such splats in the same place transmit what one of opacity o does.
+    clones get 1 - sqrt(1 - o): at their centre two such splats transmit what one of opacity o does.
     """
     rows = state.groups[action.rows].nonzero().squeeze(1)
     if action.opacity == "preserve":

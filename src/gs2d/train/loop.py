@@ -93,6 +93,7 @@ class Trainer:
         self.scene, self.recipe, self.protocol = scene, validate(recipe), protocol
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
         self._on_event, self._progress_every = on_event, progress_every
+        self._pending: list[events.Event] = []
         self.state = self._new_state(dtype) if state is None else self._checked(state)
         self._targets = Targets(
             scene.train,
@@ -134,6 +135,8 @@ class Trainer:
         """Run the entry actions of a stage and prepare its first iteration."""
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
+        while self._pending:
+            self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
         happened = [self._act(stage, action) for action in stage.on_enter]
         begin_stage(state, stage)
@@ -179,7 +182,7 @@ class Trainer:
             generator=generator,
             dtype=dtype,
         )
-        self._on_event(events.Initialised(len(initial.splats), initial.source, initial.dropped))
+        self._pending.append(events.Initialised(len(initial.splats), initial.source, initial.dropped))
         return TrainState(initial.splats, generator)
 
     def _checked(self, state: TrainState) -> TrainState:

@@ -1,0 +1,142 @@
+"""Recipes: rates, schedules of densification, and what validate() refuses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from gs2d.errors import RecipeError
+from gs2d.recipe import (
+    ALPHA,
+    CloneInPlace,
+    GradDensify,
+    LossTerm,
+    RankByError,
+    Rates,
+    Recipe,
+    Stage,
+    validate,
+)
+
+L1 = (LossTerm("l1", 1.0),)
+
+
+def one(**fields: object) -> Recipe:
+    """A recipe of one stage "s" that is valid but for ``fields``."""
+    return Recipe("r", (replace(Stage("s", 10, losses=L1), **fields),))  # type: ignore[arg-type]
+
+
+def test_recipe_modules_never_import_torch() -> None:
+    code = (
+        "import sys, gs2d.recipe, gs2d.recipe_json, gs2d.schedule, gs2d.recipes, gs2d.protocols;"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_rate_of_the_means_is_log_linear_and_stays_at_its_end() -> None:
+    rates = Rates(means=1e-4, means_final=1e-6, means_horizon=100)
+    assert rates.means_at(0) == pytest.approx(1e-4)
+    assert rates.means_at(50) == pytest.approx(1e-5)  # geometric mean
+    assert rates.means_at(100) == pytest.approx(1e-6)
+    assert rates.means_at(5000) == pytest.approx(1e-6)
+
+
+def test_rates_at_the_end_are_constant_and_leave_the_others() -> None:
+    assert Rates().at_end(30_000) == replace(Rates(), means=1.6e-6, means_final=1.6e-6)
+    half = Rates(means=1e-4, means_final=1e-6, means_horizon=100).at_end(50)
+    assert half.means == half.means_final == pytest.approx(1e-5)
+    assert half.means_at(1) == pytest.approx(1e-5)
+
+
+def test_official_densification_runs_at_600_to_14900_every_100() -> None:
+    iterations = [i for i in range(1, 30_001) if GradDensify().densifies(i)]
+    assert iterations == list(range(600, 15_000, 100))
+    assert len(iterations) == 144
+
+
+def test_official_resets_are_every_3000_before_15000_and_at_500_on_white() -> None:
+    densify = GradDensify()
+    assert [i for i in range(1, 30_001) if densify.resets(i, white=False)] == [3000, 6000, 9000, 12000]
+    assert [i for i in range(1, 30_001) if densify.resets(i, white=True)] == [500, 3000, 6000, 9000, 12000]
+
+
+def test_last_reset_ends_resets_and_reset_at_adds_some() -> None:
+    densify = GradDensify(last_reset=6000, reset_at=(40, 7000))
+    assert [i for i in range(1, 15_000) if densify.resets(i, white=False)] == [40, 3000, 6000]
+
+
+def test_faint_splats_are_spared_for_exactly_the_grace_after_a_reset() -> None:
+    densify = GradDensify(prune_grace=100)
+    spared = [i for i in range(2900, 3200) if densify.spares_faint(i, white=False)]
+    assert spared == list(range(3001, 3101))
+    assert not GradDensify().spares_faint(3001, white=False)
+
+
+def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
+    stage = Stage("s", 5000, sh_interval=1000)
+    assert [stage.active_sh_degree(i, 3) for i in (1, 999, 1000, 2000, 3000, 4999)] == [0, 0, 1, 2, 3, 3]
+    assert Stage("s", 10).active_sh_degree(1, 3) == 3
+    assert stage.active_sh_degree(4000, 1) == 1
+
+
+@pytest.mark.parametrize(
+    ("recipe", "message"),
+    [
+        (Recipe("r", ()), "at least one stage"),
+        (Recipe("r", (Stage("s", 1, losses=L1), Stage("s", 1, losses=L1))), "two stages are called 's'"),
+        (replace(one(), seed=-1), "seed"),
+        (replace(one(), sh_degree=4), "sh_degree"),
+        (one(iterations=-1), "stage 's': iterations must be an integer >= 0, got -1"),
+        (one(losses=(LossTerm("l2", 1.0),)), "stage 's': loss must be one of l1, ssim"),
+        (one(losses=()), "no loss is active"),
+        (one(losses=(LossTerm("l1", 1.0, start=5),)), "no loss is active"),
+        (one(losses=(LossTerm("l1", -1.0),)), "weight of loss 'l1'"),
+        (one(losses=(LossTerm("l1", float("nan")),)), "weight of loss 'l1'"),
+        (one(losses=(LossTerm("l1", None),)), "needs a weight"),
+        (one(losses=(*L1, *L1)), "there twice"),
+        (one(losses=(*L1, LossTerm("ssim", 1.0, depth="max"))), "depth of loss 'ssim' must be one of mean, median"),
+        (one(train={"opacity": "all"}), "stage 's': train must be one of means, quats"),
+        (one(train={}), "names no attribute"),
+        (one(train={"sh0": "high_error"}), "no earlier action writes the row group 'high_error'; no action"),
+        (one(on_enter=(CloneInPlace(),)), "no earlier action writes the row group 'high_error'"),
+        (one(on_enter=(RankByError(), CloneInPlace("clones"))), "the groups written so far are high_error"),
+        (one(on_enter=(RankByError(), CloneInPlace(opacity="halve"))), "must be one of copy, preserve"),
+        (one(on_enter=(RankByError(top_percent=0.0),)), "top_percent"),
+        (one(on_enter=(RankByError(top_percent=101.0),)), "top_percent"),
+        (one(on_enter=(RankByError(writes="all"),)), "cannot be called 'all'"),
+        (one(moments="old"), "moments must be one of fresh, kept"),
+        (one(rates=Rates(sh0=-1.0)), "rates.sh0"),
+        (one(rates=Rates(means=0.0)), "must be positive"),
+        (one(rates=Rates(beta2=1.0)), "below 1"),
+        (one(densify=GradDensify(every=0)), "densify.every"),
+        (one(densify=GradDensify(reset_opacity=0.0)), "reset_opacity"),
+        (one(densify=GradDensify(max_splats=0)), "max_splats"),
+        (one(densify=GradDensify(), train={"means": "all"}), "resets or caps opacity"),
+    ],
+)
+def test_validate_names_the_stage_and_what_exists(recipe: Recipe, message: str) -> None:
+    with pytest.raises(RecipeError) as caught:
+        validate(recipe)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_group_may_be_written_by_an_action_of_the_same_stage() -> None:
+    stage = Stage("s", 1, train={"sh0": "high_error"}, losses=L1, on_enter=(RankByError(),))
+    later = Stage("t", 1, train=dict.fromkeys(ALPHA, "clones"), losses=L1, on_enter=(CloneInPlace(),))
+    assert validate(Recipe("r", (stage, later))).name == "r"
+
+
+def test_densification_without_resets_may_freeze_opacity() -> None:
+    validate(one(densify=GradDensify(reset_every=0), train={"means": "all"}))
+
+
+def test_loss_kinds_are_those_of_the_losses_module() -> None:
+    from gs2d.losses import LOSSES
+    from gs2d.recipe import LOSS_KINDS
+
+    assert set(LOSS_KINDS) == set(LOSSES)

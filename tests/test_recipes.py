@@ -1,0 +1,154 @@
+"""The named recipes: what each row of the paper's tables trains."""
+
+from __future__ import annotations
+
+import pytest
+
+from gs2d.errors import RecipeError
+from gs2d.recipe import ALL, CloneInPlace, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
+from gs2d.recipes import RECIPES, TABLES, get_recipe
+
+
+def weights(stage: Stage) -> dict[str, tuple[float | None, int]]:
+    return {term.kind: (term.weight, term.start) for term in stage.losses}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_named_recipe_is_valid_and_carries_its_name(name: str) -> None:
+    recipe = get_recipe(name)
+    assert validate(recipe) is recipe
+    assert recipe.name == name
+    assert RECIPES[name].about
+
+
+def test_every_row_of_every_table_names_a_recipe() -> None:
+    assert set(TABLES) == {"regularizers", "benchmark", "k", "freeze", "modules", "absgs"}
+    for rows in TABLES.values():
+        for name in rows.values():
+            assert name in RECIPES
+
+
+def test_2dgs_is_the_official_recipe() -> None:
+    (stage,) = get_recipe("2dgs").stages
+    assert stage.iterations == 30_000
+    assert weights(stage) == {"l1": (0.8, 0), "ssim": (0.2, 0), "normal_consistency": (0.05, 7000)}
+    assert dict(stage.train) == dict.fromkeys(ALL, "all")
+    assert stage.densify == GradDensify()
+    assert stage.sh_interval == 1000
+    rates = stage.rates
+    assert (rates.means, rates.means_final, rates.means_horizon) == (1.6e-4, 1.6e-6, 30_000)
+    assert (rates.sh0, rates.shN, rates.opacity_logits) == (2.5e-3, 1.25e-4, 0.05)
+    assert (rates.log_scales, rates.quats) == (5e-3, 1e-3)
+    assert (rates.beta1, rates.beta2, rates.eps) == (0.9, 0.999, 1e-15)
+
+
+def test_2dgs_r_has_the_three_stages_of_the_paper() -> None:
+    surface, appearance, refine = get_recipe("2dgs-r").stages
+    assert surface == get_recipe("2dgs").stages[0]
+    assert [s.iterations for s in (surface, appearance, refine)] == [30_000, 10_000, 20_000]
+    assert appearance.on_enter == (RankByError(top_percent=1.0),)
+    assert dict(appearance.train) == {"sh0": "high_error", "shN": "high_error"}
+    assert weights(appearance) == {"l1": (0.8, 0), "ssim": (0.2, 0)}
+    assert refine.on_enter == (CloneInPlace("high_error", "copy"),)
+    assert dict(refine.train) == {n: "all" for n in ("means", "quats", "log_scales", "sh0", "shN")}
+    assert weights(refine) == {"l1": (0.8, 0), "ssim": (0.2, 0), "normal_consistency": (0.05, 0)}
+    for stage in (appearance, refine):
+        assert stage.densify is None
+        assert stage.rates.means_at(1) == pytest.approx(1.6e-6)
+        assert stage.moments == "fresh"
+        assert stage.sh_interval == 0
+
+
+def test_the_fair_control_shares_its_first_stage_and_trains_as_long_as_2dgs_r() -> None:
+    control = get_recipe("2dgs-60k")
+    assert control.stages[0] == get_recipe("2dgs").stages[0]
+    assert control.iterations == get_recipe("2dgs-r").iterations == 60_000
+    more = control.stages[1]
+    assert more.moments == "kept"
+    assert more.densify is None
+    assert more.rates.means_at(1) == pytest.approx(1.6e-6)
+    assert weights(more)["normal_consistency"] == (0.05, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "nc", "distortion"),
+    [
+        ("2dgs-no-nc", None, None),
+        ("2dgs-distortion-no-nc", None, (None, 3000)),
+        ("2dgs-distortion", (0.05, 7000), (None, 3000)),
+        ("2dgs-nc-0.1", (0.1, 7000), None),
+        ("2dgs-nc-0.3", (0.3, 7000), None),
+    ],
+)
+def test_regularizer_rows(name: str, nc: object, distortion: object) -> None:
+    (stage,) = get_recipe(name).stages
+    assert weights(stage).get("normal_consistency") == nc
+    assert weights(stage).get("distortion") == distortion  # weight None: the protocol's
+
+
+def frozen(stage: Stage) -> set[str]:
+    return set(ALL) - set(stage.train)
+
+
+def test_freeze_rows() -> None:
+    rows = {row: frozen(get_recipe(name).stages[2]) for row, name in TABLES["freeze"].items()}
+    assert rows == {
+        "(,)": set(),
+        "(alpha,SHs)": {"opacity_logits", "sh0", "shN"},
+        "(SHs)": {"sh0", "shN"},
+        "(alpha)": {"opacity_logits"},
+    }
+
+
+def test_module_rows() -> None:
+    def facts(recipe: Recipe) -> tuple[bool, bool, bool]:
+        last = recipe.stages[-1]
+        clone = any(isinstance(action, CloneInPlace) for action in last.on_enter)
+        return clone, "opacity_logits" in frozen(last), "normal_consistency" in weights(last)
+
+    rows = {row: get_recipe(name) for row, name in TABLES["modules"].items()}
+    assert rows["(I)"].stages == get_recipe("2dgs").stages
+    assert facts(rows["(II)"]) == (True, False, False)
+    assert facts(rows["(III)"]) == (True, True, False)
+    assert facts(rows["(IV)"]) == (True, True, True)
+    assert rows["(IV)"].stages == get_recipe("2dgs-r").stages
+
+
+def test_k_rows_rank_that_share() -> None:
+    for row, name in TABLES["k"].items():
+        assert get_recipe(name).stages[1].on_enter == (RankByError(top_percent=float(row.removeprefix("K="))),)
+
+
+def test_absgs_rows_densify_in_stage_3_instead_of_the_clone() -> None:
+    default, adjusted = (get_recipe(f"2dgs-r-absgs-{x}").stages[2] for x in "da")
+    for stage in (default, adjusted):
+        assert stage.on_enter == ()
+        assert frozen(stage) == set()
+        assert stage.densify is not None
+        assert stage.densify.absolute
+        assert not stage.densify.resets(500, white=True)
+    assert default.densify is not None
+    assert adjusted.densify is not None
+    d = default.densify
+    assert (d.grad_threshold, d.abs_threshold, d.percent_dense, d.opacity_cull) == (2e-4, 4e-4, 0.001, 0.005)
+    assert (d.opacity_cap, d.cap_every, d.reset_every) == (0.8, 500, 3000)
+    assert adjusted.densify.abs_threshold < d.abs_threshold
+    assert adjusted.densify.percent_dense < d.percent_dense
+
+
+def test_variants_change_what_they_say() -> None:
+    assert dict(get_recipe("2dgs-r-sh-of-all").stages[1].train) == {"sh0": "all", "shN": "all"}
+    assert set(get_recipe("2dgs-r-clones-only").stages[2].train.values()) == {"clones"}
+    assert get_recipe("2dgs-r-clone-preserve").stages[2].on_enter == (CloneInPlace("high_error", "preserve"),)
+    assert get_recipe("2dgs-r-rerank").stages[2].on_enter == (RankByError(), CloneInPlace("high_error", "copy"))
+    assert get_recipe("2dgs-r-occlusion").stages[1].on_enter == (RankByError(occlusion=True),)
+
+
+def test_a_weight_of_zero_leaves_the_term_out() -> None:
+    assert all(term.weight != 0 for name in RECIPES for s in get_recipe(name).stages for term in s.losses)
+    assert LossTerm("normal_consistency", 0.0) not in get_recipe("2dgs-no-nc").stages[0].losses
+
+
+def test_an_unknown_name_suggests_a_near_one() -> None:
+    with pytest.raises(RecipeError, match="2dgs-r-k10"):
+        get_recipe("2dgs-r-k100")

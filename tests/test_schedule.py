@@ -1,0 +1,94 @@
+"""Scaled schedules: what shrinks, what does not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from gs2d.errors import RecipeError
+from gs2d.recipe import GradDensify
+from gs2d.recipes import RECIPES, get_recipe
+from gs2d.schedule import count_densifications, scale_schedule
+
+
+def test_factor_1_is_the_recipe_itself() -> None:
+    recipe = get_recipe("2dgs-r")
+    assert scale_schedule(recipe, 1.0) is recipe
+
+
+def test_a_tenth_scales_lengths_starts_sh_interval_and_horizon() -> None:
+    surface, appearance, refine = scale_schedule(get_recipe("2dgs-r"), 0.1).stages
+    assert [s.iterations for s in (surface, appearance, refine)] == [3000, 1000, 2000]
+    assert [term.start for term in surface.losses] == [0, 0, 700]
+    assert surface.sh_interval == 100
+    assert surface.rates.means_horizon == 3000
+    assert surface.rates.means_at(surface.iterations) == pytest.approx(1.6e-6)
+    densify = surface.densify
+    assert densify is not None
+    # 100, 200, ..., 1400: fourteen fit, so the interval stays
+    assert (densify.start, densify.stop, densify.every) == (50, 1500, 100)
+
+
+@pytest.mark.parametrize(("factor", "start", "stop", "every"), [(0.03, 15, 450, 44), (0.01, 5, 150, 14)])
+def test_the_interval_shrinks_until_ten_densifications_fit(factor: float, start: int, stop: int, every: int) -> None:
+    densify = scale_schedule(get_recipe("2dgs"), factor).stages[0].densify
+    assert densify is not None
+    # 44, 88, ..., 440 are ten below 450 (45 * 10 = 450 is not); 14, ..., 140 are ten below 150 (15 * 10 = 150 is not)
+    assert (densify.start, densify.stop, densify.every) == (start, stop, every)
+    assert count_densifications(densify) == 10
+    assert count_densifications(densify) == sum(densify.densifies(i) for i in range(1, stop))
+
+
+def test_resets_keep_their_interval_get_a_grace_and_leave_200_iterations() -> None:
+    densify = scale_schedule(get_recipe("2dgs"), 0.5).stages[0].densify
+    assert densify is not None
+    assert (densify.reset_every, densify.prune_grace, densify.last_reset) == (3000, 100, 7300)
+    assert [i for i in range(1, 7500) if densify.resets(i, white=False)] == [3000, 6000]
+    # 0.41: densification stops at 6150, and the reset at 6000 would leave 150
+    late = scale_schedule(get_recipe("2dgs"), 0.41).stages[0].densify
+    assert late is not None
+    assert [i for i in range(1, late.stop) if late.resets(i, white=False)] == [3000]
+
+
+def test_the_reset_on_white_is_dropped_where_it_leaves_too_little() -> None:
+    def resets(factor: float) -> list[int]:
+        densify = scale_schedule(get_recipe("2dgs"), factor).stages[0].densify
+        assert densify is not None
+        return [i for i in range(1, densify.stop) if densify.resets(i, white=True)]
+
+    assert resets(0.03) == [15]  # 15 + 200 <= 450
+    assert resets(0.01) == []  # 5 + 200 > 150
+
+
+def test_a_longer_schedule_keeps_the_official_resets() -> None:
+    densify = scale_schedule(get_recipe("2dgs"), 2.0).stages[0].densify
+    assert densify == replace(GradDensify(), start=1000, stop=30_000)
+
+
+def test_the_random_start_shrinks_with_the_square_root() -> None:
+    assert scale_schedule(get_recipe("2dgs"), 0.25).init_points == 50_000
+    assert scale_schedule(get_recipe("2dgs"), 1e-4).init_points == 10_000
+    assert scale_schedule(get_recipe("2dgs"), 4.0).init_points == 100_000
+    few = replace(get_recipe("2dgs"), init_points=500)
+    assert scale_schedule(few, 0.1).init_points == 500
+
+
+@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("factor", [0.1, 0.03, 0.01, 1e-4])
+def test_every_recipe_scales_to_something_valid_with_the_same_stages(name: str, factor: float) -> None:
+    from gs2d.recipe import validate
+
+    recipe = get_recipe(name)
+    short = validate(scale_schedule(recipe, factor))
+    for before, after in zip(recipe.stages, short.stages, strict=True):
+        assert after.iterations == max(1, round(before.iterations * factor))
+        assert after.train == before.train
+        assert after.on_enter == before.on_enter
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
+def test_a_factor_must_be_positive_and_finite(factor: float) -> None:
+    with pytest.raises(RecipeError, match="schedule scale"):
+        scale_schedule(get_recipe("2dgs"), factor)

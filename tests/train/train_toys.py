@@ -1,0 +1,78 @@
+"""Toys for the trainer: random splats, a full state, and a ball of 80 splats seen by six cameras of 24x24 pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gs2d.camera import look_at
+from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.geometry import camera_extent
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+from gs2d.train.state import Moments, Statistics, TrainState
+
+VIEWS, SIZE, POINTS = 6, 24, 60
+
+
+def random_splats(count: int, seed: int = 0, degree: int = 3, dtype: torch.dtype = torch.float32) -> Splats:
+    """Splats in the unit ball with every attribute random."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)
+
+    return Splats(
+        means=0.4 * normal(count, 3),
+        quats=normal(count, 4),
+        log_scales=-1.8 + 0.3 * normal(count, 2),
+        opacity_logits=1.0 + normal(count),
+        sh0=0.8 * normal(count, 1, 3),
+        shN=0.05 * normal(count, (degree + 1) ** 2 - 1, 3),
+    )
+
+
+def full_state(count: int = 10, seed: int = 0) -> TrainState:
+    """A state in which everything that has rows is there, and different in every row."""
+    splats = random_splats(count, seed)
+    state = TrainState(splats, torch.Generator().manual_seed(seed))
+    state.moments = {
+        name: Moments(torch.randn_like(tensor), torch.rand_like(tensor), 7) for name, tensor in splats.items()
+    }
+    state.groups = {"high_error": torch.arange(count) % 3 == 0}
+    state.statistics = Statistics(torch.rand(count), torch.rand(count), torch.arange(count).float())
+    return state
+
+
+def make_scene() -> Scene:
+    """Six views of random splats, rendered by the reference, with noisy points to start from."""
+    truth = random_splats(80, seed=3)
+    cameras = [
+        look_at(
+            np.array([3 * np.cos(a), 3 * np.sin(a), 1.0]),
+            np.zeros(3),
+            np.array([0.0, 0.0, 1.0]),
+            width=SIZE,
+            height=SIZE,
+            fx=30.0,
+        )
+        for a in np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
+    ]
+    views = []
+    for i, camera in enumerate(cameras):
+        with torch.no_grad():
+            color = rasterize(truth, camera, RasterSettings(), backend="reference").color
+        image = (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        views.append(View.from_arrays(f"{i:03d}.png", camera, image))
+    noise = np.random.default_rng(0).normal(size=(POINTS, 3)) * 0.05
+    points = truth.means.numpy()[:POINTS].astype(np.float64) + noise
+    return Scene(
+        name="ball",
+        format="colmap",
+        train=tuple(views),
+        test=(),
+        points=PointCloud(points, np.full((POINTS, 3), 128, np.uint8)),
+        extent=camera_extent(cameras),
+        bounds=np.array([[-1.0] * 3, [1.0] * 3]),
+    )
