@@ -1,0 +1,169 @@
+"""Depth maps on their way into the volume: one frame, and a file that holds all of them.
+
+Fusion reads the frames twice (once to find the blocks, once to integrate). Frames come from rendering, so they are
+kept in a temporary file, not in memory, and not rendered again.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.errors import DiskError, ShapeError
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What one camera saw.
+
+    Attributes
+    ----------
+    camera : Camera
+    depth : ndarray or Tensor [H, W] wu
+        Depth along the optical axis at pixel centres; 0, negative, NaN and infinity carry nothing.
+    color : ndarray or Tensor [H, W, 3] or None
+        uint8, or float in [0, 1].
+    valid : ndarray or Tensor [H, W] or None
+        bool (False carries nothing: background, masked out, alpha < 0.5), or a weight >= 0 of each pixel.
+    """
+
+    camera: Camera
+    depth: Any
+    color: Any = None
+    valid: Any = None
+
+
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """A frame as fusion reads it: numpy, cleaned."""
+
+    camera: Camera
+    depth: np.ndarray  # [H, W] float32 wu, 0 where nothing was seen
+    color: np.ndarray | None  # [H, W, 3] uint8
+    weight: np.ndarray | None  # [H, W] float32, None: 1 wherever depth > 0
+
+
+def depth_map(frame: Frame) -> DepthMap:
+    """Clean a frame.
+
+    Raises
+    ------
+    ShapeError
+        If depth, colour or mask are not of the camera's size, or a weight is negative or not finite.
+    """
+    camera = frame.camera
+    depth = _array(frame.depth)
+    color = None if frame.color is None else _array(frame.color)
+    valid = None if frame.valid is None else _array(frame.valid)
+    check_shapes({"depth": (depth, f"{camera.height} {camera.width}")})
+    seen = np.isfinite(depth) & (depth > 0)
+    weight = None
+    if valid is not None:
+        check_shapes({"valid": (valid, f"{camera.height} {camera.width}")})
+        if valid.dtype != bool:
+            weight = valid.astype(np.float32)
+            if not (np.isfinite(weight).all() and (weight >= 0).all()):
+                raise ShapeError("valid must be bool or finite weights >= 0, got negative or non-finite weights")
+        seen &= valid > 0
+    if color is not None:
+        check_shapes({"color": (color, f"{camera.height} {camera.width} 3")})
+        if color.dtype != np.uint8:
+            color = np.rint(np.clip(np.nan_to_num(color), 0.0, 1.0) * 255.0).astype(np.uint8)
+    return DepthMap(camera, np.where(seen, depth, 0).astype(np.float32), color, weight)
+
+
+def _array(value: Any) -> np.ndarray:
+    """numpy, from numpy or a torch tensor on any device (no import of torch needed)."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    return np.asarray(value)
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """Where one depth map lies in the file."""
+
+    camera: Camera
+    offset: int
+    has_color: bool
+    has_weight: bool
+
+
+class Spool:
+    """Depth maps in a temporary file, to be iterated over any number of times.
+
+    Parameters
+    ----------
+    folder : path or None
+        Where the file lies (default: the system's temporary folder). It has no name and vanishes when closed.
+
+    Raises
+    ------
+    DiskError
+        If the file cannot be written.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str] | None = None) -> None:
+        try:
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by close()
+        except OSError as error:
+            raise DiskError(f"a temporary file for depth maps cannot be made in {folder}: {error.strerror}") from error
+        self._slots: list[_Slot] = []
+
+    def append(self, item: DepthMap) -> None:
+        """Write one depth map."""
+        try:
+            offset = self._file.seek(0, os.SEEK_END)
+            self._file.write(np.ascontiguousarray(item.depth, np.float32).tobytes())
+            if item.color is not None:
+                self._file.write(np.ascontiguousarray(item.color, np.uint8).tobytes())
+            if item.weight is not None:
+                self._file.write(np.ascontiguousarray(item.weight, np.float32).tobytes())
+            self._file.flush()
+        except OSError as error:
+            raise DiskError(
+                f"depth maps need a temporary file, writing number {len(self._slots) + 1} failed "
+                f"({error.strerror}); free some space or name another folder"
+            ) from error
+        self._slots.append(_Slot(item.camera, offset, item.color is not None, item.weight is not None))
+
+    def extend(self, frames: Iterable[Frame]) -> None:
+        """Clean and write frames one by one."""
+        for frame in frames:
+            self.append(depth_map(frame))
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def __iter__(self) -> Iterator[DepthMap]:
+        for slot in self._slots:
+            self._file.seek(slot.offset)
+            shape = (slot.camera.height, slot.camera.width)
+            depth = self._read(np.float32, shape)
+            color = self._read(np.uint8, (*shape, 3)) if slot.has_color else None
+            weight = self._read(np.float32, shape) if slot.has_weight else None
+            yield DepthMap(slot.camera, depth, color, weight)
+
+    def _read(self, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
+        count = int(np.prod(shape))
+        return np.frombuffer(self._file.read(count * np.dtype(dtype).itemsize), dtype, count).reshape(shape)
+
+    def close(self) -> None:
+        """Give the file back."""
+        self._file.close()
+
+    def __enter__(self) -> Spool:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,188 @@
+"""The limits of fusion, from what the cameras saw: the box, the voxel, the truncation, the depth limit.
+
+No limit comes from the distance of the nearest camera, which is a guess about the capture. All come from percentiles
+of the depth maps over all views, so a walk along a wall is fused as well as an orbit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.errors import ProtocolError
+from gs2d.mesh.frames import DepthMap
+
+FAR_FACTOR = 4.0  # times the median depth; beyond it a pixel is wider than four voxels made for the median depth
+BOX_PERCENTILES = (1.0, 99.0)
+DEPTH_PERCENTILE = 99.5
+BOX_MARGIN = 0.25  # of the robust box's longest side, on every side: room for what percentiles cut off
+VOXELS_PER_TRUNCATION = 4.0
+
+
+@dataclass(frozen=True)
+class FusionLimits:
+    """Limits of one fusion, with the numbers that they come from. Plain numbers, ready for JSON.
+
+    Attributes
+    ----------
+    lower, upper : tuple of 3 floats, wu
+        Box outside which nothing is fused.
+    voxel, truncation, depth_limit : float, wu
+        Depths beyond ``depth_limit`` carry nothing.
+    depth_median, depth_high : float, wu
+        Median and 99.5th percentile of all depths.
+    pixel_footprint : float, wu
+        Median width of a pixel on the surface.
+    cut_fraction : float
+        Part of the seen pixels that depth limit or box leave out. Large: the scene has a background that is not fused.
+    """
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    voxel: float
+    truncation: float
+    depth_limit: float
+    depth_median: float
+    depth_high: float
+    pixel_footprint: float
+    cut_fraction: float
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSample:
+    """Some pixels of one view."""
+
+    points: np.ndarray  # [P, 3] float64 wu
+    depths: np.ndarray  # [P] wu
+    footprints: np.ndarray  # [P] wu, depth / focal length
+
+
+def backproject(camera: Camera, depth: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """World points [P, 3] of the centres of pixels (columns, rows) at ``depth`` [P]."""
+    x = (columns + 0.5 - camera.cx) / camera.fx * depth
+    y = (rows + 0.5 - camera.cy) / camera.fy * depth
+    return (np.stack([x, y, depth], axis=1) - camera.T_cam_world[:3, 3]) @ camera.rotation
+
+
+def sample_depths(item: DepthMap, count: int = 4096) -> DepthSample:
+    """About ``count`` seen pixels of a depth map, evenly spread (no randomness)."""
+    rows, columns = np.nonzero(item.depth > 0)
+    pick = slice(None, None, max(1, len(rows) // count))
+    rows, columns = rows[pick], columns[pick]
+    depth = item.depth[rows, columns].astype(np.float64)
+    camera = item.camera
+    footprint = depth / np.sqrt(camera.fx * camera.fy)
+    return DepthSample(backproject(camera, depth, rows, columns), depth, footprint)
+
+
+def derive_limits(
+    samples: Iterable[DepthSample],
+    cameras: Sequence[Camera],
+    *,
+    resolution: int = 512,
+    bbox: np.ndarray | None = None,
+    voxel: float | None = None,
+    truncation: float | None = None,
+    depth_limit: float | None = None,
+    points: np.ndarray | None = None,
+) -> FusionLimits:
+    """Limits from samples of all views; every named limit overrides the derived one.
+
+    Parameters
+    ----------
+    samples : iterable of DepthSample
+        One for each view.
+    cameras : sequence of Camera
+    resolution : int
+        Voxels along the longest side of the box that holds the 1st to 99th percentile of the points. The voxel is
+        never finer than half the median width of a pixel on the surface: finer ones hold nothing but interpolation.
+    bbox : array [2, 3] wu, optional
+        Fuse this box, whole: it also sets the voxel and lifts the depth limit to its farthest corner.
+    voxel, truncation, depth_limit : float wu, optional
+    points : array [P, 3] wu, optional
+        Splat centres or points of structure from motion: the derived box is cut to their extent (with the margin).
+
+    Raises
+    ------
+    ProtocolError
+        If no pixel has a depth, or a given limit makes no sense.
+    """
+    picked = list(samples)
+    xyz = np.concatenate([s.points for s in picked]) if picked else np.zeros((0, 3))
+    depths = np.concatenate([s.depths for s in picked]) if picked else np.zeros(0)
+    footprints = np.concatenate([s.footprints for s in picked]) if picked else np.zeros(0)
+    if not len(depths):
+        raise ProtocolError("depth maps with at least one seen pixel were expected, got none; is the scene empty?")
+    _positive(voxel=voxel, truncation=truncation, depth_limit=depth_limit, resolution=resolution)
+    median, high = float(np.median(depths)), float(np.percentile(depths, DEPTH_PERCENTILE))
+
+    if bbox is not None:
+        lower, upper = _box(bbox)
+        limit = _farthest_corner(lower, upper, cameras)
+        side = float((upper - lower).max())
+    else:
+        # the margin on the percentile keeps what a few views saw just beyond it
+        limit = min(high * 1.25, FAR_FACTOR * median) if depth_limit is None else depth_limit
+        near = xyz[depths <= limit]
+        if not len(near):
+            raise ProtocolError(f"a depth limit above the nearest depth, {depths.min():.4g} wu, was expected, got {limit:g}")
+        lower, upper = np.percentile(near, BOX_PERCENTILES, axis=0)
+        side = float((upper - lower).max())
+        lower, upper = _widened(lower, upper, side, points)
+    limit = limit if depth_limit is None else depth_limit
+    near_footprints = footprints[depths <= limit]
+    footprint = float(np.median(near_footprints if len(near_footprints) else footprints))
+    size = voxel if voxel is not None else max(side / resolution, 0.5 * footprint)
+    kept = (depths <= limit) & ((xyz >= lower) & (xyz <= upper)).all(axis=1)
+    return FusionLimits(
+        lower=_triple(lower),
+        upper=_triple(upper),
+        voxel=float(size),
+        truncation=float(truncation if truncation is not None else VOXELS_PER_TRUNCATION * size),
+        depth_limit=float(limit),
+        depth_median=median,
+        depth_high=high,
+        pixel_footprint=footprint,
+        cut_fraction=float(1.0 - kept.mean()),
+    )
+
+
+def _widened(
+    lower: np.ndarray, upper: np.ndarray, side: float, points: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The robust box with its margin, cut to the extent of the points (with the same margin)."""
+    margin = BOX_MARGIN * side
+    if points is not None and len(points):
+        lower = np.maximum(lower, np.min(points, axis=0))
+        upper = np.minimum(upper, np.max(points, axis=0))
+        if not (upper > lower).all():
+            raise ProtocolError("points around the surface were expected, got points beside it; are they its own?")
+    return lower - margin, upper + margin
+
+
+def _box(bbox: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    box = np.asarray(bbox, dtype=np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
+        raise ProtocolError(f"bbox must be a lower and a higher corner [2, 3], got {np.asarray(bbox).tolist()}")
+    return box[0], box[1]
+
+
+def _farthest_corner(lower: np.ndarray, upper: np.ndarray, cameras: Sequence[Camera]) -> float:
+    corners = np.array([[(lower, upper)[c >> a & 1][a] for a in range(3)] for c in range(8)])
+    depths = [camera.project(corners)[1].max() for camera in cameras]
+    if not depths or max(depths) <= 0:
+        raise ProtocolError("a bbox in front of some camera was expected, got one behind all; is its frame the scene's?")
+    return float(max(depths))
+
+
+def _positive(**values: float | None) -> None:
+    for name, value in values.items():
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise ProtocolError(f"{name} must be positive, got {value}")
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])

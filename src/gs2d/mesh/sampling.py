@@ -1,0 +1,159 @@
+"""Reading a depth map between its pixel centres, and telling which blocks a view can change.
+
+Between pixel centres depth is read from the plane through the nearest pixel whose slopes are, along each axis, the
+smaller of its two one-sided differences (minmod; 0 where they differ in sign). On smooth surfaces that is as exact as
+bilinear interpolation; at a depth edge the slope comes from the near side alone, so no depth is made up between two
+surfaces, and a pixel beside the background keeps its full square.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gs2d.mesh.frames import DepthMap
+from gs2d.mesh.limits import FusionLimits
+
+UNSEEN = np.float32(-1e30)  # a depth so near that nothing lies before it: the weight comes out as 0, without NaN
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One depth map, ready to be looked up. Pixel arrays are flat, with a border of one unseen pixel all round."""
+
+    projection: np.ndarray  # [3, 4] float64: (x z, y z, z), x and y in px shifted by the border
+    width: int  # with the border
+    height: int
+    focal: float  # px, the larger of the two
+    principal: tuple[float, float]  # px, with the border
+    sampling: str
+    depth: np.ndarray  # [P] float32, UNSEEN where nothing was seen
+    slope_x: np.ndarray  # [P] float32 wu/px
+    slope_y: np.ndarray
+    color: np.ndarray | None  # [P, 3] float32
+    weight: np.ndarray | None  # [P] float32
+    farthest: tuple[np.ndarray, ...]  # pyramid: level l is the largest depth around tiles of 2^(l + 2) px, 0 unseen
+
+    def signed_distance(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Depth of the surface at (x, y) px minus z, hugely negative where unseen; and the flat pixel. Reuses x, y."""
+        np.clip(x, 0, self.width - 1, out=x)
+        np.clip(y, 0, self.height - 1, out=y)
+        column, row = np.floor(x), np.floor(y)
+        pixel = row.astype(np.int64)
+        pixel *= self.width
+        pixel += column.astype(np.int64)
+        x -= column
+        y -= row
+        if self.sampling == "bilinear":
+            return self._bilinear(pixel, x - np.float32(0.5), y - np.float32(0.5)) - z, pixel
+        depth = self.depth[pixel]
+        if self.sampling == "plane":
+            x -= np.float32(0.5)
+            y -= np.float32(0.5)
+            x *= self.slope_x[pixel]
+            y *= self.slope_y[pixel]
+            depth += x
+            depth += y
+        depth -= z
+        return depth, pixel
+
+    def _bilinear(self, pixel: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Bilinear where all four pixels are seen and differ little (slopes of neighbours agree), else nearest."""
+        own = self.depth[pixel]
+        step_x, step_y = np.where(x < 0, -1, 1), np.where(y < 0, -self.width, self.width)
+        inside = (pixel > self.width) & (pixel < len(self.depth) - self.width - 1)
+        safe = np.where(inside, pixel, self.width + 1)
+        dx = self.depth[safe + step_x] - own
+        dy = self.depth[safe + step_y] - own
+        dxy = self.depth[safe + step_x + step_y] - own
+        x, y = np.abs(x), np.abs(y)
+        value = x * (1 - y) * dx + y * (1 - x) * dy + x * y * dxy
+        largest = np.maximum(np.maximum(np.abs(dx), np.abs(dy)), np.abs(dxy))
+        return own + np.where(inside & (largest < self.slope_x[0]), value, 0)
+
+
+def prepare(item: DepthMap, limits: FusionLimits, sampling: str = "plane") -> View:
+    """Make a depth map ready: cut at the depth limit, pad, take slopes, build the pyramid of farthest depths."""
+    if sampling not in ("plane", "bilinear", "nearest"):
+        raise ValueError(f"sampling must be 'plane', 'bilinear' or 'nearest', got {sampling!r}")
+    camera = item.camera
+    K = camera.K.copy()
+    K[:2, 2] += 1.0  # the border
+    depth = np.pad(np.where(item.depth <= limits.depth_limit, item.depth, 0), 1).astype(np.float32)
+    seen = np.where(depth > 0, depth, np.float32(np.nan))
+    # A slope moves depth by at most half a truncation within the pixel; steeper is an edge, not a surface.
+    slope_x = _minmod(seen, axis=1, largest=limits.truncation)
+    slope_y = _minmod(seen, axis=0, largest=limits.truncation)
+    if sampling == "bilinear":
+        slope_x = np.full_like(slope_x, limits.truncation)
+    color = None if item.color is None else np.pad(item.color, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
+    return View(
+        projection=K @ camera.T_cam_world[:3],
+        width=camera.width + 2,
+        height=camera.height + 2,
+        focal=max(camera.fx, camera.fy),
+        principal=(K[0, 2], K[1, 2]),
+        sampling=sampling,
+        depth=np.where(depth > 0, depth, UNSEEN).reshape(-1),
+        slope_x=slope_x.reshape(-1),
+        slope_y=slope_y.reshape(-1),
+        color=None if color is None else color.reshape(-1, 3),
+        weight=None if item.weight is None else np.pad(item.weight, 1).reshape(-1),
+        farthest=_pyramid(depth),
+    )
+
+
+def _minmod(depth: np.ndarray, *, axis: int, largest: float) -> np.ndarray:
+    """The smaller of the two one-sided differences along an axis; 0 at unseen neighbours, sign changes and edges."""
+    step = np.diff(depth, axis=axis)
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (1, 0)
+    back = np.pad(step, pad, constant_values=np.nan)
+    pad[axis] = (0, 1)
+    ahead = np.pad(step, pad, constant_values=np.nan)
+    slope = np.where(np.abs(back) < np.abs(ahead), back, ahead)
+    slope = np.where(np.isnan(ahead), back, np.where(np.isnan(back), ahead, slope))  # at a border: the one there is
+    slope = np.where(back * ahead < 0, 0, slope)
+    return np.where(np.abs(slope) <= largest, slope, 0).astype(np.float32)
+
+
+def _pyramid(depth: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Largest depth of tiles of 4, 8, 16, ... px and their eight neighbours, up to one tile."""
+    levels = []
+    size = 4
+    while True:
+        height, width = -(-depth.shape[0] // size), -(-depth.shape[1] // size)
+        padded = np.zeros((height * size, width * size), np.float32)
+        padded[: depth.shape[0], : depth.shape[1]] = depth
+        tiles = padded.reshape(height, size, width, size).max(axis=(1, 3))
+        around = np.pad(tiles, 1)
+        columns = np.maximum(np.maximum(around[:, :-2], around[:, 1:-1]), around[:, 2:])
+        levels.append(np.maximum(np.maximum(columns[:-2], columns[1:-1]), columns[2:]))
+        if height == 1 and width == 1:
+            return tuple(levels)
+        size *= 2
+
+
+def block_visibility(view: View, centers: np.ndarray, radius: float, truncation: float) -> np.ndarray:
+    """Rows [n] of the blocks that a view may change: spheres (centers [M, 3], radius) in front of the camera, in the
+    image, over some seen pixel, and not wholly behind the surface by more than the truncation."""
+    projected = centers @ view.projection[:, :3].T + view.projection[:, 3]
+    z = projected[:, 2]
+    rows = np.flatnonzero(z > 1.01 * radius)
+    z = z[rows]
+    x, y = projected[rows, 0] / z, projected[rows, 1] / z
+    # |grad (X / Z)| = sqrt(1 + (X / Z)^2) / Z bounds how far from its centre the sphere reaches in the image
+    slant = np.hypot(1.0, np.hypot(x - view.principal[0], y - view.principal[1]) / view.focal)
+    reach = 1.2 * view.focal * radius / (z - radius) * slant + 1.0  # px
+    inside = (x + reach > 0) & (x - reach < view.width) & (y + reach > 0) & (y - reach < view.height)
+    rows, x, y, z, reach = rows[inside], x[inside], y[inside], z[inside], reach[inside]
+    level = np.ceil(np.log2(np.maximum(reach, 4.0) / 4.0)).astype(np.int64)
+    farthest = np.full(len(rows), np.inf)
+    for l, tiles in enumerate(view.farthest):
+        at = np.flatnonzero(level == l)
+        size = 4 << l
+        i = np.clip((y[at] // size).astype(np.int64), 0, tiles.shape[0] - 1)
+        j = np.clip((x[at] // size).astype(np.int64), 0, tiles.shape[1] - 1)
+        farthest[at] = tiles[i, j]
+    return rows[(farthest > 0) & (z - radius - 2 * truncation < farthest)]

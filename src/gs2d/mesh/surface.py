@@ -1,0 +1,172 @@
+"""Marching cubes over the blocks of a volume, and connected components of a mesh.
+
+A cell is eight neighbouring voxels; it makes surface only where all eight are known. Vertices lie on the edges of the
+grid and are numbered by edge, so cells of neighbouring blocks share theirs exactly: no seams, nothing to weld.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from gs2d.mesh.cases import CORNERS, EDGES, case_table
+from gs2d.mesh.fuse import BLOCK, VOXELS, Volume
+from gs2d.triangles import Mesh
+
+_CHUNK = 512  # blocks at a time
+_EDGE_GUARD = np.float32(1e-3)  # of an edge: vertices keep off its ends, so that no triangle is a point
+
+
+def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
+    """The zero set of a volume.
+
+    Parameters
+    ----------
+    volume : Volume
+    min_weight : float
+        A voxel is known from this weight on. A view adds 1 to voxels in front of its surface and to those behind it
+        up to half the truncation.
+
+    Returns
+    -------
+    Mesh
+        float32 vertices in the world, faces counter-clockwise seen from the side of positive distance (from where the
+        cameras look), colours where the volume has them. Empty where nothing is known.
+    """
+    shifted = _neighbours(volume)
+    triangles = [
+        _chunk_triangles(volume, shifted, np.arange(start, min(start + _CHUNK, len(volume.keys))), min_weight)
+        for start in range(0, len(volume.keys), _CHUNK)
+    ]
+    corners = np.concatenate(triangles) if triangles else np.zeros((0, 3), np.int64)
+    edges, faces = np.unique(corners, return_inverse=True)
+    vertices, colors = _edge_vertices(volume, shifted, edges)
+    return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32), colors)
+
+
+def _neighbours(volume: Volume) -> np.ndarray:
+    """Rows [M, 8] of the blocks shifted by each corner (0 or 1 along each axis), -1 where there is none."""
+    blocks = volume.blocks
+    rows = np.full((len(blocks), 8), -1, dtype=np.int64)
+    for corner, shift in enumerate(CORNERS):
+        block = blocks + shift
+        inside = (block < volume.dims).all(axis=1)
+        key = (block[:, 0] * volume.dims[1] + block[:, 1]) * volume.dims[2] + block[:, 2]
+        at = np.minimum(np.searchsorted(volume.keys, key), len(blocks) - 1)
+        rows[:, corner] = np.where(inside & (volume.keys[at] == key), at, -1)
+    return rows
+
+
+def _padded(values: np.ndarray, shifted: np.ndarray, fill: float) -> np.ndarray:
+    """Blocks with their upper neighbours' first layer [n, 9, 9, 9], ``fill`` where there is no neighbour."""
+    cubes = values.reshape(-1, BLOCK, BLOCK, BLOCK)
+    out = np.full((len(shifted), BLOCK + 1, BLOCK + 1, BLOCK + 1), fill, dtype=values.dtype)
+    for corner, shift in enumerate(CORNERS):
+        rows = shifted[:, corner]
+        has = rows >= 0
+        x, y, z = (slice(BLOCK, None) if s else slice(0, BLOCK) for s in shift)
+        a, b, c = (slice(0, 1) if s else slice(0, BLOCK) for s in shift)
+        out[has, x, y, z] = cubes[rows[has], a, b, c]
+    return out
+
+
+def _chunk_triangles(volume: Volume, shifted: np.ndarray, chunk: np.ndarray, min_weight: float) -> np.ndarray:
+    """Triangles [T, 3] of some blocks, as global edge numbers."""
+    inside = _padded(volume.tsdf, shifted[chunk], 0.0) < 0
+    known = _padded(volume.weight, shifted[chunk], 0.0) >= max(min_weight, 1e-12)
+    case = np.zeros((len(chunk), BLOCK, BLOCK, BLOCK), np.uint8)
+    full = np.ones_like(case, dtype=bool)
+    for corner, (x, y, z) in enumerate(CORNERS):
+        window = (slice(None), slice(x, x + BLOCK), slice(y, y + BLOCK), slice(z, z + BLOCK))
+        case |= inside[window].astype(np.uint8) << np.uint8(corner)
+        full &= known[window]
+    cells = np.flatnonzero(full.reshape(-1) & (case.reshape(-1) != 0) & (case.reshape(-1) != 255))
+    table = case_table()
+    cases = case.reshape(-1)[cells].astype(np.int64)
+    counts = table.starts[cases + 1] - table.starts[cases]
+    owner = np.repeat(np.arange(len(cells)), counts)
+    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    edges = table.edges[table.starts[cases[owner]] + within]  # [T, 3] edge of the cell
+    return _edge_numbers(shifted, chunk[cells // VOXELS][owner], (cells % VOXELS)[owner], edges)
+
+
+def _edge_numbers(shifted: np.ndarray, row: np.ndarray, voxel: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Global number of cell edges: 3 * (512 * row + voxel) + axis, of the voxel at the edge's lower end."""
+    axis = np.array([a for a, _ in EDGES])[edges]
+    low = CORNERS[np.array([c for _, c in EDGES])][edges]  # [T, 3, 3]
+    at = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1)[:, None, :] + low
+    over = at >= BLOCK  # into which neighbour
+    corner = (over * np.array([1, 2, 4])).sum(axis=2)
+    at = at - BLOCK * over
+    owner = shifted[row[:, None], corner]
+    return 3 * (owner * VOXELS + (at[..., 0] * BLOCK + at[..., 1]) * BLOCK + at[..., 2]) + axis
+
+
+def _edge_vertices(volume: Volume, shifted: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Positions [P, 3] of the zero crossings on edges, and their colours."""
+    low, axis = edges // 3, edges % 3
+    row, voxel = low // VOXELS, low % VOXELS
+    at = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1)
+    step = np.eye(3, dtype=np.int64)[axis]
+    up = at + step
+    over = up >= BLOCK
+    up_row = shifted[row, (over * np.array([1, 2, 4])).sum(axis=1)]
+    up = up - BLOCK * over
+    high = up_row * VOXELS + (up[:, 0] * BLOCK + up[:, 1]) * BLOCK + up[:, 2]
+    tsdf = volume.tsdf.reshape(-1)
+    a, b = tsdf[low], tsdf[high]
+    t = np.clip(a / np.where(a == b, 1, a - b), _EDGE_GUARD, 1 - _EDGE_GUARD)  # signs differ, so a != b
+    grid = volume.blocks[row] * BLOCK + at + t[:, None].astype(np.float64) * step
+    vertices = (np.asarray(volume.limits.lower) + grid * volume.limits.voxel).astype(np.float32)
+    if volume.color is None or volume.color_weight is None:
+        return vertices, None
+    colors, weights = volume.color.reshape(-1, 3), volume.color_weight.reshape(-1)
+    # an end that no view saw near its surface has no colour: the other end's counts alone
+    wa, wb = (1 - t) * (weights[low] > 0), t * (weights[high] > 0)
+    mixed = (wa[:, None] * colors[low] + wb[:, None] * colors[high]) / np.maximum(wa + wb, np.float32(1e-12))[:, None]
+    return vertices, np.rint(np.clip(mixed, 0, 255)).astype(np.uint8)
+
+
+def components(mesh: Mesh) -> np.ndarray:
+    """Number [F] of the connected component of every face (components share no vertex), by size: 0 is the largest.
+
+    Ties go to the component with the lowest face number.
+    """
+    n = len(mesh.vertices)
+    if not len(mesh.faces):
+        return np.zeros(0, dtype=np.int64)
+    faces = mesh.faces.astype(np.int64)
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    names, first, of_face, sizes = np.unique(
+        label[faces[:, 0]], return_index=True, return_inverse=True, return_counts=True
+    )
+    order = np.lexsort((first, -sizes))
+    rank = np.empty(len(names), dtype=np.int64)
+    rank[order] = np.arange(len(names))
+    return rank[of_face]
+
+
+def keep_components(mesh: Mesh, *, min_faces: int = 50, keep: int | None = None) -> Mesh:
+    """The mesh without small pieces: components of at least ``min_faces`` faces, and of those the ``keep`` largest.
+
+    Faces and vertices keep their order; vertices without faces go. With no component left the mesh is empty.
+    """
+    rank = components(mesh)
+    sizes = np.bincount(rank) if len(rank) else np.zeros(0, np.int64)
+    good = sizes >= min_faces
+    if keep is not None:
+        good[keep:] = False
+    return select_faces(mesh, good[rank])
+
+
+def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
+    """The faces where ``mask`` [F] is true, and only the vertices they use."""
+    faces = mesh.faces[mask]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    number = np.cumsum(used) - 1
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return Mesh(mesh.vertices[used], number[faces].astype(np.int32).reshape(-1, 3), colors)

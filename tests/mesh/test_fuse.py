@@ -1,0 +1,319 @@
+"""Fusion: known shapes come out where they are, closed, in one layer, in bounded memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from surface_shapes import (
+    box_depth,
+    edge_uses,
+    is_closed_manifold,
+    limits,
+    orbit,
+    rays,
+    signed_volume,
+    sphere_depth,
+    sphere_frames,
+)
+
+from gs2d.camera import Camera, look_at
+from gs2d.errors import DiskError, ProtocolError, ShapeError
+from gs2d.mesh.extract import extract
+from gs2d.mesh.frames import DepthMap, Frame, Spool, depth_map
+from gs2d.mesh.fuse import BLOCK, block_bytes, block_grid, fuse, touched_blocks
+from gs2d.mesh.limits import derive_limits, sample_depths
+from gs2d.mesh.surface import components, marching_cubes
+
+LIMITS = limits(1.3, 0.03)
+
+
+def maps(frames: list[Frame]) -> list[DepthMap]:
+    return [depth_map(frame) for frame in frames]
+
+
+def test_a_sphere_seen_from_all_round_is_closed_and_has_its_radius() -> None:
+    mesh = marching_cubes(fuse(maps(sphere_frames(orbit(30, 3.0))), LIMITS, threads=1))
+    assert is_closed_manifold(mesh)
+    assert components(mesh).max() == 0
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert abs(np.sqrt((radius**2).mean()) - 1) < 0.05 * LIMITS.voxel
+    assert np.abs(radius - 1).max() < 0.5 * LIMITS.voxel
+    assert signed_volume(mesh) > 0
+
+
+@pytest.mark.parametrize("sampling", ["nearest", "bilinear", "plane"])
+def test_an_oblique_plane_is_flat_to_a_part_of_a_voxel_unless_depth_is_read_at_the_nearest_pixel(sampling: str) -> None:
+    """Plane z = 4 + 0.8 x before the camera at the origin: depth 4 / (1 - 0.8 x') at the pixel ray (x', y', 1)."""
+    camera = Camera(160, 120, 200.0, 200.0, 80.0, 60.0, np.eye(4))
+    slope = (np.arange(160) + 0.5 - 80) / 200
+    depth = np.broadcast_to(4 / (1 - 0.8 * slope), (120, 160))
+    lim = replace(limits(1.0, 0.02), lower=(-1.0, -0.8, 3.2), upper=(0.8, 0.8, 4.8))
+    mesh = marching_cubes(fuse([depth_map(Frame(camera, depth))], lim, threads=1, sampling=sampling))
+    error = (mesh.vertices[:, 2] - 4 - 0.8 * mesh.vertices[:, 0]) / np.hypot(1, 0.8)
+    worst = np.abs(error).max() / lim.voxel
+    if sampling == "nearest":
+        assert 0.2 < worst < 0.5  # half a pixel of 0.02 wu with slope 0.8: 0.4 voxel along z
+    else:
+        assert worst < 0.02
+
+
+def test_depth_is_not_made_up_across_a_depth_edge() -> None:
+    """Two walls at 2 and 3 that meet at the middle column: no vertex lies between them.
+
+    What is known of the near wall's inside, half a truncation, ends there: its side is that deep and no deeper.
+    """
+    camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
+    depth = np.where(np.arange(64) < 32, 2.0, 3.0) * np.ones((64, 1))
+    lim = replace(limits(1.0, 0.02), lower=(-1.0, -0.5, 1.5), upper=(1.0, 0.5, 3.5))
+    mesh = marching_cubes(fuse([depth_map(Frame(camera, depth))], lim, threads=1))
+    z = mesh.vertices[:, 2]
+    near = z < 2 + 0.5 * lim.truncation + lim.voxel
+    assert (np.abs(z[near & (np.abs(mesh.vertices[:, 0]) > 0.05)] - 2) < 0.01).all()
+    assert (np.abs(z[~near] - 3) < 0.01).all()
+    assert (z < 2.5).any()
+    assert (z > 2.5).any()
+
+
+def test_unseen_space_makes_no_shell() -> None:
+    """One camera sees half a sphere: one open sheet, nothing behind it and nothing around the image's edge."""
+    camera = look_at(np.array([0, -3.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), width=160, height=160, fx=200)
+    depth = sphere_depth(camera, 1.0)
+    mesh = marching_cubes(fuse([depth_map(Frame(camera, depth))], limits(1.3, 0.02), threads=1))
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02
+    assert mesh.vertices[:, 1].max() < -1 / 3 + 0.05  # the outline seen from 3 away is at y = -1/3
+    _, uses, _ = edge_uses(mesh)
+    assert uses.max() == 2
+    assert (uses == 1).any()
+
+
+@pytest.mark.parametrize("thickness_voxels", [3.0, 6.0])
+def test_a_thin_plate_seen_from_both_sides_has_two_faces_and_no_other_layer(thickness_voxels: float) -> None:
+    voxel = 0.02
+    half = 0.5 * thickness_voxels * voxel
+    low, high = np.array([-0.6, -0.6, -half]), np.array([0.6, 0.6, half])
+    cameras = orbit(36, 3.0, size=160, focal=220.0)
+    frames = [Frame(camera, box_depth(camera, low, high)) for camera in cameras]
+    mesh = marching_cubes(fuse(maps(frames), limits(0.8, voxel), threads=1))
+    inner = np.abs(mesh.vertices[:, :2]).max(1) < 0.5
+    height = np.abs(mesh.vertices[inner, 2])
+    assert np.abs(height - half).max() < 0.75 * voxel  # every vertex is on one of the two faces
+    centers = mesh.vertices[mesh.faces].mean(1)
+    t = mesh.vertices.astype(np.float64)[mesh.faces]
+    normals = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
+    flat = np.abs(centers[:, :2]).max(1) < 0.5
+    assert (normals[flat, 2] * centers[flat, 2] > 0).all()  # both face outward
+    area = 0.5 * np.abs(normals[flat, 2]).sum()
+    assert area == pytest.approx(2.0, rel=0.05)  # two sheets of 1.0 x 1.0, once each
+
+
+def test_invalid_pixels_and_pixels_without_depth_carry_nothing() -> None:
+    camera = orbit(1, 3.0)[0]
+    depth = sphere_depth(camera, 1.0)
+    valid = np.zeros(depth.shape, bool)
+    with pytest.raises(ProtocolError, match="got none"):
+        fuse([depth_map(Frame(camera, depth, valid=valid))], LIMITS)
+    valid[:, :48] = True
+    left = depth_map(Frame(camera, np.where(depth > 0, depth, np.nan), valid=valid))
+    assert (left.depth[:, 48:] == 0).all()
+    assert np.isfinite(left.depth).all()
+    mesh = marching_cubes(fuse([left], LIMITS, threads=1))
+    x, _ = camera.project(mesh.vertices)
+    assert x[:, 0].max() < 48.5
+
+
+def test_weights_of_pixels_weigh() -> None:
+    """Two views from one place, of walls at 2.00 and 2.04, weighted 3 to 1: the wall is at 2.01."""
+    camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
+    one = np.ones((64, 64))
+    frames = [Frame(camera, 2.00 * one, valid=3 * one), Frame(camera, 2.04 * one, valid=1 * one)]
+    lim = replace(limits(1.0, 0.02), lower=(-0.5, -0.5, 1.5), upper=(0.5, 0.5, 2.5), truncation=0.2)
+    mesh = marching_cubes(fuse(maps(frames), lim, threads=1))
+    np.testing.assert_allclose(mesh.vertices[:, 2], 2.01, atol=1e-4)
+
+
+def test_free_space_clears_a_phantom_that_other_views_look_through() -> None:
+    cameras = orbit(60, 3.0, size=64, focal=80.0)
+    frames = sphere_frames(cameras, 0.9)
+    phantom = np.asarray(frames[0].depth).copy()
+    phantom[28:36, 28:36] = 1.95  # 0.15 before the surface
+    for position in (0, 30):  # wherever it comes in the order
+        order = [*frames[1 : 1 + position], Frame(cameras[0], phantom), *frames[1 + position :]]
+        mesh = marching_cubes(fuse(maps(order), LIMITS, threads=1))
+        assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.92
+
+
+def test_colours_come_from_the_views_that_see_the_surface() -> None:
+    cameras = orbit(30, 3.0)
+    frames = []
+    for camera in cameras:
+        depth = sphere_depth(camera, 1.0)
+        o, d = rays(camera)
+        point = o + depth[..., None] * d
+        color = np.where(point[..., 2:] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])  # red above, blue below
+        frames.append(Frame(camera, depth, color, depth > 0))
+    mesh = marching_cubes(fuse(maps(frames), LIMITS, threads=1))
+    assert mesh.colors is not None
+    top, bottom = mesh.vertices[:, 2] > 0.1, mesh.vertices[:, 2] < -0.1
+    assert mesh.colors[top, 0].min() > 230
+    assert mesh.colors[top, 2].max() < 25
+    assert mesh.colors[bottom, 2].min() > 230
+
+
+def test_the_result_does_not_depend_on_threads() -> None:
+    frames = maps(sphere_frames(orbit(6, 3.0)))
+    one, three = fuse(frames, LIMITS, threads=1), fuse(frames, LIMITS, threads=3)
+    np.testing.assert_array_equal(one.tsdf, three.tsdf)
+    np.testing.assert_array_equal(one.weight, three.weight)
+
+
+def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pyramid of farthest depths is an optimisation: compare with every block in front of the camera."""
+    cameras = orbit(8, 3.0)
+    frames = maps([Frame(c, box_depth(c, np.array([-0.9, -0.5, -0.2]), np.array([0.3, 0.8, 0.9]))) for c in cameras])
+    fast = fuse(frames, LIMITS, threads=1)
+    monkeypatch.setattr(
+        "gs2d.mesh.fuse.block_visibility",
+        lambda view, centers, radius, truncation: np.flatnonzero(
+            centers @ view.projection[2, :3] + view.projection[2, 3] > 1.01 * radius
+        ),
+    )
+    slow = fuse(frames, LIMITS, threads=1)
+    np.testing.assert_array_equal(fast.weight, slow.weight)
+    np.testing.assert_array_equal(fast.tsdf, slow.tsdf)
+
+
+def test_every_voxel_within_the_truncation_of_a_seen_point_has_a_block() -> None:
+    camera = orbit(1, 3.0)[0]
+    item = depth_map(Frame(camera, sphere_depth(camera, 1.0)))
+    dims = block_grid(LIMITS)
+    keys = set(touched_blocks(item, LIMITS, dims).tolist())
+    sample = sample_depths(item, 10**9)
+    ray = (sample.points - camera.center) / sample.depths[:, None]
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        offset = rng.uniform(-LIMITS.truncation, LIMITS.truncation, (len(ray), 1))
+        jitter = rng.uniform(-0.5, 0.5, ray.shape) * LIMITS.voxel  # the voxels next to the ray
+        block = np.floor((sample.points + offset * ray + jitter - LIMITS.lower) / (BLOCK * LIMITS.voxel)).astype(int)
+        assert set(((block[:, 0] * dims[1] + block[:, 1]) * dims[2] + block[:, 2]).tolist()) <= keys
+
+
+def test_a_pixel_wider_than_a_block_leaves_no_gaps() -> None:
+    """A wall at 2, pixels 0.25 wide, blocks 0.04 wide: the sheet has no holes."""
+    camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
+    lim = replace(limits(1.0, 0.005), lower=(-0.3, -0.3, 1.8), upper=(0.3, 0.3, 2.2))
+    mesh = marching_cubes(fuse([depth_map(Frame(camera, np.full((8, 8), 2.0)))], lim, threads=1))
+    assert components(mesh).max() == 0
+    edges, uses, _ = edge_uses(mesh)
+    border = np.abs(mesh.vertices[edges[uses == 1]][..., :2]).max(axis=(1, 2))
+    assert border.min() > 0.28
+
+
+def test_memory_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
+    frames = maps(sphere_frames(orbit(10, 3.0)))
+    lim = limits(1.3, 0.01)
+    max_bytes = 1500 * block_bytes(False)
+    with pytest.raises(ProtocolError, match="use a voxel of about") as error:
+        fuse(frames, lim, max_bytes=max_bytes)
+    assert "\n" not in str(error.value)
+    voxel = float(str(error.value).split("voxel of about ")[1].split(" ")[0])
+    volume = fuse(frames, limits(1.3, voxel), max_bytes=max_bytes, threads=1)
+    assert 0.3 * max_bytes < volume.nbytes <= max_bytes
+
+
+def test_a_volume_weighs_what_the_bound_counts() -> None:
+    frames = sphere_frames(orbit(2, 3.0))
+    colored = [replace(f, color=np.zeros((96, 96, 3), np.uint8)) for f in frames]
+    for items, has_color in ((frames, False), (colored, True)):
+        volume = fuse(maps(items), LIMITS, threads=1)
+        assert volume.nbytes == len(volume.keys) * block_bytes(has_color)
+
+
+def test_a_voxel_absurdly_small_for_the_box_is_refused() -> None:
+    with pytest.raises(ProtocolError, match="voxel"):
+        block_grid(limits(1e6, 1e-6))
+
+
+def test_a_generator_of_depth_maps_is_refused_because_it_is_read_twice() -> None:
+    with pytest.raises(TypeError, match="twice"):
+        fuse(iter(maps(sphere_frames(orbit(1, 3.0)))), LIMITS)
+
+
+def test_maps_of_another_size_than_the_camera_are_refused() -> None:
+    camera = orbit(1, 3.0)[0]
+    depth = np.ones((96, 96))
+    for frame in (
+        Frame(camera, np.ones((96, 95))),
+        Frame(camera, depth, color=np.zeros((96, 96))),
+        Frame(camera, depth, valid=np.ones((95, 96), bool)),
+        Frame(camera, depth, valid=-depth),
+    ):
+        with pytest.raises(ShapeError):
+            depth_map(frame)
+
+
+def test_torch_tensors_and_arrays_are_the_same_frame() -> None:
+    camera = orbit(1, 3.0)[0]
+    depth, color = sphere_depth(camera, 1.0).astype(np.float32), np.full((96, 96, 3), 0.5, np.float32)
+    a = depth_map(Frame(camera, depth, color, depth > 0))
+    t = torch.from_numpy
+    b = depth_map(Frame(camera, t(depth).requires_grad_(), t(color), t(depth > 0)))
+    np.testing.assert_array_equal(a.depth, b.depth)
+    assert a.color is not None
+    assert b.color is not None
+    assert (a.color == 128).all()
+    assert (b.color == 128).all()
+
+
+def test_a_spool_gives_back_what_it_was_given_as_often_as_asked() -> None:
+    camera = orbit(1, 3.0)[0]
+    depth = sphere_depth(camera, 1.0)
+    rng = np.random.default_rng(0)
+    color = rng.integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    frames = [Frame(camera, depth), Frame(camera, depth, color), Frame(camera, depth, color, rng.random((96, 96)))]
+    with Spool() as spool:
+        spool.extend(iter(frames))
+        assert len(spool) == 3
+        for _ in range(2):
+            for item, expected in zip(spool, maps(frames), strict=True):
+                for name in ("depth", "color", "weight"):
+                    a, b = getattr(item, name), getattr(expected, name)
+                    assert (a is None and b is None) or np.array_equal(a, b), name
+
+
+def test_a_spool_in_a_missing_folder_is_a_disk_error(tmp_path: object) -> None:
+    with pytest.raises(DiskError):
+        Spool(f"{tmp_path}/none")
+
+
+def test_extract_takes_a_generator_and_derives_everything() -> None:
+    cameras = orbit(30, 3.0)
+    result = extract((frame for frame in sphere_frames(cameras)), resolution=60, threads=1)
+    assert is_closed_manifold(result.mesh)
+    assert result.frames == 30
+    assert result.components == 1
+    assert result.limits.voxel == pytest.approx(2 / 60, rel=0.1)
+    radius = np.linalg.norm(result.mesh.vertices, axis=1)
+    assert np.abs(radius - 1).max() < 0.5 * result.limits.voxel
+
+
+def test_extract_takes_limits_or_their_parts_but_not_both() -> None:
+    with pytest.raises(TypeError, match="not both"):
+        extract([], limits=LIMITS, voxel=0.1)
+
+
+def test_an_orbit_at_uneven_distances_keeps_the_whole_scene() -> None:
+    """One camera close to the wall, the others far: the first cause of circular holes in other implementations."""
+    wall = np.array([-2.0, 0.0, -2.0]), np.array([2.0, 0.2, 2.0])
+    eyes = [np.array([x, -y, 0.0]) for x, y in ((0.0, 0.4), (-1.0, 4.0), (1.0, 4.0), (0.0, 5.0))]
+    up = np.array([0, 0, 1.0])
+    cameras = [look_at(e, np.array([e[0], 0, 0]), up, width=128, height=128, fx=110) for e in eyes]
+    frames = [Frame(c, box_depth(c, *wall)) for c in cameras]
+    derived = derive_limits([sample_depths(depth_map(f)) for f in frames], cameras, resolution=100)
+    assert derived.depth_limit > 5
+    mesh = extract(frames, resolution=100, threads=1).mesh
+    front = np.abs(mesh.vertices[:, 1]) < 0.05
+    assert mesh.vertices[front].min(0)[0] < -1.9
+    assert mesh.vertices[front].max(0)[0] > 1.9

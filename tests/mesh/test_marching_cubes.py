@@ -1,0 +1,176 @@
+"""Marching cubes: closed, oriented, seam-free; only known space makes surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
+
+from gs2d.mesh.cases import CORNERS, EDGES, case_table
+from gs2d.mesh.fuse import BLOCK, Volume
+from gs2d.mesh.surface import components, keep_components, marching_cubes, select_faces
+from gs2d.triangles import Mesh
+
+
+def sphere(radius: float) -> object:
+    return lambda p: np.linalg.norm(p, axis=1) - radius
+
+
+def smooth_noise(seed: int, n: int) -> object:
+    """Random waves, positive at the border of the cube of side 2, so that every surface is closed."""
+    rng = np.random.default_rng(seed)
+    k, phase = rng.normal(size=(n, 3)) * 4, rng.uniform(0, 2 * np.pi, n)
+
+    def field(p: np.ndarray) -> np.ndarray:
+        return np.cos(p @ k.T + phase).sum(1) / np.sqrt(n) + np.maximum(0, 20 * (np.abs(p).max(1) - 0.7))
+
+    return field
+
+
+def white_noise(seed: int) -> object:
+    """Independent signs at every voxel, positive at the border: every one of the 256 cases, every ambiguous face."""
+
+    def field(p: np.ndarray) -> np.ndarray:
+        values = np.random.default_rng(seed).normal(size=len(p))
+        return np.where(np.abs(p).max(1) > 0.85, 1.0, values)
+
+    return field
+
+
+def test_a_single_inside_corner_makes_one_triangle_around_it_that_faces_away() -> None:
+    table = case_table()
+    for corner in range(8):
+        triangles = table.edges[table.starts[1 << corner] : table.starts[(1 << corner) + 1]]
+        assert len(triangles) == 1
+        ends = np.array([CORNERS[EDGES[e][1]] + 0.5 * np.eye(3)[EDGES[e][0]] for e in triangles[0]])
+        normal = np.cross(ends[1] - ends[0], ends[2] - ends[0])
+        assert normal @ (ends.mean(0) - CORNERS[corner]) > 0
+
+
+def test_every_case_uses_exactly_the_edges_that_cross() -> None:
+    table = case_table()
+    for case in range(256):
+        crossing = {e for e, (a, c) in enumerate(EDGES) if (case >> c & 1) != (case >> (c | 1 << a) & 1)}
+        assert set(table.edges[table.starts[case] : table.starts[case + 1]].reshape(-1).tolist()) == crossing
+
+
+def test_a_sphere_has_its_radius_and_is_closed_and_faces_outward() -> None:
+    lim = limits(1.0, 2 / 40)
+    mesh = marching_cubes(volume_of(sphere(0.7), lim, 5))
+    assert is_closed_manifold(mesh)
+    assert signed_volume(mesh) == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=5e-3)
+    # the chord of a linear zero crossing: error below h^2 / (8 r) = 0.05^2 / 5.6
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.7).max() < 0.05**2 / 5.6 * 1.01
+    assert components(mesh).max() == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_smooth_fields_give_the_surface_of_scikit_image(seed: int) -> None:
+    measure = pytest.importorskip("skimage.measure")
+    lim = limits(1.0, 2 / 40)
+    volume = volume_of(smooth_noise(seed, 24), lim, 5)
+    mesh = marching_cubes(volume)
+    vertices, faces, _, _ = measure.marching_cubes(dense(volume), 0.0, spacing=(lim.voxel,) * 3)
+    oracle = Mesh(vertices - 1.0, faces)
+    assert is_closed_manifold(mesh)
+    assert len(mesh.vertices) == pytest.approx(len(vertices), rel=2e-3)  # Lewiner adds a vertex in some ambiguous cells
+    assert area(mesh) == pytest.approx(area(oracle), rel=2e-3)
+    assert signed_volume(mesh) == pytest.approx(signed_volume(oracle), rel=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_white_noise_with_every_ambiguous_case_is_closed(seed: int) -> None:
+    mesh = marching_cubes(volume_of(white_noise(seed), limits(1.0, 2 / 32), 4))
+    _, uses, upward = edge_uses(mesh)
+    assert (uses == 2).all()
+    assert (upward == 1).all()
+
+
+def test_zeros_on_voxels_do_not_open_the_surface_or_make_empty_triangles() -> None:
+    mesh = marching_cubes(volume_of(lambda p: np.rint((np.abs(p).max(1) - 0.5) * 8) / 8, limits(1.0, 2 / 16), 2))
+    assert is_closed_manifold(mesh)
+    t = mesh.vertices.astype(np.float64)[mesh.faces]
+    assert np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).min() > 0
+
+
+def test_blocks_in_any_cut_give_the_same_surface_without_seams() -> None:
+    """A plane through 4^3 blocks: no edge inside the box has fewer than two faces."""
+    lim = limits(1.0, 2 / 32)
+    mesh = marching_cubes(volume_of(lambda p: p @ np.array([0.3, 0.5, 0.81]) - 0.111, lim, 4))
+    edges, uses, _ = edge_uses(mesh)
+    ends = mesh.vertices[edges[uses == 1]]  # [E, 2, 3]
+    inner = (np.abs(ends) < 1 - 1.01 * lim.voxel).all(axis=(1, 2)) & (ends < 1 - 1.6 * lim.voxel).all(axis=(1, 2))
+    assert not inner.any()
+    assert components(mesh).max() == 0
+
+
+def test_unknown_voxels_make_no_surface() -> None:
+    lim = limits(1.0, 2 / 32)
+    known = volume_of(sphere(0.7), lim, 4)
+    weight = known.weight.copy()
+    weight[known.blocks[:, 0] >= 2] = 0.5  # half of space below the least weight
+    half = Volume(lim, known.dims, known.keys, known.tsdf, weight, None, None, 1)
+    mesh = marching_cubes(half, min_weight=1.0)
+    boundary = lim.lower[0] + 2 * BLOCK * lim.voxel
+    assert len(mesh.faces) > 100
+    assert mesh.vertices[:, 0].max() < boundary
+    assert marching_cubes(half, min_weight=0.5).vertices[:, 0].max() == pytest.approx(0.7, abs=0.01)
+    nothing = Volume(lim, known.dims, known.keys, known.tsdf, np.zeros_like(weight), None, None, 1)
+    assert len(marching_cubes(nothing, min_weight=0.0).faces) == 0
+
+
+def test_missing_blocks_are_unknown_space() -> None:
+    lim = limits(1.0, 2 / 32)
+    full = volume_of(sphere(0.7), lim, 4)
+    rows = np.flatnonzero(full.blocks[:, 2] != 1)
+    part = Volume(lim, full.dims, full.keys[rows], full.tsdf[rows], full.weight[rows], None, None, 1)
+    mesh = marching_cubes(part)
+    low, high = lim.lower[2] + BLOCK * lim.voxel, lim.lower[2] + 2 * BLOCK * lim.voxel
+    z = mesh.vertices[:, 2]
+    assert not ((z > low + 1e-6) & (z < high - 1e-6)).any()
+    assert (z > high).any()
+    assert (z < low).any()
+
+
+def test_vertex_colours_are_interpolated_and_uncoloured_ends_do_not_count() -> None:
+    lim = limits(1.0, 2 / 16)
+    plain = volume_of(lambda p: p[:, 2] - 0.05, lim, 2)
+    color = np.full((*plain.tsdf.shape, 3), 90.0, np.float32)
+    color[plain.tsdf < 0] = [10.0, 20.0, 30.0]
+    weights = np.ones_like(plain.tsdf)
+    # voxels lie at -1 + k/8: the plane z = 0.05 is 0.4 of the way from voxel 8 (below) to voxel 9 (above)
+    mixed = marching_cubes(Volume(lim, plain.dims, plain.keys, plain.tsdf, plain.weight, color, weights, 1))
+    assert mixed.colors is not None
+    assert (mixed.colors == [42, 48, 54]).all()  # 0.6 * 10 + 0.4 * 90 = 42
+    weights[plain.tsdf > 0] = 0
+    below = marching_cubes(Volume(lim, plain.dims, plain.keys, plain.tsdf, plain.weight, color, weights, 1))
+    assert below.colors is not None
+    assert (below.colors == [10, 20, 30]).all()
+
+
+def strips() -> Mesh:
+    """Three pieces: 2 faces, 1 face, 2 faces, with a vertex that no face uses and colours that name the vertex."""
+    faces = np.array([[0, 1, 2], [5, 6, 7], [1, 3, 2], [8, 9, 10], [9, 11, 10]], np.int32)
+    vertices = np.arange(36, dtype=np.float32).reshape(12, 3)
+    return Mesh(vertices, faces, np.repeat(np.arange(12, dtype=np.uint8)[:, None], 3, axis=1))
+
+
+def test_components_are_numbered_by_size() -> None:
+    assert components(strips()).tolist() == [0, 2, 0, 1, 1]
+
+
+def test_small_components_and_unused_vertices_go() -> None:
+    kept = keep_components(strips(), min_faces=2)
+    assert kept.colors is not None
+    assert kept.colors[:, 0].tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
+    assert kept.faces.tolist() == [[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]]
+    largest = keep_components(strips(), min_faces=1, keep=1)
+    assert largest.faces.tolist() == [[0, 1, 2], [1, 3, 2]]
+    assert len(keep_components(strips(), min_faces=3).vertices) == 0
+    assert len(keep_components(keep_components(strips(), min_faces=3), min_faces=1).faces) == 0
+
+
+def test_selecting_no_face_gives_an_empty_mesh() -> None:
+    empty = select_faces(strips(), np.zeros(5, bool))
+    assert empty.faces.shape == (0, 3)
+    assert empty.vertices.shape == (0, 3)
