@@ -124,3 +124,13 @@ def prepare() -> Library:
     library = load()
     library.use_threads(torch.get_num_threads())
     return library
+
+
+def describe() -> str:
+    """One line for ``gs2d doctor``: instruction set, pixels per vector, threads."""
+    library = prepare()
+    return f"{library.instruction_set}, {library.lanes} pixels per vector, {library.threads} threads"
+
+
+load_library = load
+describe_library = describe

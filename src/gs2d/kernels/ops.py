@@ -46,6 +46,11 @@ def _arrays(library: Library, **tensors: Tensor) -> list[Tensor]:
     return [tensor.detach().contiguous() for tensor in tensors.values()]
 
 
+def _wanted(*tensors: Tensor) -> bool:
+    """Whether a gradient may be asked for (inside an autograd.Function it is too late to know)."""
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+
+
 def _mask_bytes(mask: Tensor | None) -> Tensor | None:
     if mask is None:
         return None
@@ -81,24 +86,25 @@ class _Photometric(torch.autograd.Function):
         mask: Tensor | None,
         mean: Tensor | None,
         expected: tuple[float, float],
+        wanted: bool,
         library: Library,
     ) -> tuple[Tensor, Tensor]:
-        ctx.arguments = (target, mask, mean, library)
+        ctx.library = library
         ctx.expected = torch.tensor(expected, dtype=torch.float64).to(rendered.dtype)  # rounded as the cotangents are
-        gradient = torch.empty_like(rendered) if ctx.needs_input_grad[0] else None
-        values = _photometric(rendered, *ctx.arguments, expected, gradient)
-        ctx.save_for_backward(rendered, gradient)
+        gradient = torch.empty_like(rendered) if wanted else None
+        values = _photometric(rendered, target, mask, mean, library, expected, gradient)
+        ctx.save_for_backward(gradient, rendered, target, mask, mean)
         return values[0], values[1]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, l1_cotangent: Tensor, ssim_cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        rendered, gradient = ctx.saved_tensors
+        gradient, *images = ctx.saved_tensors
         cotangents = torch.stack([l1_cotangent, ssim_cotangent])
         if not torch.equal(cotangents, ctx.expected):
-            gradient = torch.empty_like(rendered)
-            _photometric(rendered, *ctx.arguments, tuple(cotangents.tolist()), gradient)
-        return gradient, None, None, None, None, None
+            gradient = torch.empty_like(gradient)
+            _photometric(*images, ctx.library, tuple(cotangents.tolist()), gradient)
+        return gradient, None, None, None, None, None, None
 
 
 def _photometric(
@@ -161,7 +167,9 @@ def photometric(
     (target,) = _arrays(library, target=target)
     if target_mean is not None:
         (target_mean,) = _arrays(library, target_mean=target_mean)
-    l1, ssim = _Photometric.apply(rendered.contiguous(), target, _mask_bytes(mask), target_mean, expected, library)
+    wanted = _wanted(rendered)
+    arguments = (target, _mask_bytes(mask), target_mean, expected, wanted, library)
+    l1, ssim = _Photometric.apply(rendered.contiguous(), *arguments)
     return l1, ssim
 
 
@@ -176,9 +184,9 @@ class _NormalConsistency(torch.autograd.Function):
         camera: Camera,
         per_splat: bool,
         expected: float,
+        wanted: bool,
         library: Library,
     ) -> Tensor:
-        wanted = any(ctx.needs_input_grad[:3])
         gradients = [torch.empty_like(x) if wanted else None for x in (normal, depth)]
         gradients.append(torch.empty_like(alpha) if wanted and per_splat else None)
         intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
@@ -197,7 +205,7 @@ class _NormalConsistency(torch.autograd.Function):
         gradients = ctx.saved_tensors
         if not torch.equal(cotangent, torch.tensor(ctx.expected, dtype=torch.float64).to(cotangent.dtype)):
             gradients = tuple(None if g is None else g * (cotangent / ctx.expected) for g in gradients)
-        return (*gradients, None, None, None, None, None)
+        return (*gradients, None, None, None, None, None, None)
 
 
 def normal_consistency(
@@ -243,7 +251,9 @@ def normal_consistency(
         raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
     _arrays(library, normal=normal, depth=depth, alpha=alpha)
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
-    value: Tensor = _NormalConsistency.apply(*images, _mask_bytes(mask), camera, per_splat, expected, library)
+    wanted = _wanted(normal, depth, alpha)
+    arguments = (_mask_bytes(mask), camera, per_splat, expected, wanted, library)
+    value: Tensor = _NormalConsistency.apply(*images, *arguments)
     return value
 
 

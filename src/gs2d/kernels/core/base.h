@@ -39,9 +39,13 @@ GS2D_HD double exp2(double a) { return __builtin_exp2(a); }
 GS2D_HD double log2(double a) { return __builtin_log2(a); }
 #endif
 
-// select(m, a, b) is a where m holds, else b. min(a, b) is b when a is NaN.
+// select(m, a, b) is a where m holds, else b; keep(m, a) is a or 0. min(a, b) is b when a is NaN.
 GS2D_HD float select(bool m, float a, float b) { return m ? a : b; }
 GS2D_HD double select(bool m, double a, double b) { return m ? a : b; }
+GS2D_HD bool and_not(bool a, bool b) { return a && !b; }  // a & ~b
+GS2D_HD bool invert(bool a) { return !a; }
+GS2D_HD float keep(bool m, float a) { return m ? a : 0.f; }
+GS2D_HD double keep(bool m, double a) { return m ? a : 0.; }
 GS2D_HD float min(float a, float b) { return a < b ? a : b; }
 GS2D_HD float max(float a, float b) { return a > b ? a : b; }
 GS2D_HD double min(double a, double b) { return a < b ? a : b; }

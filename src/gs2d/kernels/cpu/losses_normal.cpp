@@ -13,6 +13,9 @@ namespace {
 
 constexpr int64_t HALO = 2;  // rows of depth that the gradient of a row depends on
 
+// Background has depth 0. NaN counts as a hit: it must reach the loss.
+GS2D_HD M was_hit(V depth) { return ~(depth <= V(real(0))); }
+
 struct Images {
     const real *normal, *depth, *alpha;
     const uint8_t* mask;
@@ -67,7 +70,7 @@ class Piece {
         fill_validity(im.mask ? im.mask + y * im.width : nullptr, im.width, 1, to);
         for (int64_t i = 0; i < length; i += LANES) {
             const V z = im.width - i >= LANES ? load(from + i) : load_first(from + i, left_at(i));
-            store(to + i, keep((load(to + i) > V(real(0))) & (z > V(real(0))), z));
+            store(to + i, keep((load(to + i) > V(real(0))) & was_hit(z), z));
         }
     }
     int left_at(int64_t i) const {
@@ -92,7 +95,7 @@ class Piece {
         V total = zero;
         for (int64_t i = 0; i < length; i += LANES) {
             const V l = load(z + i - 1), r = load(z + i + 1), u = load(above + i), d = load(below + i);
-            const M defined = (l > zero) & (r > zero) & (u > zero) & (d > zero) & (load(validity + i) > zero);
+            const M defined = was_hit(l) & was_hit(r) & was_hit(u) & was_hit(d) & (load(validity + i) > zero);
             const V offset_x = iota() + V(real(double(i) + 0.5 - im.intrinsics[2]));
             const DepthNormal<V> f = depth_normal<V>(l, r, u, d, offset_x, offset_y, fx, fy);
             const Vec3<V> world = {load(qx + i), load(qy + i), load(qz + i)};

@@ -42,6 +42,7 @@ constexpr int TILE = 16;
 constexpr int BLOCKS = TILE * TILE / LANES;
 constexpr int BLOCKS_X = TILE / BLOCK_W;
 
+GS2D_HD M invert(M a) { return ~a; }
 GS2D_HD V operator-(V a) { return V(real(0)) - a; }
 GS2D_HD V& operator+=(V& a, V b) { return a = a + b; }
 GS2D_HD V& operator-=(V& a, V b) { return a = a - b; }

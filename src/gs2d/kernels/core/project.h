@@ -1,0 +1,209 @@
+// From a splat's parameters to its screen record, and back (docs/math.md, "Projection").
+//
+// With P = [s_u t_u, s_v t_v, p] in the camera frame, a pixel ray r = ((x - cx)/fx, (y - cy)/fy, 1) meets the plane at
+// (u, v, 1) = z P^-1 r. The record holds P^-1 centred on the projected splat and scaled by z_c, so that float32 keeps
+// its digits: with d the pixel's offset from the projected centre,
+//     X = au dx + bu dy,  Y = av dx + bv dy,  Q = 1 + az dx + bz dy,  u = X / Q,  v = Y / Q,  z = z_c / Q.
+// The rows of P^-1 are (t_v x p) / (s_u n.p), (p x t_u) / (s_v n.p), n / (n.p), with n = t_u x t_v.
+#pragma once
+
+#include "core/base.h"
+#include "core/sh.h"
+
+namespace gs2d {
+
+template <class V> using mask_t = decltype(V() < V());
+
+// A pinhole camera; x_cam = R x_world + t. S is a scalar.
+template <class S> struct PinholeCamera {
+    S R[9], t[3], center[3];
+    S fx, fy, cx, cy;
+};
+
+template <class V> struct SplatParameters {
+    Vec3<V> mean;
+    V qw, qx, qy, qz;
+    V log_su, log_sv;
+    V logit;
+};
+
+// The screen record: 16 reals, one cache line in float. Field order is the memory order.
+template <class V> struct Record {
+    V cx, cy, au, bu, av, bv, az, bz, zc;
+    V log2_opacity;
+    V red, green, blue;
+    V nx, ny, nz;  // world, facing the camera
+};
+constexpr int RECORD = 16;
+
+// Gradients of a record, summed over pixels. `center` counts pairs that hit the plane, `lowpass` the filtered ones:
+// the densification signal excludes the latter.
+template <class V> struct RecordGradient {
+    V cx, cy, au, bu, av, bv, az, bz, zc;
+    V ln_opacity;
+    V red, green, blue;
+    V nx, ny, nz;
+    V lowpass_cx, lowpass_cy;
+    V abs_x, abs_y;  // sums of absolute values of the densification signal, per px
+};
+constexpr int GRADIENT = 20;
+
+// What both directions need.
+template <class V> struct Frame3 {
+    V qw, qx, qy, qz, inverse_norm;       // unit quaternion, 1 / |quat|
+    Vec3<V> tu, tv, n_world;              // world
+    Vec3<V> p, a, b, n;                   // camera frame: centre, s_u t_u, s_v t_v, normal
+    Vec3<V> row0, row1, row2;             // of P^-1
+    V sign;                               // +1, or -1 where t_w looks away from the camera
+    Vec3<V> to_splat;                     // unit, world
+    V inverse_distance;
+};
+
+template <class V, class S> GS2D_HD Vec3<V> rotate(const S* R, Vec3<V> a) {
+    return {fma(V(R[0]), a.x, fma(V(R[1]), a.y, V(R[2]) * a.z)), fma(V(R[3]), a.x, fma(V(R[4]), a.y, V(R[5]) * a.z)),
+            fma(V(R[6]), a.x, fma(V(R[7]), a.y, V(R[8]) * a.z))};
+}
+template <class V, class S> GS2D_HD Vec3<V> rotate_back(const S* R, Vec3<V> a) {
+    return {fma(V(R[0]), a.x, fma(V(R[3]), a.y, V(R[6]) * a.z)), fma(V(R[1]), a.x, fma(V(R[4]), a.y, V(R[7]) * a.z)),
+            fma(V(R[2]), a.x, fma(V(R[5]), a.y, V(R[8]) * a.z))};
+}
+
+template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>& s, const PinholeCamera<S>& cam) {
+    Frame3<V> f;
+    const V one = V(S(1)), two = V(S(2)), tiny = V(S(1e-18));
+    f.inverse_norm = one / sqrt(fma(s.qw, s.qw, fma(s.qx, s.qx, fma(s.qy, s.qy, s.qz * s.qz))));
+    f.qw = s.qw * f.inverse_norm, f.qx = s.qx * f.inverse_norm, f.qy = s.qy * f.inverse_norm, f.qz = s.qz * f.inverse_norm;
+    const V xx = f.qx * f.qx, yy = f.qy * f.qy, zz = f.qz * f.qz;
+    const V xy = f.qx * f.qy, xz = f.qx * f.qz, yz = f.qy * f.qz, wx = f.qw * f.qx, wy = f.qw * f.qy, wz = f.qw * f.qz;
+    f.tu = {one - two * (yy + zz), two * (xy + wz), two * (xz - wy)};
+    f.tv = {two * (xy - wz), one - two * (xx + zz), two * (yz + wx)};
+    f.n_world = {two * (xz + wy), two * (yz - wx), one - two * (xx + yy)};
+
+    f.p = rotate(cam.R, s.mean) + Vec3<V>{V(cam.t[0]), V(cam.t[1]), V(cam.t[2])};
+    const Vec3<V> tu = rotate(cam.R, f.tu), tv = rotate(cam.R, f.tv);
+    f.n = rotate(cam.R, f.n_world);
+    const V su = max(exp(s.log_su), tiny), sv = max(exp(s.log_sv), tiny);
+    f.a = su * tu, f.b = sv * tv;
+    // Exactly edge-on there is no inverse: keep n.p away from 0, the low-pass filter draws such splats.
+    const V nd = dot(f.n, f.p), floor = V(S(1e-7)) * sqrt(dot(f.p, f.p));
+    const V inv = one / select(abs(nd) >= floor, nd, select(nd < V(S(0)), -floor, floor));
+    f.row0 = (inv / su) * cross(tv, f.p);
+    f.row1 = (inv / sv) * cross(f.p, tu);
+    f.row2 = inv * f.n;
+
+    const Vec3<V> d = s.mean - Vec3<V>{V(cam.center[0]), V(cam.center[1]), V(cam.center[2])};
+    f.inverse_distance = one / sqrt(dot(d, d));
+    f.to_splat = f.inverse_distance * d;
+    f.sign = select(dot(f.n_world, d) > V(S(0)), V(S(-1)), one);
+    return f;
+}
+
+// All of the record but the colour.
+template <class V, class S>
+GS2D_HD Record<V> project(const SplatParameters<V>& s, const Frame3<V>& f, const PinholeCamera<S>& cam) {
+    Record<V> r;
+    const V zc = f.p.z, kx = zc * V(S(1) / cam.fx), ky = zc * V(S(1) / cam.fy);
+    r.cx = fma(V(cam.fx), f.p.x / zc, V(cam.cx));
+    r.cy = fma(V(cam.fy), f.p.y / zc, V(cam.cy));
+    r.au = kx * f.row0.x, r.bu = ky * f.row0.y;
+    r.av = kx * f.row1.x, r.bv = ky * f.row1.y;
+    r.az = kx * f.row2.x, r.bz = ky * f.row2.y;
+    r.zc = zc;
+    r.log2_opacity = -log2(V(S(1)) + exp(-s.logit));  // log2 of the sigmoid
+    r.nx = f.sign * f.n_world.x, r.ny = f.sign * f.n_world.y, r.nz = f.sign * f.n_world.z;
+    return r;
+}
+
+template <class V> struct ParameterGradient {
+    Vec3<V> mean;
+    V qw, qx, qy, qz, log_su, log_sv, logit;
+    V probe_x, probe_y;  // z_c dL/d(Tu.z), z_c dL/d(Tv.z), per px; without the low-pass branch
+};
+
+// Vector-Jacobian product of `project` (the colour's part, `g_direction` with respect to f.to_splat, comes from sh.h).
+template <class V, class S>
+GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Frame3<V>& f, const Record<V>& r,
+                                         const RecordGradient<V>& g, Vec3<V> g_direction, const PinholeCamera<S>& cam) {
+    ParameterGradient<V> out;
+    const V zc = f.p.z, inv_z = V(S(1)) / zc, two = V(S(2));
+    const V kx = zc * V(S(1) / cam.fx), ky = zc * V(S(1) / cam.fy);
+    // dL/dP = -R^T G R^T with R = P^-1, G = dL/dR (its third column is 0).
+    const V g00 = kx * g.au, g01 = ky * g.bu, g10 = kx * g.av, g11 = ky * g.bv, g20 = kx * g.az, g21 = ky * g.bz;
+    const auto column = [&](Vec3<V> row) {  // of dL/dP, for the column that belongs to this row of R
+        const V x0 = fma(g00, row.x, g01 * row.y), x1 = fma(g10, row.x, g11 * row.y), x2 = fma(g20, row.x, g21 * row.y);
+        return -x0 * f.row0 + -x1 * f.row1 + -x2 * f.row2;
+    };
+    const Vec3<V> ga = column(f.row0), gb = column(f.row1);
+    Vec3<V> gp = column(f.row2);
+    const V scaled = fma(r.au, g.au, fma(r.bu, g.bu, fma(r.av, g.av, fma(r.bv, g.bv, fma(r.az, g.az, r.bz * g.bz)))));
+    const V fx_z = V(cam.fx) * inv_z, fy_z = V(cam.fy) * inv_z;
+    gp.x = fma(fx_z, g.cx, gp.x);
+    gp.y = fma(fy_z, g.cy, gp.y);
+    out.probe_x = gp.x * kx;
+    out.probe_y = gp.y * ky;
+    gp.x = fma(fx_z, g.lowpass_cx, gp.x);
+    gp.y = fma(fy_z, g.lowpass_cy, gp.y);
+    const V slide = fma(fx_z * f.p.x, g.cx + g.lowpass_cx, fy_z * f.p.y * (g.cy + g.lowpass_cy));
+    gp.z = gp.z + g.zc + (scaled - slide) * inv_z;
+
+    out.log_su = dot(ga, f.a);
+    out.log_sv = dot(gb, f.b);
+    const V su = sqrt(dot(f.a, f.a)), sv = sqrt(dot(f.b, f.b));
+    const Vec3<V> gu = rotate_back(cam.R, su * ga), gv = rotate_back(cam.R, sv * gb);  // of t_u, t_v
+    const Vec3<V> gn = f.sign * Vec3<V>{g.nx, g.ny, g.nz};
+    const V w = f.qw, x = f.qx, y = f.qy, z = f.qz;
+    const V d21 = gv.z - gn.y, d02 = gn.x - gu.z, d10 = gu.y - gv.x;  // antisymmetric and symmetric parts
+    const V s01 = gv.x + gu.y, s02 = gn.x + gu.z, s12 = gn.y + gv.z;
+    const V hw = fma(x, d21, fma(y, d02, z * d10));
+    const V hx = fma(w, d21, fma(y, s01, z * s02)) - two * x * (gv.y + gn.z);
+    const V hy = fma(w, d02, fma(x, s01, z * s12)) - two * y * (gu.x + gn.z);
+    const V hz = fma(w, d10, fma(x, s02, y * s12)) - two * z * (gu.x + gv.y);
+    const V along = fma(w, hw, fma(x, hx, fma(y, hy, z * hz))), k = two * f.inverse_norm;
+    out.qw = k * fnma(along, w, hw), out.qx = k * fnma(along, x, hx);
+    out.qy = k * fnma(along, y, hy), out.qz = k * fnma(along, z, hz);
+
+    const V radial = dot(g_direction, f.to_splat);
+    out.mean = rotate_back(cam.R, gp) + f.inverse_distance * axpy(-radial, f.to_splat, g_direction);
+    out.logit = g.ln_opacity * (V(S(1)) / (V(S(1)) + exp(s.logit)));  // d ln o / d logit = 1 - o
+    return out;
+}
+
+// Where the disc rho3d <= k^2 and the low-pass disc can be seen.
+template <class V> struct Footprint {
+    // |pixel - e| in the metric (a, b, c) is at most 1 inside the ellipse; slightly widened against rounding.
+    V ex, ey, a, b, c;
+    V disc2;                     // low-pass disc: radius^2, widened
+    V x_min, y_min, x_max, y_max;  // exact box of both, px, not clipped
+    mask_t<V> crosses;           // the disc reaches the camera plane: no ellipse, no box
+    mask_t<V> unbounded;         // crosses, or so nearly that the ellipse cannot be trusted
+};
+
+template <class V, class S>
+GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px, const PinholeCamera<S>& cam) {
+    Footprint<V> o;
+    // Screen offsets from the projected centre: (x z, y z, z) = (mu, mv, 0; ..; zu, zv, zc) (u, v, 1).
+    const V inv_z = V(S(1)) / f.p.z, rx = f.p.x * inv_z, ry = f.p.y * inv_z, zero = V(S(0)), one = V(S(1));
+    const V xu = V(cam.fx) * fnma(rx, f.a.z, f.a.x), xv = V(cam.fx) * fnma(rx, f.b.z, f.b.x);
+    const V yu = V(cam.fy) * fnma(ry, f.a.z, f.a.y), yv = V(cam.fy) * fnma(ry, f.b.z, f.b.y);
+    const V zz = f.p.z * f.p.z, reach = k2 * fma(f.a.z, f.a.z, f.b.z * f.b.z), d = reach - zz;
+    o.crosses = d >= zero;
+    const V scale = -k2 / select(o.crosses, -zz, d);  // > 0
+    const V ex = -scale * fma(xu, f.a.z, xv * f.b.z), ey = -scale * fma(yu, f.a.z, yv * f.b.z);
+    const V sxx = fma(ex, ex, scale * fma(xu, xu, xv * xv)), syy = fma(ey, ey, scale * fma(yu, yu, yv * yv));
+    const V sxy = fma(ex, ey, scale * fma(xu, yu, xv * yv));
+    // Also when the sum overflowed, or the ellipse is so large that its tests would lose their digits.
+    o.unbounded = (d > V(S(-0.01)) * zz) | invert(sxx + syy < V(S(1e12)));
+    const V hx = sqrt(sxx), hy = sqrt(syy), radius = V(lowpass_px) * sqrt(k2);
+    o.x_min = r.cx + min(ex - hx, -radius), o.x_max = r.cx + max(ex + hx, radius);
+    o.y_min = r.cy + min(ey - hy, -radius), o.y_max = r.cy + max(ey + hy, radius);
+    // Widen by 0.03 px and 0.3 % of the longer side, which bounds the rounding of the inverse below.
+    const V wide = fma(V(S(1e-5)), sxx + syy, V(S(1e-3)));
+    const V wxx = sxx + wide, wyy = syy + wide, det = fnma(sxy, sxy, wxx * wyy);
+    const V inv = one / (det * V(S(1.004)));
+    o.ex = r.cx + ex, o.ey = r.cy + ey;
+    o.a = wyy * inv, o.b = -sxy * inv, o.c = wxx * inv;
+    o.disc2 = fma(radius, radius * V(S(1.0002)), V(S(1e-3)));
+    return o;
+}
+
+}  // namespace gs2d

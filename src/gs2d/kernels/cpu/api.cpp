@@ -1,0 +1,101 @@
+// The rasterizer's exported functions. render/cpu.py calls them; sizes and types are checked there.
+#include <pthread.h>
+
+#include "cpu/export.h"
+#include "cpu/frame.h"
+
+namespace gs2d {
+namespace {
+
+pthread_mutex_t free_lock = PTHREAD_MUTEX_INITIALIZER;
+Frame* free_frames = nullptr;
+int free_count = 0;
+constexpr int KEEP = 2;  // frames whose memory is kept for the next view
+
+template <class T> void release_all(T& f) {
+    f.records.release(), f.cull.release(), f.rects.release(), f.order.release(), f.ordered_rects.release();
+    f.sort_memory.release(), f.histogram.release(), f.tile_begin.release(), f.entries.release(), f.tile_count.release();
+    f.saved.release(), f.slot_begin.release(), f.gradients.release(), f.splat_begin.release(), f.splat_slots.release();
+}
+
+void set_view(Frame& f, const View& v) {
+    f.view = v;
+    for (int i = 0; i < 9; ++i) f.camera.R[i] = real(v.R[i]);
+    for (int i = 0; i < 3; ++i) f.camera.t[i] = real(v.t[i]), f.camera.center[i] = real(v.center[i]);
+    f.camera.fx = real(v.fx), f.camera.fy = real(v.fy), f.camera.cx = real(v.cx), f.camera.cy = real(v.cy);
+    f.tiles_x = (v.width + TILE - 1) / TILE;
+    f.tiles_y = (v.height + TILE - 1) / TILE;
+    f.tiles = int64_t(f.tiles_x) * f.tiles_y;
+}
+
+}  // namespace
+
+Frame* take_frame() {
+    pthread_mutex_lock(&free_lock);
+    Frame* f = free_frames;
+    if (f) {
+        free_frames = f->next_free;
+        --free_count;
+    }
+    pthread_mutex_unlock(&free_lock);
+    if (f) return f;
+    return static_cast<Frame*>(calloc(1, sizeof(Frame)));  // all zeros is an empty frame
+}
+
+void give_back(Frame* f) {
+    if (!f) return;
+    pthread_mutex_lock(&free_lock);
+    if (free_count < KEEP) {
+        f->next_free = free_frames;
+        free_frames = f;
+        ++free_count;
+        f = nullptr;
+    }
+    pthread_mutex_unlock(&free_lock);
+    if (f) {
+        release_all(*f);
+        free(f);
+    }
+}
+
+}  // namespace gs2d
+
+using namespace gs2d;
+
+// Status of the functions below.
+enum { OK = 0, NO_MEMORY = 1 };
+
+// Renders one view. `*frame` keeps what the backward pass needs until gs2d_frame_release.
+GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, const Images* out, Frame** frame) {
+    *frame = take_frame();
+    if (!*frame) return NO_MEMORY;
+    Frame& f = **frame;
+    set_view(f, *view);
+    if (project_splats(f, *splats, Reach::BLEND, out->radii) && bin_splats(f) && blend_tiles(f, *out)) return OK;
+    give_back(*frame);
+    *frame = nullptr;
+    return NO_MEMORY;
+}
+
+// Gradients of the parameters of the same call's splats; `images` are that call's outputs.
+GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, const Images* images,
+                                     const ImageGradients* upstream, const ParameterGradients* out) {
+    const bool abs_probe = out->probe && out->probe_columns == 4;
+    if (!blend_tiles_vjp(*frame, *images, *upstream, abs_probe)) return NO_MEMORY;
+    project_splats_vjp(*frame, *splats, *out);
+    return OK;
+}
+
+// The inner sum of E_i: `image` [H, W, 3], `mask` [H, W] bytes or null, `errors` [N].
+GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, const real* image, const uint8_t* mask,
+                                  int occlusion, real* errors) {
+    Frame* f = take_frame();
+    if (!f) return NO_MEMORY;
+    set_view(*f, *view);
+    const bool ok = project_splats(*f, *splats, occlusion ? Reach::ERRORS_OCCLUDED : Reach::ERRORS, nullptr) &&
+                    (occlusion ? occluded_splat_errors(*f, image, mask, errors) : splat_errors(*f, image, mask, errors));
+    give_back(f);
+    return ok ? OK : NO_MEMORY;
+}
+
+GS2D_EXPORT void gs2d_frame_release(Frame* frame) { give_back(frame); }

@@ -1,0 +1,140 @@
+// Gradients of the blending, one tile per task: splat by splat, front to back, the sums over a splat's pixels in
+// registers. Every (tile, splat) has its own slot of gradients, so nothing depends on the order of the tiles.
+#include "cpu/frame.h"
+#include "cpu/threads.h"
+#include "cpu/tile.h"
+
+namespace gs2d {
+namespace {
+
+// Per pixel of the tile, in block order: state, then what PixelGradient<V> holds.
+enum Plane {
+    T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST, TOTAL, M1, M2, DEPTH0, PLANES
+};
+using Planes = real (*)[PIXELS];
+
+inline PixelGradient<V> load_gradient(const Planes s, int b) {
+    const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
+    return {at(RED), at(GREEN), at(BLUE), at(ALPHA), at(NX), at(NY), at(NZ), at(DEPTH), at(MEDIAN), at(MEDIAN_BELOW),
+            at(DIST), at(TOTAL), at(M1), at(M2), at(DEPTH0)};
+}
+
+inline void read_or_zero(const real* image, int channels, int channel, int width, const TileArea& a, real* out) {
+    if (image)
+        read_plane(image, channels, channel, width, a, out);
+    else
+        memset(out, 0, PIXELS * sizeof(real));
+}
+
+// Upstream gradients as PixelGradient wants them, and S = the sum over all splats of w s, from the image's totals.
+void start(const Frame& f, const Images& images, const ImageGradients& g, const TileArea& a, Planes s) {
+    const View& v = f.view;
+    const int W = v.width;
+    const int64_t pixels = int64_t(W) * v.height;
+    alignas(64) real total[7][PIXELS], g_dist[PIXELS];
+    for (int c = 0; c < 3; ++c) {
+        read_or_zero(g.color, 3, c, W, a, s[RED + c]);
+        read_or_zero(g.normal, 3, c, W, a, s[NX + c]);
+        read_plane(images.color, 3, c, W, a, total[c]);
+        read_or_zero(g.normal ? images.normal : nullptr, 3, c, W, a, total[3 + c]);
+    }
+    read_or_zero(g.alpha, 1, 0, W, a, s[ALPHA]);
+    read_or_zero(g.depth_mean, 1, 0, W, a, s[DEPTH]);
+    read_or_zero(g.depth_median, 1, 0, W, a, s[MEDIAN]);
+    read_or_zero(g.distortion, 1, 0, W, a, g_dist);
+    read_or_zero(g.depth_mean ? images.depth_mean : nullptr, 1, 0, W, a, total[6]);
+    read_plane(images.alpha, 1, 0, W, a, s[TOTAL]);
+    read_plane(&f.saved[0], 1, 0, W, a, s[T]);
+    if (g.distortion) {
+        read_plane(images.distortion, 1, 0, W, a, s[DIST]);
+        read_plane(&f.saved[pixels], 1, 0, W, a, s[M1]);
+        read_plane(&f.saved[2 * pixels], 1, 0, W, a, s[M2]);
+        read_plane(&f.saved[3 * pixels], 1, 0, W, a, s[DEPTH0]);
+    }
+    const V bg[3] = {V(real(v.background[0])), V(real(v.background[1])), V(real(v.background[2]))};
+    const double lever = v.far * v.near / (v.far - v.near);
+    for (int b = 0; b < BLOCKS; ++b) {
+        const auto at = [&](real* plane) { return load(plane + b * LANES); };
+        const auto put = [&](real* plane, V value) { store(plane + b * LANES, value); };
+        const V final_T = at(s[T]), alpha = at(s[TOTAL]), mean = at(total[6]);
+        V ga = at(s[ALPHA]), sum = V(0);
+        for (int c = 0; c < 3; ++c) {
+            const V gc = at(s[RED + c]);
+            ga = fnma(gc, bg[c], ga);
+            sum = fma(gc, fnma(final_T, bg[c], at(total[c])), sum);
+            sum = fma(at(s[NX + c]), at(total[3 + c]), sum);
+        }
+        // depth_mean = D / alpha: dD = g / alpha, dalpha = -g mean / alpha
+        const V gd = at(s[DEPTH]) / select(alpha > V(0), alpha, V(1));
+        ga = fnma(gd, mean, ga);
+        sum = fma(ga, alpha, fma(gd, mean * alpha, sum));
+        put(s[DEPTH], gd);
+        put(s[ALPHA], ga);
+        if (g.distortion) {
+            const V gx = at(g_dist);
+            sum = fma(V(2) * gx, at(s[DIST]), sum);  // each pair counts for both of its splats
+            put(s[DIST], gx * V(real(lever * lever)));
+        }
+        put(s[S], sum);
+        put(s[MEDIAN_BELOW], max(final_T, V(real(0.5))));
+        const M inside = lanes_inside(block_x(b), block_y(b), a.width, a.height);
+        put(s[T], keep(inside, V(1)));
+    }
+}
+
+template <bool Geo, bool Dist, bool Abs>
+void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
+    const V lx = lane_x(area.x0), ly = lane_y(area.y0);
+    const Entry* entry = &f.entries[f.tile_begin[tile]];
+    for (int64_t slot = f.slot_begin[tile]; slot < f.slot_begin[tile + 1]; ++slot, ++entry) {
+        const real* record = &f.records[size_t(entry->splat) * RECORD];
+        const Record<V> splat = broadcast(record);
+        const V inverse_zc = V(real(1) / record[8]), zero = V(0);
+        PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
+                            zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
+            const int b = __builtin_ctz(blocks);
+            const V x = lx + V(real(block_x(b))), y = ly + V(real(block_y(b)));
+            V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
+            const Hit<V> h = intersect(splat, x, y, limits);
+            composite_vjp<Geo, Dist, Abs>(splat, inverse_zc, h, limits, load_gradient(s, b), pixel_T, pixel_S, sums);
+            store(&s[T][b * LANES], pixel_T);
+            store(&s[S][b * LANES], pixel_S);
+        }
+        const RecordGradient<V> g = finish(splat, sums, limits);
+        const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz,
+                              g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
+        const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
+        real* to = &f.gradients[size_t(slot) * GRADIENT];
+        transpose_reduce<16>(fields, to);
+        transpose_reduce<4>(extra, to + 16);
+    }
+}
+
+using TileVjp = void (*)(const Frame&, int64_t, Planes, const TileArea&, const BlendLimits<V>&);
+
+TileVjp variant(bool geo, bool dist, bool abs) {
+    if (dist) return abs ? tile_vjp<true, true, true> : tile_vjp<true, true, false>;
+    if (geo) return abs ? tile_vjp<true, false, true> : tile_vjp<true, false, false>;
+    return abs ? tile_vjp<false, false, true> : tile_vjp<false, false, false>;
+}
+
+}  // namespace
+
+bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, bool abs_probe) {
+    if (!index_slots(f) || !f.gradients.reserve(f.slot_begin[f.tiles] * GRADIENT)) return false;
+    const bool dist = g.distortion != nullptr;
+    const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
+    const TileVjp vjp = variant(geo, dist, abs_probe);
+    const BlendLimits<V> limits = limits_of(f.view);
+    parallel_for(f.tiles, [&](int64_t tile) {
+        if (f.tile_count[tile] == 0) return;
+        alignas(64) real planes[PLANES][PIXELS];
+        const TileArea area = tile_area(f, tile);
+        start(f, images, g, area, planes);
+        vjp(f, tile, planes, area, limits);
+    });
+    return true;
+}
+
+}  // namespace gs2d

@@ -1,0 +1,104 @@
+// Splat errors: the sum over a splat's footprint of |its colour - the photograph| (rule 17 of the contract).
+#include "cpu/frame.h"
+#include "cpu/threads.h"
+#include "cpu/tile.h"
+
+namespace gs2d {
+namespace {
+
+enum Plane { RED, GREEN, BLUE, COUNTS, PLANES };  // COUNTS: 1 where a pixel counts, else 0
+
+// The photograph in block order, tile after tile, in f.gradients.
+bool load_target(Frame& f, const real* image, const uint8_t* mask) {
+    if (!f.gradients.reserve(size_t(f.tiles) * PLANES * PIXELS)) return false;
+    parallel_for(f.tiles, [&](int64_t tile) {
+        real* to = &f.gradients[size_t(tile) * PLANES * PIXELS];
+        const TileArea a = tile_area(f, tile);
+        for (int c = 0; c < 3; ++c) read_plane(image, 3, c, f.view.width, a, to + c * PIXELS);
+        for (int y = 0; y < TILE; ++y)
+            for (int x = 0; x < TILE; ++x) {
+                const bool inside = x < a.width && y < a.height;
+                const bool counts = inside && (!mask || mask[int64_t(a.y0 + y) * f.view.width + a.x0 + x]);
+                to[COUNTS * PIXELS + block_order(x, y)] = counts;
+            }
+    });
+    return true;
+}
+
+inline V difference(const Record<V>& s, const real* target, int b) {
+    const auto at = [&](Plane p) { return load(target + p * PIXELS + b * LANES); };
+    return (abs(s.red - at(RED)) + abs(s.green - at(GREEN)) + abs(s.blue - at(BLUE)));
+}
+
+// Pixels of block b that count for the splat.
+inline M counts(const Hit<V>& h, const BlendLimits<V>& limits, V cutoff2, const real* target, int b) {
+    return (h.rho <= cutoff2) & (h.depth >= limits.near) & (load(target + COUNTS * PIXELS + b * LANES) > V(0));
+}
+
+}  // namespace
+
+bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
+    if (!load_target(f, image, mask)) return false;
+    const BlockBoxes boxes;
+    const BlendLimits<V> limits = limits_of(f.view);
+    const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), lx = lane_x(0), ly = lane_y(0);
+    parallel_ranges(f.count, 256, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) {
+            const TileRect r = f.rects[i];
+            errors[i] = 0;
+            if (r.x1 <= r.x0) continue;
+            const Record<V> s = broadcast(&f.records[i * RECORD]);
+            V total = V(0);
+            for (int ty = r.y0; ty < r.y1; ++ty)
+                for (int tx = r.x0; tx < r.x1; ++tx) {
+                    const real x0 = real(tx * TILE), y0 = real(ty * TILE);
+                    const real* target = &f.gradients[(size_t(ty) * f.tiles_x + tx) * PLANES * PIXELS];
+                    for (uint32_t left = blocks_touched(f.cull[i], boxes, x0, y0); left; left &= left - 1) {
+                        const int b = __builtin_ctz(left);
+                        const Hit<V> h = intersect(s, lx + V(x0 + real(block_x(b))), ly + V(y0 + real(block_y(b))), limits);
+                        total = total + keep(counts(h, limits, cutoff2, target, b), difference(s, target, b));
+                    }
+                }
+            errors[i] = sum(total);
+        }
+    });
+    return true;
+}
+
+bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
+    if (!bin_splats(f) || !f.tile_count.reserve(f.tiles)) return false;
+    for (int64_t t = 0; t < f.tiles; ++t) f.tile_count[t] = static_cast<int32_t>(f.tile_begin[t + 1] - f.tile_begin[t]);
+    if (!index_slots(f) || !load_target(f, image, mask) || !f.saved.reserve(f.slot_begin[f.tiles])) return false;
+    const BlockBoxes boxes;
+    const BlendLimits<V> limits = limits_of(f.view);
+    const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff));
+    parallel_for(f.tiles, [&](int64_t tile) {
+        const TileArea a = tile_area(f, tile);
+        const real* target = &f.gradients[size_t(tile) * PLANES * PIXELS];
+        const V lx = lane_x(a.x0), ly = lane_y(a.y0);
+        alignas(64) real T[PIXELS];
+        for (real& t : T) t = 1;
+        for (int64_t e = f.tile_begin[tile]; e < f.tile_begin[tile + 1]; ++e) {
+            const uint32_t splat = f.entries[e].splat;
+            const Record<V> s = broadcast(&f.records[size_t(splat) * RECORD]);
+            V total = V(0);
+            for (uint32_t left = blocks_touched(f.cull[splat], boxes, real(a.x0), real(a.y0)); left; left &= left - 1) {
+                const int b = __builtin_ctz(left);
+                const Hit<V> h = intersect(s, lx + V(real(block_x(b))), ly + V(real(block_y(b))), limits);
+                const V t = load(&T[b * LANES]), alpha = keep(h.visible, min(exp2(h.log2_alpha), limits.alpha_max));
+                const V after = fnma(alpha, t, t);
+                const M open = after >= limits.transmittance_min;
+                store(&T[b * LANES], keep(open, after));  // stopped pixels stay at 0
+                total = total + keep(counts(h, limits, cutoff2, target, b) & open, difference(s, target, b));
+            }
+            f.saved[f.slot_begin[tile] + (e - f.tile_begin[tile])] = sum(total);
+        }
+    });
+    for (int64_t i = 0; i < f.count; ++i) {
+        errors[i] = 0;
+        for (int64_t k = f.splat_begin[i]; k < f.splat_begin[i + 1]; ++k) errors[i] += f.saved[f.splat_slots[k]];
+    }
+    return true;
+}
+
+}  // namespace gs2d

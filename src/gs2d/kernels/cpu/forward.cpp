@@ -1,0 +1,156 @@
+// Blending, front to back, one tile per task: block by block, with the pixels' state in registers.
+#include "cpu/frame.h"
+#include "cpu/threads.h"
+#include "cpu/tile.h"
+
+namespace gs2d {
+namespace {
+
+constexpr int CHUNK = 256;  // entries looked at before asking again whether any pixel of the tile is still live
+
+// What Pixel<V> holds, in memory between chunks.
+enum Plane { RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, DISTORTION, T, M1, M2, DEPTH0, PLANES };
+
+struct TileState {
+    alignas(64) real planes[PLANES][PIXELS];
+    M live[BLOCKS];
+    bool finished[BLOCKS];
+};
+
+struct TileWork {
+    alignas(64) real records[CHUNK][RECORD];
+    real inverse_zc[CHUNK];
+    uint32_t splats[CHUNK], touched[CHUNK], seen[CHUNK];
+    uint16_t list[CHUNK];
+    TileState state;
+};
+
+inline Pixel<V> load_pixel(const TileState& s, int b) {
+    const auto at = [&](Plane p) { return load(&s.planes[p][b * LANES]); };
+    return {at(T), at(ALPHA), at(RED), at(GREEN), at(BLUE), at(NX), at(NY), at(NZ), at(DEPTH), at(MEDIAN),
+            at(DEPTH0), at(M1), at(M2), at(DISTORTION), s.live[b]};
+}
+
+inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
+    const auto at = [&](Plane k, V v) { store(&s.planes[k][b * LANES], v); };
+    at(T, p.T), at(ALPHA, p.alpha), at(RED, p.red), at(GREEN, p.green), at(BLUE, p.blue), at(NX, p.nx), at(NY, p.ny);
+    at(NZ, p.nz), at(DEPTH, p.depth), at(MEDIAN, p.median), at(DEPTH0, p.inverse_depth0), at(M1, p.M1), at(M2, p.M2);
+    at(DISTORTION, p.distortion);
+    s.live[b] = p.live;
+    s.finished[b] = !any(p.live);
+}
+
+// Indices of the entries whose mask has bit b.
+inline int compress(const uint32_t* masks, int n, int b, uint16_t* list) {
+    int count = 0;
+    for (int i = 0; i < n; ++i) {
+        list[count] = static_cast<uint16_t>(i);
+        count += masks[i] >> b & 1;
+    }
+    return count;
+}
+
+void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const BlendLimits<V>& limits) {
+    const int count = compress(w.touched, n, b, w.list);
+    if (count == 0) return;
+    const V x = lane_x(0) + V(tile_x + real(block_x(b))), y = lane_y(0) + V(tile_y + real(block_y(b)));
+    Pixel<V> p = load_pixel(w.state, b);
+    for (int j = 0; j < count; ++j) {
+        const int i = w.list[j];
+        const Record<V> s = broadcast(w.records[i]);
+        const Hit<V> h = intersect(s, x, y, limits);
+        const M seen = composite(s, V(w.inverse_zc[i]), h, limits, p);
+        w.seen[i] |= uint32_t(any(seen)) << b;
+        if ((j & 3) == 3 && !any(p.live)) break;
+    }
+    store_pixel(w.state, b, p);
+}
+
+// Entries of the chunk that reach a live block, with their records side by side.
+int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockBoxes& boxes, const TileArea& area) {
+    uint32_t wanted = 0;
+    for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
+    int m = 0;
+    for (int i = 0; i < n; ++i) {
+        const uint32_t splat = entries[i].splat;
+        const uint32_t touched = f.view.exact_masks ? blocks_touched(f.cull[splat], boxes, real(area.x0), real(area.y0)) : ALL_BLOCKS;
+        w.splats[m] = splat;
+        w.touched[m] = touched & wanted;
+        m += (touched & wanted) != 0;
+    }
+    for (int i = 0; i < m; ++i) {
+        memcpy(w.records[i], &f.records[size_t(w.splats[i]) * RECORD], sizeof w.records[i]);
+        w.inverse_zc[i] = real(1) / w.records[i][8];
+        w.seen[i] = 0;
+    }
+    return m;
+}
+
+void start(TileState& s, const TileArea& area) {
+    memset(s.planes, 0, sizeof s.planes);
+    for (int i = 0; i < PIXELS; ++i) s.planes[T][i] = 1;
+    for (int b = 0; b < BLOCKS; ++b) {
+        s.live[b] = lanes_inside(block_x(b), block_y(b), area.width, area.height);
+        s.finished[b] = !any(s.live[b]);
+    }
+}
+
+void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
+    const View& v = f.view;
+    const V bg[3] = {V(real(v.background[0])), V(real(v.background[1])), V(real(v.background[2]))};
+    const double lever = v.far * v.near / (v.far - v.near);
+    for (int i = 0; i < PIXELS; i += LANES) {
+        const V t = load(&s.planes[T][i]), alpha = load(&s.planes[ALPHA][i]);
+        for (int c = 0; c < 3; ++c) store(&s.planes[RED + c][i], fma(t, bg[c], load(&s.planes[RED + c][i])));
+        const V depth = load(&s.planes[DEPTH][i]) / select(alpha > V(0), alpha, V(1));
+        store(&s.planes[DEPTH][i], depth);
+        store(&s.planes[DISTORTION][i], load(&s.planes[DISTORTION][i]) * V(real(lever * lever)));
+    }
+    const int64_t pixels = int64_t(v.width) * v.height;
+    for (int c = 0; c < 3; ++c) {
+        write_plane(s.planes[RED + c], out.color, 3, c, v.width, a);
+        write_plane(s.planes[NX + c], out.normal, 3, c, v.width, a);
+    }
+    write_plane(s.planes[ALPHA], out.alpha, 1, 0, v.width, a);
+    write_plane(s.planes[DEPTH], out.depth_mean, 1, 0, v.width, a);
+    write_plane(s.planes[MEDIAN], out.depth_median, 1, 0, v.width, a);
+    write_plane(s.planes[DISTORTION], out.distortion, 1, 0, v.width, a);
+    const Plane saved[4] = {T, M1, M2, DEPTH0};
+    for (int k = 0; k < 4; ++k) write_plane(s.planes[saved[k]], &f.saved[k * pixels], 1, 0, v.width, a);
+}
+
+void blend_tile(Frame& f, int64_t tile, const Images& out, const BlockBoxes& boxes, const BlendLimits<V>& limits) {
+    TileWork w;
+    const TileArea area = tile_area(f, tile);
+    start(w.state, area);
+    Entry* const begin = &f.entries[f.tile_begin[tile]];
+    Entry* const end = &f.entries[f.tile_begin[tile + 1]];
+    Entry* kept = begin;
+    for (Entry* e = begin; e < end; e += CHUNK) {
+        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, boxes, area);
+        bool live = false;
+        for (int b = 0; b < BLOCKS; ++b) {
+            if (!w.state.finished[b]) blend_block(w, b, n, real(area.x0), real(area.y0), limits);
+            live |= !w.state.finished[b];
+        }
+        for (int i = 0; i < n; ++i) {
+            *kept = {w.splats[i], w.seen[i]};
+            kept += w.seen[i] != 0;
+        }
+        if (!live) break;
+    }
+    f.tile_count[tile] = static_cast<int32_t>(kept - begin);
+    write(f, w.state, area, out);
+}
+
+}  // namespace
+
+bool blend_tiles(Frame& f, const Images& out) {
+    if (!f.tile_count.reserve(f.tiles) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
+    const BlockBoxes boxes;
+    const BlendLimits<V> limits = limits_of(f.view);
+    parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, boxes, limits); });
+    return true;
+}
+
+}  // namespace gs2d

@@ -1,0 +1,156 @@
+// Everything one view needs between its forward and its backward pass.
+#pragma once
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "core/blend.h"
+#include "core/project.h"
+#include "cpu/simd.h"
+
+namespace gs2d {
+
+// Grow-only memory on cache lines. Kept when a Frame goes back to the free list: fresh pages cost more than the work.
+template <class T> struct Buffer {
+    T* data = nullptr;
+    size_t capacity = 0;
+    // Contents are lost. False when there is no memory.
+    bool reserve(size_t n) {
+        if (n <= capacity) return true;
+        free(data);
+        const size_t wanted = n + n / 4 + 64;
+        data = static_cast<T*>(aligned_alloc(64, (wanted * sizeof(T) + 63) / 64 * 64));
+        capacity = data ? wanted : 0;
+        return data != nullptr;
+    }
+    void release() {
+        free(data);
+        data = nullptr;
+        capacity = 0;
+    }
+    T& operator[](size_t i) const { return data[i]; }
+};
+
+// Mirrored by ctypes structures in render/cpu.py; change both.
+struct View {
+    double R[9], t[3], center[3];  // x_cam = R x + t; camera centre in the world
+    double fx, fy, cx, cy;
+    double near, far, alpha_min, alpha_max, transmittance_min, error_cutoff, lowpass_px;
+    double background[3];
+    int32_t width, height, sh_degree, exact_masks;  // exact_masks = 0: no culling inside tiles (tests)
+};
+
+struct Parameters {
+    int64_t count, sh_rest;  // N; coefficients stored in shN per splat
+    const real *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
+};
+
+struct Images {
+    real *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;  // color and normal [H, W, 3], else [H, W]
+    real* radii;                                                            // [N]
+};
+
+struct ImageGradients {  // null where there is no gradient
+    const real *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;
+};
+
+struct ParameterGradients {  // null where not wanted
+    real *means, *quats, *log_scales, *opacity_logits, *sh0, *shN, *probe;
+    int64_t probe_columns;  // 2 or 4
+};
+
+// Box tests per (tile, splat), in pixels: see Footprint.
+struct CullRecord {
+    real ex, ey, a, b, c;
+    real cx, cy, disc2;  // disc2 < 0: unbounded, covers everything
+};
+
+struct TileRect {
+    uint16_t x0, y0, x1, y1;  // tiles, half open; empty for culled splats
+};
+
+constexpr uint32_t ALL_BLOCKS = BLOCKS == 32 ? 0xffffffffu : (1u << (BLOCKS % 32)) - 1u;
+
+struct Entry {  // one splat in one tile
+    uint32_t splat;
+    uint32_t blocks;  // bit b: some live pixel of block b saw the splat (before the forward pass: undefined)
+};
+
+struct Frame {
+    View view;
+    PinholeCamera<real> camera;
+    int64_t count = 0;
+    int32_t tiles_x = 0, tiles_y = 0;
+    int64_t tiles = 0;
+
+    Buffer<real> records;       // [N, RECORD]
+    Buffer<CullRecord> cull;    // [N]
+    Buffer<TileRect> rects;     // [N]
+    Buffer<uint32_t> order;     // visible splats by depth
+    Buffer<TileRect> ordered_rects;
+    Buffer<char> sort_memory;
+    int64_t visible = 0;
+    Buffer<uint32_t> histogram;  // [chunks, tiles]
+    Buffer<int64_t> tile_begin;  // [tiles + 1]
+    Buffer<Entry> entries;
+    Buffer<int32_t> tile_count;  // entries that survive the forward pass; they are moved to the front of their tile
+    Buffer<real> saved;          // [4, H W]: T_final, M1, M2, inverse_depth0
+
+    Buffer<int64_t> slot_begin;     // [tiles + 1], survivors only
+    Buffer<real> gradients;         // [slots, GRADIENT]
+    Buffer<int64_t> splat_begin;    // [N + 1]
+    Buffer<uint32_t> splat_slots;   // slots of each splat, in tile order
+
+    Frame* next_free = nullptr;
+};
+
+Frame* take_frame();
+void give_back(Frame* frame);
+
+inline BlendLimits<V> limits_of(const View& v) {
+    return {V(real(1 / (v.lowpass_px * v.lowpass_px))), V(real(v.near)), V(real(log2(v.alpha_min))),
+            V(real(v.alpha_max)), V(real(v.transmittance_min))};
+}
+
+inline Record<V> broadcast(const real* r) {
+    return {V(r[0]), V(r[1]), V(r[2]),  V(r[3]),  V(r[4]),  V(r[5]),  V(r[6]),  V(r[7]),
+            V(r[8]), V(r[9]), V(r[10]), V(r[11]), V(r[12]), V(r[13]), V(r[14]), V(r[15])};
+}
+
+// Pixel centres of a block whose first pixel is (x, y).
+inline V lane_x(int x) {
+    alignas(64) real v[LANES];
+    for (int i = 0; i < LANES; ++i) v[i] = real(x + i % BLOCK_W) + real(0.5);
+    return load(v);
+}
+inline V lane_y(int y) {
+    alignas(64) real v[LANES];
+    for (int i = 0; i < LANES; ++i) v[i] = real(y + i / BLOCK_W) + real(0.5);
+    return load(v);
+}
+// Lanes of that block inside the image.
+inline M lanes_inside(int x, int y, int width, int height) {
+    uint32_t b = 0;
+    for (int i = 0; i < LANES; ++i) b |= uint32_t(x + i % BLOCK_W < width && y + i / BLOCK_W < height) << i;
+    return mask_of(b);
+}
+
+// Which pixels a splat's footprint must hold.
+enum class Reach {
+    BLEND,           // alpha >= alpha_min; more transparent splats are culled
+    ERRORS,          // rho <= error_cutoff^2
+    ERRORS_OCCLUDED  // either
+};
+
+// The passes, in order. Those that return bool return false when memory is short.
+bool project_splats(Frame& frame, const Parameters& splats, Reach reach, real* radii);
+bool bin_splats(Frame& frame);
+bool blend_tiles(Frame& frame, const Images& images);
+// Gives each of the first tile_count entries of every tile a slot, and lists the slots of every splat in tile order.
+bool index_slots(Frame& frame);
+bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, bool abs_probe);
+bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
+bool occluded_splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
+void project_splats_vjp(Frame& frame, const Parameters& splats, const ParameterGradients& out);
+
+}  // namespace gs2d

@@ -1,0 +1,206 @@
+// Projection of all splats: records, cull records, tile rectangles, radii.
+#include "cpu/frame.h"
+#include "cpu/splat_group.h"
+#include "cpu/threads.h"
+
+namespace gs2d {
+namespace {
+
+// Reads LANES splats; `alive` is false for those culled by themselves (non-finite, behind, transparent).
+struct Group {
+    SplatParameters<V> parameters;
+    Frame3<V> frame;
+    Record<V> record;
+    M alive;
+};
+
+inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int lanes, bool opacity_counts) {
+    Group g;
+    g.parameters = load_parameters(s, i, lanes);
+    g.frame = frame_of(g.parameters, f.camera);
+    g.record = project(g.parameters, g.frame, f.camera);
+    const auto& p = g.parameters;
+    // inf - inf and inf * 0 are NaN: the sum below is finite only if everything in it is
+    const V zero = V(0), finite = zero * p.mean.x + zero * p.mean.y + zero * p.mean.z + zero * p.logit + zero * p.qw +
+                                  zero * p.qx + zero * p.qy + zero * p.qz + zero * p.log_su + zero * p.log_sv +
+                                  zero * exp(p.log_su) + zero * exp(p.log_sv) + zero * g.frame.inverse_norm;
+    g.alive = (finite >= zero) & (g.record.zc > V(real(f.view.near))) & first(lanes);
+    if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
+    return g;
+}
+
+// Evaluates the colour of the living; splats with non-finite coefficients die.
+inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lanes, Group& g) {
+    V sh[3 * SH_MAX], basis[SH_MAX];
+    const int degree = f.view.sh_degree;
+    load_sh(s, i, lanes, degree, sh);
+    sh_basis(g.frame.to_splat, degree, basis);
+    V finite = V(0);
+    for (int k = 0; k < 3 * sh_count(degree); ++k) finite = fma(V(0), sh[k], finite);
+    g.alive = g.alive & (finite >= V(0));
+    const Vec3<V> c = sh_color(sh, basis, degree);
+    g.record.red = max(c.x, V(0)), g.record.green = max(c.y, V(0)), g.record.blue = max(c.z, V(0));
+}
+
+inline int tile_floor(real px, int tiles) {  // first tile that reaches px; px may be anything but NaN
+    const real t = px * real(1.0 / TILE);
+    return t <= 0 ? 0 : t >= real(tiles) ? tiles : static_cast<int>(t);
+}
+
+// Tiles whose pixel centres the widened box can reach, and the radius of rule 14.
+inline TileRect rect_of(const Frame& f, real x_min, real y_min, real x_max, real y_max, bool unbounded) {
+    if (unbounded) return {0, 0, uint16_t(f.tiles_x), uint16_t(f.tiles_y)};
+    const real margin = real(0.05);
+    const real x0 = x_min - margin, y0 = y_min - margin, x1 = x_max + margin, y1 = y_max + margin;
+    if (!(x1 >= real(0.5) && y1 >= real(0.5) && x0 <= real(f.view.width) - real(0.5) && y0 <= real(f.view.height) - real(0.5)))
+        return {0, 0, 0, 0};
+    const int tx0 = tile_floor(x0 - real(0.5), f.tiles_x), ty0 = tile_floor(y0 - real(0.5), f.tiles_y);
+    const int tx1 = tile_floor(x1 - real(0.5), f.tiles_x), ty1 = tile_floor(y1 - real(0.5), f.tiles_y);
+    return {uint16_t(tx0), uint16_t(ty0), uint16_t(tx1 < f.tiles_x ? tx1 + 1 : f.tiles_x),
+            uint16_t(ty1 < f.tiles_y ? ty1 + 1 : f.tiles_y)};
+}
+
+inline real clipped_radius(const View& v, real x_min, real y_min, real x_max, real y_max, bool crosses) {
+    const real w = real(v.width), h = real(v.height);
+    if (crosses) return (w > h ? w : h) / 2;
+    const real x0 = x_min > 0 ? x_min : real(0), x1 = x_max < w ? x_max : w;
+    const real y0 = y_min > 0 ? y_min : real(0), y1 = y_max < h ? y_max : h;
+    const real half = real(0.5);
+    if (!(__builtin_ceil(x0 - half) + half <= x1 && __builtin_ceil(y0 - half) + half <= y1)) return 0;
+    return (x1 - x0 > y1 - y0 ? x1 - x0 : y1 - y0) / 2;
+}
+
+}  // namespace
+
+bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
+    const int64_t n = s.count;
+    f.count = n;
+    if (!f.records.reserve(n * RECORD) || !f.cull.reserve(n) || !f.rects.reserve(n)) return false;
+    const bool blending = reach == Reach::BLEND;
+    const V error_k2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), log2_alpha_min = V(real(log2(f.view.alpha_min)));
+    parallel_ranges(n, 64 * LANES, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i += LANES) {
+            const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
+            Group g = project_group(f, s, i, lanes, blending);
+            if (any(g.alive)) color_group(f, s, i, lanes, g);
+            const uint32_t alive = bits(g.alive);
+            for (int l = 0; l < lanes; ++l) f.rects[i + l] = {0, 0, 0, 0};
+            if (radii)
+                for (int l = 0; l < lanes; ++l) radii[i + l] = 0;
+            if (!alive) continue;
+            const Record<V>& r = g.record;
+            const V blend_k2 = V(real(2 * LN2)) * (r.log2_opacity - log2_alpha_min);
+            const V k2 = blending ? max(blend_k2, V(0)) : reach == Reach::ERRORS ? error_k2 : max(blend_k2, error_k2);
+            const Footprint<V> o = footprint(g.frame, r, k2, real(f.view.lowpass_px), f.camera);
+            const V fields[RECORD] = {r.cx, r.cy, r.au, r.bu, r.av, r.bv, r.az, r.bz,
+                                      r.zc, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
+            store_rows<RECORD>(&f.records[i * RECORD], RECORD, lanes, fields);
+            const V cull[8] = {o.ex, o.ey, o.a, o.b, o.c, r.cx, r.cy, select(o.unbounded, V(-1), o.disc2)};
+            store_rows<8>(reinterpret_cast<real*>(&f.cull[i]), 8, lanes, cull);
+            alignas(64) real box[4][LANES];
+            store(box[0], o.x_min), store(box[1], o.y_min), store(box[2], o.x_max), store(box[3], o.y_max);
+            const uint32_t unbounded = bits(o.unbounded), crosses = bits(o.crosses);
+            for (int l = 0; l < lanes; ++l) {
+                if (!(alive >> l & 1)) continue;
+                f.rects[i + l] = rect_of(f, box[0][l], box[1][l], box[2][l], box[3][l], unbounded >> l & 1);
+                if (radii) radii[i + l] = clipped_radius(f.view, box[0][l], box[1][l], box[2][l], box[3][l], crosses >> l & 1);
+            }
+        }
+    });
+    return true;
+}
+
+namespace {
+
+// Sum of a splat's gradient slots, in tile order.
+inline void gather(const Frame& f, int64_t first, int lanes, V* fields) {
+    alignas(64) real sums[LANES][GRADIENT];
+    for (int l = 0; l < LANES; ++l) {
+        real* s = sums[l];
+        for (int k = 0; k < GRADIENT; ++k) s[k] = 0;
+        if (l >= lanes) continue;
+        for (int64_t e = f.splat_begin[first + l]; e < f.splat_begin[first + l + 1]; ++e) {
+            const real* g = &f.gradients[size_t(f.splat_slots[e]) * GRADIENT];
+            for (int k = 0; k < GRADIENT; ++k) s[k] += g[k];
+        }
+    }
+    load_rows<GRADIENT>(sums[0], GRADIENT, LANES, fields);
+}
+
+inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
+    if (p) memset(p + first * stride, 0, size_t(lanes * stride) * sizeof(real));
+}
+
+inline void write_sh(const Frame& f, const Parameters& s, const ParameterGradients& out, int64_t i, int lanes,
+                     const Vec3<V>& g_color, const V* basis) {
+    V g[3 * SH_MAX];
+    const int count = sh_count(f.view.sh_degree);
+    for (int k = 0; k < count; ++k)
+        g[3 * k] = basis[k] * g_color.x, g[3 * k + 1] = basis[k] * g_color.y, g[3 * k + 2] = basis[k] * g_color.z;
+    if (out.sh0) store_rows<3>(out.sh0 + 3 * i, 3, lanes, g);
+    if (!out.shN) return;
+    const int64_t stride = 3 * s.sh_rest;
+    real* rest = out.shN + stride * i;
+    if (s.sh_rest > count - 1) zero_rows(rest, 0, stride, lanes);
+    if (count == 4) store_rows<9>(rest, stride, lanes, g + 3);
+    if (count == 9) store_rows<24>(rest, stride, lanes, g + 3);
+    if (count == 16) store_rows<45>(rest, stride, lanes, g + 3);
+}
+
+}  // namespace
+
+void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out) {
+    parallel_ranges(s.count, 16 * LANES, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i += LANES) {
+            const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
+            if (f.splat_begin[i + lanes] == f.splat_begin[i]) {  // nobody here was seen
+                zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes), zero_rows(out.log_scales, i, 2, lanes);
+                zero_rows(out.opacity_logits, i, 1, lanes), zero_rows(out.sh0, i, 3, lanes);
+                zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes);
+                continue;
+            }
+            uint32_t seen_bits = 0;
+            for (int l = 0; l < lanes; ++l) seen_bits |= uint32_t(f.splat_begin[i + l + 1] > f.splat_begin[i + l]) << l;
+            const M seen = mask_of(seen_bits);
+            V g[GRADIENT];
+            gather(f, i, lanes, g);
+            const RecordGradient<V> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8],  g[9],
+                                          g[10], g[11], g[12], g[13], g[14], g[15], g[16], g[17], g[18], g[19]};
+            const SplatParameters<V> p = load_parameters(s, i, lanes);
+            const Frame3<V> frame = frame_of(p, f.camera);
+            const Record<V> r = project(p, frame, f.camera);
+
+            V sh[3 * SH_MAX], basis[SH_MAX], along[SH_MAX];
+            const int degree = f.view.sh_degree;
+            load_sh(s, i, lanes, degree, sh);
+            sh_basis(frame.to_splat, degree, basis);
+            const Vec3<V> c = sh_color(sh, basis, degree);
+            const Vec3<V> g_color = {keep((c.x > V(0)) & seen, gr.red), keep((c.y > V(0)) & seen, gr.green),
+                                     keep((c.z > V(0)) & seen, gr.blue)};
+            for (int k = 0; k < sh_count(degree); ++k) {
+                basis[k] = keep(seen, basis[k]);
+                along[k] = fma(g_color.x, sh[3 * k], fma(g_color.y, sh[3 * k + 1], g_color.z * sh[3 * k + 2]));
+            }
+            write_sh(f, s, out, i, lanes, g_color, basis);
+
+            const ParameterGradient<V> d = project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
+            const auto write = [&]<int K>(real* to, V (&values)[K]) {
+                if (!to) return;
+                for (V& v : values) v = keep(seen, v);
+                store_rows<K>(to + K * i, K, lanes, values);
+            };
+            V means[] = {d.mean.x, d.mean.y, d.mean.z}, quats[] = {d.qw, d.qx, d.qy, d.qz};
+            V scales[] = {d.log_su, d.log_sv}, logit[] = {d.logit};
+            write(out.means, means), write(out.quats, quats), write(out.log_scales, scales), write(out.opacity_logits, logit);
+            const V half_w = V(real(f.view.width / 2.0)), half_h = V(real(f.view.height / 2.0));
+            V probe[] = {d.probe_x * half_w, d.probe_y * half_h, gr.abs_x * half_w, gr.abs_y * half_h};
+            V probe2[] = {probe[0], probe[1]};
+            if (out.probe_columns == 4)
+                write(out.probe, probe);
+            else
+                write(out.probe, probe2);
+        }
+    });
+}
+
+}  // namespace gs2d

@@ -1,0 +1,57 @@
+// LANES splats at a time: rows of parameters to vectors and back.
+#pragma once
+
+#include "cpu/frame.h"
+
+namespace gs2d {
+
+// v[k] lane i = p[i * stride + k] for i < lanes; missing lanes repeat the last row, so that no lane holds garbage.
+template <int K> inline void load_rows(const real* p, int64_t stride, int lanes, V* v) {
+    alignas(64) real t[K][LANES];
+    for (int i = 0; i < LANES; ++i) {
+        const real* row = p + int64_t(i < lanes ? i : lanes - 1) * stride;
+        for (int k = 0; k < K; ++k) t[k][i] = row[k];
+    }
+    for (int k = 0; k < K; ++k) v[k] = load(t[k]);
+}
+
+template <int K> inline void store_rows(real* p, int64_t stride, int lanes, const V* v) {
+    alignas(64) real t[K][LANES];
+    for (int k = 0; k < K; ++k) store(t[k], v[k]);
+    for (int i = 0; i < lanes; ++i)
+        for (int k = 0; k < K; ++k) p[i * stride + k] = t[k][i];
+}
+
+inline SplatParameters<V> load_parameters(const Parameters& s, int64_t first, int lanes) {
+    V m[3], q[4], l[2], o[1];
+    load_rows<3>(s.means + 3 * first, 3, lanes, m);
+    load_rows<4>(s.quats + 4 * first, 4, lanes, q);
+    load_rows<2>(s.log_scales + 2 * first, 2, lanes, l);
+    load_rows<1>(s.opacity_logits + first, 1, lanes, o);
+    return {{m[0], m[1], m[2]}, q[0], q[1], q[2], q[3], l[0], l[1], o[0]};
+}
+
+// Coefficients of LANES splats: sh[3 * k + channel].
+inline void load_sh(const Parameters& s, int64_t first, int lanes, int degree, V* sh) {
+    load_rows<3>(s.sh0 + 3 * first, 3, lanes, sh);
+    const int64_t stride = 3 * s.sh_rest;
+    const real* rest = s.shN + stride * first;
+    if (degree == 1) load_rows<9>(rest, stride, lanes, sh + 3);
+    if (degree == 2) load_rows<24>(rest, stride, lanes, sh + 3);
+    if (degree == 3) load_rows<45>(rest, stride, lanes, sh + 3);
+}
+
+inline M is_finite(V a) { return abs(a) < V(__builtin_inff()); }  // false for NaN
+
+// SH colour + 1/2, not clamped.
+inline Vec3<V> sh_color(const V* sh, const V* basis, int degree) {
+    Vec3<V> c = {V(real(0.5)), V(real(0.5)), V(real(0.5))};
+    for (int k = 0; k < sh_count(degree); ++k) {
+        c.x = fma(basis[k], sh[3 * k], c.x);
+        c.y = fma(basis[k], sh[3 * k + 1], c.y);
+        c.z = fma(basis[k], sh[3 * k + 2], c.z);
+    }
+    return c;
+}
+
+}  // namespace gs2d

@@ -1,0 +1,83 @@
+// Pixels of one tile in block order, and the exact footprint test of one splat against all blocks of a tile.
+#pragma once
+
+#include "cpu/frame.h"
+
+namespace gs2d {
+
+constexpr int PIXELS = TILE * TILE;
+
+// First pixel of block b within its tile.
+inline int block_x(int b) { return b % BLOCKS_X * BLOCK_W; }
+inline int block_y(int b) { return b / BLOCKS_X * BLOCK_H; }
+
+struct TileArea {
+    int x0, y0, width, height;  // first pixel; pixels inside the image
+};
+inline TileArea tile_area(const Frame& f, int64_t tile) {
+    TileArea a;
+    a.x0 = static_cast<int>(tile % f.tiles_x) * TILE;
+    a.y0 = static_cast<int>(tile / f.tiles_x) * TILE;
+    a.width = f.view.width - a.x0 < TILE ? f.view.width - a.x0 : TILE;
+    a.height = f.view.height - a.y0 < TILE ? f.view.height - a.y0 : TILE;
+    return a;
+}
+
+// Position of a tile's pixel in block order.
+inline int block_order(int x, int y) {
+    return ((y / BLOCK_H) * BLOCKS_X + x / BLOCK_W) * LANES + (y % BLOCK_H) * BLOCK_W + x % BLOCK_W;
+}
+
+// One plane of an interleaved image -> block order; pixels outside the image become `outside`.
+inline void read_plane(const real* image, int channels, int channel, int image_width, const TileArea& a, real* out) {
+    for (int y = 0; y < TILE; ++y)
+        for (int x = 0; x < TILE; x += BLOCK_W) {
+            real* to = out + block_order(x, y);
+            const real* from = image + (int64_t(a.y0 + y) * image_width + a.x0 + x) * channels + channel;
+            for (int i = 0; i < BLOCK_W; ++i) to[i] = y < a.height && x + i < a.width ? from[i * channels] : real(0);
+        }
+}
+
+inline void write_plane(const real* values, real* image, int channels, int channel, int image_width, const TileArea& a) {
+    for (int y = 0; y < a.height; ++y)
+        for (int x = 0; x < a.width; x += BLOCK_W) {
+            const real* from = values + block_order(x, y);
+            real* to = image + (int64_t(a.y0 + y) * image_width + a.x0 + x) * channels + channel;
+            const int n = a.width - x < BLOCK_W ? a.width - x : BLOCK_W;
+            for (int i = 0; i < n; ++i) to[i * channels] = from[i];
+        }
+}
+
+// Corners of the pixel centres of all blocks, relative to the tile, LANES blocks per vector.
+struct BlockBoxes {
+    V x0[BLOCKS / LANES], y0[BLOCKS / LANES];
+    BlockBoxes() {
+        alignas(64) real x[BLOCKS], y[BLOCKS];
+        for (int b = 0; b < BLOCKS; ++b) x[b] = real(block_x(b)) + real(0.5), y[b] = real(block_y(b)) + real(0.5);
+        for (int i = 0; i < BLOCKS / LANES; ++i) x0[i] = load(x + i * LANES), y0[i] = load(y + i * LANES);
+    }
+};
+
+// Bit b: the splat's ellipse or low-pass disc reaches a pixel centre of block b, or nearly so. The least value of a
+// convex quadratic over a box that does not hold its minimum is on a side that faces the minimum: two candidates.
+inline uint32_t blocks_touched(const CullRecord& s, const BlockBoxes& boxes, real tile_x, real tile_y) {
+    if (s.disc2 < 0) return ALL_BLOCKS;
+    const V ex = V(s.ex - tile_x), ey = V(s.ey - tile_y), a = V(s.a), b = V(s.b), c = V(s.c), one = V(1);
+    const V cx = V(s.cx - tile_x), cy = V(s.cy - tile_y), disc2 = V(s.disc2);
+    const V slope_y = V(-s.b / s.c), slope_x = V(-s.b / s.a);
+    uint32_t mask = 0;
+    for (int i = 0; i < BLOCKS / LANES; ++i) {
+        const V x0 = boxes.x0[i], y0 = boxes.y0[i];
+        const V x1 = x0 + V(real(BLOCK_W - 1)), y1 = y0 + V(real(BLOCK_H - 1));
+        const V px = min(max(ex, x0), x1) - ex, py = min(max(ey, y0), y1) - ey;  // nearest in x, in y
+        const V qy = min(max(fma(slope_y, px, ey), y0), y1) - ey;                // best y on the side x = px
+        const V qx = min(max(fma(slope_x, py, ex), x0), x1) - ex;
+        const V f1 = fma(a * px, px, fma(c * qy, qy, V(2) * b * px * qy));
+        const V f2 = fma(a * qx, qx, fma(c * py, py, V(2) * b * qx * py));
+        const V dx = min(max(cx, x0), x1) - cx, dy = min(max(cy, y0), y1) - cy;
+        mask |= bits((f1 <= one) | (f2 <= one) | (fma(dx, dx, dy * dy) <= disc2)) << (i * LANES % 32);
+    }
+    return mask;
+}
+
+}  // namespace gs2d

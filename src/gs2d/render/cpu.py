@@ -1,0 +1,263 @@
+"""The native CPU backend: ctypes around the kernels in ``gs2d/kernels``, as one differentiable torch function.
+
+Arguments are checked by :mod:`gs2d.render.api`; what is checked again here is what would crash native code.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gs2d.camera import Camera
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.library import Library, prepare
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import ATTRIBUTES, Splats
+
+__all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
+
+IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
+
+
+class _View(ctypes.Structure):
+    """``struct View`` of kernels/cpu/frame.h."""
+
+    _fields_ = (
+        ("R", ctypes.c_double * 9),
+        ("t", ctypes.c_double * 3),
+        ("center", ctypes.c_double * 3),
+        *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
+        *((name, ctypes.c_double) for name in ("near", "far", "alpha_min", "alpha_max", "transmittance_min")),
+        *((name, ctypes.c_double) for name in ("error_cutoff", "lowpass_px")),
+        ("background", ctypes.c_double * 3),
+        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks")),
+    )
+
+
+class _Parameters(ctypes.Structure):
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        ("sh_rest", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ATTRIBUTES),
+    )
+
+
+class _Images(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in (*IMAGES, "radii"))
+
+
+class _ImageGradients(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in IMAGES)
+
+
+class _ParameterGradients(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in (*ATTRIBUTES, "probe")),
+        ("probe_columns", ctypes.c_int64),
+    )
+
+
+class _Frame:
+    """What the forward pass leaves for the backward pass, in native memory; freed with this object."""
+
+    def __init__(self, library: Library, pointer: ctypes.c_void_p) -> None:
+        self.pointer = pointer
+        self._release = library.function("gs2d_frame_release", None, [ctypes.c_void_p])
+
+    def __del__(self) -> None:
+        self._release(self.pointer)
+
+
+def _view(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
+    if settings.lowpass_depth != "center":
+        raise BackendError(
+            f"lowpass_depth must be 'center' on the cpu backend, got {settings.lowpass_depth!r}; use --backend reference"
+        )
+    if max(camera.width, camera.height) > 1 << 19:
+        raise BackendError(f"the cpu backend renders up to 524288 px a side, got {camera.width}x{camera.height}")
+    view = _View()
+    view.R[:] = np.asarray(camera.rotation).ravel().tolist()
+    view.t[:] = np.asarray(camera.T_cam_world[:3, 3]).tolist()
+    view.center[:] = np.asarray(camera.center).tolist()
+    view.background[:] = [float(c) for c in settings.background]
+    for name in ("fx", "fy", "cx", "cy", "width", "height"):
+        setattr(view, name, getattr(camera, name))
+    for name in ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px", "sh_degree"):
+        setattr(view, name, getattr(settings, name))
+    view.exact_masks = int(exact_masks)
+    return view
+
+
+def _address(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
+
+
+def _parameters(tensors: Sequence[Tensor]) -> _Parameters:
+    means, *_, shN = tensors
+    return _Parameters(means.shape[0], shN.shape[1], *(_address(t) for t in tensors))
+
+
+def _check(code: int) -> None:
+    if code != 0:
+        raise BackendError("the CPU kernels ran out of memory; use fewer splats or --downscale")
+
+
+def _check_tensors(splats: Splats, settings: RasterSettings, dtype: torch.dtype) -> None:
+    for name, tensor in splats.items():
+        if tensor.device.type != "cpu" or tensor.dtype != dtype:
+            raise ShapeError(
+                f"{name} must be {dtype} on the CPU for the cpu backend, got {tensor.dtype} on {tensor.device}; "
+                "convert with splats.to(...) or use --backend reference"
+            )
+    if not 0 <= settings.sh_degree <= 3 or (settings.sh_degree + 1) ** 2 > 1 + splats.shN.shape[1]:
+        raise ShapeError(
+            f"sh_degree must be 0 to 3 and within the stored coefficients ({1 + splats.shN.shape[1]}), "
+            f"got {settings.sh_degree}"
+        )
+    if len(splats) >= 1 << 31:
+        raise BackendError(f"the cpu backend takes fewer than 2^31 splats, got {len(splats)}")
+
+
+class _Rasterize(torch.autograd.Function):
+    """Images and radii from the six parameter tensors; the seventh input is the screen probe or None."""
+
+    @staticmethod
+    def forward(ctx: Any, library: Library, view: _View, probe: Tensor | None, *parameters: Tensor) -> tuple[Tensor, ...]:
+        tensors = [p.detach().contiguous() for p in parameters]
+        H, W = int(view.height), int(view.width)
+        options: dict[str, Any] = {"dtype": library.dtype}
+        images = {name: torch.empty((H, W, 3) if name in ("color", "normal") else (H, W), **options) for name in IMAGES}
+        radii = torch.empty(len(tensors[0]), **options)
+        forward = library.function("gs2d_raster_forward", ctypes.c_int, [ctypes.c_void_p] * 4)
+        pointer = ctypes.c_void_p()
+        native_images = _Images(*(_address(t) for t in images.values()), _address(radii))
+        native_splats = _parameters(tensors)
+        _check(forward(*(ctypes.byref(x) for x in (view, native_splats, native_images, pointer))))
+        frame = _Frame(library, pointer)
+        if any(ctx.needs_input_grad):
+            ctx.library, ctx.frame = library, frame
+            ctx.probe_shape = None if probe is None else tuple(probe.shape)
+            saved = [images[name] for name in ("color", "alpha", "normal", "depth_mean", "distortion")]
+            ctx.save_for_backward(*saved, *tensors)
+            ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(radii)
+        return (*images.values(), radii)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        library: Library = ctx.library
+        color, alpha, normal, depth_mean, distortion, *tensors = ctx.saved_tensors
+        images = _Images(*(_address(t) for t in (color, alpha, normal, depth_mean, None, distortion, None)))
+        given = [None if g is None else g.detach().to(library.dtype).contiguous() for g in upstream[: len(IMAGES)]]
+        _, _, want_probe, *want = ctx.needs_input_grad
+        grads = [torch.empty_like(t) if wanted else None for t, wanted in zip(tensors, want, strict=True)]
+        probe = torch.empty(ctx.probe_shape, dtype=library.dtype) if want_probe else None
+        columns = 0 if probe is None else int(probe.shape[1])
+        out = _ParameterGradients(*(_address(g) for g in grads), _address(probe), columns)
+        backward = library.function("gs2d_raster_backward", ctypes.c_int, [ctypes.c_void_p] * 5)
+        native_splats, native_given = _parameters(tensors), _ImageGradients(*(_address(g) for g in given))
+        arguments = (native_splats, images, native_given, out)
+        _check(backward(ctx.frame.pointer, *(ctypes.byref(a) for a in arguments)))
+        return None, None, probe, *grads
+
+
+def rasterize_with(
+    library: Library,
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    screen_probe: Tensor | None = None,
+    *,
+    exact_masks: bool = True,
+) -> RenderOutput:
+    """:func:`rasterize` on a given variant of the library; ``exact_masks=False`` turns off culling inside tiles."""
+    _check_tensors(splats, settings, library.dtype)
+    view = _view(camera, settings, exact_masks)
+    *images, radii = _Rasterize.apply(library, view, screen_probe, *(t for _, t in splats.items()))
+    return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
+
+
+def rasterize(
+    splats: Splats, camera: Camera, settings: RasterSettings, screen_probe: Tensor | None = None
+) -> RenderOutput:
+    """Render one view on the CPU; the contract is in :mod:`gs2d.render.api`.
+
+    Bit-identical for any number of threads on one machine, instruction set and version.
+
+    Parameters
+    ----------
+    splats : Splats
+        float32 tensors on the CPU.
+    camera : Camera
+    settings : RasterSettings
+    screen_probe : Tensor [N, 2] or [N, 4], optional
+        Zeros; its gradient is the densification signal.
+
+    Raises
+    ------
+    ShapeError
+        If a tensor is not float32 on the CPU.
+    BackendError
+        If the native library is missing, memory runs out, or a setting is one of the reference backend only.
+    """
+    return rasterize_with(prepare(), splats, camera, settings, screen_probe)
+
+
+def splat_errors_with(
+    library: Library,
+    splats: Splats,
+    camera: Camera,
+    image: Tensor,
+    settings: RasterSettings,
+    mask: Tensor | None = None,
+    occlusion: bool = False,
+) -> Tensor:
+    """:func:`splat_errors` on a given variant of the library."""
+    _check_tensors(splats, settings, library.dtype)
+    expected = (camera.height, camera.width, 3)
+    if tuple(image.shape) != expected or image.dtype != library.dtype or image.device.type != "cpu":
+        raise ShapeError(
+            f"image must be {list(expected)} {library.dtype} on the CPU, got {list(image.shape)} {image.dtype} "
+            f"on {image.device}"
+        )
+    if mask is not None and (tuple(mask.shape) != expected[:2] or mask.dtype != torch.bool):
+        raise ShapeError(f"mask must be bool {list(expected[:2])}, got {mask.dtype} {list(mask.shape)}")
+    tensors = [t.detach().contiguous() for _, t in splats.items()]
+    image = image.detach().contiguous()
+    mask = None if mask is None else mask.contiguous()
+    errors = torch.empty(len(splats), dtype=library.dtype)
+    native = library.function(
+        "gs2d_splat_errors", ctypes.c_int, [ctypes.c_void_p] * 4 + [ctypes.c_int, ctypes.c_void_p]
+    )
+    view, parameters = _view(camera, settings, True), _parameters(tensors)
+    _check(
+        native(
+            ctypes.byref(view), ctypes.byref(parameters), _address(image), _address(mask), int(occlusion), _address(errors)
+        )
+    )
+    return errors
+
+
+def splat_errors(
+    splats: Splats,
+    camera: Camera,
+    image: Tensor,
+    settings: RasterSettings,
+    mask: Tensor | None = None,
+    occlusion: bool = False,
+) -> Tensor:
+    """Inner sum of the paper's E_i for one view [N]; rule 17 of the contract in :mod:`gs2d.render.api`.
+
+    Raises
+    ------
+    ShapeError, BackendError
+        As for :func:`rasterize`.
+    """
+    return splat_errors_with(prepare(), splats, camera, image, settings, mask, occlusion)
