@@ -1,6 +1,6 @@
 """Find, load and describe the native CPU library.
 
-There is one library per instruction set (CMakeLists.txt); ``load()`` picks the best one this processor can run.
+There is one library per instruction set (CMakeLists.txt); ``load_library()`` picks the best one this processor can run.
 The environment variable ``GS2D_CPU_VARIANT`` (``v4``, ``v3`` or ``portable``) overrides the choice.
 """
 
@@ -94,7 +94,7 @@ def _load(variant: str) -> Library:
     return Library(_path(variant), variant)
 
 
-def load(variant: str | None = None) -> Library:
+def load_library(variant: str | None = None) -> Library:
     """The native library: the best variant of this machine, or the one that is named.
 
     Parameters
@@ -116,21 +116,17 @@ def load(variant: str | None = None) -> Library:
         return _load(choices[0])
     if wanted in choices or (wanted == "f64" and _path("f64").exists()):
         return _load(wanted)
-    raise BackendError(f"CPU kernels: expected a variant of {', '.join(choices)}, got {wanted!r}; unset GS2D_CPU_VARIANT")
+    raise BackendError(f"CPU variant must be one of {', '.join(choices)}, got {wanted!r}; unset GS2D_CPU_VARIANT")
 
 
 def prepare() -> Library:
-    """``load()``, set to as many threads as torch uses: call it at the start of every native operation."""
-    library = load()
+    """``load_library()``, set to as many threads as torch uses: call it at the start of every native operation."""
+    library = load_library()
     library.use_threads(torch.get_num_threads())
     return library
 
 
-def describe() -> str:
+def describe_library() -> str:
     """One line for ``gs2d doctor``: instruction set, pixels per vector, threads."""
     library = prepare()
     return f"{library.instruction_set}, {library.lanes} pixels per vector, {library.threads} threads"
-
-
-load_library = load
-describe_library = describe

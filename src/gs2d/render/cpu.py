@@ -22,6 +22,7 @@ from gs2d.splats import ATTRIBUTES, Splats
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
+CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 
 
@@ -33,8 +34,7 @@ class _View(ctypes.Structure):
         ("t", ctypes.c_double * 3),
         ("center", ctypes.c_double * 3),
         *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
-        *((name, ctypes.c_double) for name in ("near", "far", "alpha_min", "alpha_max", "transmittance_min")),
-        *((name, ctypes.c_double) for name in ("error_cutoff", "lowpass_px")),
+        *((name, ctypes.c_double) for name in CONSTANTS),
         ("background", ctypes.c_double * 3),
         *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks")),
     )
@@ -77,7 +77,7 @@ class _Frame:
 def _view(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
     if settings.lowpass_depth != "center":
         raise BackendError(
-            f"lowpass_depth must be 'center' on the cpu backend, got {settings.lowpass_depth!r}; use --backend reference"
+            f"the cpu backend needs lowpass_depth 'center', got {settings.lowpass_depth!r}; use --backend reference"
         )
     if max(camera.width, camera.height) > 1 << 19:
         raise BackendError(f"the cpu backend renders up to 524288 px a side, got {camera.width}x{camera.height}")
@@ -88,7 +88,7 @@ def _view(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
     view.background[:] = [float(c) for c in settings.background]
     for name in ("fx", "fy", "cx", "cy", "width", "height"):
         setattr(view, name, getattr(camera, name))
-    for name in ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px", "sh_degree"):
+    for name in (*CONSTANTS, "sh_degree"):
         setattr(view, name, getattr(settings, name))
     view.exact_masks = int(exact_masks)
     return view
@@ -128,7 +128,9 @@ class _Rasterize(torch.autograd.Function):
     """Images and radii from the six parameter tensors; the seventh input is the screen probe or None."""
 
     @staticmethod
-    def forward(ctx: Any, library: Library, view: _View, probe: Tensor | None, *parameters: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, library: Library, view: _View, probe: Tensor | None, *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         H, W = int(view.height), int(view.width)
         options: dict[str, Any] = {"dtype": library.dtype}
@@ -150,7 +152,7 @@ class _Rasterize(torch.autograd.Function):
         return (*images.values(), radii)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         library: Library = ctx.library
         color, alpha, normal, depth_mean, distortion, *tensors = ctx.saved_tensors
@@ -237,11 +239,8 @@ def splat_errors_with(
         "gs2d_splat_errors", ctypes.c_int, [ctypes.c_void_p] * 4 + [ctypes.c_int, ctypes.c_void_p]
     )
     view, parameters = _view(camera, settings, True), _parameters(tensors)
-    _check(
-        native(
-            ctypes.byref(view), ctypes.byref(parameters), _address(image), _address(mask), int(occlusion), _address(errors)
-        )
-    )
+    given = (ctypes.byref(view), ctypes.byref(parameters), _address(image), _address(mask))
+    _check(native(*given, int(occlusion), _address(errors)))
     return errors
 
 
