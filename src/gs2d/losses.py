@@ -3,8 +3,8 @@
 The total of official 2DGS is 0.8 L1 + 0.2 (1 - SSIM) + lambda_n mean(1 - alpha <n, N>) + lambda_d mean(distortion): the
 weights are the :class:`~gs2d.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math_losses.md``.
 
-There are two implementations of each kind: plain torch (``losses_reference``), used by the reference backend, and native
-fused operations (``kernels.ops``), used by the cpu backend. The name of the backend chooses; nothing falls back.
+There are two implementations of each kind: plain torch (``losses_reference``), used by the reference backend, and
+native fused operations (``kernels.ops``), used by the cpu backend. The backend's name chooses; nothing falls back.
 """
 
 from __future__ import annotations
@@ -133,9 +133,7 @@ NATIVE_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
 )
 """The same kinds as fused native operations."""
 
-_BY_BACKEND: Mapping[str, Mapping[str, LossFunction]] = MappingProxyType(
-    {"reference": LOSSES, "cpu": NATIVE_LOSSES}
-)
+_BY_BACKEND: Mapping[str, Mapping[str, LossFunction]] = MappingProxyType({"reference": LOSSES, "cpu": NATIVE_LOSSES})
 
 
 def compute_losses(
@@ -181,7 +179,7 @@ def compute_losses(
     ShapeError
         Target, mask or camera of another size than the image, or a cache of another target.
     RecipeError
-        A kind that is not in LOSSES.
+        A kind that is not in LOSSES, or a term without a weight.
     BackendError
         A backend without losses.
     """
@@ -196,17 +194,20 @@ def compute_losses(
     if target_cache is not None:
         target_cache.check(target)
     weights: dict[str, float] = {}
-    active = [term for term in terms if iteration > term.start]
+    active: list[tuple[LossTerm, float]] = []
     for term in terms:
         if term.kind not in functions:
             raise RecipeError(f"loss kind must be one of {', '.join(LOSSES)}, got {term.kind!r}")
-    for term in active:
-        weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
+        if term.weight is None:
+            raise RecipeError(f"loss {term.kind!r} has no weight; resolve the recipe's losses with a protocol first")
+        if iteration > term.start:
+            active.append((term, term.weight))
+            weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
     mean = target_cache.mean if target_cache is not None else None
     inputs = LossInputs(output, target, mask, camera, mean, weights)
     values: dict[str, Tensor] = {}
-    for term in active:
-        value = term.weight * functions[term.kind](inputs, term.depth or depth_kind)
+    for term, weight in active:
+        value = weight * functions[term.kind](inputs, term.depth or depth_kind)
         values[term.kind] = values[term.kind] + value if term.kind in values else value
     return values
 

@@ -1,8 +1,8 @@
-"""The training losses in plain torch: any dtype, any device, written to be read beside the docs, judge of the native ops.
+"""The training losses in plain torch: any dtype and device, to be read beside the docs, judge of the native operations.
 
 Conventions (``docs/math_losses.md``): images are [H, W, C]; a mask is bool [H, W] with False = ignore this pixel. Means
-run over the valid pixels only (the mean over no pixel at all is 0). What was rendered at an ignored pixel has no influence
-on any value and receives no gradient.
+run over the valid pixels only (the mean over no pixel at all is 0). What was rendered at an ignored pixel has no
+influence on any value and receives no gradient.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
     return torch.where(valid, values, torch.zeros_like(values)).sum() / count
 
 
-def fill_ignored(rendered: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """``rendered`` [H, W, C] with the target's value at ignored pixels."""
-    return rendered if mask is None else torch.where(mask[..., None], rendered, target)
+def fill_ignored(rendered: Tensor, filler: Tensor, mask: Tensor | None) -> Tensor:
+    """``rendered`` [H, W] or [H, W, C] with the filler's value at ignored pixels (whatever is there, even NaN)."""
+    if mask is None:
+        return rendered
+    return torch.where(mask if rendered.dim() == 2 else mask[..., None], rendered, filler)
 
 
 def l1(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -59,7 +61,7 @@ def blur(image: Tensor) -> Tensor:
 
 
 def ssim_map(rendered: Tensor, target: Tensor) -> Tensor:
-    """SSIM of every pixel and channel [H, W, C] (Wang et al. 2004; window, padding and constants of the official 2DGS)."""
+    """SSIM of every pixel and channel [H, W, C] (Wang et al. 2004; window, padding, constants of the official 2DGS)."""
     mu_x, mu_y = blur(rendered), blur(target)
     var_x = blur(rendered * rendered) - mu_x * mu_x
     var_y = blur(target * target) - mu_y * mu_y
@@ -86,18 +88,19 @@ def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None
         Depth along the optical axis; 0 where nothing was hit.
     camera : Camera
     mask : Tensor [H, W] bool, optional
-        False = treat the pixel as not hit.
+        False = treat the pixel as not hit, and give it no normal.
 
     Returns
     -------
     Tensor [H, W, 3]
-        Unit normals in the world frame; 0 on the one-pixel border and wherever one of the four neighbours was not hit.
+        Unit normals in the world frame; 0 on the one-pixel border, at ignored pixels, and wherever one of the four
+        neighbours was not hit.
         Differentiable in ``depth``.
     """
     height, width = depth.shape
     if min(height, width) < 3:
         return torch.zeros_like(depth)[..., None].expand(-1, -1, 3)
-    hit = depth > 0 if mask is None else (depth > 0) & mask
+    hit = ~(depth <= 0) if mask is None else ~(depth <= 0) & mask  # NaN counts as a hit: it must reach the loss
     z = torch.where(hit, depth, torch.ones_like(depth))  # keeps the undefined pixels' gradients finite
     i = torch.arange(width, dtype=depth.dtype, device=depth.device)
     j = torch.arange(height, dtype=depth.dtype, device=depth.device)
@@ -108,6 +111,8 @@ def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None
     right = points[1:-1, 2:] - points[1:-1, :-2]
     normals = F.normalize(torch.linalg.cross(down, right), dim=-1, eps=0.0)
     defined = hit[2:, 1:-1] & hit[:-2, 1:-1] & hit[1:-1, 2:] & hit[1:-1, :-2]
+    if mask is not None:
+        defined = defined & mask[1:-1, 1:-1]
     normals = torch.where(defined[..., None], normals, torch.zeros_like(normals))
     rotation = torch.as_tensor(camera.rotation, dtype=depth.dtype, device=depth.device)
     return F.pad(normals @ rotation, (0, 0, 1, 1, 1, 1))  # rows n^T R = (R^T n)^T
@@ -121,6 +126,7 @@ def normal_consistency(
     Where N is undefined (border, not hit, ignored neighbour) the pixel contributes the constant 1.
     """
     surface = normals_from_depth(depth, camera, mask)
+    normal, alpha = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha))
     return masked_mean(1 - alpha.detach() * (normal * surface).sum(dim=-1), mask)
 
 
@@ -132,6 +138,7 @@ def normal_consistency_per_splat(
     Where N is undefined the pixel contributes 0: there is nothing to be consistent with.
     """
     surface = normals_from_depth(depth, camera, mask)
+    normal, alpha = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha))
     defined = (surface.detach() != 0).any(dim=-1)
     value = alpha - (normal * surface).sum(dim=-1)
     return masked_mean(torch.where(defined, value, torch.zeros_like(value)), mask)

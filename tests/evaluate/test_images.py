@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.errors import DataError, ShapeError
+from gs2d.errors import BackendError, DataError, ShapeError
 from gs2d.evaluate.images import (
     Metric,
     image_metrics,
@@ -21,6 +21,16 @@ from gs2d.evaluate.images import (
     ssim_float,
 )
 from gs2d.evaluate.lpips import BLOCKS, WIDTHS, Lpips, load_lpips
+from gs2d.kernels.library import load
+
+
+@pytest.fixture
+def native() -> None:
+    """Skip where the native library is not built."""
+    try:
+        load()
+    except BackendError as error:
+        pytest.skip(str(error))
 
 
 def vgg_state(seed: int = 0) -> dict[str, Tensor]:
@@ -29,7 +39,8 @@ def vgg_state(seed: int = 0) -> dict[str, Tensor]:
     state, width_in = {}, 3
     for layers, width in zip(BLOCKS, WIDTHS, strict=True):
         for i in layers:
-            state[f"features.{i}.weight"] = torch.randn(width, width_in, 3, 3, generator=g) * (2 / (9 * width_in)) ** 0.5
+            scale = (2 / (9 * width_in)) ** 0.5
+            state[f"features.{i}.weight"] = scale * torch.randn(width, width_in, 3, 3, generator=g)
             state[f"features.{i}.bias"] = 0.1 * torch.randn(width, generator=g)
             width_in = width
     return state

@@ -1,10 +1,10 @@
 """LPIPS (Zhang et al. 2018) with a VGG-16 and five 1x1 heads, from weight files that the user supplies.
 
-Two conventions are in use, and their numbers differ: ``"-1..1"`` scales images to [-1, 1] first, as the authors' package
-does; ``"0..1"`` feeds [0, 1], as the evaluation scripts of 3DGS and 2DGS do. A number must say which it is.
+Two conventions are in use, and their numbers differ: ``"-1..1"`` scales images to [-1, 1] first, as the authors'
+package does; ``"0..1"`` feeds [0, 1], as the evaluation scripts of 3DGS and 2DGS do. A number must say which it is.
 
-Nothing is downloaded. The files are torchvision's VGG-16 state dict (keys ``features.0.weight`` ...) and the heads of the
-``lpips`` package, version 0.1 (keys ``lin0.model.1.weight`` ...).
+Nothing is downloaded. The files are torchvision's VGG-16 state dict (keys ``features.0.weight`` ...) and the heads of
+the ``lpips`` package, version 0.1 (keys ``lin0.model.1.weight`` ...).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 from gs2d.errors import DataError, ShapeError
 
 CONVENTIONS = ("0..1", "-1..1")
-BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # torchvision's `features` indices of the convolutions
+BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))  # the convolutions among torchvision's `features`
 WIDTHS = (64, 128, 256, 512, 512)
 SHIFT = (-0.030, -0.088, -0.188)  # of the LPIPS scaling layer, on [-1, 1]
 SCALE = (0.458, 0.448, 0.450)
@@ -69,7 +69,8 @@ class Lpips:
             if block > 0:
                 x = F.max_pool2d(x, 2)
             for i in layers:
-                x = F.relu(F.conv2d(x, self.weights[f"features.{i}.weight"], self.weights[f"features.{i}.bias"], padding=1))
+                kernel, bias = (self.weights[f"features.{i}.{name}"] for name in ("weight", "bias"))
+                x = F.relu(F.conv2d(x, kernel, bias, padding=1))
             unit = x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)  # [2, C, h, w]
             difference = (unit[:1] - unit[1:]).square()
             total = total + F.conv2d(difference, self.weights[f"lin{block}.model.1.weight"]).mean()
@@ -107,7 +108,8 @@ def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu")
         try:
             state = torch.load(file, map_location=device, weights_only=True)
         except (OSError, RuntimeError, UnpicklingError, EOFError, ValueError) as error:
-            raise DataError(f"{file} is not a readable PyTorch state dict ({str(error).splitlines()[0]}); {REMEDY}") from error
+            first = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise DataError(f"{file} is not a readable PyTorch state dict ({first}); {REMEDY}") from error
         if not isinstance(state, Mapping):
             raise DataError(f"{file} must hold a state dict, got {type(state).__name__}; {REMEDY}")
         weights |= {key: value.float() for key, value in state.items() if key in expected}

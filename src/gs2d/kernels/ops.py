@@ -99,11 +99,12 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, l1_cotangent: Tensor, ssim_cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        gradient, *images = ctx.saved_tensors
+        gradient, rendered, target, mask, mean = ctx.saved_tensors
         cotangents = torch.stack([l1_cotangent, ssim_cotangent])
         if not torch.equal(cotangents, ctx.expected):
             gradient = torch.empty_like(gradient)
-            _photometric(*images, ctx.library, tuple(cotangents.tolist()), gradient)
+            l1, ssim = cotangents.tolist()
+            _photometric(rendered, target, mask, mean, ctx.library, (l1, ssim), gradient)
         return gradient, None, None, None, None, None, None
 
 

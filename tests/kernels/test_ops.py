@@ -1,0 +1,290 @@
+"""The native losses against the torch references, on every instruction set this machine can run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d import losses_reference as reference
+from gs2d.camera import Camera, look_at
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels import ops
+from gs2d.kernels.library import Library, available_variants, load
+
+SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]
+
+
+@pytest.fixture(params=["v4", "v3", "portable"])
+def library(request: pytest.FixtureRequest) -> Library:
+    """Each float32 library that this processor can run, on two threads."""
+    if request.param not in available_variants():
+        pytest.skip(f"this machine cannot run variant {request.param}, or the native library was not built")
+    library = load(request.param)
+    library.use_threads(2)
+    return library
+
+
+@pytest.fixture
+def double() -> Library:
+    """The float64 build of the same sources."""
+    try:
+        library = load("f64")
+    except BackendError as error:
+        pytest.skip(str(error))
+    library.use_threads(2)
+    return library
+
+
+def make_camera(height: int, width: int) -> Camera:
+    T = look_at(
+        np.array([1.0, -2.0, 0.7]), np.zeros(3), np.array([0.1, 0.2, 1.0]), width=width, height=height, fx=1.0
+    ).T_cam_world
+    return Camera(width, height, 0.9 * width + 2, 1.1 * width + 2, 0.4 * width, 0.55 * height, T)
+
+
+def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """A smooth target, a noisy rendering of it with some equal pixels, and a mask; float64."""
+    g = torch.Generator().manual_seed(seed)
+    target = reference.blur(torch.rand(height, width, 3, generator=g, dtype=torch.float64))
+    rendered = (target + 0.2 * torch.randn(height, width, 3, generator=g, dtype=torch.float64)).clamp(0, 1)
+    rendered = torch.where(torch.rand(height, width, 1, generator=g) < 0.1, target, rendered)
+    return rendered, target, torch.rand(height, width, generator=g) < 0.8
+
+
+def geometry(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rendered normals, depth with holes, alpha and a mask; float64."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    depth = torch.where(rand(height, width) < 0.05, 0.0, 2 + rand(height, width))
+    return rand(height, width, 3) - 0.5, depth, rand(height, width), rand(height, width) < 0.85
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    """Relative Frobenius norm of a difference."""
+    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_l1_and_ssim_and_their_gradient_are_those_of_the_reference(
+    library: Library, size: tuple[int, int], masked: bool
+) -> None:
+    rendered, target, mask = photographs(*size)
+    valid = mask if masked else None
+    x, y = rendered.float().requires_grad_(), target.float()
+    exact, exact_y = x.detach().double().requires_grad_(), y.double()  # the very numbers that the native op sees
+    l1, ssim = ops.photometric(x, y, valid, library=library)
+    expected_l1, expected_ssim = reference.l1(exact, exact_y, valid), reference.ssim(exact, exact_y, valid)
+    assert l1.item() == pytest.approx(expected_l1.item(), abs=1e-7)
+    assert ssim.item() == pytest.approx(expected_ssim.item(), abs=1e-6)
+    for weights in [(0.8, -0.2), (0.0, 1.0), (1.0, 0.0), (-0.3, 2.0)]:  # the first is what the op prepared for
+        (found,) = torch.autograd.grad((l1, ssim), x, tuple(map(torch.tensor, weights)), retain_graph=True)
+        total = weights[0] * expected_l1 + weights[1] * expected_ssim
+        (expected,) = torch.autograd.grad(total, exact, retain_graph=True)
+        assert relative_error(found, expected) < 1e-5
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("per_splat", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
+    library: Library, size: tuple[int, int], per_splat: bool, masked: bool
+) -> None:
+    *images, mask = geometry(*size)
+    camera, valid = make_camera(*size), mask if masked else None
+    found_in = [image.float().requires_grad_() for image in images]
+    exact_in = [image.detach().double().requires_grad_() for image in found_in]
+    value = ops.normal_consistency(*found_in, camera, valid, per_splat=per_splat, library=library)
+    function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
+    exact = function(*exact_in, camera, valid)
+    assert value.item() == pytest.approx(exact.item(), abs=1e-6)
+    if min(size) < 3:
+        assert value.item() == (0 if per_splat else 1)
+        return
+    for cotangent in (0.05, 3.0):  # the first is what the op prepared for
+        found = torch.autograd.grad(value, found_in, torch.tensor(cotangent), allow_unused=True, retain_graph=True)
+        expected = torch.autograd.grad(
+            exact, exact_in, torch.tensor(cotangent).double(), allow_unused=True, retain_graph=True
+        )
+        assert (found[2] is None) == (expected[2] is None) == (not per_splat)
+        for f, e in zip(found, expected, strict=True):
+            if f is not None and e is not None:
+                assert relative_error(f, e) < 5e-6
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_masked_mean_and_its_gradient_are_those_of_the_reference(library: Library, size: tuple[int, int]) -> None:
+    _, _, values, mask = geometry(*size)
+    for valid in (None, mask, torch.zeros_like(mask)):
+        x = values.float().requires_grad_()
+        exact = x.detach().double().requires_grad_()
+        found, expected = ops.masked_mean(x, valid, library=library), reference.distortion(exact, valid)
+        assert found.item() == pytest.approx(expected.item(), abs=1e-6)
+        (gradient,) = torch.autograd.grad(3 * found, x)
+        torch.testing.assert_close(gradient, 3 * torch.autograd.grad(expected, exact)[0].float())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, masked: bool) -> None:
+    size = (8, 9)
+    rendered, target, mask = photographs(*size, seed=3)
+    rendered = torch.where((rendered - target).abs() < 1e-3, target + 0.05, rendered)  # |x - y| has a corner
+    valid = mask if masked else None
+    assert torch.autograd.gradcheck(
+        lambda x: ops.photometric(x, target, valid, library=double), (rendered.requires_grad_(),)
+    )
+    normal, depth, alpha, _ = geometry(*size, seed=4)
+    camera = make_camera(*size)
+    inputs = (normal.requires_grad_(), torch.where(depth > 0, depth, 2.5).requires_grad_(), alpha.requires_grad_())
+    assert torch.autograd.gradcheck(
+        lambda *x: ops.normal_consistency(*x, camera, valid, per_splat=True, library=double), inputs
+    )
+    assert torch.autograd.gradcheck(  # alpha is detached in this form
+        lambda n, d: ops.normal_consistency(n, d, alpha.detach(), camera, valid, library=double), inputs[:2]
+    )
+    assert torch.autograd.gradcheck(lambda x: ops.masked_mean(x, valid, library=double), (inputs[2],))
+
+
+def test_in_float64_native_and_reference_agree_to_rounding(double: Library) -> None:
+    rendered, target, mask = photographs(33, 47, seed=5)
+    x, y = rendered.clone().requires_grad_(), rendered.clone().requires_grad_()
+    l1, ssim = ops.photometric(x, target, mask, library=double)
+    expected = 0.8 * reference.l1(y, target, mask) - 0.2 * reference.ssim(y, target, mask)
+    assert (0.8 * l1 - 0.2 * ssim).item() == pytest.approx(expected.item(), rel=1e-14)
+    (found,), (wanted,) = torch.autograd.grad(0.8 * l1 - 0.2 * ssim, x), torch.autograd.grad(expected, y)
+    assert relative_error(found, wanted) < 1e-13
+
+
+def everything(library: Library, height: int = 150, width: int = 41) -> list[Tensor]:
+    """Values and gradients of every native loss."""
+    rendered, target, mask = photographs(height, width, seed=6)
+    normal, depth, alpha, _ = geometry(height, width, seed=7)
+    leaves = [image.float().requires_grad_() for image in (rendered, normal, depth, alpha)]
+    x, n, z, a = leaves
+    y = target.float()
+    values = [
+        *ops.photometric(x, y, mask, library=library),
+        *ops.photometric(x, y, library=library),
+        ops.normal_consistency(n, z, a, make_camera(height, width), mask, library=library),
+        ops.normal_consistency(n, z, a, make_camera(height, width), per_splat=True, library=library),
+        ops.masked_mean(a, mask, library=library),
+    ]
+    return [*values, *torch.autograd.grad(sum(values), leaves), ops.blur(y, library=library)]
+
+
+def test_every_bit_is_the_same_for_any_number_of_threads(library: Library) -> None:
+    library.use_threads(1)
+    expected = everything(library)
+    for threads in (2, 3, 7):
+        library.use_threads(threads)
+        for found, wanted in zip(everything(library), expected, strict=True):
+            assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_cached_target_mean_changes_no_bit(library: Library, masked: bool) -> None:
+    rendered, target, mask = photographs(45, 38, seed=8)
+    x, y, valid = rendered.float().requires_grad_(), target.float(), mask if masked else None
+    results = []
+    for mean in (None, ops.blur(y, library=library)):
+        l1, ssim = ops.photometric(x, y, valid, mean, library=library)
+        results.append((l1, ssim, *torch.autograd.grad(0.8 * l1 - 0.2 * ssim, x)))
+    for found, wanted in zip(*results, strict=True):
+        assert torch.equal(found, wanted)
+
+
+def test_a_wrong_target_mean_does_change_the_value(library: Library) -> None:
+    rendered, target, _ = photographs(20, 20)
+    x, y = rendered.float(), target.float()
+    assert (
+        ops.photometric(x, y, None, torch.zeros_like(y), library=library)[1]
+        < 0.9 * ops.photometric(x, y, library=library)[1].item()
+    )
+
+
+def test_blur_is_that_of_the_reference(library: Library) -> None:
+    image = photographs(23, 31)[0].float()
+    torch.testing.assert_close(ops.blur(image, library=library), reference.blur(image), atol=1e-6, rtol=0)
+
+
+def test_images_that_are_not_contiguous_are_read_right(library: Library) -> None:
+    rendered, target, mask = (image.float() if image.is_floating_point() else image for image in photographs(18, 25))
+
+    def strided(image: Tensor) -> Tensor:
+        return image.transpose(0, 1).contiguous().transpose(0, 1)
+
+    plain = ops.photometric(rendered, target, mask, library=library)
+    other = ops.photometric(strided(rendered), strided(target), strided(mask), library=library)
+    assert not strided(mask).is_contiguous()
+    assert torch.equal(torch.stack(plain), torch.stack(other))
+
+
+def test_nan_at_a_valid_pixel_reaches_the_loss(library: Library) -> None:
+    rendered, target, _ = photographs(20, 20)
+    x = rendered.float()
+    x[3, 4, 1] = float("nan")
+    assert all(value.isnan() for value in ops.photometric(x, target.float(), library=library))
+    camera = make_camera(20, 20)
+    for bad in range(3):
+        images = [image.float() for image in geometry(20, 20)[:3]]
+        images[1][images[1] == 0] = 2.5
+        images[bad][7, 8] = float("nan")
+        assert ops.normal_consistency(*images, camera, library=library).isnan()
+        assert reference.normal_consistency(*images, camera).isnan()
+
+
+def test_an_equal_pixel_has_no_l1_gradient(library: Library) -> None:
+    y = torch.rand(6, 6, 3)
+    x = y.clone().requires_grad_()
+    l1, _ = ops.photometric(x, y, expected=(1.0, 0.0), library=library)
+    assert l1.item() == 0
+    assert (torch.autograd.grad(l1, x)[0] == 0).all()
+
+
+def test_without_gradients_nothing_is_kept(library: Library) -> None:
+    rendered, target, _ = photographs(9, 9)
+    x = rendered.float().requires_grad_()
+    with torch.no_grad():
+        values = ops.photometric(x, target.float(), library=library)
+    assert not any(value.requires_grad for value in values)
+    assert torch.equal(torch.stack(values), torch.stack(ops.photometric(x, target.float(), library=library)))
+
+
+def test_a_target_changed_before_backward_is_an_error_not_a_wrong_gradient(library: Library) -> None:
+    rendered, target, _ = photographs(9, 9)
+    x, y = rendered.float().requires_grad_(), target.float().contiguous()
+    l1, _ = ops.photometric(x, y, library=library)
+    y.zero_()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        l1.backward()
+
+
+def test_a_wrong_argument_is_refused_in_one_line(library: Library) -> None:
+    image, mask, camera = torch.rand(8, 9, 3), torch.ones(8, 9, dtype=torch.bool), make_camera(8, 9)
+    depth, alpha = torch.ones(8, 9), torch.ones(8, 9)
+    cases = [
+        (lambda: ops.photometric(image, image[:7], library=library), "rendered must be"),
+        (lambda: ops.photometric(image.double(), image, library=library), "rendered must be torch.float32"),
+        (lambda: ops.photometric(image, image.double(), library=library), "target must be torch.float32"),
+        (lambda: ops.photometric(image, image, mask[:5], library=library), "mask must be"),
+        (lambda: ops.photometric(image, image, mask.float(), library=library), "mask must be bool"),
+        (lambda: ops.photometric(image, image, None, image[:4], library=library), "target_mean must be"),
+        (lambda: ops.blur(image[..., :2], library=library), "image must be"),
+        (lambda: ops.masked_mean(image, library=library), "values must be"),
+        (lambda: ops.normal_consistency(image, depth[:4], alpha, camera, library=library), "normal must be"),
+        (
+            lambda: ops.normal_consistency(image, depth, alpha, replace(camera, width=8), library=library),
+            "camera is 8x8",
+        ),
+    ]
+    for call, words in cases:
+        with pytest.raises(ShapeError, match=words) as caught:
+            call()
+        assert "\n" not in str(caught.value)
