@@ -1,6 +1,6 @@
 """Find, load and describe the native CPU library.
 
-There is one library per instruction set (CMakeLists.txt); ``load_library()`` picks the best one this processor can run.
+There is one library per instruction set (CMakeLists.txt); ``load()`` picks the best one this processor can run.
 The environment variable ``GS2D_CPU_VARIANT`` (``v4``, ``v3`` or ``portable``) overrides the choice.
 """
 
@@ -94,7 +94,7 @@ def _load(variant: str) -> Library:
     return Library(_path(variant), variant)
 
 
-def load_library(variant: str | None = None) -> Library:
+def load(variant: str | None = None) -> Library:
     """The native library: the best variant of this machine, or the one that is named.
 
     Parameters
@@ -120,8 +120,8 @@ def load_library(variant: str | None = None) -> Library:
 
 
 def prepare() -> Library:
-    """``load_library()``, set to as many threads as torch uses: call it at the start of every native operation."""
-    library = load_library()
+    """``load()``, set to as many threads as torch uses: call it at the start of every native operation."""
+    library = load()
     library.use_threads(torch.get_num_threads())
     return library
 
