@@ -1,0 +1,372 @@
+"""``report.html``: what a run was, what came out, and pictures of it, in one file that works offline.
+
+Everything is read from the run folder: ``run.json``, ``metrics.json``, ``events.jsonl``, ``renders/``, ``mesh.ply``.
+What is not there is said in words.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.disk import atomic_write
+from gs2d.io.run import MESH, RENDERS, REPORT, open_run
+from gs2d.report_curves import curves, read_history
+from gs2d.report_html import drawing, escape, facts, missing, page, table
+from gs2d.report_pictures import hero, mesh_section, view_sections
+
+_IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a run folder says about itself.
+
+    Attributes
+    ----------
+    path : Path
+    definition : dict
+        ``run.json``.
+    stages : tuple of dict
+        Entries of ``metrics.json``; empty before the first stage is finished.
+    surface : dict or None
+        Surface metrics; ``surface_reason`` says why there are none.
+    events : list of dict
+        ``events.jsonl``.
+    """
+
+    path: Path
+    definition: dict[str, Any]
+    stages: tuple[dict[str, Any], ...]
+    surface: dict[str, Any] | None
+    surface_reason: str | None
+    events: list[dict[str, Any]]
+
+    @property
+    def split(self) -> str:
+        """Which views the figures are about: the test views where there are any."""
+        return "test" if any(stage.get("test") for stage in self.stages) else "train"
+
+
+def read_record(folder: Path) -> RunRecord:
+    """Read what is needed of a run folder.
+
+    Raises
+    ------
+    RunError
+        Not a run.
+    DataError
+        A file is not JSON.
+    """
+    run = open_run(folder)
+    metrics = run.metrics()
+    return RunRecord(
+        path=Path(folder),
+        definition=run.definition(),
+        stages=tuple(metrics.get("stages") or ()),
+        surface=metrics.get("surface"),
+        surface_reason=metrics.get("surface_reason"),
+        events=run.events.read(),
+    )
+
+
+def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
+    """Write ``report.html`` into a run folder.
+
+    Parameters
+    ----------
+    run : Path
+        A run folder, finished or not.
+    cameras : sequence of Camera, optional
+        From where the mesh is shown (the first three). Default: around it, taking the third axis as up.
+
+    Returns
+    -------
+    Path
+        The report.
+
+    Raises
+    ------
+    RunError
+        Not a run folder.
+    DataError
+        A file in it is broken.
+    DiskError
+        The report could not be written.
+    """
+    record = read_record(run)
+    renders = record.path / RENDERS
+    scene = _scene_name(record)
+    body = [
+        f'<div class="eyebrow">gs2d report</div><h1>{escape(scene)}</h1>',
+        f'<p class="lead">{verdict(record)}</p>',
+        hero(renders),
+        "<h2>Results</h2>",
+        stage_table(record),
+        "<h2>Surface</h2>",
+        surface_table(record),
+        mesh_section(record.path / MESH, cameras),
+        "<h2>Every stage beside the photographs</h2>",
+        view_sections(renders, expected_stages=[stage["name"] for stage in record.stages]),
+        "<h2>Training</h2>",
+        curve_section(record),
+        story(record.events),
+        "<h2>What was run</h2>",
+        facts(definition_facts(record.definition)),
+        _raw("The whole definition (run.json)", record.definition),
+        _raw("All figures (metrics.json)", {"stages": record.stages, "surface": record.surface}),
+    ]
+    target = record.path / REPORT
+    with atomic_write(target, "w") as file:
+        file.write(page(f"{scene}: gs2d report", [part for part in body if part]))
+    return target
+
+
+def _scene_name(record: RunRecord) -> str:
+    scene = record.definition.get("scene")
+    return str(scene.get("name") if isinstance(scene, Mapping) else scene or record.path.name)
+
+
+def _name_of(value: Any) -> str:
+    return str(value.get("name", "unnamed") if isinstance(value, Mapping) else value)
+
+
+# -- figures -----------------------------------------------------------------------------------------------------------
+def figure(value: Any, digits: int) -> str:
+    """A number with fixed digits, or a dash."""
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return "-" if value is None or not isinstance(value, float) else str(value)
+    return f"{value:,.{digits}f}"
+
+
+def verdict(record: RunRecord) -> str:
+    """One sentence (HTML) on what the run shows: quality at its end, and what the later stages changed and cost."""
+    recipe = escape(_name_of(record.definition.get("recipe", "an unnamed recipe")))
+    split, scored = record.split, [s for s in record.stages if (s.get(record.split) or {}).get("psnr") is not None]
+    if not scored:
+        return f"No stage of {recipe} is finished and scored yet."
+    first, last = scored[0], scored[-1]
+    text = f"{recipe} reaches <b>{last[split]['psnr']:.2f} dB</b> PSNR on the {split} views"
+    if isinstance(last[split].get("ssim"), int | float):
+        text += f" (SSIM {last[split]['ssim']:.4f})"
+    if first is not last:
+        gain = last[split]["psnr"] - first[split]["psnr"]
+        words = "more than" if gain >= 0 else "less than"
+        text += f", {abs(gain):.2f} dB {words} after its first stage ({escape(first['name'])})"
+        text += _price(first, last, record.stages)
+    return text + "." + _surface_sentence(record.surface) + _unfinished(record)
+
+
+def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[Mapping[str, Any]]) -> str:
+    """What the stages after the first cost in storage and time."""
+    parts = []
+    if first.get("bytes") and last.get("bytes"):
+        parts.append(f"{100 * (last['bytes'] / first['bytes'] - 1):+.1f} % storage")
+    later = [s.get("seconds") for s in stages[list(stages).index(first) + 1 :]]
+    if first.get("seconds") and later and all(isinstance(s, int | float) for s in later):
+        parts.append(f"{100 * sum(s for s in later if s is not None) / first['seconds']:+.0f} % training time")
+    return f", for {' and '.join(parts)}" if parts else ""
+
+
+def _surface_sentence(surface: Mapping[str, Any] | None) -> str:
+    rows = (surface or {}).get("thresholds") or []
+    best = next((row for row in reversed(rows) if isinstance(row.get("f_score"), int | float)), None)
+    if best is None:
+        return ""
+    return f" The mesh scores an F-score of {best['f_score']:.3f} within {best['threshold']:.3g} world units."
+
+
+def _unfinished(record: RunRecord) -> str:
+    recipe = record.definition.get("recipe")
+    planned = [_name_of(s) for s in recipe.get("stages", ())] if isinstance(recipe, Mapping) else []
+    done = [stage["name"] for stage in record.stages]
+    left = [name for name in planned if name not in done]
+    return f" Not finished: {escape(', '.join(left))}." if left else ""
+
+
+def stage_table(record: RunRecord) -> str:
+    """One row a stage: quality, size, time."""
+    if not record.stages:
+        return missing("metrics.json has no finished stage yet.")
+    splits = [name for name in ("test", "train") if any(stage.get(name) for stage in record.stages)]
+    columns = ["Stage", "Iterations"]
+    shown = [  # a figure that no stage has gets no column; why is said below the table
+        (split, key, label, digits, _best(record.stages, split, key, sign))
+        for split in splits
+        for key, label, digits, sign in _IMAGE_METRICS
+        if any((stage.get(split) or {}).get(key) is not None for stage in record.stages)
+    ]
+    columns += [f"{label} ({split})" for split, _, label, _, _ in shown]
+    columns += ["Splats", "MB", "Seconds", "Peak memory, MB"]
+    rows = []
+    for stage in record.stages:
+        rows.append([_stage_name(stage), figure(stage.get("iterations"), 0)])
+        rows[-1] += [_metric_cell(stage.get(split) or {}, key, digits, best) for split, key, _, digits, best in shown]
+        rows[-1] += [
+            figure(stage.get("splats"), 0),
+            figure(_scaled(stage.get("bytes"), 1e-6), 2),
+            figure(stage.get("seconds"), 1),
+            figure(_scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
+        ]
+    notes = [_reasons(record.stages, splits), _clone_note(record)]
+    return table(columns, rows) + "".join(notes)
+
+
+def _scaled(value: Any, factor: float) -> float | None:
+    return value * factor if isinstance(value, int | float) else None
+
+
+def _stage_name(stage: Mapping[str, Any]) -> str:
+    reused = f'<span class="why">reused from {escape(stage["reused_from"])}</span>' if stage.get("reused_from") else ""
+    return f"<td>{escape(stage['name'])}{reused}</td>"
+
+
+def _best(stages: Sequence[Mapping[str, Any]], split: str, key: str, sign: int) -> float | None:
+    values = [(stage.get(split) or {}).get(key) for stage in stages]
+    numbers = [sign * value for value in values if isinstance(value, int | float)]
+    return sign * max(numbers) if len(numbers) > 1 else None
+
+
+def _metric_cell(scores: Mapping[str, Any], key: str, digits: int, best: float | None) -> str:
+    value = scores.get(key)
+    style = ' class="best"' if value is not None and value == best else ""
+    return f"<td{style}>{figure(value, digits)}</td>"
+
+
+def _reasons(stages: Sequence[Mapping[str, Any]], splits: Sequence[str]) -> str:
+    """Why figures are missing, once each."""
+    said: dict[str, None] = {}
+    for stage in stages:
+        for split in ("test", "train"):
+            if stage.get(f"{split}_reason"):
+                said[f"{split} views: {stage[f'{split}_reason']}"] = None
+        for split in splits:
+            for key, label, _, _ in _IMAGE_METRICS:
+                scores = stage.get(split) or {}
+                if scores.get(f"{key}_reason"):
+                    said[f"{label.partition(',')[0]}: {scores[f'{key}_reason']}"] = None
+    return "".join(missing(text) for text in said)
+
+
+def _clone_note(record: RunRecord) -> str:
+    """PSNR just before and just after splats were cloned in place."""
+    split, lines = record.split, []
+    for before, stage in zip(record.stages, record.stages[1:], strict=False):
+        after = ((stage.get("after_clone") or {}).get(split) or {}).get("psnr")
+        earlier = (before.get(split) or {}).get("psnr")
+        if isinstance(after, int | float) and isinstance(earlier, int | float):
+            lines.append(
+                f"Cloning in place at the start of {stage['name']} changed PSNR on the {split} views "
+                f"from {earlier:.2f} to {after:.2f} dB."
+            )
+    return "".join(f'<p class="soft">{escape(line)}</p>' for line in lines)
+
+
+def surface_table(record: RunRecord) -> str:
+    """Distances and scores against the true surface."""
+    surface = record.surface
+    if not surface:
+        reason = record.surface_reason or "no true surface was given (gs2d evaluate RUN --ground-truth FILE)"
+        return missing(f"The surface was not scored: {reason}.")
+    parts = []
+    rows = [
+        [f"{row['threshold']:.4g}", *(figure(row.get(name), 4) for name in ("precision", "recall", "f_score"))]
+        for row in surface.get("thresholds") or []
+    ]
+    if rows:
+        parts.append(table(["Within, world units", "Precision", "Recall", "F-score"], rows))
+    scalars = [
+        (name.replace("_", " "), f"{value:.5g}" if isinstance(value, float) else str(value))
+        for name, value in surface.items()
+        if isinstance(value, int | float | str)
+    ]
+    if scalars:
+        parts.append(facts(scalars))
+    return "".join(parts) or missing("metrics.json has a surface entry without figures.")
+
+
+# -- training ----------------------------------------------------------------------------------------------------------
+def curve_section(record: RunRecord) -> str:
+    """Curves from the log."""
+    if not record.events:
+        return missing("events.jsonl is missing or empty: there are no curves.")
+    split = record.split
+    ends = {
+        stage["name"]: float(stage[split]["psnr"])
+        for stage in record.stages
+        if isinstance((stage.get(split) or {}).get("psnr"), int | float) and np.isfinite(stage[split]["psnr"])
+    }
+    drawn = curves(read_history(record.events), ends, split)
+    if not drawn:
+        return missing("events.jsonl holds no figures of training steps: there are no curves.")
+    return '<div class="curves">' + "".join(drawing(svg, title) for title, svg in drawn.items()) + "</div>"
+
+
+def story(events: Sequence[Mapping[str, Any]]) -> str:
+    """The log's turning points as a list."""
+    lines: list[str] = []
+    densified: dict[str, list[int]] = {}
+    resets: dict[str, int] = {}
+    for event in events:
+        kind, stage = str(event.get("kind", event.get("event", ""))), str(event.get("stage", ""))
+        if kind == "initialised":
+            lines.append(f"Started from {figure(event.get('splats'), 0)} splats ({event.get('source', 'unknown')}).")
+        elif kind in ("densify", "densified"):
+            counts = densified.setdefault(stage, [0, 0, 0])
+            counts[0] += int(event.get("cloned", 0))
+            counts[1] += int(event.get("split", 0))
+            counts[2] += sum(int(event.get(name, 0)) for name in ("pruned", "pruned_faint", "pruned_large"))
+        elif kind == "opacity_limited" and event.get("reset"):
+            resets[stage] = resets.get(stage, 0) + 1
+        elif kind == "ranked":
+            share = event.get("share")
+            held = f", which hold {100 * share:.1f} % of the summed colour error" if isinstance(share, float) else ""
+            lines.append(f"{stage}: ranked by colour error; the worst {figure(event.get('count'), 0)} splats{held}.")
+        elif kind == "cloned":
+            lines.append(
+                f"{stage}: cloned {figure(event.get('count'), 0)} splats in place "
+                f"(opacity: {event.get('opacity', 'not said')}), {figure(event.get('splats'), 0)} after it."
+            )
+    grown = [
+        f"{stage}: densification cloned {clone:,}, split {split:,} and pruned {prune:,} splats"
+        + (f"; {resets[stage]} opacity resets." if stage in resets else ".")
+        for stage, (clone, split, prune) in densified.items()
+    ]
+    lines = [*lines[:1], *grown, *lines[1:]]
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+
+
+# -- the definition ----------------------------------------------------------------------------------------------------
+def definition_facts(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The definition in short; the whole of it follows in the report."""
+    scene, machine = definition.get("scene"), definition.get("machine")
+    backend = definition.get("backend")
+    pairs = [("Recipe", _name_of(definition.get("recipe", "not said")))]
+    pairs.append(("Protocol", _name_of(definition.get("protocol", "not said"))))
+    if isinstance(scene, Mapping):
+        pairs.append(("Scene", f"{scene.get('name')} ({scene.get('format', 'format not said')})"))
+        pairs.append(("Views", f"{scene.get('train', '?')} train, {scene.get('test', '?')} test"))
+        pairs += [("Skipped", ", ".join(map(str, scene["skipped"])))] if scene.get("skipped") else []
+    details = f" ({backend['details']})" if isinstance(backend, Mapping) and backend.get("details") else ""
+    pairs.append(("Backend", _name_of(definition.get("backend", "not said")) + details))
+    pairs.append(("Seed", str(definition.get("seed", "not said"))))
+    pairs += [("Downscale", str(definition["downscale"]))] if definition.get("downscale") else []
+    if isinstance(machine, Mapping):
+        pairs.append(("Machine", ", ".join(f"{name}: {value}" for name, value in machine.items())))
+    versions = definition.get("versions")
+    if isinstance(versions, Mapping):
+        pairs.append(("Versions", ", ".join(f"{name} {version}" for name, version in versions.items())))
+    pairs += [("Made", str(definition["created"]))] if definition.get("created") else []
+    return pairs
+
+
+def _raw(title: str, value: Any) -> str:
+    text = json.dumps(value, indent=2, ensure_ascii=False)
+    return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"

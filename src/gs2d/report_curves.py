@@ -1,0 +1,204 @@
+"""Curves of a run for the report: losses, PSNR, splat count, mean opacity and mean K_a, as SVG text."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+_INK = "#858b94"  # readable on white and on black
+_COLORS = ("#3f86d6", "#e0893a", "#46a56b", "#c6509f", "#8a74d8", "#b9a02d", "#50a9b8")
+_STEP_KINDS = ("step", "progress")
+_AREA_NAMES = ("mean_area", "mean_k_a", "mean_Ka")
+
+
+@dataclass(frozen=True)
+class StageSpan:
+    """Iterations of a stage within the run: [start, stop)."""
+
+    name: str
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class History:
+    """What the log says, against iterations counted over all stages.
+
+    Attributes
+    ----------
+    stages : tuple of StageSpan
+    series : mapping of name to (iterations, values)
+        "splats", "mean_opacity", "mean_area", "psnr", and "loss/<term>" for each term.
+    """
+
+    stages: tuple[StageSpan, ...] = ()
+    series: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+
+
+def read_history(events: Sequence[Mapping[str, Any]]) -> History:
+    """Sort the log's steps into series. Kinds and figures that are not known are passed over."""
+    order: list[str] = []
+    lengths: dict[str, int] = {}
+    for event in events:
+        stage = event.get("stage")
+        if not isinstance(stage, str):
+            continue
+        if stage not in lengths:
+            order.append(stage)
+            lengths[stage] = 0
+        declared = event.get("iterations") if _kind(event) in ("stage_start", "stage_started") else None
+        lengths[stage] = max(lengths[stage], _whole(declared), _whole(event.get("iteration")))
+    starts, total = {}, 0
+    for stage in order:
+        starts[stage] = total
+        total += lengths[stage]
+    points: dict[str, list[tuple[float, float]]] = {}
+    for event in events:
+        if _kind(event) in _STEP_KINDS and event.get("stage") in starts and "iteration" in event:
+            iteration = starts[event["stage"]] + _whole(event["iteration"])
+            for name, value in _figures(event).items():
+                points.setdefault(name, []).append((iteration, value))
+    series = {name: (np.array(rows)[:, 0], np.array(rows)[:, 1]) for name, rows in points.items()}
+    spans = tuple(StageSpan(name, starts[name], starts[name] + lengths[name]) for name in order)
+    return History(spans, series)
+
+
+def _kind(event: Mapping[str, Any]) -> str:
+    return str(event.get("kind", event.get("event", "")))
+
+
+def _whole(value: Any) -> int:
+    return int(value) if isinstance(value, int | float) else 0
+
+
+def _figures(event: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers of one step that are finite."""
+    named: dict[str, Any] = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity")}
+    named["mean_area"] = next((event[name] for name in _AREA_NAMES if name in event), None)
+    losses = event.get("losses")
+    for term, value in losses.items() if isinstance(losses, Mapping) else ():
+        named[f"loss/{term}"] = value
+    return {
+        name: float(value) for name, value in named.items() if isinstance(value, int | float) and np.isfinite(value)
+    }
+
+
+def smoothed(values: np.ndarray, count: int = 9) -> np.ndarray:
+    """A centred running mean over ``count`` values, shorter at the ends."""
+    ones = np.convolve(np.ones(len(values)), np.ones(count), mode="same")
+    return np.asarray(np.convolve(values, np.ones(count), mode="same") / ones)
+
+
+def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dict[str, str]:
+    """One SVG per figure, keyed by its title; figures without data are left out.
+
+    Parameters
+    ----------
+    history : History
+    stage_psnr : mapping of stage name to PSNR at its end, dB
+        Of the ``split`` views; drawn as points.
+    """
+    drawn: dict[str, str] = {}
+    terms = sorted(name for name in history.series if name.startswith("loss/"))
+    if terms:
+        lines = {name.removeprefix("loss/"): name for name in terms}
+        drawn["Loss terms, weighted"] = _figure(history, lines, log=True, smooth=True)
+    if "psnr" in history.series or stage_psnr:
+        ends = {span.stop: stage_psnr[span.name] for span in history.stages if span.name in stage_psnr}
+        line = {"a few views, while training": "psnr"} if "psnr" in history.series else {}
+        if line or ends:
+            drawn["PSNR, dB"] = _figure(history, line, smooth=True, marks=(f"all {split} views", ends))
+    for name, title, log in (
+        ("splats", "Splats", False),
+        ("mean_opacity", "Mean opacity", False),
+        ("mean_area", "Mean Kₐ = s_u s_v, square world units", True),
+    ):
+        if name in history.series:
+            drawn[title] = _figure(history, {"": name}, log=log)
+    return drawn
+
+
+def _figure(
+    history: History,
+    lines: Mapping[str, str],
+    *,
+    log: bool = False,
+    smooth: bool = False,
+    marks: tuple[str, Mapping[int, float]] | None = None,
+) -> str:
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.4, 2.7), layout="constrained")
+    FigureCanvasSVG(figure)
+    axes = figure.add_subplot()
+    for k, (label, name) in enumerate(lines.items()):
+        color = _COLORS[k % len(_COLORS)]
+        for span in history.stages:  # one line a stage: nothing is drawn or averaged across a boundary
+            x, y = _within(history, name, span)
+            if not len(x):
+                continue
+            if smooth and len(x) > 30:
+                axes.plot(x, y, color=color, linewidth=0.6, alpha=0.25)
+                y = smoothed(y)
+            axes.plot(x, y, color=color, linewidth=1.5)
+        axes.plot([], [], color=color, linewidth=1.5, label=label)
+    if marks and marks[1]:
+        x_marks, y_marks = list(marks[1]), list(marks[1].values())
+        axes.plot(x_marks, y_marks, "o", color=_COLORS[1], markersize=5, label=marks[0], clip_on=False)
+        for x_mark, y_mark in marks[1].items():
+            axes.annotate(
+                f"{y_mark:.2f}",
+                (x_mark, y_mark),
+                (-5, 5),
+                textcoords="offset points",
+                ha="right",
+                fontsize=8,
+                color=_INK,
+            )
+    _dress(axes, history, log=log, legend=any(lines) or bool(marks and marks[1]))
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "gs2d"}):  # the same run gives the same bytes
+        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
+    return text.getvalue()
+
+
+def _within(history: History, name: str, span: StageSpan) -> tuple[np.ndarray, np.ndarray]:
+    x, y = history.series[name]
+    chosen = (x > span.start) & (x <= span.stop) if span.start else (x >= 0) & (x <= span.stop)
+    return x[chosen], y[chosen]
+
+
+def _dress(axes: Any, history: History, *, log: bool, legend: bool) -> None:
+    """Axes in grey, stage boundaries and names."""
+    from matplotlib.ticker import EngFormatter
+
+    values = [y for line in axes.get_lines() for y in np.atleast_1d(line.get_ydata()) if y > 0]
+    if log and values:
+        axes.set_yscale("log")
+    last = max((span.stop for span in history.stages), default=1)
+    axes.set_xlim(0, max(last, 1))
+    for span in history.stages:
+        if span.start:
+            axes.axvline(span.start, color=_INK, linewidth=0.8, linestyle=(0, (4, 3)))
+        if len(history.stages) > 1 and span.stop - span.start >= 0.06 * last:
+            middle = (span.start + span.stop) / 2
+            axes.text(
+                middle, 1.02, span.name, transform=axes.get_xaxis_transform(), ha="center", fontsize=8, color=_INK
+            )
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlabel("iteration", fontsize=8, color=_INK)
+    axes.tick_params(colors=_INK, labelsize=8, which="both", length=3)
+    axes.grid(True, color=_INK, alpha=0.18, linewidth=0.6)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(_INK)
+    if legend:
+        axes.legend(fontsize=8, frameon=False, labelcolor=_INK, loc="best", handlelength=1.4)
+    if any(side > 9999 for side in axes.get_ylim()) and not log:
+        axes.yaxis.set_major_formatter(EngFormatter(sep=""))

@@ -1,0 +1,189 @@
+"""The pictures of the report: renderings of every stage beside the photographs, and the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.images import composite, read_image
+from gs2d.io.files import read_json
+from gs2d.io.ply import read_mesh
+from gs2d.report_html import color_bar, escape, missing, picture
+from gs2d.report_images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
+from gs2d.report_mesh import mesh_pictures, orbit_cameras
+
+MOST_VIEWS = 4
+MOST_FACES = 4_000_000  # a picture of more would take gigabytes
+PHOTOS = "photos"
+KINDS = {
+    "color": "Colour",
+    "normal": "Normal",
+    "depth": "Depth",
+    "error": "Error",
+    "high_error": "High-error splats",
+}
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """A view of which there are pictures; ``file`` is the stem of their names."""
+
+    name: str
+    file: str
+    split: str
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """What is in ``renders/``."""
+
+    folder: Path
+    views: tuple[ShownView, ...]
+    stages: tuple[str, ...]
+
+    def photo(self, view: ShownView) -> np.ndarray | None:
+        """The photograph of a view."""
+        return _read(self.folder / PHOTOS / f"{view.file}.png")
+
+    def rendering(self, stage: str, view: ShownView, kind: str) -> np.ndarray | None:
+        """One rendering."""
+        return _read(self.folder / stage / f"{view.file}.{kind}.png")
+
+
+def _read(path: Path) -> np.ndarray | None:
+    return read_image(path) if path.is_file() else None
+
+
+def read_gallery(renders: Path) -> Gallery | None:
+    """The gallery by its ``index.json``; None where there is none.
+
+    Raises
+    ------
+    DataError
+        The index is broken.
+    """
+    index = renders / "index.json"
+    if not index.is_file():
+        return None
+    data = read_json(index)
+    views = tuple(
+        ShownView(str(view["name"]), str(view.get("file", view["name"])), str(view.get("split", "")))
+        for view in data.get("views", ())
+    )
+    return Gallery(renders, views, tuple(str(stage) for stage in data.get("stages", ())))
+
+
+def hero(renders: Path) -> str:
+    """The first view large: photograph, the last stage's colour and normal, and its error."""
+    gallery = read_gallery(renders)
+    if gallery is None or not gallery.views or not gallery.stages:
+        return ""
+    view, stage = gallery.views[0], gallery.stages[-1]
+    images = [("Photograph", gallery.photo(view))]
+    images += [
+        (f"{KINDS[kind]}, {stage}", gallery.rendering(stage, view, kind)) for kind in ("color", "normal", "depth")
+    ]
+    figures = [
+        picture(image, title, alt=f"{title} of {view.name}", width=520) for title, image in images if image is not None
+    ]
+    return f'<div class="hero">{"".join(figures)}</div>' if figures else ""
+
+
+def view_sections(renders: Path, *, expected_stages: Sequence[str]) -> str:
+    """For every shown view a grid: kinds of picture down, photograph and stages across."""
+    gallery = read_gallery(renders)
+    if gallery is None or not gallery.views:
+        return missing("renders/ holds no pictures (gs2d render RUN makes them).")
+    stages = list(dict.fromkeys([*gallery.stages, *expected_stages]))
+    parts = []
+    for view in gallery.views[:MOST_VIEWS]:
+        split = f" <small>{escape(view.split)} view</small>" if view.split else ""
+        parts.append(f'<h3>{escape(view.name)}{split}</h3><div class="scroll">{_grid(gallery, view, stages)}</div>')
+    left = len(gallery.views) - MOST_VIEWS
+    if left > 0:
+        parts.append(missing(f"{left} more views are in the folder renders/."))
+    return "".join(parts)
+
+
+def _grid(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> str:
+    photo = gallery.photo(view)
+    cells = ['<div class="head"></div><div class="head">photograph</div>']
+    cells += [f'<div class="head">{escape(stage)}</div>' for stage in stages]
+    for kind, title in KINDS.items():
+        images = [gallery.rendering(stage, view, kind) for stage in stages]
+        cells.append(f'<div class="row">{title}</div>')
+        if kind == "color":
+            missing_photo = missing("no photograph in renders/photos")
+            cells.append(missing_photo if photo is None else picture(photo, alt=f"photograph {view.name}"))
+        else:
+            cells.append(_key(kind))
+        for stage, image in zip(stages, images, strict=True):
+            if image is None:
+                cells.append(missing(_why_missing(kind, stage)))
+                continue
+            caption = _psnr_caption(image, photo) if kind == "color" else ""
+            cells.append(picture(image, caption, alt=f"{title} of {view.name} after {stage}"))
+    columns = f"5.2rem repeat({len(stages) + 1}, minmax(8rem, 1fr))"
+    return f'<div class="views" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
+
+
+def _why_missing(kind: str, stage: str) -> str:
+    if kind == "high_error":
+        return "no splats were ranked by error up to this stage"
+    return f"not rendered for {stage}"
+
+
+def _key(kind: str) -> str:
+    """What the colours of a row mean."""
+    if kind == "error":
+        return color_bar(
+            error_scale(9), "0", f"{ERROR_TOP:g} and more", "mean absolute error over channels, colours in [0, 1]"
+        )
+    if kind == "depth":
+        return color_bar(depth_scale(9), "near", "far", "depth along the optical axis")
+    if kind == "normal":
+        return '<div class="key">world normals facing the camera: red, green, blue for x, y, z</div>'
+    solid = np.tile(np.array(HIGHLIGHT, dtype=np.float32), (2, 1))
+    fade = np.stack([np.full(3, 0.8, dtype=np.float32), solid[0]])
+    return color_bar(fade, "0", "1", "share of the splats with the highest colour error in a pixel")
+
+
+def _psnr_caption(image: np.ndarray, photo: np.ndarray | None) -> str:
+    """PSNR of the two 8-bit pictures, where they have the same size."""
+    if photo is None or image.shape[:2] != photo.shape[:2]:
+        return ""
+    white = (1.0, 1.0, 1.0)
+    difference = composite(image, white).astype(np.float64) - composite(photo, white)
+    squared = float(np.mean(difference**2))
+    return "equal" if squared == 0 else f"{-10 * np.log10(squared):.2f} dB"
+
+
+def mesh_section(path: Path, cameras: Sequence[Camera]) -> str:
+    """Pictures of the mesh as clay and in its colours.
+
+    Raises
+    ------
+    DataError
+        The file is broken.
+    """
+    if not path.is_file():
+        return missing("There is no mesh.ply (gs2d mesh RUN makes it).")
+    mesh = read_mesh(path)
+    if not len(mesh.faces):
+        return missing("mesh.ply has no faces: no surface was covered well enough.")
+    counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
+    if len(mesh.faces) > MOST_FACES:
+        return missing(f"mesh.ply has {counts}: too many for a picture here (at most {MOST_FACES:,} faces).")
+    chosen = tuple(cameras)[:3] or orbit_cameras(mesh)
+    where = "from cameras of the capture" if cameras else "from two sides, taking the third axis as up"
+    figures = []
+    for shown in mesh_pictures(mesh, chosen):
+        figures.append(picture(shown.shape, alt="the mesh as clay", width=420))
+        if shown.color is not None:
+            figures.append(picture(shown.color, alt="the mesh in its vertex colours", width=420))
+    words = "as clay and in its vertex colours" if mesh.colors is not None else "as clay (it has no vertex colours)"
+    return f'<div class="meshes">{"".join(figures)}</div><p class="soft">The mesh, {counts}, {words}, {where}.</p>'
