@@ -93,7 +93,9 @@ def quaternion(T: np.ndarray) -> tuple[float, ...]:
     return float(w), float(x), float(y), float(z)
 
 
-def small_colmap(root: Path, *, count: int = 9, where: str = "sparse/0", kind: str = "bin", **model_args) -> ColmapModel:
+def small_colmap(
+    root: Path, *, count: int = 9, where: str = "sparse/0", kind: str = "bin", **model_args
+) -> ColmapModel:
     """A ring of PINHOLE cameras with an off-centre principal point; images 0.png, 1.png ... of 40x30."""
     model = ColmapModel(cameras={7: ("PINHOLE", 40, 30, (35.0, 36.0, 18.5, 16.25))})
     for index, camera in enumerate(ring(count)):
@@ -132,7 +134,9 @@ def small_blender(root: Path, *, train: int = 4, test: int = 2, width: int = 40,
     return cameras
 
 
-def small_nerfstudio(root: Path, *, count: int = 9, meta: dict | None = None, frame: dict | None = None) -> list[Camera]:
+def small_nerfstudio(
+    root: Path, *, count: int = 9, meta: dict | None = None, frame: dict | None = None
+) -> list[Camera]:
     """One transforms.json with shared intrinsics, off-centre; ``meta`` and ``frame`` add keys to all of each kind."""
     cameras = ring(count)
     frames = []
@@ -148,7 +152,9 @@ def small_nerfstudio(root: Path, *, count: int = 9, meta: dict | None = None, fr
 SCALE_MAT = np.array([[200.0, 0, 0, -30], [0, 200, 0, 10], [0, 0, 200, 640], [0, 0, 0, 1]])
 
 
-def small_dtu(root: Path, *, count: int = 5, digits: int = 3, images: str = "image", archive: str = "cameras_sphere.npz"):
+def small_dtu(
+    root: Path, *, count: int = 5, digits: int = 3, images: str = "image", archive: str = "cameras_sphere.npz"
+):
     """world_mat and scale_mat of a ring, with pixel centres at whole numbers as DTU has them."""
     cameras = ring(count)
     arrays = {}

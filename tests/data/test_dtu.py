@@ -102,3 +102,14 @@ def test_another_number_of_images_than_cameras_without_numbers_is_an_error(tmp_p
     write_picture(tmp_path / "image/extra.png")
     with pytest.raises(DataError, match=r"as many images as cameras_sphere\.npz has views, 5, or be numbered; got 6"):
         load_scene(tmp_path)
+
+
+def test_an_alpha_channel_is_a_silhouette_and_the_background_stays(tmp_path: Path) -> None:
+    small_dtu(tmp_path)
+    pixels = write_picture(tmp_path / "image/000000.png", alpha=True)
+    for path in (tmp_path / "mask").iterdir():
+        path.unlink()
+    view = load_scene(tmp_path).train[0]
+    np.testing.assert_array_equal(view.image(), pixels[..., :3])
+    np.testing.assert_array_equal(view.object_mask(), pixels[..., 3] >= 128)
+    assert view.alpha() is None

@@ -92,7 +92,9 @@ def test_shared_intrinsics_with_an_off_centre_principal_point(tmp_path: Path) ->
 
 def test_intrinsics_of_a_frame_win_over_shared_ones(tmp_path: Path) -> None:
     small_nerfstudio(tmp_path)
-    edit(tmp_path / "transforms.json", lambda m: m["frames"][2].update(fl_x=40.0, fl_y=41.0, cx=1.0, cy=2.0, w=80, h=60))
+    edit(
+        tmp_path / "transforms.json", lambda m: m["frames"][2].update(fl_x=40.0, fl_y=41.0, cx=1.0, cy=2.0, w=80, h=60)
+    )
     c = load_scene(tmp_path, test_every=0).train[2].camera
     assert (c.fx, c.fy, c.cx, c.cy) == (20.0, 20.5, 0.5, 1.0)  # stated for 80x60, the file is 40x30
 
@@ -191,7 +193,10 @@ def _drop(*path: Any) -> Any:
     ("change", "message"),
     [
         (_drop("frames"), r'must be an object with a list "frames", got the keys \[\'cx\''),
-        (_drop("frames", 3, "transform_matrix"), r'frame 3 must have the key "transform_matrix", got \[\'file_path\'\]'),
+        (
+            _drop("frames", 3, "transform_matrix"),
+            r'frame 3 must have the key "transform_matrix", got \[\'file_path\'\]',
+        ),
         (_drop("frames", 3, "file_path"), 'frame 3 must have the key "file_path"'),
         (lambda m: (m.pop("fl_x"), m.pop("fl_y")), 'must have a focal length, "fl_x" or "camera_angle_x"'),
         (lambda m: m.update(fl_x="35"), "fl_x must be a finite number, got '35'"),

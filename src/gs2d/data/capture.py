@@ -43,6 +43,9 @@ class Frame:
         None: the data set has no split of its own.
     mask, object_mask : Path or None
         Image files; white = counts, white = object.
+    alpha_is_silhouette : bool
+        The alpha channel says where the object is and the colour behind it is real (DTU as 2DGS ships it): alpha
+        becomes the object mask and the picture stays opaque.
     """
 
     name: str
@@ -52,6 +55,7 @@ class Frame:
     split: str | None = None
     mask: Path | None = None
     object_mask: Path | None = None
+    alpha_is_silhouette: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +93,9 @@ class Decoder:
             )
         mask = self._read_mask(frame.mask, need=1.0)
         object_mask = self._read_mask(frame.object_mask, need=0.5)
+        if frame.alpha_is_silhouette and image.shape[2] == 4:
+            object_mask = image[:, :, 3] >= 128 if object_mask is None else object_mask
+            image = image[:, :, :3]
         if k.lens is not None:
             positions, valid = self.lens_maps(k)
             image = undistort_image(image, positions, valid)

@@ -27,7 +27,7 @@ def read_dtu(root: Path) -> Capture:
     View i is the i-th file in sorted order. P_i = world_mat_i @ scale_mat_i maps the unit-sphere frame, which is the
     scene's frame, to pixels whose centres are whole numbers; ours are at + 0.5, so 0.5 is added to cx and cy.
     T_metric_scene = scale_mat_0 maps the scene to millimetres. Masks (``mask/NNN.png``) are silhouettes
-    (``View.object_mask``): the background is trained. All views train. Sparse points of ``sparse/0`` are used if its
+    (``View.object_mask``), as is an alpha channel: the background is trained. All views train. Sparse points of ``sparse/0`` are used if its
     cameras stand where these do.
 
     Raises
@@ -60,6 +60,7 @@ def read_dtu(root: Path) -> Capture:
                 Intrinsics(width, height, fx, fy, cx + 0.5, cy + 0.5),
                 T,
                 object_mask=mask_of.get(index),
+                alpha_is_silhouette=True,
             )
         )
     missing = sorted(set(world) - set(indices))
@@ -89,7 +90,7 @@ def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float
         Not finite, singular, or with a skew that a pinhole camera does not have.
     """
     M = P[:3, :3]
-    if not np.isfinite(P[:3]).all() or abs(np.linalg.det(M)) < 1e-12 * max(np.abs(M).max(), 1e-300) ** 3:
+    if not np.isfinite(P[:3]).all() or not abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3:
         raise DataError(
             f"{where}: world_mat @ scale_mat must be a finite camera of full rank, got {P[:3].round(4).tolist()}"
         )

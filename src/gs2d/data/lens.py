@@ -195,7 +195,7 @@ def source_positions(intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     -------
     positions : ndarray float32 [H, W, 2] px, corner origin
     valid : ndarray bool [H, W]
-        True where the position lies between pixel centres of the distorted image and the lens model is still one to one.
+        True where the position lies between pixel centres of the distorted image and the lens is one to one.
     """
     k, lens = intrinsics, intrinsics.lens
     x = (np.arange(k.width) + 0.5 - k.cx) / k.fx

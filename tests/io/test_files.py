@@ -1,0 +1,175 @@
+"""Atomic writes and JSON."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from gs2d.errors import DataError, DiskError
+from gs2d.io.files import atomic_write, read_json, write_json
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_a_file_appears_complete_and_only_at_the_end(tmp_path: Path) -> None:
+    with atomic_write(tmp_path / "a.bin") as file:
+        file.write(b"12")
+        file.flush()
+        assert "a.bin" not in names(tmp_path)
+        file.write(b"34")
+    assert (tmp_path / "a.bin").read_bytes() == b"1234"
+    with atomic_write(tmp_path / "a.bin", "w") as text:
+        text.write("ä\n")
+    assert (tmp_path / "a.bin").read_bytes() == "ä\n".encode()
+    assert names(tmp_path) == ["a.bin"]
+
+
+def write_and_raise(path: Path, error: BaseException) -> None:
+    with atomic_write(path) as file:
+        file.write(b"new")
+        raise error
+
+
+def test_a_failing_body_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("old")
+    for error in (RuntimeError("ours"), KeyboardInterrupt()):
+        with pytest.raises(type(error)):
+            write_and_raise(tmp_path / "a", error)
+        assert (tmp_path / "a").read_text() == "old"
+        assert names(tmp_path) == ["a"]
+
+
+def test_the_user_s_umask_decides_who_may_read(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_json(tmp_path / "a.json", 1)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_folder_that_is_missing_or_a_file_or_the_name_of_a_folder_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder").mkdir()
+    for path, message in (
+        ("gone/a.json", "folder does not exist: create it first"),
+        ("file/a.json", "a part of the path is a file, not a folder"),
+        ("folder", "a folder has this name"),
+        ("x" * 300, "choose a shorter name"),
+    ):
+        with pytest.raises(DiskError, match=message) as caught:
+            write_json(tmp_path / path, {})
+        assert str(tmp_path / path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert names(tmp_path) == ["file", "folder"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_one_line(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(DiskError, match="Permission denied; choose a folder that you may write to"):
+            write_json(tmp_path / "a.json", {})
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_an_error_about_another_file_is_not_taken_for_a_failed_write(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a") as file:
+        file.write((tmp_path / "input").read_bytes())
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("what", ["bytes", "text", "json", "torch"])
+def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Path, what: str) -> None:
+    """A file-size limit of 4 KiB stands in for the full disk: the kernel refuses the write in the same way."""
+    (tmp_path / "out").write_text("old")
+    body = {
+        "bytes": "with atomic_write(path) as f:\n    for _ in range(100): f.write(bytes(1000)); f.flush()",
+        "text": "with atomic_write(path, 'w') as f: f.write('x' * 10000)",
+        "json": "write_json(path, list(range(10000)))",
+        "torch": "import torch\nwith atomic_write(path) as f: torch.save(torch.zeros(100000), f)",
+    }[what]
+    code = textwrap.dedent(
+        """
+        import resource, sys
+        from gs2d.errors import DiskError
+        from gs2d.io.files import atomic_write, write_json
+        path = sys.argv[1]
+        if "torch" in sys.argv[2]: import torch
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        try:
+            exec(sys.argv[2])
+        except DiskError as error:
+            print(error)
+            sys.exit(7)
+        """
+    )
+    source = Path(__file__).resolve().parents[2] / "src"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "out"), body],
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(source)}, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 7, done.stderr
+    assert done.stdout.count("\n") == 1
+    assert f"cannot write {tmp_path / 'out'}: File too large" in done.stdout
+    assert (tmp_path / "out").read_text() == "old"
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_kill_in_the_middle_leaves_the_old_file(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("old")
+    code = (
+        "import os, sys, signal\nfrom gs2d.io.files import atomic_write\n"
+        "with atomic_write(sys.argv[1]) as f:\n    f.write(b'new'); f.flush(); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    source = Path(__file__).resolve().parents[2] / "src"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "out")],
+        env={**os.environ, "PYTHONPATH": str(source)}, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == -signal.SIGKILL
+    assert (tmp_path / "out").read_text() == "old"
+
+
+def test_json_round_trip_keeps_order_and_letters(tmp_path: Path) -> None:
+    value = {"b": [1, 2.5, None, True], "a": "Glück"}
+    write_json(tmp_path / "a.json", value)
+    assert list(read_json(tmp_path / "a.json").items()) == list(value.items())
+    assert "Glück" in (tmp_path / "a.json").read_text(encoding="utf-8")
+
+
+def test_nan_is_not_json(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json(tmp_path / "a.json", {"psnr": float("nan")})
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b'{"a": 1,\n "b": }', r"a\.json must be JSON, got: .*line 2 column 7.*; is the file complete"),
+        (b"\xff\xfe\x00", r"a\.json must be JSON in UTF-8, got a byte that is not at offset 0"),
+        (b"", r"a\.json must be JSON"),
+        (b"[" * 200000, r"a\.json must be JSON, got brackets nested"),
+    ],
+)
+def test_a_file_that_is_no_json_is_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        read_json(tmp_path / "a.json")
+
+
+def test_a_missing_json_is_one_line_and_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"cannot read .*gone\.json: No such file"):
+        read_json(tmp_path / "gone.json")
+    (tmp_path / "bom.json").write_bytes(b"\xef\xbb\xbf[1]")
+    assert read_json(tmp_path / "bom.json") == [1]
