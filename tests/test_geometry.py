@@ -1,0 +1,87 @@
+"""Rotations, neighbour distances, and what cameras say about a scene's size."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from gs2d.camera import look_at
+from gs2d.errors import ShapeError
+from gs2d.geometry import camera_extent, focus_point, nearest_distances, quats_to_matrices
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_quaternions_are_wxyz_rotations_of_any_length() -> None:
+    q = torch.randn(20, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = Rotation.from_quat(q.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(quats_to_matrices(q).numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(quats_to_matrices(-7 * q).numpy(), expected, atol=1e-12)
+
+
+def test_a_quarter_turn_about_z_sends_x_to_y() -> None:
+    R = quats_to_matrices(torch.tensor([[math.sqrt(0.5), 0, 0, math.sqrt(0.5)]]))
+    torch.testing.assert_close(R[0, :, 0], torch.tensor([0.0, 1.0, 0.0]))
+
+
+def test_a_zero_quaternion_is_no_rotation() -> None:
+    assert bool(quats_to_matrices(torch.zeros(1, 4)).isnan().all())
+
+
+def test_nearest_distances_are_the_rms_to_the_three_nearest_others() -> None:
+    # From 0 on a line: the others are at 1, 2, 4, 9; rms of 1, 2, 4 = sqrt(21 / 3).
+    points = np.zeros((5, 3))
+    points[:, 0] = [0, 1, 2, 4, 9]
+    distances = nearest_distances(points)
+    assert distances[0] == pytest.approx(math.sqrt(7))
+    assert distances[1] == pytest.approx(math.sqrt((1 + 1 + 9) / 3))
+    assert nearest_distances(points, k=1)[4] == pytest.approx(5)
+
+
+def test_nearest_distances_with_few_or_coincident_points() -> None:
+    assert nearest_distances(np.array([[0.0, 0, 0], [3, 4, 0]])) == pytest.approx([5, 5])
+    assert nearest_distances(np.ones((4, 3))) == pytest.approx([0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.zeros((1, 3)), "at least 2 points"),
+        (np.full((3, 3), np.nan), "finite points"),
+        (np.zeros((3, 2)), r"points must be \[P, 3\]"),
+    ],
+)
+def test_nearest_distances_refuses_what_has_no_neighbours(points: np.ndarray, message: str) -> None:
+    with pytest.raises(ShapeError, match=message):
+        nearest_distances(points)
+
+
+def test_the_focus_point_is_where_the_optical_axes_meet() -> None:
+    target = np.array([1.0, -2.0, 0.5])
+    eyes = target + np.array([[3.0, 0, 0], [0, 4, 1], [-2, -2, 2]])
+    cameras = [look_at(eye, target, UP, width=8, height=8, fx=8) for eye in eyes]
+    np.testing.assert_allclose(focus_point(cameras), target, atol=1e-12)
+
+
+def test_the_focus_point_of_parallel_axes_stays_beside_the_cameras() -> None:
+    # Axes along +x through (0, +-1, 0): any (x, 0, 0) is as near; the mean centre (0, 0, 0) is taken.
+    cameras = [look_at(np.array([0, y, 0]), np.array([5.0, y, 0]), UP, width=8, height=8, fx=8) for y in (-1.0, 1.0)]
+    np.testing.assert_allclose(focus_point(cameras), np.zeros(3), atol=1e-9)
+
+
+def test_the_extent_is_a_tenth_more_than_the_farthest_camera_from_their_mean() -> None:
+    # Centres at x = 0, 0, 3: mean 1, farthest 2.
+    eyes = [np.array([x, 0.0, 0.0]) for x in (0, 0, 3)]
+    cameras = [look_at(eye, np.array([0.0, 9.0, 0.0]), UP, width=8, height=8, fx=8) for eye in eyes]
+    assert camera_extent(cameras) == pytest.approx(2.2)
+    assert camera_extent(cameras[:1]) == 0
+
+
+@pytest.mark.parametrize("function", [focus_point, camera_extent])
+def test_no_cameras_say_nothing(function: object) -> None:
+    with pytest.raises(ShapeError, match="needs at least one camera"):
+        function([])  # type: ignore[operator]
