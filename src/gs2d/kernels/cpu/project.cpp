@@ -20,11 +20,10 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     g.frame = frame_of(g.parameters, f.camera);
     g.record = project(g.parameters, g.frame, f.camera);
     const auto& p = g.parameters;
-    // inf - inf and inf * 0 are NaN: the sum below is finite only if everything in it is
-    const V zero = V(0), finite = zero * p.mean.x + zero * p.mean.y + zero * p.mean.z + zero * p.logit + zero * p.qw +
-                                  zero * p.qx + zero * p.qy + zero * p.qz + zero * p.log_su + zero * p.log_sv +
-                                  zero * exp(p.log_su) + zero * exp(p.log_sv) + zero * g.frame.inverse_norm;
-    g.alive = (finite >= zero) & (g.record.zc > V(real(f.view.near))) & first(lanes);
+    // A sum of absolute values is finite only if every term is. (gcc 12 folds 0 * x to 0 with -fno-signed-zeros.)
+    const V size = abs(p.mean.x) + abs(p.mean.y) + abs(p.mean.z) + abs(p.logit) + abs(p.qw) + abs(p.qx) + abs(p.qy) +
+                   abs(p.qz) + abs(p.log_su) + abs(p.log_sv) + exp(p.log_su) + exp(p.log_sv) + g.frame.inverse_norm;
+    g.alive = is_finite(size) & (g.record.zc > V(real(f.view.near))) & first(lanes);
     if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
     return g;
 }
@@ -35,9 +34,9 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     const int degree = f.view.sh_degree;
     load_sh(s, i, lanes, degree, sh);
     sh_basis(g.frame.to_splat, degree, basis);
-    V finite = V(0);
-    for (int k = 0; k < 3 * sh_count(degree); ++k) finite = fma(V(0), sh[k], finite);
-    g.alive = g.alive & (finite >= V(0));
+    V size = V(0);
+    for (int k = 0; k < 3 * sh_count(degree); ++k) size = size + abs(sh[k]);
+    g.alive = g.alive & is_finite(size);
     const Vec3<V> c = sh_color(sh, basis, degree);
     g.record.red = max(c.x, V(0)), g.record.green = max(c.y, V(0)), g.record.blue = max(c.z, V(0));
 }
