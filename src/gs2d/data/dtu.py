@@ -27,8 +27,8 @@ def read_dtu(root: Path) -> Capture:
     View i is the i-th file in sorted order. P_i = world_mat_i @ scale_mat_i maps the unit-sphere frame, which is the
     scene's frame, to pixels whose centres are whole numbers; ours are at + 0.5, so 0.5 is added to cx and cy.
     T_metric_scene = scale_mat_0 maps the scene to millimetres. Masks (``mask/NNN.png``) are silhouettes
-    (``View.object_mask``), as is an alpha channel: the background is trained. All views train. Sparse points of ``sparse/0`` are used if its
-    cameras stand where these do.
+    (``View.object_mask``), as is an alpha channel: the background is trained. All views train.
+    Sparse points of ``sparse/0`` are used if its cameras stand where these do.
 
     Raises
     ------
