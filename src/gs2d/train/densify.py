@@ -76,7 +76,6 @@ def densify_and_prune(
     to_clone, to_split = _select(state, densify, extent)
     _append_clones(state, to_clone)
     _append_children(state, to_split, densify)
-    grown = len(state.splats) - len(to_split)
     parents = torch.zeros(len(state.splats), dtype=torch.bool, device=state.splats.device)
     parents[: len(to_split)] = to_split
     faint, large = _prunable(state.splats, densify, iteration=iteration, extent=extent, white=white)
@@ -85,8 +84,8 @@ def densify_and_prune(
     keep = ~(parents | faint | large)
     if not bool(keep.any()):
         raise DivergedError(
-            f"all {grown} splats were pruned at iteration {iteration}: none has opacity >= {densify.opacity_cull} and "
-            f"size <= {densify.scale_cull * extent:g}; check the cameras, or lower opacity_cull"
+            f"all {int((faint | large).sum())} splats were pruned at iteration {iteration}: none has opacity >= "
+            f"{densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras or lower opacity_cull"
         )
     keep_rows(state, keep)
     state.statistics = Statistics.zeros(state.splats)
