@@ -224,7 +224,7 @@ def info(command: c.Info, console: Console) -> None:
     console.result(facts)
 
 
-# -- tables --------------------------------------------------------------------------------------------------------------
+# -- tables ----------------------------------------------------------------------------------------------------
 def show_run(path: Path, metrics: dict[str, Any], console: Console, definition: dict[str, Any] | None = None) -> None:
     """The metrics of a run as a table, and where its files are."""
     if definition is not None:
@@ -245,7 +245,7 @@ def show_run(path: Path, metrics: dict[str, Any], console: Console, definition: 
                 figure(seen.get("ssim"), 4),
             ]
         )
-    columns = ["stage", "iterations", "seconds", "splats", "MB", "train PSNR", "test PSNR", "SSIM"]
+    columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
     console.table("", columns, rows)
     _surface_table(metrics.get("surface"), console)
     for name in ("report.html", "mesh.ply", "splats.ply"):

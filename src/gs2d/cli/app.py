@@ -88,7 +88,7 @@ def parse(argv: Sequence[str]) -> Common:
     try:
         with contextlib.redirect_stderr(complaint):
             command = tyro.cli(
-                Command,  # type: ignore[arg-type]  # a union of annotated dataclasses
+                Command,
                 prog="gs2d",
                 description="Posed photographs in; a surface mesh and a scene of 2D Gaussian splats out.",
                 args=list(argv),

@@ -129,9 +129,9 @@ class Evaluate(Common):
     run: RunPath
     """Run folder."""
     ground_truth: Annotated[Path | None, arg(metavar="MESH_OR_POINTS")] = None
-    """PLY file of the true surface, in the frame of the capture."""
+    """PLY file of the true surface, in the frame of the capture (DTU: of the data set, in millimetres)."""
     thresholds: tuple[float, ...] = ()
-    """Distances at which precision and recall are taken, world units (default: fractions of the surface's size)."""
+    """Distances at which precision and recall are taken, world units (default: 0.25, 0.5, 1 % of its size)."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights for the LPIPS metric."""
     threads: int | None = None

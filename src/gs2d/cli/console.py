@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from rich import box
 from rich.console import Console as RichConsole
 from rich.markup import escape
 from rich.progress import (
@@ -85,9 +86,9 @@ class Console:
         """A table for people, on stdout; the first column is text, the others are figures."""
         if self.quiet or self.as_json:
             return
-        table = Table(title=escape(title) or None, title_justify="left")
+        table = Table(title=escape(title) or None, title_justify="left", box=box.SIMPLE)
         for i, column in enumerate(columns):
-            table.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=i == 0)
+            table.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=True)
         for row in rows:
             table.add_row(*(escape(cell) for cell in row))
         self._out.print(table, soft_wrap=False)
@@ -111,4 +112,4 @@ def stage_line(metrics: dict[str, Any]) -> str:
 
 def figure(value: float | None, digits: int, unit: str = "") -> str:
     """A number for a table; a dash where there is none."""
-    return "–" if value is None else f"{value:,.{digits}f}{unit}"
+    return "-" if value is None else f"{value:,.{digits}f}{unit}"

@@ -34,7 +34,7 @@ class DemoOptions:
     size: int = SIZE
 
 
-def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> RunFolder:  # noqa: B008 (frozen)
+def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> RunFolder:
     """Run the demo. An earlier demo in the same folder is replaced, any other run there is not.
 
     Raises

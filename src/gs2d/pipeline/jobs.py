@@ -17,7 +17,7 @@ from gs2d.io.ply import read_mesh, read_splats, write_splats
 from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, RunFolder, make_folder, open_run
 from gs2d.pipeline.events import OnEvent, counted, ignore
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
-from gs2d.pipeline.pictures import file_name, render_view
+from gs2d.pipeline.pictures import file_name, render_view, shown_cameras
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.scoring import score_views, split_metrics
 from gs2d.pipeline.surface import extract_mesh
@@ -188,7 +188,7 @@ def report_run(path: Path) -> Path:
     from gs2d.report import write_report
 
     run = open_run(path)
-    write_report(run.path)
+    write_report(run.path, cameras=shown_cameras(run))
     return run.file(REPORT)
 
 

@@ -98,7 +98,7 @@ class EvaluateOptions:
     ground_truth : Path or None
         PLY file of the true surface: a mesh or points.
     thresholds : tuple of float
-        Distances at which precision and recall are taken, wu; empty = 0.25, 0.5, 1 and 2 % of the true surface's diagonal.
+        Distances at which precision and recall are taken, wu; empty = 0.25, 0.5 and 1 % of the true diagonal.
     lpips_weights : Path or None
     """
 

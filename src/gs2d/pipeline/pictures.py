@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.camera import Camera
 from gs2d.data import Scene, View
 from gs2d.images import write_image
 from gs2d.io.files import read_json, write_json
@@ -78,9 +79,22 @@ def draw_stage(
         for what, picture in pictures.items():
             write_image(folder / stage / f"{file_name(view)}.{what}.png", picture)
         write_image(folder / "photos" / f"{file_name(view)}.png", photo)
-        views.append({"name": view.name, "file": file_name(view), "split": split, "depth_limits": near_far})
+        shown_as = {"name": view.name, "file": file_name(view), "split": split, "depth_limits": near_far}
+        views.append({**shown_as, "camera": camera_json(view.camera)})
     stages = [*(name for name in index["stages"] if name != stage), stage]
     write_json(index_file, {"views": views, "stages": stages, "images": list(IMAGES)})
+
+
+def camera_json(camera: Camera) -> dict[str, Any]:
+    """A camera as plain numbers; ``Camera(**it)`` is the camera again."""
+    facts = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {**facts, "T_cam_world": camera.T_cam_world.tolist()}
+
+
+def shown_cameras(run: RunFolder) -> list[Camera]:
+    """Cameras of the views that were drawn; none before the first stage was."""
+    index = run.file(RENDERS) / INDEX
+    return [Camera(**entry["camera"]) for entry in read_json(index)["views"]] if index.exists() else []
 
 
 def render_view(splats: Splats, view: View, settings: RasterSettings, backend: Backend) -> RenderOutput:

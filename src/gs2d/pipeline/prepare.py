@@ -14,8 +14,7 @@ import numpy as np
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run import RunFolder, versions
-from gs2d.kernels.library import ABI_VERSION
-from gs2d.kernels.library import load as load_library
+from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.protocols import FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
@@ -136,8 +135,8 @@ def backend_facts(name: str) -> dict[str, Any]:
     """What decides the bytes that a backend computes: its name, and of the native one instruction set and version."""
     if name != "cpu":
         return {"name": name}
-    library = load_library()
-    return {"name": name, "instruction_set": library.instruction_set, "kernels": ABI_VERSION}
+    library = native.load()
+    return {"name": name, "instruction_set": library.instruction_set, "kernels": native.ABI_VERSION}
 
 
 def read_scene(path: Path, scene_format: str, downscale: int, protocol: Protocol, on_event: OnEvent) -> Scene:

@@ -19,7 +19,7 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
 def _describe_stage(stage: Stage) -> Iterator[str]:
     for action in stage.on_enter:
         if isinstance(action, RankByError):
-            yield f"first: the {action.top_percent:g} % of splats with the largest colour error become '{action.writes}'"
+            yield f"first: the {action.top_percent:g} % of splats with the largest E_i become '{action.writes}'"
         elif isinstance(action, CloneInPlace):
             yield f"first: clone '{action.rows}' in place (opacity: {action.opacity}); the clones are '{action.writes}'"
     groups: dict[str, list[str]] = {}

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
-from gs2d.data import View
 from gs2d.errors import DivergedError
 from gs2d.evaluate.images import mean_metrics
 from gs2d.io.run import RunFolder, load_tensors
@@ -156,9 +155,9 @@ class Recorder:
     def _finish_reused(self, state: TrainState) -> None:
         """Pictures of the stages taken over, and the scores of one that was killed before it was scored."""
         done = len(self._run.metrics()["stages"])
-        if 0 < state.stage and done < state.stage:
+        if state.stage > 0 and done < state.stage:
             self._score_stage(state.stage - 1)
-        elif 0 < state.stage:
+        elif state.stage > 0:
             draw_stage(
                 self._run, self._job, self._shown, self._stage(state.stage - 1).name, state.splats, _group(state)
             )
@@ -243,4 +242,4 @@ def _group(state: TrainState) -> Any:
     return state.groups.get("high_error")
 
 
-__all__ = ["Recorder", "View"]
+__all__ = ["Recorder"]

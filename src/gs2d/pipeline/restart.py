@@ -123,12 +123,12 @@ def _from_run(job: Job, path: Path) -> FinishedStage:
             return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
     have = ", ".join(c.stage for c in ends) or "none"
     raise RunError(
-        f"--from {path} has no finished stage in common with this run (its stages: {have}); scene, protocol, downscale, "
-        "seed, backend, versions and the stages' settings must be the same"
+        f"--from {path} has no finished stage in common with this run (its stages: {have}); scene, protocol, "
+        "downscale, seed, backend, versions and the stages' settings must be the same"
     )
 
 
-# -- the stage cache -------------------------------------------------------------------------------------------------------
+# -- the stage cache ------------------------------------------------------------------------------------------
 def _cache_file(folder: Path, key: str) -> Path:
     return folder / f"{key[:32]}.pt"
 

@@ -22,8 +22,8 @@ from gs2d.splats import Splats
 def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     """Train a run to its end: splats, mesh, metrics, report.
 
-    A run that fails before its first checkpoint leaves nothing behind; one that fails or is killed later can be resumed,
-    and then ends with the same ``splats.ply``, byte for byte, as if it had never stopped.
+    A run that fails before its first checkpoint leaves nothing behind; one that fails or is killed later can be
+    resumed, and then ends with the same ``splats.ply``, byte for byte, as if it had never stopped.
 
     Parameters
     ----------
