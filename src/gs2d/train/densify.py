@@ -85,7 +85,7 @@ def densify_and_prune(
     if not bool(keep.any()):
         raise DivergedError(
             f"all {int((faint | large).sum())} splats were pruned at iteration {iteration}: none has opacity >= "
-            f"{densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras or lower opacity_cull"
+            f"{densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or opacity_cull"
         )
     keep_rows(state, keep)
     state.statistics = Statistics.zeros(state.splats)
