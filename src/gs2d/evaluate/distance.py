@@ -66,8 +66,9 @@ def distances_to_mesh(
 ) -> np.ndarray:
     """Distance [Q] of each query [Q, 3] to the surface.
 
-    Exact distances to the faces of the eight nearest among all face centroids and ``samples`` points of the surface;
-    the spacing of the samples does not enter, as it would in a distance to the nearest sample.
+    The least of the exact distances to the faces of the eight nearest among all face centroids and ``samples`` points
+    of the surface. The spacing of the samples does not enter, as it would in a distance to the nearest sample, but for
+    the rare query whose nearest face is large and has no sample near: then the distance is too long by less than it.
     """
     t = mesh.vertices.astype(np.float64)[mesh.faces]
     spread = sample_surface(mesh, samples, seed=seed)

@@ -8,7 +8,7 @@ The protocol (ours; docs/decisions.md, Evaluation):
 3. Accuracy and precision ask of every reconstructed point how far the truth is, all of it, seen or not. Only
    reconstructed surface that some camera would see counts, the reconstruction hiding itself: what is inside or below
    and cannot appear in any picture is neither rewarded nor punished.
-4. Distances are to triangles, exactly, or to the nearest point where the truth is a point cloud.
+4. Distances are to triangles, not to samples; or to the nearest point where the truth is a point cloud.
 """
 
 from __future__ import annotations
@@ -132,8 +132,8 @@ def evaluate_surface(
     # Everything below happens in the mesh's frame; distances return to the truth's units at the end.
     local = _moved(truth, np.linalg.inv(T))
     tolerance = SEEN_TOLERANCE * diagonal / scale
-    theirs = _true_side(local, cameras, seen, min_views, samples, seed, tolerance)
-    ours = _reconstructed_side(mesh, cameras, samples, seed, tolerance)
+    theirs = _true_side(local, cameras, seen, min_views, samples, seed, tolerance, workers)
+    ours = _reconstructed_side(mesh, cameras, samples, seed, tolerance, workers)
     if not len(mesh.faces) or not len(ours.points):
         why = "the mesh is empty" if not len(mesh.faces) else "no camera sees any of the mesh"
         nothing = tuple(ThresholdScore(t, None, 0.0, 0.0) for t in tau)
@@ -174,11 +174,12 @@ def _true_side(
     samples: int,
     seed: int,
     tolerance: float,
+    workers: int | None,
 ) -> _Side:
     """True points that enough cameras see."""
     if not isinstance(truth, Mesh):
         if seen is not None:
-            raise DataError("counts of views that see each face were given, but the truth is a point cloud; leave them out")
+            raise DataError("a true mesh was expected with counts of views of each face, got a point cloud")
         keep = frustum_counts(truth, cameras) >= min_views if len(cameras) else np.ones(len(truth), bool)
         return _side(truth, keep, samples, seed)
     if seen is not None:
@@ -189,7 +190,8 @@ def _true_side(
     points = sample_surface(truth, samples, seed=seed).points
     if not len(cameras):
         return _side(points, np.ones(len(points), bool), samples, seed)
-    return _side(points, visible_counts(points, truth, cameras, tolerance=tolerance) >= min_views, samples, seed)
+    counts = visible_counts(points, truth, cameras, tolerance=tolerance, workers=workers)
+    return _side(points, counts >= min_views, samples, seed)
 
 
 def _side(points: np.ndarray, keep: np.ndarray, samples: int, seed: int) -> _Side:
@@ -202,13 +204,13 @@ def _side(points: np.ndarray, keep: np.ndarray, samples: int, seed: int) -> _Sid
 
 
 def _reconstructed_side(
-    mesh: Mesh, cameras: Sequence[Camera], samples: int, seed: int, tolerance: float
+    mesh: Mesh, cameras: Sequence[Camera], samples: int, seed: int, tolerance: float, workers: int | None
 ) -> _Side:
     """Reconstructed points that some camera would see."""
     points = sample_surface(mesh, samples, seed=seed + 1).points  # other points than on an equal truth
     if not len(points) or not len(cameras):
         return _Side(points, 0.0)
-    keep = visible_counts(points, mesh, cameras, tolerance=tolerance) > 0
+    keep = visible_counts(points, mesh, cameras, tolerance=tolerance, workers=workers) > 0
     return _Side(points[keep], float(1.0 - keep.mean()))
 
 

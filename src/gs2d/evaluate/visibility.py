@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -39,23 +41,30 @@ def _pixel_boxes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Faces [n] that may cover a pixel centre, the first (column, row) [n, 2] of their boxes and the sizes [n, 2]."""
     z = corners[:, 2]
-    safe = np.where(z > 1e-9, z, np.nan)
-    x = corners[:, 0] / safe * camera.fx + camera.cx
-    y = corners[:, 1] / safe * camera.fy + camera.cy
-    depth = z[faces]
-    behind = depth <= 1e-9
-    crosses = behind.any(axis=1) & ~behind.all(axis=1)
-    low = np.empty((len(faces), 2), np.int64)
-    high = np.empty((len(faces), 2), np.int64)
+    ahead = z > 1e-9
+    safe = np.where(ahead, z, 1.0)
+    # pixel centres are the integers of these coordinates
+    x = corners[:, 0] / safe * camera.fx + (camera.cx - 0.5)
+    y = corners[:, 1] / safe * camera.fy + (camera.cy - 0.5)
+    whole = np.arange(len(faces))
+    if ahead.all():
+        crossing = np.zeros(0, np.int64)
+    else:
+        count = ahead[faces].sum(axis=1)
+        crossing, whole = np.flatnonzero((count > 0) & (count < 3)), np.flatnonzero(count == 3)
+    # most faces of a fine mesh lie between two columns or two rows of pixel centres: drop them on integers, cheaply
+    for values, end in ((x, camera.width), (y, camera.height)):
+        cell = np.floor(np.clip(values, -1, end)).astype(np.int32)
+        c0, c1, c2 = (cell[faces[whole, i]] for i in range(3))
+        whole = whole[(c0 != c1) | (c1 != c2)]
+    low = np.zeros((len(whole) + len(crossing), 2), np.int64)  # faces that cross the camera plane: the whole image
+    high = np.tile(np.array([camera.width - 1, camera.height - 1]), (len(low), 1))
     for axis, (values, end) in enumerate(((x, camera.width), (y, camera.height))):
-        v0, v1, v2 = values[faces[:, 0]], values[faces[:, 1]], values[faces[:, 2]]
-        # NaN (a corner behind the camera) makes an empty box here; faces that cross the plane get the whole image below
-        first = np.nan_to_num(np.ceil(np.minimum(np.minimum(v0, v1), v2) - 0.5 - 1e-6), nan=end)
-        last = np.nan_to_num(np.floor(np.maximum(np.maximum(v0, v1), v2) - 0.5 + 1e-6), nan=-1)
-        low[:, axis] = np.where(crosses, 0, np.clip(first, 0, end))
-        high[:, axis] = np.where(crosses, end - 1, np.clip(last, -1, end - 1))
-    hit = np.flatnonzero((high >= low).all(axis=1))
-    return hit, low[hit], (high - low + 1)[hit]
+        ends = values[faces[whole]]
+        low[: len(whole), axis] = np.clip(np.ceil(ends.min(axis=1) - 1e-6), 0, end)
+        high[: len(whole), axis] = np.clip(np.floor(ends.max(axis=1) + 1e-6), -1, end - 1)
+    hit = (high >= low).all(axis=1)
+    return np.concatenate([whole, crossing])[hit], low[hit], (high - low + 1)[hit]
 
 
 def _draw(buffer: np.ndarray, corners: np.ndarray, low: np.ndarray, size: np.ndarray, camera: Camera) -> None:
@@ -83,7 +92,13 @@ def _draw(buffer: np.ndarray, corners: np.ndarray, low: np.ndarray, size: np.nda
 
 
 def visible_counts(
-    points: np.ndarray, mesh: Mesh, cameras: Sequence[Camera], *, tolerance: float, max_side: int = 800
+    points: np.ndarray,
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    *,
+    tolerance: float,
+    max_side: int = 800,
+    workers: int | None = None,
 ) -> np.ndarray:
     """In how many views each point [P, 3] is visible, the mesh being the only thing that hides it.
 
@@ -99,12 +114,17 @@ def visible_counts(
     -------
     ndarray [P] int64
     """
-    counts = np.zeros(len(points), dtype=np.int64)
-    for camera in cameras:
+
+    def visible(camera: Camera) -> np.ndarray:
         small = _shrunk(camera, max_side)
         buffer = maximum_filter(depth_buffer(mesh, small), size=3, mode="nearest")
         index, rows, columns, z = _in_image(points, small)
-        counts[index[z <= buffer[rows, columns] + tolerance]] += 1
+        return np.asarray(index[z <= buffer[rows, columns] + tolerance])
+
+    counts = np.zeros(len(points), dtype=np.int64)
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+        for index in pool.map(visible, cameras):
+            counts[index] += 1
     return counts
 
 

@@ -128,7 +128,7 @@ def derive_limits(
         limit = min(high * 1.25, FAR_FACTOR * median) if depth_limit is None else depth_limit
         near = xyz[depths <= limit]
         if not len(near):
-            raise ProtocolError(f"a depth limit above the nearest depth, {depths.min():.4g} wu, was expected, got {limit:g}")
+            raise ProtocolError(f"depth_limit must exceed the nearest depth, {depths.min():.4g} wu, got {limit:g}")
         lower, upper = np.percentile(near, BOX_PERCENTILES, axis=0)
         side = float((upper - lower).max())
         lower, upper = _widened(lower, upper, side, points)
@@ -174,7 +174,7 @@ def _farthest_corner(lower: np.ndarray, upper: np.ndarray, cameras: Sequence[Cam
     corners = np.array([[(lower, upper)[c >> a & 1][a] for a in range(3)] for c in range(8)])
     depths = [camera.project(corners)[1].max() for camera in cameras]
     if not depths or max(depths) <= 0:
-        raise ProtocolError("a bbox in front of some camera was expected, got one behind all; is its frame the scene's?")
+        raise ProtocolError("a bbox in front of some camera was expected, got one behind all; check its frame")
     return float(max(depths))
 
 

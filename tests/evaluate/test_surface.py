@@ -1,0 +1,272 @@
+"""Surface metrics: distances worked by hand, and only what cameras see counts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs2d.camera import Camera, look_at
+from gs2d.errors import DataError
+from gs2d.evaluate.distance import distances_to_mesh, face_areas, point_triangle_distances, sample_surface
+from gs2d.evaluate.surface import evaluate_surface
+from gs2d.evaluate.visibility import depth_buffer, frustum_counts, visible_counts
+from gs2d.io.ply import read_mesh
+from gs2d.triangles import Mesh
+
+
+def square(height: float, half: float = 1.0, cells: int = 1) -> Mesh:
+    """A horizontal square of 2 cells^2 triangles at z = height."""
+    line = np.linspace(-half, half, cells + 1)
+    x, y = np.meshgrid(line, line)
+    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+    i = np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)
+    a, b, c, d = i.ravel(), (i + 1).ravel(), (i + cells + 2).ravel(), (i + cells + 1).ravel()
+    return Mesh(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32))
+
+
+def merged(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    faces = np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)]).astype(np.int32)
+    return Mesh(np.concatenate([m.vertices for m in meshes]), faces)
+
+
+def from_above(count: int = 3, height: float = 5.0) -> list[Camera]:
+    """Cameras that look straight down on the whole square, a little apart."""
+    eyes = [np.array([0.3 * np.cos(a), 0.3 * np.sin(a), height]) for a in 2 * np.pi * np.arange(count) / count]
+    return [look_at(e, e * [1, 1, 0], np.array([0, 1.0, 0]), width=100, height=100, fx=120) for e in eyes]
+
+
+# distances
+
+
+def test_distances_to_a_triangle_are_to_its_plane_its_edges_or_its_corners() -> None:
+    triangle = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0]])
+    points = np.array([[1, 1, 2.0], [2, -3, 4], [-3, -4, 0], [7, 0, 4], [4, 3, 0], [0, 0, 0]])
+    # above the inside: 2; beside the edge y = 0: (3, 4) -> 5; at the corner: 5; beyond (4,0,0): 5;
+    # beside 3x + 4y = 12: (12 + 12 - 12) / 5 = 2.4; on it: 0
+    expected = [2, 5, 5, 5, 2.4, 0]
+    got = point_triangle_distances(points, np.repeat(triangle[None], len(points), axis=0))
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+
+
+def test_distances_to_triangles_without_area_are_to_their_segment() -> None:
+    flat = np.array([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0]], [[1.0, 1, 1], [1, 1, 1], [1, 1, 1]]])
+    got = point_triangle_distances(np.array([[1.5, 2, 0], [1, 1, 3]]), flat)
+    np.testing.assert_allclose(got, [2, 2])
+
+
+@pytest.mark.parametrize("cells", [1, 200])
+def test_distances_to_a_mesh_are_exact_whatever_the_size_of_its_faces(cells: int) -> None:
+    rng = np.random.default_rng(0)
+    queries = rng.uniform(-1, 1, (2000, 3)) * [1, 1, 0.02]
+    got = distances_to_mesh(queries, square(0.0, cells=cells), samples=5000)
+    np.testing.assert_allclose(got, np.abs(queries[:, 2]), atol=1e-12)
+
+
+def test_distances_agree_with_trimesh_on_a_crumpled_mesh() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    rng = np.random.default_rng(1)
+    mesh = square(0.0, cells=12)
+    crumpled = Mesh(mesh.vertices + rng.normal(0, 0.03, mesh.vertices.shape), mesh.faces)
+    queries = rng.uniform(-1, 1, (300, 3)) * [1, 1, 0.2]
+    _, expected, _ = trimesh.proximity.closest_point_naive(
+        trimesh.Trimesh(crumpled.vertices, crumpled.faces, process=False), queries
+    )
+    np.testing.assert_allclose(distances_to_mesh(queries, crumpled, samples=20000), expected, atol=1e-9)
+
+
+# samples
+
+
+def test_samples_lie_on_the_surface_in_proportion_to_area_and_come_back_for_the_same_seed() -> None:
+    mesh = merged(square(0.0, half=1.0), square(1.0, half=2.0))  # areas 4 and 16
+    assert face_areas(mesh).tolist() == [2.0, 2.0, 8.0, 8.0]
+    one, two = sample_surface(mesh, 10_000, seed=3), sample_surface(mesh, 10_000, seed=3)
+    np.testing.assert_array_equal(one.points, two.points)
+    assert not np.array_equal(one.points, sample_surface(mesh, 10_000, seed=4).points)
+    np.testing.assert_allclose(one.points[:, 2], one.faces >= 2, atol=1e-12)
+    # stratified: each face has its share within one point at each end
+    np.testing.assert_allclose(np.bincount(one.faces), [1000, 1000, 4000, 4000], atol=2)
+    high = one.points[one.faces >= 2]
+    assert np.abs(high.mean(0)[:2]).max() < 4 * (4 / np.sqrt(12)) / np.sqrt(8000)  # uniform: four standard errors
+    quarter = ((high[:, 0] > 0) & (high[:, 1] > 0)).mean()
+    assert abs(quarter - 0.25) < 0.02
+
+
+def test_masked_faces_get_no_samples_and_no_area_gives_none() -> None:
+    mesh = merged(square(0.0), square(1.0))
+    upper = sample_surface(mesh, 100, mask=np.array([False, False, True, True]))
+    np.testing.assert_allclose(upper.points[:, 2], 1)
+    assert len(sample_surface(mesh, 100, mask=np.zeros(4, bool)).points) == 0
+    assert len(sample_surface(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), 10).points) == 0
+
+
+# visibility
+
+
+def test_the_depth_buffer_is_the_ray_cast_of_a_real_mesh(shared: Callable[[str], Path]) -> None:
+    """Against the published depth maps of test views, float16: within 0.002."""
+    folder = shared("rendered_bottle")
+    mesh = read_mesh(folder / "mesh_gt.ply")
+    info = json.loads((folder / "transforms_test.json").read_text())
+    focal = 200 / np.tan(info["camera_angle_x"] / 2)
+    T = np.linalg.inv(np.array(info["frames"][0]["transform_matrix"]) @ np.diag([1.0, -1, -1, 1]))
+    got = depth_buffer(mesh, Camera(400, 400, focal, focal, 200.0, 200.0, T))
+    expected = np.load(folder / "depth_test" / "r_0.npy").astype(np.float64)
+    assert (np.isfinite(got) != (expected > 0)).sum() <= 2
+    both = np.isfinite(got) & (expected > 0)
+    assert both.sum() > 10_000
+    assert np.abs(got - expected)[both].max() < 0.003
+
+
+def test_faces_that_cross_the_camera_plane_are_drawn() -> None:
+    """A floor 1 below the camera: the ray (x', y', 1) with y' > 0 meets it at depth 1 / y'."""
+    camera = Camera(20, 20, 10.0, 10.0, 10.0, 10.0, np.eye(4))
+    floor = Mesh(np.array([[-1e4, 1, -50], [1e4, 1, -50], [0, 1, 1e5]], np.float64), np.array([[0, 1, 2]], np.int32))
+    got = depth_buffer(floor, camera)
+    y = (np.arange(20) + 0.5 - 10) / 10
+    np.testing.assert_allclose(got[10:], np.broadcast_to((1 / y[10:])[:, None], (10, 20)))
+    assert np.isinf(got[:10]).all()
+
+
+def test_a_closed_surface_has_no_pinholes() -> None:
+    camera = look_at(np.array([1, 2, 4.0]), np.zeros(3), np.array([0, 1.0, 0]), width=200, height=200, fx=150)
+    rng = np.random.default_rng(0)
+    mesh = square(0.0, half=20.0, cells=40)
+    jitter = rng.uniform(-0.2, 0.2, mesh.vertices.shape) * [1, 1, 0]
+    assert np.isfinite(depth_buffer(Mesh(mesh.vertices + jitter, mesh.faces), camera)).all()
+
+
+def test_points_behind_a_surface_outside_the_image_or_behind_the_camera_are_not_visible() -> None:
+    cameras = from_above(3)
+    mesh = square(0.0)
+    points = np.array([[0, 0, 0.0], [0, 0, -0.5], [0, 0, 1.0], [5, 0, 0], [0, 0, 9.0], [0, 0, -0.005]])
+    assert visible_counts(points, mesh, cameras, tolerance=0.01).tolist() == [3, 0, 3, 0, 0, 3]
+    assert frustum_counts(points, cameras).tolist() == [3, 3, 3, 0, 0, 3]
+
+
+def test_large_images_are_drawn_small_with_the_same_answer() -> None:
+    cameras = [c.resized(1000, 1000) for c in from_above(2)]
+    points = np.array([[0, 0, 0.0], [0, 0, -0.5]])
+    assert visible_counts(points, square(0.0), cameras, tolerance=0.01, max_side=100).tolist() == [2, 0]
+
+
+# scores
+
+
+def test_parallel_squares_have_their_distance_both_ways() -> None:
+    score = evaluate_surface(square(0.1), square(0.0), thresholds=[0.09, 0.11], samples=1000)
+    assert score.accuracy == pytest.approx(0.1)
+    assert score.completeness == pytest.approx(0.1)
+    assert score.chamfer == pytest.approx(0.1)
+    assert [(s.precision, s.recall, s.f_score) for s in score.scores] == [(0, 0, 0), (1, 1, 1)]
+    assert score.diagonal == pytest.approx(8**0.5)
+    assert (score.mesh_hidden, score.truth_hidden, score.reason) == (0, 0, None)
+
+
+def test_half_of_a_square_has_full_precision_and_half_recall() -> None:
+    whole = square(0.0, cells=2)
+    half = Mesh(whole.vertices, whole.faces[whole.vertices[whole.faces].mean(1)[:, 0] < 0])
+    score = evaluate_surface(half, whole, thresholds=[1e-6], samples=20_000)
+    (at,) = score.scores
+    assert at.precision is not None
+    assert at.precision > 0.999  # a point beside the edge of a large face may miss it
+    assert at.recall == pytest.approx(0.5, abs=0.01)
+    assert at.f_score == pytest.approx(2 / 3, abs=0.01)
+    assert score.accuracy == pytest.approx(0, abs=1e-5)
+    assert score.completeness == pytest.approx(0.25, abs=0.01)  # half the points, at 0 to 1 from the half square
+
+
+def test_default_thresholds_are_fractions_of_the_diagonal() -> None:
+    score = evaluate_surface(square(0.0), square(0.0), samples=100)
+    assert [s.threshold for s in score.scores] == pytest.approx([0.0025 * 8**0.5, 0.005 * 8**0.5, 0.01 * 8**0.5])
+
+
+def test_true_surface_that_too_few_cameras_see_does_not_count() -> None:
+    truth = merged(square(0.0), square(-1.0))  # the lower one is hidden
+    cameras = from_above(3)
+    score = evaluate_surface(square(0.0), truth, cameras=cameras, thresholds=[0.01], samples=4000)
+    assert score.scores[0].recall == 1
+    assert score.truth_hidden == pytest.approx(0.5, abs=0.05)  # slanted views see a rim of it past the edge
+    everything = evaluate_surface(square(0.0), truth, thresholds=[0.01], samples=4000)
+    assert everything.scores[0].recall == pytest.approx(0.5, abs=0.01)
+    with pytest.raises(DataError, match="no part of it is seen"):
+        evaluate_surface(square(0.0), truth, cameras=cameras[:2], samples=100)
+
+
+def test_counts_that_come_with_the_data_are_used() -> None:
+    truth = merged(square(0.0), square(-1.0))
+    seen = np.array([5, 5, 2, 2])
+    score = evaluate_surface(square(0.0), truth, seen=seen, thresholds=[0.01], samples=4000)
+    assert score.scores[0].recall == 1
+    assert score.truth_hidden == pytest.approx(0.5, abs=0.001)
+    low = evaluate_surface(square(0.0), truth, seen=seen, min_views=2, thresholds=[0.01], samples=4000)
+    assert low.scores[0].recall == pytest.approx(0.5, abs=0.001)
+    with pytest.raises(DataError, match="one count for each of 4"):
+        evaluate_surface(square(0.0), truth, seen=seen[:3])
+
+
+def test_reconstructed_surface_that_no_camera_sees_is_neither_punished_nor_rewarded() -> None:
+    inside = merged(square(0.0), square(-0.5, half=0.5))  # a second sheet below, hidden by the first
+    score = evaluate_surface(inside, square(0.0), cameras=from_above(3), thresholds=[0.01], samples=4000)
+    assert score.scores[0].precision == 1
+    assert score.mesh_hidden == pytest.approx(0.2, abs=0.02)  # 1 of 5
+    above = merged(square(0.0), square(0.5, half=0.5))  # a sheet above is in every picture
+    punished = evaluate_surface(above, square(0.0), cameras=from_above(3), thresholds=[0.01], samples=4000)
+    assert punished.scores[0].precision is not None
+    assert punished.scores[0].precision < 0.85
+
+
+def test_reconstruction_on_true_but_unseen_surface_is_not_wrong() -> None:
+    truth = merged(square(0.0), square(-1.0))
+    score = evaluate_surface(square(-1.0), truth, seen=np.array([3, 3, 0, 0]), thresholds=[0.01], samples=1000)
+    assert score.scores[0].precision == 1
+    assert score.scores[0].recall == 0
+
+
+def test_a_point_cloud_is_a_truth_too_and_points_outside_all_images_do_not_count() -> None:
+    rng = np.random.default_rng(0)
+    cloud = np.concatenate([rng.uniform(-1, 1, (4000, 3)) * [1, 1, 0], np.array([[50.0, 0, 0]])])
+    score = evaluate_surface(square(0.0), cloud, cameras=from_above(3), thresholds=[0.1], samples=2000)
+    assert score.truth_points == 2000
+    assert score.truth_hidden == pytest.approx(1 / 4001)
+    assert score.scores[0].recall == 1
+    assert score.scores[0].precision == 1  # 4000 points on 4 wu^2: nearest neighbours at about 0.016
+    assert 0.01 < (score.accuracy or 0) < 0.02
+
+
+def test_a_mesh_in_another_frame_is_scored_in_the_units_of_the_truth() -> None:
+    """truth = 2 R mesh + t: a mesh 0.1 off in its own frame is 0.2 off in the truth's."""
+    c, s = np.cos(0.7), np.sin(0.7)
+    T = np.eye(4)
+    T[:3, :3] = 2 * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    T[:3, 3] = [5, -3, 1]
+    flat = square(0.0)
+    truth = Mesh(flat.vertices @ T[:3, :3].T + T[:3, 3], flat.faces)
+    score = evaluate_surface(square(0.1), truth, cameras=from_above(3), T_truth_mesh=T, thresholds=[0.25], samples=1000)
+    assert score.accuracy == pytest.approx(0.2)
+    assert score.completeness == pytest.approx(0.2)
+    assert score.scores[0].f_score == 1
+    T[0, 0] *= 1.1
+    with pytest.raises(DataError, match="one positive scale"):
+        evaluate_surface(flat, truth, T_truth_mesh=T)
+
+
+def test_an_empty_mesh_has_no_distances_and_a_reason() -> None:
+    empty = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    score = evaluate_surface(empty, square(0.0), samples=100)
+    assert (score.accuracy, score.completeness, score.chamfer) == (None, None, None)
+    assert score.scores[0].precision is None
+    assert score.scores[0].f_score == 0
+    assert score.reason == "the mesh is empty"
+    far = evaluate_surface(square(50.0), square(0.0), cameras=from_above(3), samples=100)
+    assert far.reason == "no camera sees any of the mesh"
+
+
+def test_an_empty_truth_is_a_data_error() -> None:
+    with pytest.raises(DataError, match="finite points"):
+        evaluate_surface(square(0.0), np.zeros((0, 3)))
