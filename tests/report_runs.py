@@ -108,7 +108,7 @@ def write_renders(folder: Path, size: int) -> None:
         stripes = np.sin(40 * hits.depth)[..., None] * [0.2, 0.15, -0.1] + [0.6, 0.4, 0.3]
         photo = stripes * alpha[..., None] + 1 - alpha[..., None]
         name = f"{split}/r_{k}"
-        views.append({"name": name, "file": name.replace("/", "__"), "split": split})
+        views.append({"name": name, "file": name.replace("/", "__"), "split": split, "depth_limits": [1.5, 4.25]})
         (folder / "renders" / "photos").mkdir(parents=True, exist_ok=True)
         write_image(folder / "renders" / "photos" / f"{split}__r_{k}.png", photo)
         for index, (stage, _) in enumerate(STAGES):

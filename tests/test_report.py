@@ -103,6 +103,12 @@ def test_all_that_was_run_is_said(page: str) -> None:
     assert re.search(r"Seed\s+7", text)
 
 
+def test_the_scales_of_the_pictures_say_their_ends(page: str) -> None:
+    text = " ".join(text_of(page).split())
+    assert "depth along the optical axis, world units 1.5 4.25" in text
+    assert "mean absolute error over channels, colours in [0, 1] 0 0.2 and more" in text
+
+
 def test_names_from_files_cannot_break_the_page(page: str) -> None:
     assert "still <life>" not in page
     assert "still &lt;life&gt;" in page
@@ -152,6 +158,11 @@ def test_the_verdict_states_gain_and_price() -> None:
     text = text_of(verdict(record()))
     assert "2dgs-r reaches  27.35 dB  PSNR on the test views (SSIM 0.9094)" in text
     assert "0.85 dB more than after its first stage (surface), for +1.0 % storage and +65 % training time." in text
+
+
+def test_the_verdict_takes_the_middle_threshold_of_the_surface() -> None:
+    rows = [{"threshold": t, "f_score": f} for t, f in ((0.01, 0.4), (0.02, 0.7), (0.04, 0.9))]
+    assert "an F-score of 0.700 within 0.02 world units" in verdict(record(surface={"thresholds": rows}))
 
 
 def test_the_verdict_does_not_hide_a_loss_or_an_unfinished_run() -> None:

@@ -176,11 +176,11 @@ def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[M
 
 
 def _surface_sentence(surface: Mapping[str, Any] | None) -> str:
-    rows = (surface or {}).get("thresholds") or []
-    best = next((row for row in reversed(rows) if isinstance(row.get("f_score"), int | float)), None)
-    if best is None:
+    rows = [row for row in (surface or {}).get("thresholds") or [] if isinstance(row.get("f_score"), int | float)]
+    if not rows:
         return ""
-    return f" The mesh scores an F-score of {best['f_score']:.3f} within {best['threshold']:.3g} world units."
+    middle = rows[len(rows) // 2]  # neither the strictest nor the kindest
+    return f" The mesh has an F-score of {middle['f_score']:.3f} within {middle['threshold']:.3g} world units."
 
 
 def _unfinished(record: RunRecord) -> str:

@@ -43,7 +43,7 @@ def orbit_cameras(mesh: Mesh, *, count: int = 2, size: int = 420) -> tuple[Camer
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         )
         eye = center + 3.0 * radius * towards
-        cameras.append(look_at(eye, center, np.array([0, 0, 1.0]), width=size, height=size, fx=1.35 * size))
+        cameras.append(look_at(eye, center, np.array([0, 0, 1.0]), width=size, height=size, fx=1.6 * size))
     return tuple(cameras)
 
 

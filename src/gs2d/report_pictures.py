@@ -30,11 +30,12 @@ KINDS = {
 
 @dataclass(frozen=True)
 class ShownView:
-    """A view of which there are pictures; ``file`` is the stem of their names."""
+    """A view of which there are pictures; ``file`` is the stem of their names, ``depth_limits`` are wu."""
 
     name: str
     file: str
     split: str
+    depth_limits: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,12 @@ def read_gallery(renders: Path) -> Gallery | None:
         return None
     data = read_json(index)
     views = tuple(
-        ShownView(str(view["name"]), str(view.get("file", view["name"])), str(view.get("split", "")))
+        ShownView(
+            str(view["name"]),
+            str(view.get("file", view["name"])),
+            str(view.get("split", "")),
+            tuple(view["depth_limits"]) if view.get("depth_limits") else None,
+        )
         for view in data.get("views", ())
     )
     return Gallery(renders, views, tuple(str(stage) for stage in data.get("stages", ())))
@@ -120,7 +126,7 @@ def _grid(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> str:
             missing_photo = missing("no photograph in renders/photos")
             cells.append(missing_photo if photo is None else picture(photo, alt=f"photograph {view.name}"))
         else:
-            cells.append(_key(kind))
+            cells.append(_key(kind, view))
         for stage, image in zip(stages, images, strict=True):
             if image is None:
                 cells.append(missing(_why_missing(kind, stage)))
@@ -137,14 +143,15 @@ def _why_missing(kind: str, stage: str) -> str:
     return f"not rendered for {stage}"
 
 
-def _key(kind: str) -> str:
+def _key(kind: str, view: ShownView) -> str:
     """What the colours of a row mean."""
     if kind == "error":
         return color_bar(
             error_scale(9), "0", f"{ERROR_TOP:g} and more", "mean absolute error over channels, colours in [0, 1]"
         )
     if kind == "depth":
-        return color_bar(depth_scale(9), "near", "far", "depth along the optical axis")
+        near, far = ("near", "far") if view.depth_limits is None else (f"{limit:.3g}" for limit in view.depth_limits)
+        return color_bar(depth_scale(9), near, far, "depth along the optical axis, world units")
     if kind == "normal":
         return '<div class="key">world normals facing the camera: red, green, blue for x, y, z</div>'
     solid = np.tile(np.array(HIGHLIGHT, dtype=np.float32), (2, 1))

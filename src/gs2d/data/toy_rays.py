@@ -70,11 +70,10 @@ def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samp
 
     nearest = np.full(width * height, _NO_HIT, dtype=np.uint64)
     for pair_face, pair_x, pair_y in _pairs(low, high):
-        edge = edges[pair_face]
         dx, dy = directions_x[pair_x], directions_y[pair_y]
-        e = edge[:, :, 0] * dx[:, None] + edge[:, :, 1] * dy[:, None] + edge[:, :, 2]  # [pairs, 3]
-        inside = (e >= 0).all(axis=1) | (e <= 0).all(axis=1)
-        total = e[inside].sum(axis=1)
+        e = [edges[pair_face, k, 0] * dx + edges[pair_face, k, 1] * dy + edges[pair_face, k, 2] for k in range(3)]
+        inside = _same_sign(*e)
+        total = e[0][inside] + e[1][inside] + e[2][inside]
         face = pair_face[inside]
         depth = volume[face] / np.where(total == 0, np.inf, total)
         hit = depth > _CLOSEST
@@ -143,7 +142,7 @@ def _hits(nearest: np.ndarray, edges: np.ndarray, directions_x: np.ndarray, dire
 
 
 def occluded(
-    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, direction: np.ndarray, *, cells: int = 128
+    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, direction: np.ndarray, *, cells: int = 256
 ) -> np.ndarray:
     """Whether the ray from each point towards a distant light meets a triangle.
 
@@ -184,13 +183,14 @@ def occluded(
     low = np.clip(np.floor((corners[:, :, :2].min(axis=1) - origin) / cell_size).astype(np.int64), 0, cells)
     high = np.clip(np.floor((corners[:, :, :2].max(axis=1) - origin) / cell_size).astype(np.int64) + 1, 0, cells)
     low = np.minimum(low, cells - 1)
+    top = corners[:, :, 2].max(axis=1)
     for face, x, y in _pairs(low, np.maximum(high, low + 1)):
         occupied = counts[y * cells + x]
         pair_face = np.repeat(face, occupied)
         first = np.repeat(starts[y * cells + x], occupied)
         within = np.arange(len(pair_face)) - np.repeat(np.cumsum(occupied) - occupied, occupied)
         query = order[first + within]
-        above = corners[pair_face, :, 2].max(axis=1) > queries[query, 2]
+        above = top[pair_face] > queries[query, 2]
         pair_face, query = pair_face[above], query[above]
         blocked[query[_is_under(corners[pair_face], queries[query])]] = True
     return blocked
@@ -198,13 +198,19 @@ def occluded(
 
 def _is_under(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether a ray from each point [n, 3] along +z meets its triangle [n, 3, 3]."""
-    p = triangles[:, :, :2] - points[:, None, :2]
-    q = np.roll(p, -1, axis=1)
-    e = p[:, :, 0] * q[:, :, 1] - p[:, :, 1] * q[:, :, 0]  # edge k lies opposite to corner k + 2
-    total = e.sum(axis=1)
-    inside = ((e >= 0).all(axis=1) | (e <= 0).all(axis=1)) & (total != 0)
-    z = (np.roll(e, -1, axis=1) * triangles[:, :, 2]).sum(axis=1)  # times the total
-    return np.asarray(inside & (z / np.where(total == 0, 1, total) > points[:, 2]))
+    x, y = (triangles[:, :, axis] - points[:, axis, None] for axis in (0, 1))
+    # e[k] belongs to the edge from corner k + 1 to corner k + 2, opposite to corner k.
+    e = [x[:, i] * y[:, j] - y[:, i] * x[:, j] for i, j in ((1, 2), (2, 0), (0, 1))]
+    total = e[0] + e[1] + e[2]
+    z = (e[0] * triangles[:, 0, 2] + e[1] * triangles[:, 1, 2] + e[2] * triangles[:, 2, 2]) / np.where(
+        total == 0, 1, total
+    )
+    return _same_sign(*e) & (total != 0) & (z > points[:, 2])
+
+
+def _same_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Whether three numbers are all >= 0 or all <= 0 (column by column: a reduction over an axis of 3 is slow)."""
+    return np.asarray(((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0)))
 
 
 def _frame(direction: np.ndarray) -> np.ndarray:
