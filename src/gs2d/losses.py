@@ -1,7 +1,7 @@
 """The terms of the training loss: kind -> function, and the weighted values of the terms of a stage.
 
 The total of official 2DGS is 0.8 L1 + 0.2 (1 - SSIM) + lambda_n mean(1 - alpha <n, N>) + lambda_d mean(distortion): the
-weights are the :class:`~gs2d.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math_losses.md``.
+weights are the :class:`~gs2d.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math.md``.
 
 There are two implementations of each kind: plain torch (``losses_reference``), used by the reference backend, and
 native fused operations (``kernels.ops``), used by the cpu backend. The backend's name chooses; nothing falls back.

@@ -1,6 +1,6 @@
 """The training losses in plain torch: any dtype and device, to be read beside the docs, judge of the native operations.
 
-Conventions (``docs/math_losses.md``): images are [H, W, C]; a mask is bool [H, W] with False = ignore this pixel. Means
+Conventions (``docs/math.md``): images are [H, W, C]; a mask is bool [H, W] with False = ignore this pixel. Means
 run over the valid pixels only (the mean over no pixel at all is 0). What was rendered at an ignored pixel has no
 influence on any value and receives no gradient.
 """

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -264,6 +266,29 @@ def test_a_target_changed_before_backward_is_an_error_not_a_wrong_gradient(libra
     y.zero_()
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         l1.backward()
+
+
+def test_the_benchmark_runs(double: Library, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+    from benchmarks.losses import main
+
+    main(
+        [
+            "--sizes",
+            "24",
+            "--threads",
+            "1",
+            "--repeats",
+            "2",
+            "--probe-size",
+            "64",
+            "--json",
+            str(tmp_path / "out.json"),
+        ]
+    )
+    rows = json.loads((tmp_path / "out.json").read_text())["rows"]
+    assert {row["loss"] for row in rows} >= {"L1 + SSIM", "normal consistency", "distortion mean"}
+    assert all(row["native"]["median"] > 0 and row["probe_gflops"] > 0 for row in rows)
 
 
 def test_a_wrong_argument_is_refused_in_one_line(library: Library) -> None:

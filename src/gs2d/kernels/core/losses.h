@@ -1,4 +1,4 @@
-// The losses of one pixel, and their vector-Jacobian products (docs/math_losses.md has the same formulas in words).
+// The losses of one pixel, and their vector-Jacobian products (docs/math.md has the same formulas in words).
 #pragma once
 
 #include "base.h"

@@ -1,0 +1,165 @@
+"""Native losses, value and gradient, beside the torch forms that they replace.
+
+::
+
+    python -m benchmarks.losses [--sizes 400 800] [--threads 1 2] [--repeats 40] [--json benchmarks/results/losses.json]
+
+Times include the autograd and ctypes overhead of a training step. Each row stands beside a matrix-product probe
+(GFLOP/s) taken just before it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.timing import Timing, machine, measure, peak_probe
+from gs2d import losses_reference as reference
+from gs2d.camera import Camera, look_at
+from gs2d.kernels import ops
+from gs2d.kernels.library import load
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    loss: str
+    size: int
+    threads: int
+    native: Timing
+    torch: Timing | None
+    probe_gflops: float
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Seeded inputs of one image size."""
+
+    rendered: Tensor  # [H, W, 3]
+    target: Tensor  # [H, W, 3]
+    mean: Tensor  # [H, W, 3]
+    mask: Tensor  # [H, W]
+    normal: Tensor  # [H, W, 3]
+    depth: Tensor  # [H, W] wu
+    alpha: Tensor  # [H, W]
+    camera: Camera
+
+
+def make_frame(size: int) -> Frame:
+    """Random images; depth with 10 % background."""
+    g = torch.Generator().manual_seed(0)
+    T = look_at(
+        np.array([1.0, 2.0, 3.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=1, height=1, fx=1.0
+    ).T_cam_world
+    target = torch.rand(size, size, 3, generator=g)
+    depth = torch.where(torch.rand(size, size, generator=g) < 0.1, 0.0, 2 + torch.rand(size, size, generator=g))
+    return Frame(
+        rendered=(target + 0.1 * torch.randn(size, size, 3, generator=g)).requires_grad_(),
+        target=target,
+        mean=ops.blur(target),
+        mask=torch.rand(size, size, generator=g) < 0.8,
+        normal=(torch.rand(size, size, 3, generator=g) - 0.5).requires_grad_(),
+        depth=depth.requires_grad_(),
+        alpha=torch.rand(size, size, generator=g).requires_grad_(),
+        camera=Camera(size, size, 0.9 * size, 0.9 * size, size / 2, size / 2, T),
+    )
+
+
+def photometric_step(frame: Frame, mask: Tensor | None = None, mean: Tensor | None = None) -> None:
+    """0.8 L1 - 0.2 SSIM, native, forward and backward."""
+    l1, ssim = ops.photometric(frame.rendered, frame.target, mask, mean)
+    torch.autograd.grad(0.8 * l1 - 0.2 * ssim, frame.rendered)
+
+
+def torch_photometric_step(frame: Frame) -> None:
+    """The same in torch."""
+    l1, ssim = reference.l1(frame.rendered, frame.target), reference.ssim(frame.rendered, frame.target)
+    torch.autograd.grad(0.8 * l1 - 0.2 * ssim, frame.rendered)
+
+
+def ssim_value(frame: Frame) -> None:
+    """SSIM without a gradient, native."""
+    with torch.no_grad():
+        ops.photometric(frame.rendered, frame.target)
+
+
+def torch_ssim_value(frame: Frame) -> None:
+    """The same in torch."""
+    with torch.no_grad():
+        reference.ssim(frame.rendered, frame.target)
+
+
+def normal_step(frame: Frame) -> None:
+    """Normal consistency, native, forward and backward."""
+    value = ops.normal_consistency(frame.normal, frame.depth, frame.alpha, frame.camera)
+    torch.autograd.grad(0.05 * value, (frame.normal, frame.depth))
+
+
+def torch_normal_step(frame: Frame) -> None:
+    """The same in torch."""
+    value = reference.normal_consistency(frame.normal, frame.depth, frame.alpha, frame.camera)
+    torch.autograd.grad(0.05 * value, (frame.normal, frame.depth))
+
+
+def run(sizes: Sequence[int], threads: Sequence[int], repeats: int, probe_size: int) -> list[Row]:
+    """Measure every loss at every size and number of threads."""
+    rows: list[Row] = []
+    for size in sizes:
+        frame = make_frame(size)
+        cases: dict[str, tuple[Callable[[], None], Callable[[], None] | None]] = {
+            "L1 + SSIM": (lambda f=frame: photometric_step(f), lambda f=frame: torch_photometric_step(f)),
+            "L1 + SSIM, target mean cached": (lambda f=frame: photometric_step(f, None, f.mean), None),
+            "L1 + SSIM, masked": (lambda f=frame: photometric_step(f, f.mask), None),
+            "SSIM, value only": (lambda f=frame: ssim_value(f), lambda f=frame: torch_ssim_value(f)),
+            "normal consistency": (lambda f=frame: normal_step(f), lambda f=frame: torch_normal_step(f)),
+            "distortion mean": (lambda f=frame: ops.masked_mean(f.alpha), None),
+        }
+        for n in threads:
+            for name, (native, slow) in cases.items():
+                probe = peak_probe(n, size=probe_size)
+                torch.set_num_threads(n)
+                fast = measure(native, repeats=repeats)
+                other = None if slow is None else measure(slow, repeats=max(3, repeats // 8), warmup=1)
+                rows.append(Row(name, size, n, fast, other, probe))
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table, and write it where ``--json`` says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[400, 800])
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--repeats", type=int, default=40)
+    parser.add_argument("--probe-size", type=int, default=1024)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    before = torch.get_num_threads()
+    try:
+        rows = run(options.sizes, options.threads, options.repeats, options.probe_size)
+    finally:
+        torch.set_num_threads(before)
+    facts = machine() | {"kernels": load().variant}
+    print(", ".join(f"{key} {value}" for key, value in facts.items()))
+    print(
+        "| loss (forward + backward) | image | threads | native ms, median (best) | torch ms, median | probe GFLOP/s |"
+    )
+    print("|---|---|---|---|---|---|")
+    for row in rows:
+        slow = "" if row.torch is None else f"{row.torch.median:.1f}"
+        times = f"{row.native.median:.2f} ({row.native.best:.2f})"
+        print(f"| {row.loss} | {row.size}x{row.size} | {row.threads} | {times} | {slow} | {row.probe_gflops:.0f} |")
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps({"machine": facts, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
