@@ -24,9 +24,9 @@ from gs2d.splats import Splats
 
 # 13 --------------------------------------------------------------------------------------------------------------
 def signal(backend: Backend, scene: Splats, columns: int, *pixels: tuple[int, int]) -> Tensor:
-    """Gradient of the screen probe for the sum of alpha over (row, column) pixels."""
+    """Gradient of the screen probe for the sum of alpha over (row, column) pixels; 9 x 11 px, middle pixel (5, 4)."""
     probe = torch.zeros(len(scene), columns, requires_grad=True)
-    alpha = rasterize(requiring_grad(scene), front_camera(), backend=backend, screen_probe=probe).alpha
+    alpha = rasterize(requiring_grad(scene), front_camera(9, 11), backend=backend, screen_probe=probe).alpha
     sum(alpha[p] for p in pixels).backward()  # type: ignore[union-attr]
     assert probe.grad is not None
     return probe.grad
@@ -34,22 +34,22 @@ def signal(backend: Backend, scene: Splats, columns: int, *pixels: tuple[int, in
 
 @pytest.mark.parametrize("columns", [2, 4])
 def test_13_the_probe_is_the_gradient_of_the_screen_map_in_official_units(backend: Backend, columns: int) -> None:
-    # u = (x z - Tu.z) / (f s): du/dTu.z = -1 / (10 * 0.4) = -1/4. Pixel (5, 4): u = 1/2, dalpha/du = -u alpha.
+    # u = (x z - Tu.z) / (f s): du/dTu.z = -1 / (10 * 0.4) = -1/4. One column right: u = 1/2, dalpha/du = -u alpha.
     # Signal = z_c W/2 * alpha u / 4 = 2 * 4.5 * alpha / 8.
     alpha = 0.5 * exp(-1 / 8)
-    equal(signal(backend, splat(), columns, (4, 5))[0, :2], [9 * alpha / 8, 0.0])
-    alpha = 0.5 * exp(-4 / 8)  # two rows up: v = -1, signal = -9 * alpha / 4
-    equal(signal(backend, splat(), columns, (2, 4))[0, :2], [0.0, -9 * alpha / 4])
+    equal(signal(backend, splat(), columns, (5, 5))[0, :2], [9 * alpha / 8, 0.0])
+    alpha = 0.5 * exp(-4 / 8)  # two rows up: v = -1, signal = -z_c H/2 * alpha / 4
+    equal(signal(backend, splat(), columns, (3, 4))[0, :2], [0.0, -11 * alpha / 4])
 
 
 def test_13_opposite_pixels_cancel_in_the_signed_half_and_add_in_the_absolute_half(backend: Backend) -> None:
     alpha = 0.5 * exp(-1 / 8)
-    equal(signal(backend, splat(), 4, (4, 5), (4, 3)), [[0.0, 0.0, 2 * 9 * alpha / 8, 0.0]])
+    equal(signal(backend, splat(), 4, (5, 5), (5, 3)), [[0.0, 0.0, 2 * 9 * alpha / 8, 0.0]])
 
 
 def test_13_the_low_pass_branch_does_not_count(backend: Backend) -> None:
     scene = splat((0.03, 0.02, 2), scales=(1e-3, 1e-3))
-    equal(signal(backend, scene, 4, (4, 4), (5, 5)), [[0.0, 0.0, 0.0, 0.0]])
+    equal(signal(backend, scene, 4, (5, 4), (6, 5)), [[0.0, 0.0, 0.0, 0.0]])
 
 
 # 14 --------------------------------------------------------------------------------------------------------------
