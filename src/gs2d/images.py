@@ -155,29 +155,34 @@ def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     """
     if factor == 1:
         return image
-    blocks = _blocks(image, factor)  # [h, n, w, n, C]
+    count = np.uint32(factor * factor)
     if image.shape[2] == 3:
-        total = blocks.sum(axis=(1, 3), dtype=np.uint32)
-        count = np.uint32(factor * factor)
-        return ((total + count // 2) // count).astype(np.uint8)
-    alpha = blocks[..., 3:].astype(np.uint32)
-    weight = alpha.sum(axis=(1, 3), dtype=np.uint64)  # [h, w, 1]
-    color = (blocks[..., :3] * alpha).sum(axis=(1, 3), dtype=np.uint64)
+        total = sum(part.astype(np.uint32) for part in _block_parts(image, factor))
+        return np.asarray((total + count // 2) // count).astype(np.uint8)
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    color = np.zeros((height, width, 3), dtype=np.uint64)
+    weight = np.zeros((height, width, 1), dtype=np.uint64)
+    for part in _block_parts(image, factor):
+        alpha = part[..., 3:].astype(np.uint64)
+        weight += alpha
+        color += part[..., :3] * alpha
     safe = np.maximum(weight, np.uint64(1))
-    count64 = np.uint64(factor * factor)
     straight = (color + safe // np.uint64(2)) // safe
-    return np.concatenate([straight, (weight + count64 // np.uint64(2)) // count64], axis=2).astype(np.uint8)
+    return np.concatenate([straight, (weight + count // 2) // count], axis=2).astype(np.uint8)
 
 
 def mask_downscale(mask: np.ndarray, factor: int, *, need: float) -> np.ndarray:
     """Bool [H, W] to bool [H // n, W // n]: True where at least the share ``need`` of the n x n block is True."""
     if factor == 1:
         return mask
-    return np.asarray(_blocks(mask[:, :, None], factor).mean(axis=(1, 3))[:, :, 0] >= need)
+    share = sum(part.astype(np.float64) for part in _block_parts(mask, factor)) / factor**2
+    return np.asarray(share >= need)
 
 
-def _blocks(image: np.ndarray, factor: int) -> np.ndarray:
+def _block_parts(image: np.ndarray, factor: int) -> list[np.ndarray]:
+    """The n x n pictures [H // n, W // n, ...] of the pixels at each place in the blocks (views, no copies)."""
     height, width = image.shape[0] // factor, image.shape[1] // factor
     if factor < 1 or height < 1 or width < 1:
         raise ShapeError(f"downscale must leave at least one pixel of {image.shape[1]}x{image.shape[0]}, got {factor}")
-    return image[: height * factor, : width * factor].reshape(height, factor, width, factor, image.shape[2])
+    h, w = height * factor, width * factor
+    return [image[dy:h:factor, dx:w:factor] for dy in range(factor) for dx in range(factor)]

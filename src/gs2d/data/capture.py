@@ -208,7 +208,7 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
         twice = next(a for a, b in itertools.pairwise(names) if a == b)
         raise DataError(f"{root} must name each view once, got {twice} more than once")
     views = [_view(frame, factor, cache, lens_maps) for frame in frames]
-    train, test, split_notes = _split(frames, views, capture.default_test_every, test_every, root)
+    train, test = _split(frames, views, capture.default_test_every, test_every, root)
     cameras = [view.camera for view in train]
     extent = camera_extent(cameras)
     if not extent > 1e-9 * (1 + max(float(np.abs(camera.center).max()) for camera in cameras)):
@@ -228,7 +228,7 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=capture.skipped,
-        notes=capture.notes + _lens_notes(frames) + split_notes + point_notes + bound_notes,
+        notes=capture.notes + _lens_notes(frames) + point_notes + bound_notes,
         root=root,
     )
 
@@ -244,12 +244,9 @@ def _view(frame: Frame, factor: int, cache: ImageCache, lens_maps: LensMaps) -> 
 
 def _split(
     frames: list[Frame], views: list[View], default_every: int, test_every: int | None, root: Path
-) -> tuple[tuple[View, ...], tuple[View, ...], tuple[str, ...]]:
-    notes: tuple[str, ...] = ()
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
     if any(frame.split for frame in frames):
         is_test = [frame.split == "test" for frame in frames]
-        if test_every is not None:
-            notes = ("the data set has its own split into training and test views, so test_every has no effect",)
     else:
         every = default_every if test_every is None else test_every
         is_test = [bool(every) and index % every == 0 for index in range(len(views))]
@@ -257,7 +254,7 @@ def _split(
     test = tuple(view for view, test in zip(views, is_test, strict=True) if test)
     if not train:
         raise DataError(f"{root} must have a training view, got {len(test)} test views only; use test_every=0")
-    return train, test, notes
+    return train, test
 
 
 def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, tuple[str, ...]]:
