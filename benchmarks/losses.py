@@ -4,8 +4,8 @@
 
     python -m benchmarks.losses [--sizes 400 800] [--threads 1 2] [--repeats 40] [--json benchmarks/results/losses.json]
 
-Times include the autograd and ctypes overhead of a training step. Each row stands beside a matrix-product probe
-(GFLOP/s) taken just before it.
+Times include the autograd and ctypes overhead of a training step. Each row stands beside the peak rate of fused
+multiply-adds (GFLOP/s, same threads) measured just before it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from benchmarks.timing import Timing, machine, measure, peak_probe
 from gs2d import losses_reference as reference
 from gs2d.camera import Camera, look_at
 from gs2d.kernels import ops
-from gs2d.kernels.library import load
+from gs2d.kernels.library import load, prepare
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def torch_normal_step(frame: Frame) -> None:
     torch.autograd.grad(0.05 * value, (frame.normal, frame.depth))
 
 
-def run(sizes: Sequence[int], threads: Sequence[int], repeats: int, probe_size: int) -> list[Row]:
+def run(sizes: Sequence[int], threads: Sequence[int], repeats: int) -> list[Row]:
     """Measure every loss at every size and number of threads."""
     rows: list[Row] = []
     for size in sizes:
@@ -124,8 +124,8 @@ def run(sizes: Sequence[int], threads: Sequence[int], repeats: int, probe_size: 
         }
         for n in threads:
             for name, (native, slow) in cases.items():
-                probe = peak_probe(n, size=probe_size)
                 torch.set_num_threads(n)
+                probe = peak_probe(prepare())
                 fast = measure(native, repeats=repeats)
                 other = None if slow is None else measure(slow, repeats=max(3, repeats // 8), warmup=1)
                 rows.append(Row(name, size, n, fast, other, probe))
@@ -138,12 +138,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[400, 800])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=40)
-    parser.add_argument("--probe-size", type=int, default=1024)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     before = torch.get_num_threads()
     try:
-        rows = run(options.sizes, options.threads, options.repeats, options.probe_size)
+        rows = run(options.sizes, options.threads, options.repeats)
     finally:
         torch.set_num_threads(before)
     facts = machine() | {"kernels": load().variant}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import platform
 import statistics
 import time
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
+from gs2d.kernels.library import Library
 
 
 @dataclass(frozen=True)
@@ -34,17 +37,13 @@ def measure(work: Callable[[], object], *, repeats: int, warmup: int = 5) -> Tim
     return Timing(statistics.median(times), min(times), repeats)
 
 
-def peak_probe(threads: int, *, size: int = 1024, repeats: int = 7) -> float:
-    """GFLOP/s of a float32 matrix product on this many threads, best of a few: near the processor's peak.
+def peak_probe(library: Library) -> float:
+    """GFLOP/s of fused multiply-adds on the library's threads right now, the better of three.
 
     Compare it with the same figure of a quiet machine before comparing times.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    a = torch.ones(size, size)
-    best = measure(lambda: a @ a, repeats=repeats, warmup=2).best
-    torch.set_num_threads(before)
-    return 2 * size**3 / best / 1e6
+    rate = library.function("gs2d_probe_fma", ctypes.c_double, [])
+    return max(rate() for _ in range(3))
 
 
 def machine() -> dict[str, str]:

@@ -280,8 +280,6 @@ def test_the_benchmark_runs(double: Library, tmp_path: Path, monkeypatch: pytest
             "1",
             "--repeats",
             "2",
-            "--probe-size",
-            "64",
             "--json",
             str(tmp_path / "out.json"),
         ]
