@@ -54,7 +54,6 @@ PEERS = {
     ("geometry", "camera"),
     ("images", "camera"),
     ("data", "io"),
-    ("io", "data"),
     ("render", "kernels"),
 }
 # Inside render: api > backend > the rasterizers > types.

@@ -113,7 +113,7 @@ def test_03_an_edge_on_plane_is_not_hit_and_the_low_pass_filter_decides(backend:
 
 def test_03_a_plane_met_behind_the_camera_is_not_hit(backend: Backend) -> None:
     # Turned 85 degrees: sin85 x + cos85 (z - 2) = 0, so z (sin85 k/10 + cos85) = 2 cos85.
-    # k = -1 meets it behind the camera, where rho3d would be 0.64 < 2: the filter gives exp(-1) at z_c. k = 1: z = 0.93.
+    # k = -1 meets it behind the camera, where rho3d would be 0.64 < 2: the filter gives exp(-1), z_c. k = 1: z = 0.93.
     s, c = sin(radians(85)), cos(radians(85))
     out = rasterize(splat(scales=(20, 20), axis=Y_AXIS, degrees=85, opacity=0.5), front_camera(), backend=backend)
     equal(out.alpha[4, 3], 0.5 * exp(-1))
