@@ -88,7 +88,7 @@ def test_an_error_about_another_file_is_not_taken_for_a_failed_write(tmp_path: P
     assert names(tmp_path) == []
 
 
-@pytest.mark.parametrize("what", ["bytes", "text", "json", "torch"])
+@pytest.mark.parametrize("what", ["bytes", "text", "json", "torch", "library"])
 def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Path, what: str) -> None:
     """A file-size limit of 4 KiB stands in for the full disk: the kernel refuses the write in the same way."""
     (tmp_path / "out").write_text("old")
@@ -96,6 +96,9 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Pa
         "bytes": "with atomic_write(path) as f:\n    for _ in range(100): f.write(bytes(1000)); f.flush()",
         "text": "with atomic_write(path, 'w') as f: f.write('x' * 10000)",
         "json": "write_json(path, list(range(10000)))",
+        # A library that hides the system's error behind its own.
+        "library": "with atomic_write(path) as f:\n    try: f.write(bytes(2 << 20))\n"
+        "    except OSError: raise RuntimeError('failed') from None",
         "torch": "import torch\nwith atomic_write(path) as f: torch.save(torch.zeros(100000), f)",
     }[what]
     code = textwrap.dedent(
