@@ -34,6 +34,7 @@ class Console:
         self._err = RichConsole(file=sys.stderr, highlight=False)
         self._progress: Progress | None = None
         self._task: TaskID | None = None
+        self._named: set[str] = set()  # phases that a log file has heard of
 
     def on_event(self, event: Event) -> None:
         """Draw an event of the pipeline."""
@@ -51,7 +52,9 @@ class Console:
 
     def _begin(self, phase: Phase) -> None:
         if not self._err.is_terminal:  # a log file: one line a phase, no bars
-            self._err.print(f"{phase.name} ({phase.total})")
+            if phase.name not in self._named:
+                self._err.print(f"{phase.name} ({phase.total})")
+            self._named.add(phase.name)
             return
         if self._progress is None:
             self._progress = Progress(

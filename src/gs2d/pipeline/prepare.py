@@ -141,7 +141,8 @@ def backend_facts(name: str) -> dict[str, Any]:
 
 def read_scene(path: Path, scene_format: str, downscale: int, protocol: Protocol, on_event: OnEvent) -> Scene:
     """Load a capture and tell what was decided or skipped."""
-    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=protocol.test_every)
+    test_every = None if scene_format == "blender" else protocol.test_every  # Blender captures bring their split
+    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every)
     for text in (*scene.notes, *scene.skipped):
         on_event(Notice(text))
     return scene
