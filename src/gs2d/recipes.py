@@ -180,7 +180,11 @@ def _registry() -> dict[str, NamedRecipe]:
 def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> None:
     """The other readings of what the paper leaves open."""
     preserve = partial(two_dgs_r, stage_3=refine(clone="preserve"))
-    add("2dgs-r-clone-preserve", "Variant: a splat and its clone share the opacity, so the image hardly changes", preserve)
+    add(
+        "2dgs-r-clone-preserve",
+        "Variant: a splat and its clone share the opacity, so the image hardly changes",
+        preserve,
+    )
     sh_of_all = partial(two_dgs_r, stage_2=appearance(rows="all"))
     add("2dgs-r-sh-of-all", "Variant: stage 2 trains the SH of every splat", sh_of_all)
     clones_only = partial(two_dgs_r, stage_3=refine(rows="clones"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from train_toys import make_scene
+from train_toys import backends, make_scene
 
 from gs2d.data.scene import Scene
 
@@ -11,3 +11,10 @@ from gs2d.data.scene import Scene
 @pytest.fixture(scope="session")
 def scene() -> Scene:
     return make_scene()
+
+
+@pytest.fixture(params=["reference", "cpu"])
+def backend(request: pytest.FixtureRequest) -> str:
+    if request.param not in backends():
+        pytest.skip("the native library is not built")
+    return str(request.param)

@@ -17,6 +17,7 @@ def test_the_worst_are_the_largest_and_ties_go_by_index() -> None:
     errors = torch.tensor([1.0, 5.0, 5.0, 2.0, 5.0])
     assert worst(errors, 40).tolist() == [1, 2]
     assert worst(errors, 100).tolist() == [1, 2, 4, 3, 0]
+    assert worst(torch.ones(5000), 10).tolist() == list(range(500))  # many: an unstable sort would mix them
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from gs2d.camera import look_at
 from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.errors import BackendError
 from gs2d.geometry import camera_extent
+from gs2d.protocols import GENERIC
+from gs2d.recipe import GradDensify, Rates, Recipe
+from gs2d.recipes import appearance, refine, surface
 from gs2d.render.api import rasterize
+from gs2d.render.backend import get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.splats import Splats
+from gs2d.train import events
+from gs2d.train.loop import Trainer
 from gs2d.train.state import Moments, Statistics, TrainState
 
 VIEWS, SIZE, POINTS = 6, 24, 60
@@ -76,3 +85,75 @@ def make_scene() -> Scene:
         extent=camera_extent(cameras),
         bounds=np.array([[-1.0] * 3, [1.0] * 3]),
     )
+
+
+def short(absgs: bool = False) -> Recipe:
+    """2DGS-R in 10 + 4 + 5 iterations: densified at 3, 6 and 9, reset after 5, normal consistency after 4."""
+    densify = GradDensify(
+        every=3, start=1, stop=10, reset_every=0, reset_at=(5,), opacity_cull=0.005, max_splats=75, absolute=absgs
+    )
+    first = surface()
+    return Recipe(
+        "short",
+        (
+            replace(
+                first,
+                iterations=10,
+                densify=densify,
+                sh_interval=3,
+                losses=tuple(replace(term, start=min(term.start, 4)) for term in first.losses),
+                rates=Rates(means_horizon=10),
+            ),
+            replace(appearance(k=20.0), iterations=4),
+            replace(refine(), iterations=5),
+        ),
+    )
+
+
+def backends() -> list[str]:
+    try:
+        get_backend("cpu")
+    except BackendError:
+        return ["reference"]
+    return ["reference", "cpu"]
+
+
+class Recorder:
+    """Keeps the events, and a copy of the splats at each."""
+
+    def __init__(self) -> None:
+        self.events: list[events.Event] = []
+        self.splats: list[Splats] = []
+        self.trainer: Trainer | None = None
+
+    def __call__(self, event: events.Event) -> None:
+        self.events.append(event)
+        assert self.trainer is not None
+        self.splats.append(self.trainer.splats.clone())
+
+    def at(self, kind: type, stage: str) -> Splats:
+        """The splats at the first event of a kind in a stage."""
+        for event, splats in zip(self.events, self.splats, strict=True):
+            if isinstance(event, kind) and event.stage == stage:  # type: ignore[attr-defined]
+                return splats
+        raise AssertionError(f"no {kind.__name__} in {stage}")
+
+
+def train(scene: Scene, recipe: Recipe, **options: object) -> tuple[Trainer, Recorder]:
+    recorder = Recorder()
+    trainer = Trainer(
+        scene,
+        recipe,
+        options.pop("protocol", GENERIC),
+        on_event=recorder,
+        progress_every=1,
+        **({"backend": "reference"} | options),  # type: ignore[arg-type]
+    )
+    recorder.trainer = trainer
+    trainer.run()
+    return trainer, recorder
+
+
+def same(a: Splats, b: Splats) -> bool:
+    """Whether all bytes are the same."""
+    return all(torch.equal(x, y) for (_, x), (_, y) in zip(a.items(), b.items(), strict=True))

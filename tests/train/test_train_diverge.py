@@ -1,0 +1,79 @@
+"""Training that cannot go on stops, and says where and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from train_toys import random_splats, short, train
+
+from gs2d.camera import Camera
+from gs2d.data.scene import Scene
+from gs2d.errors import DataError, DivergedError, RecipeError
+from gs2d.protocols import GENERIC
+from gs2d.recipe import ALL, Rates, Recipe
+from gs2d.recipes import surface
+from gs2d.render import reference, reference_errors
+from gs2d.render.backend import Backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import Splats
+from gs2d.train.loop import Trainer
+from gs2d.train.state import TrainState
+
+
+def test_bad_recipes_and_empty_scenes_stop_before_anything_is_trained(scene: Scene) -> None:
+    with pytest.raises(RecipeError, match="at least one stage"):
+        Trainer(scene, Recipe("r", ()), GENERIC, backend="reference")
+    with pytest.raises(DataError, match="no training views"):
+        Trainer(replace(scene, train=()), short(), GENERIC, backend="reference")
+
+
+def spoiled(spoil: Callable[[Splats, RenderOutput], RenderOutput], calls: int) -> Backend:
+    """The reference, whose render number ``calls`` is spoiled."""
+    count = [0]
+
+    def rasterize(
+        splats: Splats, camera: Camera, settings: RasterSettings, probe: torch.Tensor | None = None
+    ) -> RenderOutput:
+        count[0] += 1
+        output = reference.rasterize(splats, camera, settings, probe)
+        return spoil(splats, output) if count[0] == calls else output
+
+    return Backend("reference", rasterize, reference_errors.splat_errors)
+
+
+def test_nan_in_the_loss_stops_with_stage_and_iteration(scene: Scene) -> None:
+    bad = spoiled(lambda _, out: replace(out, color=out.color * float("nan")), 4)
+    with pytest.raises(DivergedError, match=r"iteration 4 of stage 'surface': the loss .* is NaN or infinite"):
+        train(scene, short(), backend=bad)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_nan_in_a_gradient_names_the_attribute(scene: Scene, name: str) -> None:
+    def spoil(splats: Splats, output: RenderOutput) -> RenderOutput:
+        def hook(gradient: torch.Tensor) -> torch.Tensor:
+            spoiled_gradient = gradient.clone()
+            spoiled_gradient.view(-1)[-1] = float("inf")
+            return spoiled_gradient
+
+        getattr(splats, name).register_hook(hook)
+        return output
+
+    with pytest.raises(DivergedError, match=f"iteration 2 of stage 'surface': the gradient of {name} is NaN"):
+        train(scene, short(), backend=spoiled(spoil, 2))
+
+
+def test_nan_in_a_parameter_stops_at_the_door_though_the_rasterizer_would_skip_it(scene: Scene) -> None:
+    splats = random_splats(5)
+    splats.log_scales[3, 1] = float("nan")
+    state = TrainState(splats, torch.Generator())
+    with pytest.raises(DivergedError, match="log_scales is NaN"):
+        Trainer(scene, short(), GENERIC, backend="reference", state=state).run()
+
+
+def test_an_update_that_leaves_the_finite_numbers_stops(scene: Scene) -> None:
+    wild = replace(surface(), iterations=3, densify=None, rates=Rates(sh0=1e39))
+    with pytest.raises(DivergedError, match="iteration 1 of stage 'surface': sh0 is NaN"):
+        train(scene, Recipe("r", (wild,)))

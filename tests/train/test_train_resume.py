@@ -1,0 +1,110 @@
+"""Resuming is exact: after any event, after a kill, from a shared stage; states of another run are refused."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import pytest
+import torch
+from train_toys import backends, random_splats, same, short, train
+
+from gs2d.data.scene import Scene
+from gs2d.errors import RunError
+from gs2d.protocols import GENERIC
+from gs2d.recipe import Recipe
+from gs2d.recipes import proceed
+from gs2d.train import events
+from gs2d.train.loop import Trainer
+from gs2d.train.state import TrainState
+
+
+def reload(data: bytes) -> TrainState:
+    return TrainState.from_state_dict(torch.load(io.BytesIO(data), weights_only=True))
+
+
+def saved(trainer: Trainer) -> bytes:
+    file = io.BytesIO()
+    torch.save(trainer.state.state_dict(), file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("absgs", [False, True])
+def test_resuming_from_any_event_gives_the_same_bytes(scene: Scene, absgs: bool) -> None:
+    kept: list[tuple[events.Event, bytes]] = []
+    backend = backends()[-1]
+    trainer = Trainer(
+        scene,
+        short(absgs),
+        GENERIC,
+        backend=backend,
+        progress_every=1,
+        on_event=lambda event: kept.append((event, saved(trainer))),
+    )
+    end = trainer.run()
+    assert {type(event) for event, _ in kept} == set(events.Event.__args__)  # type: ignore[attr-defined]
+    for event, data in kept[:: 1 if backend == "cpu" else 5]:
+        resumed = Trainer(scene, short(absgs), GENERIC, backend=backend, state=reload(data))
+        assert same(resumed.run(), end), event
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize("when", [1, 9, 20, 26])
+def test_a_run_that_is_killed_in_an_event_resumes_from_its_last_save_to_the_same_bytes(
+    scene: Scene, backend: str, when: int
+) -> None:
+    end = Trainer(scene, short(), GENERIC, backend=backend, progress_every=1).run()
+    saves: list[bytes] = []
+
+    def on_event(event: events.Event) -> None:
+        if isinstance(event, events.Progress) and event.iteration % 3 == 0:
+            saves.append(saved(trainer))
+        seen.append(event)
+        if len(seen) == when:
+            raise Killed
+
+    seen: list[events.Event] = []
+    trainer = Trainer(scene, short(), GENERIC, backend=backend, on_event=on_event, progress_every=1)
+    with pytest.raises(Killed):
+        trainer.run()
+    state = reload(saves[-1]) if saves else None
+    assert same(Trainer(scene, short(), GENERIC, backend=backend, state=state).run(), end)
+
+
+def test_a_finished_stage_can_be_shared_with_a_recipe_of_the_same_first_stage(scene: Scene) -> None:
+    first = short().stages[0]
+    longer = Recipe("longer", (first, replace(proceed(), iterations=4)))
+    at_finish: list[bytes] = []
+
+    def on_event(event: events.Event) -> None:
+        if isinstance(event, events.StageFinished) and event.index == 0:
+            at_finish.append(saved(trainer))
+
+    trainer = Trainer(scene, short(), GENERIC, backend="reference", on_event=on_event)
+    trainer.run()
+    shared = Trainer(scene, longer, GENERIC, backend="reference", state=reload(at_finish[0]))
+    assert same(shared.run(), Trainer(scene, longer, GENERIC, backend="reference").run())
+    assert shared.state.moments["means"].steps > 4  # kept
+
+
+def test_a_finished_run_has_nothing_left_to_do(scene: Scene) -> None:
+    trainer, _ = train(scene, short())
+    again = Trainer(scene, short(), GENERIC, backend="reference", state=reload(saved(trainer)))
+    assert again.done
+    assert same(again.run(), trainer.splats)
+
+
+def test_states_of_another_recipe_or_scene_are_refused(scene: Scene) -> None:
+    state = TrainState(random_splats(5, degree=2), torch.Generator())
+    with pytest.raises(RunError, match="SH degree 2"):
+        Trainer(scene, short(), GENERIC, backend="reference", state=state)
+    for stage, step in ((0, 11), (3, 1), (4, 0)):
+        state = TrainState(random_splats(5), torch.Generator(), stage=stage, step=step)
+        with pytest.raises(RunError, match=f"stage {stage}, iteration {step}"):
+            Trainer(scene, short(), GENERIC, backend="reference", state=state)
+    state = TrainState(random_splats(5), torch.Generator(), queue=[6])
+    with pytest.raises(RunError, match="view 6"):
+        Trainer(scene, short(), GENERIC, backend="reference", state=state)
