@@ -15,7 +15,7 @@ from gs2d.triangles import Mesh
 
 def limits(half: float, voxel: float, truncation: float | None = None, depth_limit: float = 100.0) -> FusionLimits:
     """A cube of half side ``half`` around the origin."""
-    trunc = truncation if truncation is not None else 4 * voxel
+    trunc = truncation if truncation is not None else 5 * voxel
     low, high = (-half, -half, -half), (half, half, half)
     return FusionLimits(low, high, voxel, trunc, depth_limit, 1.0, 1.0, voxel, 0.0)
 

@@ -23,7 +23,7 @@ from gs2d.mesh.sampling import View, block_visibility, prepare
 
 BLOCK = 8  # voxels along the side of a block
 VOXELS = BLOCK**3
-FULL_WEIGHT_BEHIND = 0.5  # of the truncation: the weight falls from 1 here to 0 at the truncation
+FULL_WEIGHT_BEHIND = 0.75  # of the truncation: the weight falls from 1 here to 0 at the truncation
 _CHUNK = 48  # blocks at a time: the temporaries of a chunk fit the second-level cache
 
 

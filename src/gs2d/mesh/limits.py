@@ -19,7 +19,7 @@ FAR_FACTOR = 4.0  # times the median depth; beyond it a pixel is wider than four
 BOX_PERCENTILES = (1.0, 99.0)
 DEPTH_PERCENTILE = 99.5
 BOX_MARGIN = 0.25  # of the robust box's longest side, on every side: room for what percentiles cut off
-VOXELS_PER_TRUNCATION = 4.0
+VOXELS_PER_TRUNCATION = 5.0
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
     volume : Volume
     min_weight : float
         A voxel is known from this weight on. A view adds 1 to voxels in front of its surface and to those behind it
-        up to half the truncation.
+        up to ``fuse.FULL_WEIGHT_BEHIND`` of the truncation.
 
     Returns
     -------
