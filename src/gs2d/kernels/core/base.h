@@ -51,6 +51,9 @@ GS2D_HD float max(float a, float b) { return a > b ? a : b; }
 GS2D_HD double min(double a, double b) { return a < b ? a : b; }
 GS2D_HD double max(double a, double b) { return a > b ? a : b; }
 
+// 2^x where x <= 0; for very negative or non-finite x the result is not meant to be used.
+template <class V> GS2D_HD V exp2_small(V x) { return exp2(x); }
+
 // c - a * b, fused.
 template <class V> GS2D_HD V fnma(V a, V b, V c) { return fma(-a, b, c); }
 

@@ -14,29 +14,28 @@ template <class V> struct BlendLimits {
     V alpha_max, transmittance_min;
 };
 
+// A splat at a pixel. Filtered pairs (the low-pass filter decides) have u = v = 0 and Q = 1 / Q = 1, so that their depth is
+// z_c; skipped pairs have alpha = 0. Nothing in here is NaN or infinite.
 template <class V> struct Hit {
-    V dx, dy;       // px, from the projected centre
-    V Q, rq, u, v;  // plane coordinates; rq = 1 / Q
-    V rho, depth;
-    V log2_alpha;
-    mask_t<V> ray;  // the plane decides; elsewhere the low-pass filter
-    mask_t<V> visible;
+    V u, v;      // plane coordinates
+    V Q, rq;     // z_c / depth, and its inverse
+    V rho;
+    V alpha;     // not yet limited to alpha_max
+    mask_t<V> ray;  // the plane decides
 };
 
-// x, y: pixel centre. NaN and infinity in u, v, rq are possible where `ray` is false.
-template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V x, V y, const BlendLimits<V>& k) {
+// dx, dy: pixel centre - projected splat centre, px.
+template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h;
-    h.dx = x - s.cx, h.dy = y - s.cy;
-    h.Q = fma(s.az, h.dx, fma(s.bz, h.dy, V(1)));
-    h.rq = V(1) / h.Q;
-    h.u = fma(s.au, h.dx, s.bu * h.dy) * h.rq;
-    h.v = fma(s.av, h.dx, s.bv * h.dy) * h.rq;
-    const V rho3d = fma(h.u, h.u, h.v * h.v), rho2d = fma(h.dx, h.dx, h.dy * h.dy) * k.inv_lowpass2;
-    h.ray = (h.Q > V(0)) & (rho3d <= rho2d);
+    const V Q = fma(s.az, dx, fma(s.bz, dy, V(1))), rq = V(1) / Q;
+    const V u = fma(s.au, dx, s.bu * dy) * rq, v = fma(s.av, dx, s.bv * dy) * rq;
+    const V rho3d = fma(u, u, v * v), rho2d = fma(dx, dx, dy * dy) * k.inv_lowpass2;
+    h.ray = (Q > V(0)) & (rho3d <= rho2d);
     h.rho = select(h.ray, rho3d, rho2d);
-    h.depth = select(h.ray, s.zc * h.rq, s.zc);
-    h.log2_alpha = fma(V(-0.5 * LOG2E), h.rho, s.log2_opacity);
-    h.visible = (h.log2_alpha >= k.log2_alpha_min) & (h.depth >= k.near);
+    h.u = keep(h.ray, u), h.v = keep(h.ray, v);
+    h.Q = select(h.ray, Q, V(1)), h.rq = select(h.ray, rq, V(1));
+    const V log2_alpha = fma(V(-0.5 * LOG2E), h.rho, s.log2_opacity);
+    h.alpha = keep((log2_alpha >= k.log2_alpha_min) & (s.zc * h.rq >= k.near), exp2_small(log2_alpha));
     return h;
 }
 
@@ -51,28 +50,25 @@ template <class V> struct Pixel {
     mask_t<V> live;
 };
 
-// Composites one splat; returns where it was visible to a live pixel (also where that pixel stops).
+// Composites one splat, given what `intersect` found; returns where a live pixel saw it (also where that pixel stops).
 template <class V>
-GS2D_HD mask_t<V> composite(const Record<V>& s, V inverse_zc, const Hit<V>& h, const BlendLimits<V>& k, Pixel<V>& p) {
-    const auto seen = h.visible & p.live;
-    const V alpha = min(exp2(h.log2_alpha), k.alpha_max);
+GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
+    const auto seen = (raw_alpha > V(0)) & p.live;
+    const V alpha = keep(seen, min(raw_alpha, k.alpha_max));
     const V after = fnma(alpha, p.T, p.T);
-    const auto stays = after >= k.transmittance_min;
-    const auto blends = seen & stays;
-    p.live = and_not(p.live, and_not(seen, stays));
-    const V w = keep(blends, alpha * p.T);
-    const V inverse_depth = select(h.ray, h.Q * inverse_zc, inverse_zc);
+    p.live = p.live & (after >= k.transmittance_min);  // T of a live pixel never is below: only `seen` can stop it
+    const V w = keep(p.live, alpha * p.T);
     p.inverse_depth0 = select(p.alpha <= V(0), inverse_depth, p.inverse_depth0);
     const V q = inverse_depth - p.inverse_depth0, wq = w * q;
     p.distortion = fma(wq, fma(q, p.alpha, V(-2) * p.M1), fma(w, p.M2, p.distortion));
     p.M1 = p.M1 + wq;
     p.M2 = fma(wq, q, p.M2);
-    p.median = select(blends & (p.T > V(0.5)), h.depth, p.median);
-    p.T = select(blends, after, p.T);
+    p.median = select((w > V(0)) & (p.T > V(0.5)), depth, p.median);
+    p.T = select(p.live, after, p.T);
     p.alpha = p.alpha + w;
     p.red = fma(w, s.red, p.red), p.green = fma(w, s.green, p.green), p.blue = fma(w, s.blue, p.blue);
     p.nx = fma(w, s.nx, p.nx), p.ny = fma(w, s.ny, p.ny), p.nz = fma(w, s.nz, p.nz);
-    p.depth = fma(w, h.depth, p.depth);
+    p.depth = fma(w, depth, p.depth);
     return seen;
 }
 
@@ -100,50 +96,51 @@ template <class V> struct PairSums {
 // One splat at one pixel, front to back. T is 0 where the pixel has stopped (or does not exist).
 // Geo: normal or depth images have gradients. Dist: the distortion has. Abs: the AbsGS signal is wanted.
 template <bool Geo, bool Dist, bool Abs, class V>
-GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, const Hit<V>& h, const BlendLimits<V>& k,
+GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
                            const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
-    const V raw = exp2(h.log2_alpha), alpha = min(raw, k.alpha_max);
+    const V alpha = min(h.alpha, k.alpha_max), depth = s.zc * h.rq;
     const V after = fnma(alpha, T, T);
-    const auto blends = h.visible & (after >= k.transmittance_min);
-    const V w = keep(blends, alpha * T);
+    const auto goes_on = after >= k.transmittance_min;
+    const V w = keep(goes_on, alpha * T);
     V along = fma(s.red, g.red, fma(s.green, g.green, fma(s.blue, g.blue, g.alpha)));  // s = dL/dw, transmittance held
     V gz = V(0);
     if constexpr (Geo) {
         along = fma(s.nx, g.nx, fma(s.ny, g.ny, fma(s.nz, g.nz, along)));
-        along = fma(h.depth, g.depth, along);
-        gz = fma(w, g.depth, keep(blends & (T > V(0.5)) & (after <= g.median_below), g.median));
+        along = fma(depth, g.depth, along);
+        gz = fma(w, g.depth, keep((w > V(0)) & (T > V(0.5)) & (after <= g.median_below), g.median));
     }
     if constexpr (Dist) {
-        const V inverse_depth = select(h.ray, h.Q * inverse_zc, inverse_zc);
+        const V inverse_depth = inverse_zc * h.Q;
         const V q = inverse_depth - g.inverse_depth0, lever = fma(q, g.total, -g.M1);
         along = fma(g.distortion, fma(q, lever - g.M1, g.M2), along);
         gz = fnma(V(2) * w * g.distortion * lever, inverse_depth * inverse_depth, gz);
     }
     S = fnma(w, along, S);
     // d alpha / d ln(alpha) = the unclamped alpha: the ceiling passes gradients
-    const V gl = keep(blends, fma(T, along, -(S / (V(1) - alpha))) * raw);
-    T = select(h.visible, keep(blends, after), T);
+    const V gl = keep(goes_on, fma(T, along, -(S / (V(1) - alpha))) * h.alpha);
+    T = keep(goes_on, after);
 
     sums.ln_alpha = sums.ln_alpha + gl;
     sums.red = fma(w, g.red, sums.red), sums.green = fma(w, g.green, sums.green), sums.blue = fma(w, g.blue, sums.blue);
-    // Plane branch: rho = (X^2 + Y^2) / Q^2, z = z_c / Q.
-    const V rq = keep(h.ray, h.rq), u = keep(h.ray, h.u), v = keep(h.ray, h.v);
-    const V t = gl * rq, tu = t * u, tv = t * v;  // -dL/dX, -dL/dY
+    // Plane branch: rho = (X^2 + Y^2) / Q^2, z = z_c / Q. Filtered pairs: only zc and the filter's centre.
+    const V t = gl * h.rq, tu = t * h.u, tv = t * h.v;  // -dL/dX, -dL/dY
     V gQ = t * h.rho;
     if constexpr (Geo) {
         sums.nx = fma(w, g.nx, sums.nx), sums.ny = fma(w, g.ny, sums.ny), sums.nz = fma(w, g.nz, sums.nz);
-        gQ = fnma(gz * rq, h.depth, gQ);
-        sums.zc = sums.zc + select(h.ray, gz * rq, gz);
+        const V gzc = gz * h.rq;
+        sums.zc = sums.zc + gzc;
+        gQ = fnma(gzc, depth, gQ);
     }
-    sums.X = sums.X + tu, sums.Xx = fma(tu, h.dx, sums.Xx), sums.Xy = fma(tu, h.dy, sums.Xy);
-    sums.Y = sums.Y + tv, sums.Yx = fma(tv, h.dx, sums.Yx), sums.Yy = fma(tv, h.dy, sums.Yy);
-    sums.Q = sums.Q + gQ, sums.Qx = fma(gQ, h.dx, sums.Qx), sums.Qy = fma(gQ, h.dy, sums.Qy);
+    gQ = keep(h.ray, gQ);
+    sums.X = sums.X + tu, sums.Xx = fma(tu, dx, sums.Xx), sums.Xy = fma(tu, dy, sums.Xy);
+    sums.Y = sums.Y + tv, sums.Yx = fma(tv, dx, sums.Yx), sums.Yy = fma(tv, dy, sums.Yy);
+    sums.Q = sums.Q + gQ, sums.Qx = fma(gQ, dx, sums.Qx), sums.Qy = fma(gQ, dy, sums.Qy);
     if constexpr (Abs) {
         const V px = fma(s.au, tu, fma(s.av, tv, -(s.az * gQ))), py = fma(s.bu, tu, fma(s.bv, tv, -(s.bz * gQ)));
-        sums.abs_x = sums.abs_x + abs(keep(h.ray, h.Q * px)), sums.abs_y = sums.abs_y + abs(keep(h.ray, h.Q * py));
+        sums.abs_x = sums.abs_x + abs(h.Q * px), sums.abs_y = sums.abs_y + abs(h.Q * py);
     }
     const V filtered = select(h.ray, V(0), gl);
-    sums.lowpass_x = fma(filtered, h.dx, sums.lowpass_x), sums.lowpass_y = fma(filtered, h.dy, sums.lowpass_y);
+    sums.lowpass_x = fma(filtered, dx, sums.lowpass_x), sums.lowpass_y = fma(filtered, dy, sums.lowpass_y);
 }
 
 // dL/d(record) from the sums, per lane (the sum over lanes is left to the caller).

@@ -82,22 +82,41 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     }
 }
 
+// What the first pass over a splat's blocks leaves for the second.
+struct Hits {
+    alignas(64) real u[BLOCKS][LANES], v[BLOCKS][LANES], Q[BLOCKS][LANES], rq[BLOCKS][LANES], rho[BLOCKS][LANES], alpha[BLOCKS][LANES];
+    M ray[BLOCKS];
+};
+
+// Two passes per splat: intersections first, whose long chains then overlap, and compositing after.
 template <bool Geo, bool Dist, bool Abs>
 void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
-    const V lx = lane_x(area.x0), ly = lane_y(area.y0);
+    alignas(64) real px[BLOCKS][LANES], py[BLOCKS][LANES];
+    for (int b = 0; b < BLOCKS; ++b) store(px[b], lane_x(area.x0 + block_x(b))), store(py[b], lane_y(area.y0 + block_y(b)));
+    Hits hits;
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     for (int64_t slot = f.slot_begin[tile]; slot < f.slot_begin[tile + 1]; ++slot, ++entry) {
         const real* record = &f.records[size_t(entry->splat) * RECORD];
         const Record<V> splat = broadcast(record);
+        int i = 0;
+        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1, ++i) {
+            const int b = __builtin_ctz(blocks);
+            const Hit<V> h = intersect(splat, load(px[b]) - splat.cx, load(py[b]) - splat.cy, limits);
+            store(hits.u[i], h.u), store(hits.v[i], h.v), store(hits.rq[i], h.rq), store(hits.rho[i], h.rho), store(hits.alpha[i], h.alpha);
+            if constexpr (Dist || Abs) store(hits.Q[i], h.Q);
+            hits.ray[i] = h.ray;
+        }
         const V inverse_zc = V(real(1) / record[8]), zero = V(0);
         PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
                             zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
-        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
+        i = 0;
+        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1, ++i) {
             const int b = __builtin_ctz(blocks);
-            const V x = lx + V(real(block_x(b))), y = ly + V(real(block_y(b)));
+            Hit<V> h = {load(hits.u[i]), load(hits.v[i]), zero, load(hits.rq[i]), load(hits.rho[i]), load(hits.alpha[i]), hits.ray[i]};
+            if constexpr (Dist || Abs) h.Q = load(hits.Q[i]);
             V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
-            const Hit<V> h = intersect(splat, x, y, limits);
-            composite_vjp<Geo, Dist, Abs>(splat, inverse_zc, h, limits, load_gradient(s, b), pixel_T, pixel_S, sums);
+            composite_vjp<Geo, Dist, Abs>(splat, inverse_zc, load(px[b]) - splat.cx, load(py[b]) - splat.cy, h, limits,
+                                          load_gradient(s, b), pixel_T, pixel_S, sums);
             store(&s[T][b * LANES], pixel_T);
             store(&s[S][b * LANES], pixel_S);
         }

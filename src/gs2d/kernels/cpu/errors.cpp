@@ -31,8 +31,8 @@ inline V difference(const Record<V>& s, const real* target, int b) {
 }
 
 // Pixels of block b that count for the splat.
-inline M counts(const Hit<V>& h, const BlendLimits<V>& limits, V cutoff2, const real* target, int b) {
-    return (h.rho <= cutoff2) & (h.depth >= limits.near) & (load(target + COUNTS * PIXELS + b * LANES) > V(0));
+inline M counts(const Record<V>& s, const Hit<V>& h, const BlendLimits<V>& limits, V cutoff2, const real* target, int b) {
+    return (h.rho <= cutoff2) & (s.zc * h.rq >= limits.near) & (load(target + COUNTS * PIXELS + b * LANES) > V(0));
 }
 
 }  // namespace
@@ -55,8 +55,9 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
                     const real* target = &f.gradients[(size_t(ty) * f.tiles_x + tx) * PLANES * PIXELS];
                     for (uint32_t left = blocks_touched(f.cull[i], boxes, x0, y0); left; left &= left - 1) {
                         const int b = __builtin_ctz(left);
-                        const Hit<V> h = intersect(s, lx + V(x0 + real(block_x(b))), ly + V(y0 + real(block_y(b))), limits);
-                        total = total + keep(counts(h, limits, cutoff2, target, b), difference(s, target, b));
+                        const V x = lx + V(x0 + real(block_x(b))), y = ly + V(y0 + real(block_y(b)));
+                        const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
+                        total = total + keep(counts(s, h, limits, cutoff2, target, b), difference(s, target, b));
                     }
                 }
             errors[i] = sum(total);
@@ -84,12 +85,13 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
             V total = V(0);
             for (uint32_t left = blocks_touched(f.cull[splat], boxes, real(a.x0), real(a.y0)); left; left &= left - 1) {
                 const int b = __builtin_ctz(left);
-                const Hit<V> h = intersect(s, lx + V(real(block_x(b))), ly + V(real(block_y(b))), limits);
-                const V t = load(&T[b * LANES]), alpha = keep(h.visible, min(exp2(h.log2_alpha), limits.alpha_max));
+                const V x = lx + V(real(block_x(b))), y = ly + V(real(block_y(b)));
+                const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
+                const V t = load(&T[b * LANES]), alpha = min(h.alpha, limits.alpha_max);
                 const V after = fnma(alpha, t, t);
                 const M open = after >= limits.transmittance_min;
                 store(&T[b * LANES], keep(open, after));  // stopped pixels stay at 0
-                total = total + keep(counts(h, limits, cutoff2, target, b) & open, difference(s, target, b));
+                total = total + keep(counts(s, h, limits, cutoff2, target, b) & open, difference(s, target, b));
             }
             f.saved[f.slot_begin[tile] + (e - f.tile_begin[tile])] = sum(total);
         }

@@ -20,8 +20,8 @@ struct TileState {
 struct TileWork {
     alignas(64) real records[CHUNK][RECORD];
     real inverse_zc[CHUNK];
-    uint32_t splats[CHUNK], touched[CHUNK], seen[CHUNK];
-    uint16_t list[CHUNK];
+    uint32_t splats[CHUNK], seen[CHUNK];
+    uint32_t touched[CHUNK + LANES], list[CHUNK + LANES];  // read and written a vector at a time
     TileState state;
 };
 
@@ -40,28 +40,32 @@ inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
     s.finished[b] = !any(p.live);
 }
 
-// Indices of the entries whose mask has bit b.
-inline int compress(const uint32_t* masks, int n, int b, uint16_t* list) {
-    int count = 0;
-    for (int i = 0; i < n; ++i) {
-        list[count] = static_cast<uint16_t>(i);
-        count += masks[i] >> b & 1;
-    }
-    return count;
-}
+// Splats are first intersected BATCH at a time and then composited: the long chain of an intersection does not depend
+// on the pixel's state, and so many of them overlap; the state stays in registers while it is used.
+constexpr int BATCH = 8;
 
 void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const BlendLimits<V>& limits) {
-    const int count = compress(w.touched, n, b, w.list);
+    const int count = indices_with_bit(w.touched, n, b, w.list);
     if (count == 0) return;
     const V x = lane_x(0) + V(tile_x + real(block_x(b))), y = lane_y(0) + V(tile_y + real(block_y(b)));
     Pixel<V> p = load_pixel(w.state, b);
-    for (int j = 0; j < count; ++j) {
-        const int i = w.list[j];
-        const Record<V> s = broadcast(w.records[i]);
-        const Hit<V> h = intersect(s, x, y, limits);
-        const M seen = composite(s, V(w.inverse_zc[i]), h, limits, p);
-        w.seen[i] |= uint32_t(any(seen)) << b;
-        if ((j & 3) == 3 && !any(p.live)) break;
+    for (int j = 0; j < count; j += BATCH) {
+        alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
+        const int m = count - j < BATCH ? count - j : BATCH;
+        for (int i = 0; i < m; ++i) {
+            const uint32_t e = w.list[j + i];
+            const Record<V> s = broadcast(w.records[e]);
+            const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
+            store(alpha[i], h.alpha);
+            store(depth[i], s.zc * h.rq);
+            store(inverse_depth[i], V(w.inverse_zc[e]) * h.Q);
+        }
+        for (int i = 0; i < m; ++i) {
+            const uint32_t e = w.list[j + i];
+            const M seen = composite(broadcast(w.records[e]), load(alpha[i]), load(depth[i]), load(inverse_depth[i]), limits, p);
+            w.seen[e] |= uint32_t(any(seen)) << b;
+        }
+        if (!any(p.live)) break;
     }
     store_pixel(w.state, b, p);
 }

@@ -48,16 +48,28 @@ GS2D_HD V& operator+=(V& a, V b) { return a = a + b; }
 GS2D_HD V& operator-=(V& a, V b) { return a = a - b; }
 GS2D_HD V& operator*=(V& a, V b) { return a = a * b; }
 
+#if !(defined(__AVX512F__) && !defined(GS2D_DOUBLE))
+// Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
+    int count = 0;
+    for (int i = 0; i < n; ++i) {
+        out[count] = static_cast<uint32_t>(i);
+        count += static_cast<int>(masks[i] >> bit & 1u);
+    }
+    return count;
+}
+#endif
+
 #if !defined(GS2D_DOUBLE)
-// 2^x for x in [-126, 127]; relative error below 2e-7. Degree 5, minimax on [-1/2, 1/2] with value 1 at 0.
-GS2D_HD V exp2(V x) {
-    x = min(max(x, V(-126.f)), V(127.f));
+// 2^x for x in [-126, 127]; relative error below 2e-7. Degree 5, minimax on [-1/2, 1/2].
+GS2D_HD V exp2_small(V x) {
     const V n = round(x), f = x - n;
     const V f2 = f * f;
     const V p01 = fma(V(0.69314697f), f, V(1.f)), p23 = fma(V(0.05550713f), f, V(0.2402212f));
     const V p45 = fma(V(0.0013276472f), f, V(0.0096755413f));
     return scale2(fma(fma(p45, f2, p23), f2, p01), n);
 }
+GS2D_HD V exp2(V x) { return exp2_small(min(max(x, V(-126.f)), V(127.f))); }
 
 // e^x, relative error below 4e-7 where the result is a normal number; saturates outside.
 GS2D_HD V exp(V x) {

@@ -59,6 +59,20 @@ GS2D_HD void store_first(float* p, V a, int n) { _mm512_mask_storeu_ps(p, first(
 GS2D_HD V iota() { return _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
 GS2D_HD float sum(V a) { return _mm512_reduce_add_ps(a.v); }
 
+// Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
+    const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16);
+    __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    int count = 0;
+    for (int i = 0; i < n; i += 16, index = _mm512_add_epi32(index, step)) {
+        const __mmask16 inside = static_cast<__mmask16>(n - i >= 16 ? 0xffffu : (1u << (n - i)) - 1u);
+        const __mmask16 k = _mm512_mask_test_epi32_mask(inside, _mm512_loadu_si512(masks + i), wanted);
+        _mm512_storeu_si512(out + count, _mm512_maskz_compress_epi32(k, index));
+        count += __builtin_popcount(k);
+    }
+    return count;
+}
+
 // Each step halves the number of vectors and of partial sums per vector.
 template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {
     static_assert(K == 16 || K == 4);

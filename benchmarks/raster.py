@@ -1,0 +1,117 @@
+"""Times the CPU rasterizer, forward and backward of all outputs, beside what the machine can do at that moment.
+
+    python benchmarks/raster.py [--threads 2] [--repeats 15] [--json FILE]
+
+Prints one line per workload: minimum and median milliseconds, and peak multiply-add and copy rates measured in the
+same seconds. On a shared machine compare ratios and minimums, not medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import platform
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from workload import camera, room
+
+from gs2d.kernels.library import Library, load
+from gs2d.render.cpu import IMAGES, rasterize_with
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+WORKLOADS = ((20_000, 400), (100_000, 400), (100_000, 800))
+TARGET_MS = {(20_000, 400): 15.5, (100_000, 400): 35.0, (100_000, 800): 82.2}  # the design's figures, 2 threads
+# gradients that reach the rasterizer: all of them, or what L1 + SSIM alone sends
+UPSTREAM = {"all": IMAGES, "color": ("color",)}
+
+
+def machine() -> dict[str, object]:
+    """What the numbers depend on."""
+    model = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        model = names[0] if names else model
+    return {"cpu": model, "python": platform.python_version(), "torch": torch.__version__, "system": platform.platform()}
+
+
+def probe(library: Library) -> dict[str, float]:
+    """Peak multiply-add rate and copy bandwidth right now, the better of three."""
+    fma = library.function("gs2d_probe_fma", ctypes.c_double, [])
+    copy = library.function("gs2d_probe_copy", ctypes.c_double, [])
+    return {"fma_gflops": round(max(fma() for _ in range(3)), 1), "copy_gb_s": round(max(copy() for _ in range(3)), 1)}
+
+
+def timed(library: Library, splats: Splats, size: int, upstream: tuple[str, ...], repeats: int) -> dict[str, float]:
+    """Milliseconds of forward and backward."""
+    view, settings = camera(size), RasterSettings()
+    leaves = Splats(**{name: tensor.clone().requires_grad_() for name, tensor in splats.items()})
+    inputs = [tensor for _, tensor in leaves.items()]
+    generator = torch.Generator().manual_seed(1)
+    cotangents: list[Tensor] = []
+    forward, backward = [], []
+    for _ in range(repeats + 2):
+        start = time.perf_counter()
+        output = rasterize_with(library, leaves, view, settings)
+        middle = time.perf_counter()
+        images = [getattr(output, name) for name in upstream]
+        if not cotangents:
+            cotangents = [torch.randn(image.shape, generator=generator) for image in images]
+        between = time.perf_counter()
+        torch.autograd.grad(images, inputs, cotangents)
+        end = time.perf_counter()
+        forward.append(1e3 * (middle - start))
+        backward.append(1e3 * (end - between))
+    forward, backward = forward[2:], backward[2:]
+    both = [f + b for f, b in zip(forward, backward, strict=True)]
+    return {
+        "forward_min": round(min(forward), 2),
+        "backward_min": round(min(backward), 2),
+        "total_min": round(min(both), 2),
+        "total_median": round(statistics.median(both), 2),
+    }
+
+
+def main() -> None:
+    """Run the workloads and print or write the results."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--variant", default=None)
+    parser.add_argument("--upstream", choices=tuple(UPSTREAM), default="all")
+    parser.add_argument("--splats", type=int, help="only this many splats, at 64 px (smoke test)")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    library = load(arguments.variant)
+    torch.set_num_threads(arguments.threads)
+    library.use_threads(arguments.threads)
+    rows = []
+    for n, size in WORKLOADS if arguments.splats is None else ((arguments.splats, 64),):
+        before = probe(library)
+        times = timed(library, room(n), size, UPSTREAM[arguments.upstream], arguments.repeats)
+        after = probe(library)
+        peak = {key: max(before[key], after[key]) for key in before}
+        row = {"splats": n, "size": size, "threads": arguments.threads, "upstream": arguments.upstream, **times, **peak}
+        target = TARGET_MS.get((n, size))
+        if target is not None and arguments.threads == 2 and arguments.upstream == "all":
+            row["times_design"] = round(times["total_min"] / target, 2)
+        rows.append(row)
+        print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+    if arguments.json is not None:
+        result = {"machine": machine(), "variant": library.variant, "rows": rows}
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
