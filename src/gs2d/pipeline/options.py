@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gs2d.protocols import Protocol
 from gs2d.recipe import Recipe
 
 
@@ -20,7 +21,9 @@ class TrainOptions:
         Run folder.
     recipe : str or Recipe
         A registered name, or the recipe itself.
-    protocol, backend, format : str
+    protocol : str or Protocol
+        A name, "auto" (by the format of the capture), or the protocol itself.
+    backend, format : str
         Names, or "auto".
     downscale : int
     schedule_scale : float
@@ -47,7 +50,7 @@ class TrainOptions:
     scene: Path
     out: Path
     recipe: str | Recipe = "2dgs-r"
-    protocol: str = "auto"
+    protocol: str | Protocol = "auto"
     backend: str = "auto"
     format: str = "auto"
     downscale: int = 1

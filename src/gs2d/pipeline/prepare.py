@@ -112,10 +112,12 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     if options.checkpoint_every < 1:
         raise RecipeError(f"--checkpoint-every must be a whole number >= 1, got {options.checkpoint_every}")
-    named = None if options.protocol == "auto" else get_protocol(options.protocol)
+    named = options.protocol
+    if isinstance(named, str) and named != "auto":
+        named = get_protocol(named)
     backend = choose_backend(options.backend, on_event)
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
-    protocol = named or protocol_for(scene_format)
+    protocol = protocol_for(scene_format) if isinstance(named, str) else named
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     digest = scene_digest(scene, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
