@@ -53,7 +53,7 @@ class Console:
     def _begin(self, phase: Phase) -> None:
         if not self._err.is_terminal:  # a log file: one line a phase, no bars
             if phase.name not in self._named:
-                self._err.print(f"{phase.name} ({phase.total})")
+                self._err.print(f"{phase.name} ({phase.total})" if phase.total else phase.name)
             self._named.add(phase.name)
             return
         if self._progress is None:
@@ -72,7 +72,9 @@ class Console:
             self._progress.start()
         if self._task is not None:
             self._progress.remove_task(self._task)
-        self._task = self._progress.add_task(escape(phase.name), total=phase.total, completed=phase.done, detail="")
+        self._task = self._progress.add_task(
+            escape(phase.name), total=phase.total or None, completed=phase.done, detail=""
+        )
 
     def close(self) -> None:
         """Take the progress bar off the screen."""

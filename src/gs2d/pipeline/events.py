@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of work with a known number of steps begins; the phase before it is over."""
+    """A stretch of work of ``total`` steps (0 = nobody knows) begins; the phase before it is over."""
 
     name: str
     total: int

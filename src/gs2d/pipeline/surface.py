@@ -97,7 +97,7 @@ def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator
         if mask is not None:
             valid = valid & mask
         yield Frame(view.camera, output.depth(depth).numpy(), surface_color(output, job).numpy(), valid)
-    on_event(Phase("fusing", 1))
+    on_event(Phase("fusing", 0))
 
 
 def surface_color(output: RenderOutput, job: Job) -> torch.Tensor:

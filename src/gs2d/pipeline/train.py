@@ -10,7 +10,7 @@ import torch
 from gs2d.errors import RecipeError
 from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run
-from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.events import OnEvent, Phase, ignore
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
@@ -109,4 +109,5 @@ def finish(run: RunFolder, job: Job, splats: Splats, on_event: OnEvent) -> None:
     write_splats(run.file(SPLATS), splats)
     if not run.file(MESH).exists():
         extract_mesh(job, splats, MeshOptions(), run.file(MESH), on_event)
-    on_event(Notice(f"report: {report_run(run.path)}"))
+    on_event(Phase("writing the report", 0))
+    report_run(run.path)

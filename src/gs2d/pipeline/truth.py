@@ -11,7 +11,7 @@ import numpy as np
 from gs2d.errors import DataError
 from gs2d.evaluate.surface import evaluate_surface
 from gs2d.io.ply import read_mesh, read_points
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.pipeline.events import Notice, OnEvent, Phase
 from gs2d.pipeline.options import EvaluateOptions
 from gs2d.pipeline.prepare import Job
 from gs2d.triangles import Mesh
@@ -72,7 +72,7 @@ def score_surface(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, 
     """
     if any(not t > 0 for t in options.thresholds):
         raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, options.thresholds))}")
-    on_event(Phase("scoring the surface", 1))
+    on_event(Phase("scoring the surface", 0))
     if truth.seen is not None:
         on_event(Notice(f"which true faces count is taken from {truth.path.stem}{SEEN_SUFFIX}"))
     score = evaluate_surface(
@@ -83,7 +83,6 @@ def score_surface(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, 
         T_truth_mesh=job.scene.T_metric_scene,
         thresholds=options.thresholds or None,
     )
-    on_event(Step(1))
     facts = asdict(score)
     facts["thresholds"] = list(facts.pop("scores"))
     return {"ground_truth": str(truth.path), **facts}
