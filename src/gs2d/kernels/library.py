@@ -23,7 +23,7 @@ VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs
 LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "portable", "f64": "portable, float64"}
 FOLDER = Path(__file__).parent / "lib"
 REMEDY = (
-    "install a C++20 compiler (g++ >= 11 or clang++ >= 14) and run `pip install --force-reinstall --no-deps .` "
+    "install a C++20 compiler (g++ >= 12 or clang++ >= 14) and run `pip install --force-reinstall --no-deps .` "
     "(in a source checkout: `make kernels`), or use --backend reference"
 )
 

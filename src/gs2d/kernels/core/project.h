@@ -46,7 +46,7 @@ template <class V> struct RecordGradient {
     V lowpass_cx, lowpass_cy;
     V abs_x, abs_y;  // sums of absolute values of the densification signal, per px
 };
-constexpr int GRADIENT = 20;
+constexpr int GRADIENT = RECORD, GRADIENT_EXTRA = 4;  // the latter: lowpass_cx to abs_y
 
 // What both directions need.
 template <class V> struct Frame3 {

@@ -16,6 +16,7 @@ template <class T> void release_all(T& f) {
     f.records.release(), f.cull.release(), f.rects.release(), f.order.release(), f.ordered_rects.release();
     f.sort_memory.release(), f.histogram.release(), f.tile_begin.release(), f.entries.release(), f.tile_count.release();
     f.saved.release(), f.slot_begin.release(), f.gradients.release(), f.splat_begin.release(), f.splat_slots.release();
+    f.extra_gradients.release(), f.has_extra.release();
 }
 
 void set_view(Frame& f, const View& v) {

@@ -19,37 +19,28 @@ inline PixelGradient<V> load_gradient(const Planes s, int b) {
             at(DIST), at(TOTAL), at(M1), at(M2), at(DEPTH0)};
 }
 
-inline void read_or_zero(const real* image, int channels, int channel, int width, const TileArea& a, real* out) {
-    if (image)
-        read_plane(image, channels, channel, width, a, out);
-    else
-        memset(out, 0, PIXELS * sizeof(real));
-}
-
 // Upstream gradients as PixelGradient wants them, and S = the sum over all splats of w s, from the image's totals.
 void start(const Frame& f, const Images& images, const ImageGradients& g, const TileArea& a, Planes s) {
     const View& v = f.view;
     const int W = v.width;
     const int64_t pixels = int64_t(W) * v.height;
     alignas(64) real total[7][PIXELS], g_dist[PIXELS];
-    for (int c = 0; c < 3; ++c) {
-        read_or_zero(g.color, 3, c, W, a, s[RED + c]);
-        read_or_zero(g.normal, 3, c, W, a, s[NX + c]);
-        read_plane(images.color, 3, c, W, a, total[c]);
-        read_or_zero(g.normal ? images.normal : nullptr, 3, c, W, a, total[3 + c]);
-    }
-    read_or_zero(g.alpha, 1, 0, W, a, s[ALPHA]);
-    read_or_zero(g.depth_mean, 1, 0, W, a, s[DEPTH]);
-    read_or_zero(g.depth_median, 1, 0, W, a, s[MEDIAN]);
-    read_or_zero(g.distortion, 1, 0, W, a, g_dist);
-    read_or_zero(g.depth_mean ? images.depth_mean : nullptr, 1, 0, W, a, total[6]);
-    read_plane(images.alpha, 1, 0, W, a, s[TOTAL]);
-    read_plane(&f.saved[0], 1, 0, W, a, s[T]);
+    read_planes<3>(g.color, W, a, s[RED]);
+    read_planes<3>(g.normal, W, a, s[NX]);
+    read_planes<3>(images.color, W, a, total[0]);
+    read_planes<3>(g.normal ? images.normal : nullptr, W, a, total[3]);
+    read_planes<1>(g.alpha, W, a, s[ALPHA]);
+    read_planes<1>(g.depth_mean, W, a, s[DEPTH]);
+    read_planes<1>(g.depth_median, W, a, s[MEDIAN]);
+    read_planes<1>(g.distortion, W, a, g_dist);
+    read_planes<1>(g.depth_mean ? images.depth_mean : nullptr, W, a, total[6]);
+    read_planes<1>(images.alpha, W, a, s[TOTAL]);
+    read_planes<1>(&f.saved[0], W, a, s[T]);
     if (g.distortion) {
-        read_plane(images.distortion, 1, 0, W, a, s[DIST]);
-        read_plane(&f.saved[pixels], 1, 0, W, a, s[M1]);
-        read_plane(&f.saved[2 * pixels], 1, 0, W, a, s[M2]);
-        read_plane(&f.saved[3 * pixels], 1, 0, W, a, s[DEPTH0]);
+        read_planes<1>(images.distortion, W, a, s[DIST]);
+        read_planes<1>(&f.saved[pixels], W, a, s[M1]);
+        read_planes<1>(&f.saved[2 * pixels], W, a, s[M2]);
+        read_planes<1>(&f.saved[3 * pixels], W, a, s[DEPTH0]);
     }
     const V bg[3] = {V(real(v.background[0])), V(real(v.background[1])), V(real(v.background[2]))};
     const double lever = v.far * v.near / (v.far - v.near);
@@ -98,6 +89,8 @@ void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, cons
     for (int64_t slot = f.slot_begin[tile]; slot < f.slot_begin[tile + 1]; ++slot, ++entry) {
         const real* record = &f.records[size_t(entry->splat) * RECORD];
         const Record<V> splat = broadcast(record);
+        const V inverse_zc = V(real(1) / record[8]), zero = V(0);
+        bool filtered = false;  // whether the low-pass filter decided any pair
         int i = 0;
         for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1, ++i) {
             const int b = __builtin_ctz(blocks);
@@ -105,8 +98,8 @@ void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, cons
             store(hits.u[i], h.u), store(hits.v[i], h.v), store(hits.rq[i], h.rq), store(hits.rho[i], h.rho), store(hits.alpha[i], h.alpha);
             if constexpr (Dist || Abs) store(hits.Q[i], h.Q);
             hits.ray[i] = h.ray;
+            filtered |= any(and_not(h.alpha > zero, h.ray));
         }
-        const V inverse_zc = V(real(1) / record[8]), zero = V(0);
         PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
                             zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
         i = 0;
@@ -123,10 +116,12 @@ void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, cons
         const RecordGradient<V> g = finish(splat, sums, limits);
         const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz,
                               g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
-        const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
-        real* to = &f.gradients[size_t(slot) * GRADIENT];
-        transpose_reduce<16>(fields, to);
-        transpose_reduce<4>(extra, to + 16);
+        transpose_reduce<GRADIENT>(fields, &f.gradients[size_t(slot) * GRADIENT]);
+        f.has_extra[slot] = Abs || filtered;
+        if (Abs || filtered) {
+            const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
+            transpose_reduce<GRADIENT_EXTRA>(extra, &f.extra_gradients[size_t(slot) * GRADIENT_EXTRA]);
+        }
     }
 }
 
@@ -141,7 +136,10 @@ TileVjp variant(bool geo, bool dist, bool abs) {
 }  // namespace
 
 bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, bool abs_probe) {
-    if (!index_slots(f) || !f.gradients.reserve(f.slot_begin[f.tiles] * GRADIENT)) return false;
+    if (!index_slots(f)) return false;
+    const int64_t slots = f.slot_begin[f.tiles];
+    if (!f.gradients.reserve(slots * GRADIENT) || !f.extra_gradients.reserve(slots * GRADIENT_EXTRA) || !f.has_extra.reserve(slots))
+        return false;
     const bool dist = g.distortion != nullptr;
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
     const TileVjp vjp = variant(geo, dist, abs_probe);

@@ -14,7 +14,7 @@ bool load_target(Frame& f, const real* image, const uint8_t* mask) {
     parallel_for(f.tiles, [&](int64_t tile) {
         real* to = &f.gradients[size_t(tile) * PLANES * PIXELS];
         const TileArea a = tile_area(f, tile);
-        for (int c = 0; c < 3; ++c) read_plane(image, 3, c, f.view.width, a, to + c * PIXELS);
+        read_planes<3>(image, f.view.width, a, to);
         for (int y = 0; y < TILE; ++y)
             for (int x = 0; x < TILE; ++x) {
                 const bool inside = x < a.width && y < a.height;

@@ -9,7 +9,7 @@ namespace {
 constexpr int CHUNK = 256;  // entries looked at before asking again whether any pixel of the tile is still live
 
 // What Pixel<V> holds, in memory between chunks.
-enum Plane { RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, DISTORTION, T, M1, M2, DEPTH0, PLANES };
+enum Plane { RED, GREEN, BLUE, NX, NY, NZ, ALPHA, DEPTH, MEDIAN, DISTORTION, T, M1, M2, DEPTH0, PLANES };
 
 struct TileState {
     alignas(64) real planes[PLANES][PIXELS];
@@ -111,16 +111,14 @@ void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
         store(&s.planes[DISTORTION][i], load(&s.planes[DISTORTION][i]) * V(real(lever * lever)));
     }
     const int64_t pixels = int64_t(v.width) * v.height;
-    for (int c = 0; c < 3; ++c) {
-        write_plane(s.planes[RED + c], out.color, 3, c, v.width, a);
-        write_plane(s.planes[NX + c], out.normal, 3, c, v.width, a);
-    }
-    write_plane(s.planes[ALPHA], out.alpha, 1, 0, v.width, a);
-    write_plane(s.planes[DEPTH], out.depth_mean, 1, 0, v.width, a);
-    write_plane(s.planes[MEDIAN], out.depth_median, 1, 0, v.width, a);
-    write_plane(s.planes[DISTORTION], out.distortion, 1, 0, v.width, a);
+    write_planes<3>(s.planes[RED], out.color, v.width, a);
+    write_planes<3>(s.planes[NX], out.normal, v.width, a);
+    write_planes<1>(s.planes[ALPHA], out.alpha, v.width, a);
+    write_planes<1>(s.planes[DEPTH], out.depth_mean, v.width, a);
+    write_planes<1>(s.planes[MEDIAN], out.depth_median, v.width, a);
+    write_planes<1>(s.planes[DISTORTION], out.distortion, v.width, a);
     const Plane saved[4] = {T, M1, M2, DEPTH0};
-    for (int k = 0; k < 4; ++k) write_plane(s.planes[saved[k]], &f.saved[k * pixels], 1, 0, v.width, a);
+    for (int k = 0; k < 4; ++k) write_planes<1>(s.planes[saved[k]], &f.saved[k * pixels], v.width, a);
 }
 
 void blend_tile(Frame& f, int64_t tile, const Images& out, const BlockBoxes& boxes, const BlendLimits<V>& limits) {

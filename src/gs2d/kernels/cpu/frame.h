@@ -98,6 +98,8 @@ struct Frame {
 
     Buffer<int64_t> slot_begin;     // [tiles + 1], survivors only
     Buffer<real> gradients;         // [slots, GRADIENT]
+    Buffer<real> extra_gradients;   // [slots, GRADIENT_EXTRA], only where has_extra
+    Buffer<uint8_t> has_extra;      // [slots]
     Buffer<int64_t> splat_begin;    // [N + 1]
     Buffer<uint32_t> splat_slots;   // slots of each splat, in tile order
 

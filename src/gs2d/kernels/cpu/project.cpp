@@ -111,19 +111,30 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
 
 namespace {
 
-// Sum of a splat's gradient slots, in tile order.
-inline void gather(const Frame& f, int64_t first, int lanes, V* fields) {
-    alignas(64) real sums[LANES][GRADIENT];
-    for (int l = 0; l < LANES; ++l) {
-        real* s = sums[l];
-        for (int k = 0; k < GRADIENT; ++k) s[k] = 0;
-        if (l >= lanes) continue;
+// Sums of the gradient slots of LANES splats, in tile order, and their extra slots.
+inline void gather(const Frame& f, int64_t first, int lanes, V* fields, V* extras) {
+    constexpr int PARTS = GRADIENT / LANES;
+    alignas(64) real sums[LANES][GRADIENT], extra[LANES][GRADIENT_EXTRA];
+    memset(sums, 0, sizeof sums), memset(extra, 0, sizeof extra);
+    for (int l = 0; l < lanes; ++l) {
+        V total[PARTS];
+        for (V& v : total) v = V(0);
         for (int64_t e = f.splat_begin[first + l]; e < f.splat_begin[first + l + 1]; ++e) {
-            const real* g = &f.gradients[size_t(f.splat_slots[e]) * GRADIENT];
-            for (int k = 0; k < GRADIENT; ++k) s[k] += g[k];
+            const size_t slot = f.splat_slots[e];
+            for (int k = 0; k < PARTS; ++k) total[k] = total[k] + load(&f.gradients[slot * GRADIENT + k * LANES]);
+            if (f.has_extra[slot])
+                for (int k = 0; k < GRADIENT_EXTRA; ++k) extra[l][k] += f.extra_gradients[slot * GRADIENT_EXTRA + k];
         }
+        for (int k = 0; k < PARTS; ++k) store(&sums[l][k * LANES], total[k]);
     }
     load_rows<GRADIENT>(sums[0], GRADIENT, LANES, fields);
+    load_rows<GRADIENT_EXTRA>(extra[0], GRADIENT_EXTRA, LANES, extras);
+}
+
+// The slots of a splat lie far apart: ask for those of the splats to come.
+inline void prefetch_slots(const Frame& f, int64_t first, int64_t last) {
+    for (int64_t e = f.splat_begin[first]; e < f.splat_begin[last]; ++e)
+        __builtin_prefetch(&f.gradients[size_t(f.splat_slots[e]) * GRADIENT]);
 }
 
 inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
@@ -161,10 +172,11 @@ void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients&
             uint32_t seen_bits = 0;
             for (int l = 0; l < lanes; ++l) seen_bits |= uint32_t(f.splat_begin[i + l + 1] > f.splat_begin[i + l]) << l;
             const M seen = mask_of(seen_bits);
-            V g[GRADIENT];
-            gather(f, i, lanes, g);
+            V g[GRADIENT], e[GRADIENT_EXTRA];
+            prefetch_slots(f, i + LANES < s.count ? i + LANES : s.count, i + 2 * LANES < s.count ? i + 2 * LANES : s.count);
+            gather(f, i, lanes, g, e);
             const RecordGradient<V> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8],  g[9],
-                                          g[10], g[11], g[12], g[13], g[14], g[15], g[16], g[17], g[18], g[19]};
+                                          g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
             const SplatParameters<V> p = load_parameters(s, i, lanes);
             const Frame3<V> frame = frame_of(p, f.camera);
             const Record<V> r = project(p, frame, f.camera);

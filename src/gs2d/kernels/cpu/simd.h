@@ -15,6 +15,7 @@
 //   exp2, exp, log2           a few ulp               select(m, a, b)             m ? a : b
 //   keep(m, a)                m ? a : 0               any(m), all(m), bits(m), mask_of(bits), first(n)
 //   iota()                    0, 1, 2, ...            sum(v)                      fixed order
+//   transpose(v)              in place, LANES vectors
 //   transpose_reduce<K>(v, p) p[k] = sum(v[k]), K = 16 or 4, fixed order
 #pragma once
 

@@ -73,6 +73,23 @@ GS2D_HD float sum(V a) {
     return _mm_cvtss_f32(_mm_add_ss(h, _mm_movehdup_ps(h)));
 }
 
+// In place, LANES x LANES.
+GS2D_HD void transpose(V* v) {
+    __m256 t[8], r[8];
+    for (int i = 0; i < 8; i += 2) {
+        t[i] = _mm256_unpacklo_ps(v[i].v, v[i + 1].v);
+        t[i + 1] = _mm256_unpackhi_ps(v[i].v, v[i + 1].v);
+    }
+    for (int i = 0; i < 8; i += 4) {  // 128-bit part m of r[i + j]: column 4 m + j of rows i .. i + 3
+        r[i] = _mm256_shuffle_ps(t[i], t[i + 2], 0x44), r[i + 1] = _mm256_shuffle_ps(t[i], t[i + 2], 0xee);
+        r[i + 2] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0x44), r[i + 3] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0xee);
+    }
+    for (int j = 0; j < 4; ++j) {
+        v[j] = _mm256_permute2f128_ps(r[j], r[4 + j], 0x20);
+        v[4 + j] = _mm256_permute2f128_ps(r[j], r[4 + j], 0x31);
+    }
+}
+
 template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {
     static_assert(K % 4 == 0);
     for (int i = 0; i < K / 4; ++i) {

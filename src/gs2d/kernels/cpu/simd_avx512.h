@@ -59,6 +59,27 @@ GS2D_HD void store_first(float* p, V a, int n) { _mm512_mask_storeu_ps(p, first(
 GS2D_HD V iota() { return _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
 GS2D_HD float sum(V a) { return _mm512_reduce_add_ps(a.v); }
 
+// In place, LANES x LANES.
+GS2D_HD void transpose(V* v) {
+    __m512 t[16], r[16];
+    for (int i = 0; i < 16; i += 2) {
+        t[i] = _mm512_unpacklo_ps(v[i].v, v[i + 1].v);
+        t[i + 1] = _mm512_unpackhi_ps(v[i].v, v[i + 1].v);
+    }
+    for (int i = 0; i < 16; i += 4) {  // 128-bit part m of r[i + j]: column 4 m + j of rows i .. i + 3
+        const __m512d a = _mm512_castps_pd(t[i]), b = _mm512_castps_pd(t[i + 1]);
+        const __m512d c = _mm512_castps_pd(t[i + 2]), d = _mm512_castps_pd(t[i + 3]);
+        r[i] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, c)), r[i + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, c));
+        r[i + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d)), r[i + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
+    }
+    for (int j = 0; j < 4; ++j) {
+        const __m512 e = _mm512_shuffle_f32x4(r[j], r[4 + j], 0x88), f = _mm512_shuffle_f32x4(r[8 + j], r[12 + j], 0x88);
+        const __m512 g = _mm512_shuffle_f32x4(r[j], r[4 + j], 0xdd), h = _mm512_shuffle_f32x4(r[8 + j], r[12 + j], 0xdd);
+        v[j] = _mm512_shuffle_f32x4(e, f, 0x88), v[8 + j] = _mm512_shuffle_f32x4(e, f, 0xdd);
+        v[4 + j] = _mm512_shuffle_f32x4(g, h, 0x88), v[12 + j] = _mm512_shuffle_f32x4(g, h, 0xdd);
+    }
+}
+
 // Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
 GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16);

@@ -115,6 +115,12 @@ GS2D_HD V iota() {
 GS2D_HD real sum(V a) {
     return ((a.v[0] + a.v[4]) + (a.v[2] + a.v[6])) + ((a.v[1] + a.v[5]) + (a.v[3] + a.v[7]));
 }
+// In place, LANES x LANES.
+GS2D_HD void transpose(V* v) {
+    real t[LANES][LANES];
+    for (int i = 0; i < LANES; ++i) store(t[i], v[i]);
+    for (int i = 0; i < LANES; ++i) v[i] = per_lane([&](int j) { return t[j][i]; });
+}
 template <int K> GS2D_HD void transpose_reduce(const V* v, real* p) {
     for (int k = 0; k < K; ++k) p[k] = sum(v[k]);
 }

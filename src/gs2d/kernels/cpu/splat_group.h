@@ -7,19 +7,39 @@ namespace gs2d {
 
 // v[k] lane i = p[i * stride + k] for i < lanes; missing lanes repeat the last row, so that no lane holds garbage.
 template <int K> inline void load_rows(const real* p, int64_t stride, int lanes, V* v) {
-    alignas(64) real t[K][LANES];
-    for (int i = 0; i < LANES; ++i) {
-        const real* row = p + int64_t(i < lanes ? i : lanes - 1) * stride;
-        for (int k = 0; k < K; ++k) t[k][i] = row[k];
+    if constexpr (K >= LANES) {
+        for (int k = 0; k < K; k += LANES) {
+            const int from = k + LANES <= K ? k : K - LANES;  // the last part may overlap the one before
+            V part[LANES];
+            for (int i = 0; i < LANES; ++i) part[i] = load(p + int64_t(i < lanes ? i : lanes - 1) * stride + from);
+            transpose(part);
+            for (int j = 0; j < LANES; ++j) v[from + j] = part[j];
+        }
+    } else {
+        alignas(64) real t[K][LANES];
+        for (int i = 0; i < LANES; ++i) {
+            const real* row = p + int64_t(i < lanes ? i : lanes - 1) * stride;
+            for (int k = 0; k < K; ++k) t[k][i] = row[k];
+        }
+        for (int k = 0; k < K; ++k) v[k] = load(t[k]);
     }
-    for (int k = 0; k < K; ++k) v[k] = load(t[k]);
 }
 
 template <int K> inline void store_rows(real* p, int64_t stride, int lanes, const V* v) {
-    alignas(64) real t[K][LANES];
-    for (int k = 0; k < K; ++k) store(t[k], v[k]);
-    for (int i = 0; i < lanes; ++i)
-        for (int k = 0; k < K; ++k) p[i * stride + k] = t[k][i];
+    if constexpr (K >= LANES) {
+        for (int k = 0; k < K; k += LANES) {
+            const int from = k + LANES <= K ? k : K - LANES;
+            V part[LANES];
+            for (int j = 0; j < LANES; ++j) part[j] = v[from + j];
+            transpose(part);
+            for (int i = 0; i < lanes; ++i) store(p + i * stride + from, part[i]);
+        }
+    } else {
+        alignas(64) real t[K][LANES];
+        for (int k = 0; k < K; ++k) store(t[k], v[k]);
+        for (int i = 0; i < lanes; ++i)
+            for (int k = 0; k < K; ++k) p[i * stride + k] = t[k][i];
+    }
 }
 
 inline SplatParameters<V> load_parameters(const Parameters& s, int64_t first, int lanes) {

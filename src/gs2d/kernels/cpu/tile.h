@@ -28,24 +28,59 @@ inline int block_order(int x, int y) {
     return ((y / BLOCK_H) * BLOCKS_X + x / BLOCK_W) * LANES + (y % BLOCK_H) * BLOCK_W + x % BLOCK_W;
 }
 
-// One plane of an interleaved image -> block order; pixels outside the image become `outside`.
-inline void read_plane(const real* image, int channels, int channel, int image_width, const TileArea& a, real* out) {
-    for (int y = 0; y < TILE; ++y)
-        for (int x = 0; x < TILE; x += BLOCK_W) {
-            real* to = out + block_order(x, y);
-            const real* from = image + (int64_t(a.y0 + y) * image_width + a.x0 + x) * channels + channel;
-            for (int i = 0; i < BLOCK_W; ++i) to[i] = y < a.height && x + i < a.width ? from[i * channels] : real(0);
-        }
+// Four pixels of a row: the unit in which images are rearranged.
+typedef real Four __attribute__((vector_size(4 * sizeof(real))));
+inline Four load4(const real* p) {
+    Four v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+inline void store4(real* p, Four v) { memcpy(p, &v, sizeof v); }
+
+template <int C> inline void split4(const real* from, real* to) {
+    if constexpr (C == 1) {
+        store4(to, load4(from));
+    } else {
+        static_assert(C == 3 && BLOCK_W == 4);
+        const Four a = load4(from), b = load4(from + 4), c = load4(from + 8);
+        store4(to, __builtin_shufflevector(__builtin_shufflevector(a, b, 0, 3, 6, 6), c, 0, 1, 2, 5));
+        store4(to + PIXELS, __builtin_shufflevector(__builtin_shufflevector(a, b, 1, 4, 7, 7), c, 0, 1, 2, 6));
+        store4(to + 2 * PIXELS, __builtin_shufflevector(__builtin_shufflevector(a, b, 2, 5, 5, 5), c, 0, 1, 4, 7));
+    }
+}
+template <int C> inline void join4(const real* from, real* to) {
+    if constexpr (C == 1) {
+        store4(to, load4(from));
+    } else {
+        static_assert(C == 3);
+        const Four r = load4(from), g = load4(from + PIXELS), b = load4(from + 2 * PIXELS);
+        store4(to, __builtin_shufflevector(__builtin_shufflevector(r, g, 0, 4, 1, 1), b, 0, 1, 4, 2));
+        store4(to + 4, __builtin_shufflevector(__builtin_shufflevector(r, g, 5, 5, 2, 6), b, 0, 5, 2, 3));
+        store4(to + 8, __builtin_shufflevector(__builtin_shufflevector(r, g, 3, 3, 7, 7), b, 6, 1, 2, 7));
+    }
 }
 
-inline void write_plane(const real* values, real* image, int channels, int channel, int image_width, const TileArea& a) {
-    for (int y = 0; y < a.height; ++y)
-        for (int x = 0; x < a.width; x += BLOCK_W) {
-            const real* from = values + block_order(x, y);
-            real* to = image + (int64_t(a.y0 + y) * image_width + a.x0 + x) * channels + channel;
-            const int n = a.width - x < BLOCK_W ? a.width - x : BLOCK_W;
-            for (int i = 0; i < n; ++i) to[i * channels] = from[i];
-        }
+// An interleaved image -> C planes in block order, one after the other; 0 outside the image, and where it is null.
+template <int C> inline void read_planes(const real* image, int image_width, const TileArea& a, real* out) {
+    if (!image || a.width < TILE || a.height < TILE) memset(out, 0, sizeof(real) * C * PIXELS);
+    if (!image) return;
+    const real* from = image + (int64_t(a.y0) * image_width + a.x0) * C;
+    for (int y = 0; y < a.height; ++y, from += int64_t(image_width) * C) {
+        int x = 0;
+        for (; x + 4 <= a.width; x += 4) split4<C>(from + x * C, out + block_order(x, y));
+        for (; x < a.width; ++x)
+            for (int c = 0; c < C; ++c) out[c * PIXELS + block_order(x, y)] = from[x * C + c];
+    }
+}
+
+template <int C> inline void write_planes(const real* values, real* image, int image_width, const TileArea& a) {
+    real* to = image + (int64_t(a.y0) * image_width + a.x0) * C;
+    for (int y = 0; y < a.height; ++y, to += int64_t(image_width) * C) {
+        int x = 0;
+        for (; x + 4 <= a.width; x += 4) join4<C>(values + block_order(x, y), to + x * C);
+        for (; x < a.width; ++x)
+            for (int c = 0; c < C; ++c) to[x * C + c] = values[c * PIXELS + block_order(x, y)];
+    }
 }
 
 // Corners of the pixel centres of all blocks, relative to the tile, LANES blocks per vector.
