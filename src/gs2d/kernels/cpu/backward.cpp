@@ -79,6 +79,8 @@ struct Hits {
     M ray[BLOCKS];
 };
 
+constexpr int AHEAD = 8;  // records lie far apart: ask for them this many splats early
+
 // Two passes per splat: intersections first, whose long chains then overlap, and compositing after.
 template <bool Geo, bool Dist, bool Abs>
 void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
@@ -86,7 +88,9 @@ void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, cons
     for (int b = 0; b < BLOCKS; ++b) store(px[b], lane_x(area.x0 + block_x(b))), store(py[b], lane_y(area.y0 + block_y(b)));
     Hits hits;
     const Entry* entry = &f.entries[f.tile_begin[tile]];
-    for (int64_t slot = f.slot_begin[tile]; slot < f.slot_begin[tile + 1]; ++slot, ++entry) {
+    const int64_t end = f.slot_begin[tile + 1];
+    for (int64_t slot = f.slot_begin[tile]; slot < end; ++slot, ++entry) {
+        if (slot + AHEAD < end) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
         const real* record = &f.records[size_t(entry->splat) * RECORD];
         const Record<V> splat = broadcast(record);
         const V inverse_zc = V(real(1) / record[8]), zero = V(0);

@@ -75,8 +75,13 @@ int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const Block
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
     int m = 0;
+    constexpr int AHEAD = 16;  // what a splat needs lies far apart: ask for it early
     for (int i = 0; i < n; ++i) {
         const uint32_t splat = entries[i].splat;
+        if (i + AHEAD < n) {
+            __builtin_prefetch(&f.cull[entries[i + AHEAD].splat]);
+            __builtin_prefetch(&f.records[size_t(entries[i + AHEAD].splat) * RECORD]);
+        }
         const uint32_t touched = f.view.exact_masks ? blocks_touched(f.cull[splat], boxes, real(area.x0), real(area.y0)) : ALL_BLOCKS;
         w.splats[m] = splat;
         w.touched[m] = touched & wanted;
