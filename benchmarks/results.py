@@ -105,7 +105,7 @@ def f_score(surface: dict) -> float | None:
 
 def number(value: float | None, digits: int) -> str:
     """A figure, or a dash where there is none."""
-    return "–" if value is None else f"{value:.{digits}f}"
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def main() -> None:
