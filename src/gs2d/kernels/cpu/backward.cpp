@@ -73,6 +73,26 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     }
 }
 
+// The rows of a tile lie far apart: ask for those of the next tile while this one is worked on.
+void prefetch_tile(const Frame& f, const Images& images, const ImageGradients& g, int64_t tile) {
+    if (tile >= f.tiles) return;
+    const TileArea a = tile_area(f, tile);
+    const int64_t W = f.view.width, pixels = W * f.view.height;
+    const real* const rgb[] = {g.color, g.normal, images.color, g.normal ? images.normal : nullptr};
+    const real* const gray[] = {g.alpha, g.depth_mean, g.depth_median, g.distortion, images.alpha, &f.saved[0],
+                                g.depth_mean ? images.depth_mean : nullptr, g.distortion ? images.distortion : nullptr,
+                                g.distortion ? &f.saved[pixels] : nullptr, g.distortion ? &f.saved[2 * pixels] : nullptr,
+                                g.distortion ? &f.saved[3 * pixels] : nullptr};
+    for (int y = 0; y < a.height; ++y) {
+        const int64_t at = (a.y0 + y) * W + a.x0;
+        for (const real* image : rgb)
+            if (image)
+                for (int i = 0; i < 3 * a.width; i += 16) __builtin_prefetch(image + 3 * at + i);
+        for (const real* image : gray)
+            if (image) __builtin_prefetch(image + at);
+    }
+}
+
 // What the first pass over a splat's blocks leaves for the second.
 struct Hits {
     alignas(64) real u[BLOCKS][LANES], v[BLOCKS][LANES], Q[BLOCKS][LANES], rq[BLOCKS][LANES], rho[BLOCKS][LANES], alpha[BLOCKS][LANES];
@@ -117,10 +137,12 @@ void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, cons
             store(&s[T][b * LANES], pixel_T);
             store(&s[S][b * LANES], pixel_S);
         }
-        const RecordGradient<V> g = finish(splat, sums, limits);
+        RecordGradient<V> g = finish(splat, sums, limits);
+        if (!f.probe) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
         const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz,
                               g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
         transpose_reduce<GRADIENT>(fields, &f.gradients[size_t(slot) * GRADIENT]);
+        if (!f.probe) continue;
         f.has_extra[slot] = Abs || filtered;
         if (Abs || filtered) {
             const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
@@ -139,21 +161,25 @@ TileVjp variant(bool geo, bool dist, bool abs) {
 
 }  // namespace
 
-bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, bool abs_probe) {
+bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t probe_columns) {
+    f.probe = probe_columns > 0;
     if (!index_slots(f)) return false;
     const int64_t slots = f.slot_begin[f.tiles];
     if (!f.gradients.reserve(slots * GRADIENT) || !f.extra_gradients.reserve(slots * GRADIENT_EXTRA) || !f.has_extra.reserve(slots))
         return false;
     const bool dist = g.distortion != nullptr;
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
-    const TileVjp vjp = variant(geo, dist, abs_probe);
+    const TileVjp vjp = variant(geo, dist, probe_columns == 4);
     const BlendLimits<V> limits = limits_of(f.view);
-    parallel_for(f.tiles, [&](int64_t tile) {
-        if (f.tile_count[tile] == 0) return;
-        alignas(64) real planes[PLANES][PIXELS];
-        const TileArea area = tile_area(f, tile);
-        start(f, images, g, area, planes);
-        vjp(f, tile, planes, area, limits);
+    parallel_ranges(f.tiles, 4, [&](int64_t begin, int64_t end) {
+        for (int64_t tile = begin; tile < end; ++tile) {
+            prefetch_tile(f, images, g, tile + 1);
+            if (f.tile_count[tile] == 0) continue;
+            alignas(64) real planes[PLANES][PIXELS];
+            const TileArea area = tile_area(f, tile);
+            start(f, images, g, area, planes);
+            vjp(f, tile, planes, area, limits);
+        }
     });
     return true;
 }

@@ -3,12 +3,17 @@
 
 #include <stdlib.h>
 #include <string.h>
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 #include "core/blend.h"
 #include "core/project.h"
 #include "cpu/simd.h"
 
 namespace gs2d {
+
+constexpr size_t HUGE_PAGE = size_t(2) << 20;
 
 // Grow-only memory on cache lines. Kept when a Frame goes back to the free list: fresh pages cost more than the work.
 template <class T> struct Buffer {
@@ -19,8 +24,12 @@ template <class T> struct Buffer {
         if (n <= capacity) return true;
         free(data);
         const size_t wanted = n + n / 4 + 64;
-        data = static_cast<T*>(aligned_alloc(64, (wanted * sizeof(T) + 63) / 64 * 64));
+        const size_t page = wanted * sizeof(T) >= HUGE_PAGE ? HUGE_PAGE : 64, bytes = (wanted * sizeof(T) + page - 1) / page * page;
+        data = static_cast<T*>(aligned_alloc(page, bytes));
         capacity = data ? wanted : 0;
+#if defined(MADV_HUGEPAGE)
+        if (data && page == HUGE_PAGE) madvise(data, bytes, MADV_HUGEPAGE);  // access is scattered; a wish, not a need
+#endif
         return data != nullptr;
     }
     void release() {
@@ -100,6 +109,7 @@ struct Frame {
     Buffer<real> gradients;         // [slots, GRADIENT]
     Buffer<real> extra_gradients;   // [slots, GRADIENT_EXTRA], only where has_extra
     Buffer<uint8_t> has_extra;      // [slots]
+    bool probe = false;             // whether the densification signal is wanted; without it there are no extras
     Buffer<int64_t> splat_begin;    // [N + 1]
     Buffer<uint32_t> splat_slots;   // slots of each splat, in tile order
 
@@ -150,7 +160,7 @@ bool bin_splats(Frame& frame);
 bool blend_tiles(Frame& frame, const Images& images);
 // Gives each of the first tile_count entries of every tile a slot, and lists the slots of every splat in tile order.
 bool index_slots(Frame& frame);
-bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, bool abs_probe);
+bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, int64_t probe_columns);
 bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 bool occluded_splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 void project_splats_vjp(Frame& frame, const Parameters& splats, const ParameterGradients& out);

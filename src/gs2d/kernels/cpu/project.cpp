@@ -122,7 +122,7 @@ inline void gather(const Frame& f, int64_t first, int lanes, V* fields, V* extra
         for (int64_t e = f.splat_begin[first + l]; e < f.splat_begin[first + l + 1]; ++e) {
             const size_t slot = f.splat_slots[e];
             for (int k = 0; k < PARTS; ++k) total[k] = total[k] + load(&f.gradients[slot * GRADIENT + k * LANES]);
-            if (f.has_extra[slot])
+            if (f.probe && f.has_extra[slot])
                 for (int k = 0; k < GRADIENT_EXTRA; ++k) extra[l][k] += f.extra_gradients[slot * GRADIENT_EXTRA + k];
         }
         for (int k = 0; k < PARTS; ++k) store(&sums[l][k * LANES], total[k]);
@@ -133,8 +133,11 @@ inline void gather(const Frame& f, int64_t first, int lanes, V* fields, V* extra
 
 // The slots of a splat lie far apart: ask for those of the splats to come.
 inline void prefetch_slots(const Frame& f, int64_t first, int64_t last) {
-    for (int64_t e = f.splat_begin[first]; e < f.splat_begin[last]; ++e)
-        __builtin_prefetch(&f.gradients[size_t(f.splat_slots[e]) * GRADIENT]);
+    for (int64_t e = f.splat_begin[first]; e < f.splat_begin[last]; ++e) {
+        const size_t slot = f.splat_slots[e];
+        __builtin_prefetch(&f.gradients[slot * GRADIENT]);
+        if (f.probe && f.has_extra[slot]) __builtin_prefetch(&f.extra_gradients[slot * GRADIENT_EXTRA]);
+    }
 }
 
 inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
