@@ -224,7 +224,8 @@ def _scaled(value: Any, factor: float) -> float | None:
 
 
 def _stage_name(stage: Mapping[str, Any]) -> str:
-    reused = f'<span class="why">reused from {escape(stage["reused_from"])}</span>' if stage.get("reused_from") else ""
+    source = stage.get("reused_from")  # a file of the stage cache, or a run; metrics.json has the whole path
+    reused = f'<span class="why">trained before ({escape(Path(source).name[:12])})</span>' if source else ""
     return f"<td>{escape(stage['name'])}{reused}</td>"
 
 

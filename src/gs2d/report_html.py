@@ -43,6 +43,7 @@ td .why { display: block; color: var(--soft); font-size: .72rem; white-space: no
   max-width: 16rem; margin-left: auto; }
 figure { margin: 0; } img { display: block; width: 100%; height: auto; border-radius: 6px; background: #fff; }
 .hero, .meshes { display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: .9rem; }
+.meshes { grid-template-columns: repeat(auto-fit, minmax(18rem, 1fr)); }
 figcaption { padding: .3rem .1rem 0; }
 .views { display: grid; gap: .5rem; align-items: start; min-width: 46rem; }
 .views > .head { font-size: .8rem; font-weight: 600; color: var(--soft); text-align: center; }

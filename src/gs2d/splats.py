@@ -63,7 +63,7 @@ class Splats:
     @property
     def sh_degree(self) -> int:
         """Highest SH degree that the coefficients can hold."""
-        return int(round((1 + self.shN.shape[1]) ** 0.5)) - 1
+        return round(float(1 + self.shN.shape[1]) ** 0.5) - 1
 
     @property
     def device(self) -> torch.device:

@@ -69,6 +69,7 @@ def mesh_run(
         metrics = run.metrics()
         if metrics.get("surface"):  # was of the mesh before
             run.write_metrics({**metrics, "surface": None})
+    report_run(path)
     return result
 
 
@@ -137,7 +138,7 @@ def evaluate_run(
     *,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json``.
+    """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json`` and the report.
 
     Raises
     ------
@@ -163,6 +164,7 @@ def evaluate_run(
         last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
+    report_run(path)
     return result
 
 
