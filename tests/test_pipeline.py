@@ -20,6 +20,7 @@ import torch
 from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.ply import read_mesh, read_splats
 from gs2d.io.run import RunFolder, open_run
+from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.events import Event, Notice, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
@@ -398,3 +399,26 @@ def test_a_capture_that_moved_is_named(undisturbed: RunFolder, tmp_path: Path) -
 
 def test_training_leaves_the_threads_of_torch_as_asked(capture: Path, undisturbed: RunFolder) -> None:
     assert torch.get_num_threads() == 1
+
+
+def test_the_demo_makes_its_capture_trains_scores_the_surface_and_reports(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    small = DemoOptions(out=out, threads=1, schedule_scale=0.0005, train_views=3, test_views=1, size=24)
+    run = demo(small)
+    metrics = run.metrics()
+    assert [stage["name"] for stage in metrics["stages"]] == ["surface", "appearance", "refine"]
+    assert len(metrics["surface"]["thresholds"]) >= 3
+    assert metrics["surface"]["ground_truth"].endswith("mesh_gt.ply")
+    assert (out / "capture" / "transforms_train.json").exists()
+    assert (out / "report.html").exists()
+    before = run.file("splats.ply").read_bytes()
+    again = demo(replace(small, resume=True))  # the capture is taken as it is
+    assert again.file("splats.ply").read_bytes() == before
+    assert again.metrics()["surface"] is not None
+
+
+def test_the_demo_does_not_replace_a_run_of_another_kind(undisturbed: RunFolder) -> None:
+    before = comparable(undisturbed)
+    with pytest.raises(RunError, match="holds a run that is not a demo"):
+        demo(DemoOptions(out=undisturbed.path))
+    assert comparable(undisturbed) == before

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.data.toy import write_demo_capture
 from gs2d.errors import RunError
 from gs2d.io.run import RunFolder, is_run, open_run
 from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
-from gs2d.pipeline.jobs import evaluate_run, report_run
+from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.train import train, use_threads
-from gs2d.protocols import NERF_SYNTHETIC
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 TRAIN_VIEWS, TEST_VIEWS, SIZE = 40, 8, 256
 SCHEDULE_SCALE = 0.1
-# White tiles on a white background may as well be holes. This blue-grey is no colour of the scene.
-PROTOCOL = replace(NERF_SYNTHETIC, name="demo", background=(0.53, 0.58, 0.66))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +67,6 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
         TrainOptions(
             scene=capture,
             out=options.out,
-            protocol=PROTOCOL,
             backend=options.backend,
             seed=options.seed,
             threads=options.threads,
@@ -82,5 +78,4 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
         on_event,
     )
     evaluate_run(run.path, EvaluateOptions(ground_truth=capture / TRUTH), on_event)
-    report_run(run.path)
     return run
