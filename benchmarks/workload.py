@@ -73,5 +73,10 @@ def _quats_of(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def camera(size: int) -> Camera:
     """A square image with focal length 0.9 x its side, looking at the room."""
     return look_at(
-        np.array([0.3, -0.5, -4.0]), np.array([0.0, 0.0, 0.2]), np.array([0.0, -1.0, 0.0]), width=size, height=size, fx=0.9 * size
+        np.array([0.3, -0.5, -4.0]),
+        np.array([0.0, 0.0, 0.2]),
+        np.array([0.0, -1.0, 0.0]),
+        width=size,
+        height=size,
+        fx=0.9 * size,
     )

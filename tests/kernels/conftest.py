@@ -1,0 +1,47 @@
+"""What the kernels' tests share: every library this machine can run, and the rasterizer tests' scenes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from gs2d.errors import BackendError
+from gs2d.kernels.library import Library, available_variants, load
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "render"))  # render_scenes
+
+
+@pytest.fixture(params=["v4", "v3", "portable"])
+def native(request: pytest.FixtureRequest) -> Library:
+    """Each float32 library that this processor can run, on two threads."""
+    if request.param not in available_variants():
+        pytest.skip(f"this machine cannot run variant {request.param}, or the native library was not built")
+    library = load(request.param)
+    library.use_threads(2)
+    return library
+
+
+@pytest.fixture
+def native64() -> Library:
+    """The float64 build of the same sources."""
+    try:
+        library = load("f64")
+    except BackendError as error:
+        pytest.skip(str(error))
+    library.use_threads(2)
+    return library
+
+
+@pytest.fixture(params=["v4", "v3", "portable", "f64"])
+def any_native(request: pytest.FixtureRequest) -> Library:
+    """Each library, the float64 one included."""
+    if request.param not in (*available_variants(), "f64"):
+        pytest.skip(f"this machine cannot run variant {request.param}")
+    try:
+        library = load(request.param)
+    except BackendError as error:
+        pytest.skip(str(error))
+    library.use_threads(2)
+    return library

@@ -1,0 +1,319 @@
+"""The native rasterizer: gradients, instruction sets, threads, culling. Its contract is tested in tests/render."""
+
+from __future__ import annotations
+
+import gc
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
+from torch import Tensor
+
+from gs2d.camera import Camera, look_at
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.library import Library, available_variants, load
+from gs2d.render import cpu, reference, reference_errors
+from gs2d.render.types import RasterSettings
+from gs2d.splats import ATTRIBUTES, Splats
+
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.7))
+
+
+def cotangents(camera: Camera, dtype: torch.dtype, seed: int) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shape = (camera.height, camera.width)
+    return {
+        name: torch.randn(
+            *shape, *([3] if name in ("color", "normal") else []), generator=generator, dtype=torch.float64
+        ).to(dtype)
+        for name in IMAGES
+    }
+
+
+def everything(library: Library, splats: Splats, camera: Camera, *, seed: int = 0, probe: int = 4) -> dict[str, Tensor]:
+    """All images, radii, gradients and splat errors of one view, by name."""
+    leaves = requiring_grad(splats.to(dtype=library.dtype))
+    zeros = torch.zeros(len(splats), probe, dtype=library.dtype, requires_grad=True) if probe else None
+    output = cpu.rasterize_with(library, leaves, camera, SETTINGS, zeros)
+    given = cotangents(camera, library.dtype, seed)
+    torch.autograd.backward([getattr(output, name) for name in IMAGES], [given[name] for name in IMAGES])
+    image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(9)).to(library.dtype)
+    found = {name: getattr(output, name).detach() for name in (*IMAGES, "radii")}
+    found |= {f"d_{name}": tensor.grad for name, tensor in leaves.items() if tensor.grad is not None}
+    if zeros is not None and zeros.grad is not None:
+        found["d_probe"] = zeros.grad
+    for occlusion in (False, True):
+        found[f"errors_{occlusion}"] = cpu.splat_errors_with(
+            library, leaves.detach(), camera, image, SETTINGS, None, occlusion
+        )
+    return found
+
+
+def awkward_scene(seed: int, count: int = 120) -> tuple[Splats, Camera]:
+    rng = np.random.default_rng(seed)
+    camera = random_camera(rng)
+    return random_splats(rng, camera, count), camera
+
+
+# ------------------------------------------------------------------------------------------------ formulas in float64
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_float64_build_equals_the_reference_to_rounding(native64: Library, seed: int) -> None:
+    splats, camera = awkward_scene(seed, 60)
+    leaves = requiring_grad(splats)
+    zeros = torch.zeros(len(splats), 4, dtype=torch.float64, requires_grad=True)
+    expected = reference.rasterize(leaves, camera, SETTINGS, zeros)
+    given = cotangents(camera, torch.float64, seed)
+    torch.autograd.backward([getattr(expected, name) for name in IMAGES], [given[name] for name in IMAGES])
+    found = everything(native64, splats, camera, seed=seed)
+    for name in (*IMAGES, "radii"):
+        torch.testing.assert_close(found[name], getattr(expected, name).detach(), rtol=1e-9, atol=1e-9, msg=name)
+    for name, leaf in (*leaves.items(), ("probe", zeros)):
+        assert leaf.grad is not None
+        # edge-on splats have a condition number of about 1e4 here
+        torch.testing.assert_close(
+            found[f"d_{name}"], leaf.grad, rtol=1e-7, atol=1e-7 * float(leaf.grad.norm()), msg=name
+        )
+    image = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(9)).double()
+    for occlusion in (False, True):
+        errors = reference_errors.splat_errors(splats, camera, image, SETTINGS, None, occlusion)
+        torch.testing.assert_close(found[f"errors_{occlusion}"], errors, rtol=1e-9, atol=1e-9)
+
+
+def smooth_scene() -> tuple[Splats, Camera]:
+    """Five overlapping splats: hits, a filtered sliver, a clamped colour; no pair within 1e-4 of a threshold."""
+    rng = np.random.default_rng(4)
+    camera = look_at(
+        np.array([0.1, -0.2, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=9, height=7, fx=9.0, fy=8.0
+    )
+    splats = Splats(
+        means=torch.tensor(rng.normal(size=(5, 3)) * 0.35),
+        quats=torch.tensor(rng.normal(size=(5, 4))),
+        log_scales=torch.tensor(np.log([[0.5, 0.3], [0.6, 0.7], [0.9, 0.4], [0.05, 0.08], [0.4, 1.2]])),
+        opacity_logits=torch.tensor([0.3, -0.5, 1.2, 2.0, 0.1], dtype=torch.float64),
+        sh0=torch.tensor(rng.normal(size=(5, 1, 3)) * 0.8),
+        shN=torch.tensor(rng.normal(size=(5, 15, 3)) * 0.2),
+    )
+    return splats, camera
+
+
+@pytest.mark.parametrize("image", IMAGES)
+def test_gradients_of_every_image_equal_finite_differences(native64: Library, image: str) -> None:
+    splats, camera = smooth_scene()
+    given = cotangents(camera, torch.float64, 3)[image]
+
+    def scalar(*tensors: Tensor) -> Tensor:
+        output = cpu.rasterize_with(native64, Splats(*tensors), camera, SETTINGS)
+        return (getattr(output, image) * given).sum()
+
+    inputs = tuple(tensor.clone().requires_grad_() for _, tensor in splats.items())
+    assert torch.autograd.gradcheck(scalar, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+def test_a_limited_alpha_passes_the_gradient_of_the_unlimited_one(native64: Library) -> None:
+    # Finite differences are 0 here; the official code and rule 6 pass dL/dalpha through. One splat, o = 0.999, at the
+    # pixel of its centre: rho = 0, alpha = 0.99, dalpha/dlogit = o (1 - o) = 0.000999.
+    camera = look_at(np.array([0.0, 0, -2]), np.zeros(3), np.array([0.0, -1, 0]), width=1, height=1, fx=1.0)
+    logit = torch.logit(torch.tensor([0.999], dtype=torch.float64)).requires_grad_()
+    one = torch.ones(1, 3, dtype=torch.float64)
+    splats = Splats(
+        torch.zeros(1, 3).double(),
+        torch.tensor([[1.0, 0, 0, 0]]).double(),
+        -one[:, :2],
+        logit,
+        one[None],
+        torch.zeros(1, 0, 3).double(),
+    )
+    alpha = cpu.rasterize_with(native64, splats, camera, replace(SETTINGS, sh_degree=0)).alpha
+    assert alpha.item() == pytest.approx(0.99)
+    (gradient,) = torch.autograd.grad(alpha.sum(), logit)
+    assert gradient.item() == pytest.approx(0.999 * 0.001, rel=1e-6)
+
+
+# --------------------------------------------------------------------------------------- instruction sets, threads
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_instruction_set_agrees_with_float64(native: Library, native64: Library, seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    camera = random_camera(rng)
+    splats = random_splats(rng, camera, 80, ("plain", "huge", "tiny", "transparent", "opaque", "behind", "twins"))
+    splats = splats.to(dtype=torch.float32)  # the same numbers for both
+    single, double = everything(native, splats, camera, seed=seed), everything(native64, splats, camera, seed=seed)
+    for name in IMAGES:
+        difference = (single[name].double() - double[name]).abs()
+        scale = max(1.0, float(double[name].abs().max()))
+        assert difference.median() < 1e-5 * scale, name
+        assert (difference > 1e-3 * scale).double().mean() < 0.01, name  # threshold flips
+    for name in (f"d_{attribute}" for attribute in ATTRIBUTES):
+        assert (single[name].double() - double[name]).norm() < 2e-3 * double[name].norm(), name
+
+
+@pytest.mark.parametrize("probe", [0, 2, 4])
+def test_results_are_bit_identical_for_any_number_of_threads(native: Library, probe: int) -> None:
+    rng = np.random.default_rng(7)
+    camera = replace(random_camera(rng), width=83, height=70)  # 30 tiles
+    splats = random_splats(rng, camera, 700)
+    results = []
+    for threads in (1, 2, 3, 8):
+        native.use_threads(threads)
+        results.append(everything(native, splats, camera, probe=probe))
+    for other in results[1:]:
+        for name, tensor in results[0].items():
+            assert torch.equal(tensor, other[name]), name
+
+
+def test_two_views_at_once_do_not_disturb_each_other(native: Library) -> None:
+    scenes = [awkward_scene(seed, 200) for seed in (1, 2, 3, 4)]
+    alone = [everything(native, *scene) for scene in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda scene: everything(native, *scene), scenes * 4))
+    for i, found in enumerate(together):
+        for name, tensor in alone[i % 4].items():
+            assert torch.equal(tensor, found[name]), name
+
+
+def test_signed_gradients_do_not_depend_on_which_probe_is_asked_for(native: Library) -> None:
+    splats, camera = awkward_scene(5)
+    two, four = (everything(native, splats, camera, probe=columns) for columns in (2, 4))
+    assert torch.equal(two["d_probe"], four["d_probe"][:, :2])
+    assert (four["d_probe"][:, 2:] >= four["d_probe"][:, :2].abs() * (1 - 1e-4) - 1e-5).all()
+    none = everything(native, splats, camera, probe=0)
+    for name in ATTRIBUTES:  # without a probe the filter's gradient is added up elsewhere
+        torch.testing.assert_close(
+            none[f"d_{name}"], two[f"d_{name}"], rtol=1e-3, atol=1e-4 * float(two[f"d_{name}"].norm())
+        )
+
+
+# ------------------------------------------------------------------------------------------------- culling and order
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_culling_inside_tiles_does_not_change_a_single_bit(any_native: Library, seed: int) -> None:
+    splats, camera = awkward_scene(50 + seed, 150)
+    splats = splats.to(dtype=any_native.dtype)
+    culled, full = (
+        cpu.rasterize_with(any_native, splats, camera, SETTINGS, exact_masks=exact) for exact in (True, False)
+    )
+    for name in IMAGES:
+        assert torch.equal(getattr(culled, name), getattr(full, name)), name
+
+
+def test_equal_depths_are_blended_in_row_order_among_thousands(native: Library) -> None:
+    # 5000 opaque copies of one splat (alpha 0.9 each): only the first ones of the depth order are seen.
+    n = 5000
+    camera = look_at(np.array([0.0, 0, -2]), np.zeros(3), np.array([0.0, -1, 0]), width=1, height=1, fx=1.0)
+    sh0 = torch.zeros(n, 1, 3, requires_grad=True)
+    splats = Splats(
+        torch.zeros(n, 3), torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4), torch.full((n, 2), -1.0),
+        torch.full((n,), 2.1972246), sh0, torch.zeros(n, 0, 3),
+    )  # fmt: skip
+    color = cpu.rasterize_with(native, splats, camera, replace(SETTINGS, sh_degree=0)).color
+    (gradient,) = torch.autograd.grad(color.sum(), sh0)
+    weights = gradient[:, 0, 0] / 0.28209479
+    assert weights[:3].tolist() == pytest.approx([0.9, 0.09, 0.009], rel=1e-4)
+    assert (weights[4:] == 0).all()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (4, 4), (15, 17), (16, 16), (33, 5), (3, 50)])
+def test_images_of_any_size_are_filled_to_the_last_pixel(any_native: Library, size: tuple[int, int]) -> None:
+    # One opaque splat that covers everything: alpha is 0.99 in every pixel, whatever the tiles and blocks.
+    width, height = size
+    camera = look_at(np.array([0.0, 0, -2]), np.zeros(3), np.array([0.0, -1, 0]), width=width, height=height, fx=100.0)
+    one = torch.ones(1, 3, dtype=any_native.dtype)
+    quat = torch.tensor([[2.0, 0, 0, 0]], dtype=any_native.dtype)
+    splats = Splats(
+        0 * one, quat, 5 * one[:, :2], 20 * one[:, 0], one[None], torch.zeros(1, 0, 3, dtype=any_native.dtype)
+    )
+    output = cpu.rasterize_with(any_native, splats, camera, replace(SETTINGS, sh_degree=0))
+    assert torch.allclose(output.alpha, torch.full_like(output.alpha, 0.99))
+    assert output.radii.item() == max(width, height) / 2
+
+
+def test_no_splats_give_the_background(any_native: Library) -> None:
+    empty = Splats(
+        *(
+            torch.zeros(0, *shape, dtype=any_native.dtype, requires_grad=True)
+            for shape in ((3,), (4,), (2,), (), (1, 3), (15, 3))
+        )
+    )
+    camera = awkward_scene(0)[1]
+    found = everything(any_native, empty, camera)
+    assert torch.equal(found["color"][0, 0], torch.tensor(SETTINGS.background, dtype=any_native.dtype))
+    assert float(found["alpha"].abs().sum()) == 0
+    assert found["d_means"].shape == (0, 3)
+
+
+# --------------------------------------------------------------------------------------------------------- edges
+
+
+def test_only_the_wanted_gradients_are_computed(native: Library) -> None:
+    splats, camera = awkward_scene(3)
+    splats = splats.to(dtype=torch.float32)
+    splats.sh0.requires_grad_()
+    cpu.rasterize_with(native, splats, camera, SETTINGS).color.sum().backward()
+    assert splats.sh0.grad is not None
+    assert all(tensor.grad is None for name, tensor in splats.items() if name != "sh0")
+
+
+def test_a_lower_sh_degree_ignores_the_coefficients_above_it(any_native: Library) -> None:
+    splats, camera = awkward_scene(6)
+    splats = requiring_grad(splats.to(dtype=any_native.dtype))
+    output = cpu.rasterize_with(any_native, splats, camera, replace(SETTINGS, sh_degree=1))
+    output.color.sum().backward()
+    cut = Splats(**{name: t.detach()[:, :3] if name == "shN" else t.detach() for name, t in splats.items()})
+    same = cpu.rasterize_with(any_native, cut, camera, replace(SETTINGS, sh_degree=1))
+    assert torch.equal(output.color, same.color)
+    assert splats.shN.grad is not None
+    assert (splats.shN.grad[:, 3:] == 0).all()
+    assert (splats.shN.grad[:, :3] != 0).any()
+
+
+def test_memory_of_views_without_a_backward_pass_is_given_back() -> None:
+    if not available_variants():
+        pytest.skip("the native library was not built")
+    resource, native = pytest.importorskip("resource"), load()
+    splats, camera = awkward_scene(8)
+    splats = requiring_grad(splats.to(dtype=torch.float32))
+    camera = camera.resized(800, 800)  # 10 MB of saved planes each
+    for i in range(40):
+        if i == 5:
+            gc.collect()
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        cpu.rasterize_with(native, splats, camera, SETTINGS)
+    growth = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before  # KiB on Linux
+    assert growth < 150_000
+
+
+def test_other_dtypes_and_coefficients_that_are_not_there_are_refused(native: Library) -> None:
+    splats, camera = awkward_scene(0)
+    with pytest.raises(ShapeError, match=r"means must be torch.float32 on the CPU .* got torch.float64"):
+        cpu.rasterize_with(native, splats, camera, SETTINGS)
+    few = Splats(**{name: (t[:, :3] if name == "shN" else t).float() for name, t in splats.items()})
+    with pytest.raises(ShapeError, match=r"sh_degree .* stored coefficients \(4\), got 3"):
+        cpu.rasterize_with(native, few, camera, SETTINGS)
+    with pytest.raises(BackendError, match="lowpass_depth"):
+        cpu.rasterize_with(native, splats.to(dtype=torch.float32), camera, replace(SETTINGS, lowpass_depth="plane"))
+
+
+def test_the_best_variant_is_chosen_and_the_environment_overrides_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not available_variants():
+        pytest.skip("the native library was not built")
+    monkeypatch.delenv("GS2D_CPU_VARIANT", raising=False)
+    assert load().variant == available_variants()[0]
+    monkeypatch.setenv("GS2D_CPU_VARIANT", "portable")
+    assert load().variant == "portable"
+    monkeypatch.setenv("GS2D_CPU_VARIANT", "sse9")
+    with pytest.raises(BackendError, match=r"must be one of .*portable.*, got 'sse9'"):
+        load()
+
+
+def test_a_missing_library_is_said_with_the_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
+    monkeypatch.setattr("gs2d.kernels.library.FOLDER", tmp_path)
+    assert available_variants() == ()
+    with pytest.raises(BackendError, match=r"found none; .*compiler.*--backend reference"):
+        load()

@@ -1,0 +1,90 @@
+"""The vector wrapper: its functions against numpy, on every instruction set."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.kernels.library import Library
+
+UNARY = {"exp2": 0, "exp": 1, "log2": 2, "round": 3, "sqrt": 4}
+
+
+def real(library: Library) -> np.dtype:
+    return np.dtype(np.float64 if library.dtype == torch.float64 else np.float32)
+
+
+def apply(library: Library, name: str, x: np.ndarray) -> np.ndarray:
+    function = library.function(
+        "gs2d_selftest_unary", ctypes.c_int, [ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64]
+    )
+    padded = np.ascontiguousarray(np.resize(x, -(-len(x) // 64) * 64), dtype=real(library))
+    out = np.empty_like(padded)
+    assert function(UNARY[name], padded.ctypes.data, out.ctypes.data, len(padded))
+    return out[: len(x)].astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high", "bound"), [("exp2", -126, 0, 2.5e-7), ("exp", -87, 88, 4e-7), ("log2", 1e-30, 1e30, 3e-7)]
+)
+def test_transcendental_functions_are_within_a_few_roundings(
+    any_native: Library, name: str, low: float, high: float, bound: float
+) -> None:
+    x = np.geomspace(low, high, 20_011) if low > 0 else np.linspace(low, high, 20_011)
+    x = np.concatenate([x, np.linspace(-1, 1, 999) if low <= 0 and high > 0 else [x[0]]]).astype(real(any_native))
+    expected = getattr(np, name)(x.astype(np.float64))
+    error = np.abs(apply(any_native, name, x) - expected) / np.maximum(np.abs(expected), 1e-30 if low <= 0 else 1.0)
+    assert error.max() < bound
+
+
+def test_log2_of_numbers_next_to_one_keeps_its_digits(any_native: Library) -> None:
+    x = (1 + np.linspace(-1e-3, 1e-3, 640)).astype(real(any_native))
+    assert np.abs(apply(any_native, "log2", x) - np.log2(x.astype(np.float64))).max() < 2e-9
+
+
+def test_exp_saturates_to_zero_and_infinity(any_native: Library) -> None:
+    with np.errstate(over="ignore"):
+        values = apply(any_native, "exp", np.array([-1e4, -200.0, 1e4, -np.inf, np.inf]))
+    assert values.tolist()[2:] == [np.inf, 0.0, np.inf]
+    assert values[0] == 0
+    assert values[1] < 1e-38
+
+
+def test_round_is_to_the_nearest_even(any_native: Library) -> None:
+    x = np.array([-2.5, -1.5, -0.5, -0.4, 0.0, 0.5, 1.5, 2.5, 2.6, 1e6 + 0.25])
+    assert apply(any_native, "round", x).tolist() == np.rint(x).tolist()
+
+
+def test_sqrt_is_correctly_rounded(any_native: Library) -> None:
+    x = np.geomspace(1e-30, 1e30, 3001).astype(real(any_native))
+    assert np.array_equal(apply(any_native, "sqrt", x), np.sqrt(x).astype(np.float64))
+
+
+def test_transpose_swaps_rows_and_columns(any_native: Library) -> None:
+    n = any_native.lanes
+    x = np.arange(n * n, dtype=real(any_native)).reshape(n, n)
+    out = np.empty_like(x)
+    any_native.function("gs2d_selftest_transpose", None, [ctypes.c_void_p] * 2)(x.ctypes.data, out.ctypes.data)
+    assert np.array_equal(out, x.T)
+
+
+def test_transposing_reduction_sums_each_vector_into_its_own_place(any_native: Library) -> None:
+    x = np.random.default_rng(0).integers(-99, 99, size=(20, any_native.lanes)).astype(real(any_native))
+    out = np.empty(20, dtype=x.dtype)
+    any_native.function("gs2d_selftest_transpose_reduce", None, [ctypes.c_void_p] * 2)(x.ctypes.data, out.ctypes.data)
+    assert np.array_equal(out, x.sum(axis=1))
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 8, 15, 16, 17, 31, 64, 255])
+def test_lists_of_entries_hold_exactly_those_with_the_bit_in_order(any_native: Library, n: int) -> None:
+    masks = np.random.default_rng(n).integers(0, 2**32, size=n + 64, dtype=np.uint32)  # what follows must not count
+    out = np.zeros(n + 64, dtype=np.uint32)
+    compress = any_native.function(
+        "gs2d_selftest_indices_with_bit", ctypes.c_int, [ctypes.c_void_p, ctypes.c_int, ctypes.c_int, ctypes.c_void_p]
+    )
+    for bit in (0, 5, 31):
+        count = compress(masks.ctypes.data, n, bit, out.ctypes.data)
+        assert out[:count].tolist() == [i for i in range(n) if masks[i] >> bit & 1]
