@@ -422,3 +422,25 @@ def test_the_demo_does_not_replace_a_run_of_another_kind(undisturbed: RunFolder)
     with pytest.raises(RunError, match="holds a run that is not a demo"):
         demo(DemoOptions(out=undisturbed.path))
     assert comparable(undisturbed) == before
+
+
+def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "ball"
+    shutil.copytree(capture, folder)
+    for i in range(4):
+        (folder / "train" / f"r_{i}.png").unlink()
+    heard: list[Event] = []
+
+    def listen(event: Event) -> None:
+        heard.append(event)
+        if isinstance(event, Step) and "loss" in event.detail:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(options(folder, tmp_path / "run", protocol="generic"), listen)
+    texts = [event.text for event in heard if isinstance(event, Notice)]
+    assert "starting from 150 random points in the box the cameras look at" in texts
+    assert any("r_0" in text for text in texts)
+    assert "... and 1 more views skipped; `gs2d info` lists them" in texts
+    assert any(text.startswith("near plane at") for text in texts)
+    assert not (tmp_path / "run").exists()  # nothing was saved yet

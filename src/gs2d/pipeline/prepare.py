@@ -27,6 +27,7 @@ from gs2d.schedule import scale_schedule
 from gs2d.train.loop import raster_settings
 
 DECODE_THREADS = 2
+SHOWN_SKIPS = 3
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,8 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     digest = scene_digest(scene, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
+    if protocol.near is None:
+        on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
     return Job(recipe, protocol, scene, backend, settings, options.downscale, digest)
 
 
@@ -145,8 +148,10 @@ def read_scene(path: Path, scene_format: str, downscale: int, protocol: Protocol
     """Load a capture and tell what was decided or skipped."""
     test_every = None if scene_format == "blender" else protocol.test_every  # Blender captures bring their split
     scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every)
-    for text in (*scene.notes, *scene.skipped):
+    for text in (*scene.notes, *scene.skipped[:SHOWN_SKIPS]):
         on_event(Notice(text))
+    if len(scene.skipped) > SHOWN_SKIPS:
+        on_event(Notice(f"... and {len(scene.skipped) - SHOWN_SKIPS} more views skipped; `gs2d info` lists them"))
     return scene
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from gs2d.errors import DivergedError
 from gs2d.evaluate.images import mean_metrics
 from gs2d.io.run import RunFolder, load_tensors
-from gs2d.pipeline.events import OnEvent, Phase, StageDone, Step
+from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
 from gs2d.pipeline.prepare import Job
@@ -87,6 +87,8 @@ class Recorder:
             self._log("stage_end", event)
             self._finish_stage(event.index)
         else:
+            if isinstance(event, train_events.Initialised):
+                self._on_event(Notice(start_text(event)))
             self._log(_KINDS[type(event)], event)
 
     # -- the log -------------------------------------------------------------------------------------------------------
@@ -231,6 +233,13 @@ def _due(iteration: int, iterations: int, count: int, step: int) -> bool:
     """Whether an iteration that is a multiple of ``step`` is one of about ``count`` of a stage."""
     every = max(1, math.ceil(iterations / count / step)) * step
     return iteration % every == 0
+
+
+def start_text(event: train_events.Initialised) -> str:
+    """What training starts from, in words."""
+    source = "points of the capture" if event.source == "points" else "random points in the box the cameras look at"
+    dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
+    return f"starting from {event.splats:,} {source}{dropped}"
 
 
 def _storable(value: Any) -> bool:
