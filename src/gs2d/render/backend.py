@@ -118,14 +118,14 @@ def get_backend(name: str) -> Backend:
 
 def backend_report() -> tuple[BackendStatus, ...]:
     """What this machine can run and why not, in the order of preference."""
-    from gs2d.kernels.library import REMEDY, available_variants, load
+    from gs2d.kernels.library import REMEDY, available_variants, prepare
 
     try:
-        library = load()
+        library = prepare()
         details = f"{library.instruction_set}; {library.threads} threads; built: {', '.join(available_variants())}"
         cpu = BackendStatus("cpu", True, "", "", details)
     except BackendError as error:
         cpu = BackendStatus("cpu", False, str(error).partition(";")[0], REMEDY, "")
-    cuda = BackendStatus("cuda", False, NO_CUDA, "use --backend cpu", "")
+    cuda = BackendStatus("cuda", False, NO_CUDA, "nothing yet: the cpu backend trains everything", "")
     reference = BackendStatus("reference", True, "", "", "plain torch, slow; float32 and float64, any device")
     return cpu, cuda, reference
