@@ -39,7 +39,7 @@ GS2D_HD vreal pick(vint m, vreal a, vreal b) { return (vreal)((m & (vint)a) | (~
 // Without a fused instruction a call per lane would cost ten times the rest: round twice there. The double library
 // always rounds twice: it is compared with finite differences, not bit for bit.
 GS2D_HD V fma(V a, V b, V c) {
-#if defined(FP_FAST_FMAF) && !defined(GS2D_DOUBLE)
+#if (defined(__FP_FAST_FMAF) || defined(__ARM_FEATURE_FMA)) && !defined(GS2D_DOUBLE)
     return per_lane([&](int i) { return __builtin_fmaf(a.v[i], b.v[i], c.v[i]); });
 #else
     return a.v * b.v + c.v;
