@@ -1,8 +1,8 @@
-"""The table of docs/results.md: every row is one `gs2d` command, run here and tabulated.
+"""The tables of docs/results.md: every row is one `gs2d` command, run here and tabulated.
 
 ::
 
-    python -m benchmarks.results --data DIR --out runs/results [--only lego bottle] [--scale 0.1]
+    python -m benchmarks.results --data DIR --out runs/results [--only lego bottle] [--scale 0.1] [--why]
 
 ``DIR`` holds the captures under the names of ``CASES``. Runs that are finished are not repeated (their ``metrics.json``
 is read), so the command can be stopped and started again. Stage 1 is shared through the stage cache.
@@ -36,14 +36,42 @@ CASES = (
     Case("dtu24", "dtu_scan24", downscale=4, split="train"),
     Case("fountain", "strecha_fountain_P11", downscale=4),
 )
-RECIPES = ("2dgs-no-nc", "2dgs", "2dgs-r", "2dgs-60k")
-TITLES = {"2dgs-no-nc": "2DGS without NC", "2dgs": "2DGS", "2dgs-60k": "2DGS, as long as 2DGS-R", "2dgs-r": "2DGS-R"}
 
 
-def train_command(case: Case, recipe: str, data: str, out: Path, scale: float, seed: int) -> list[str]:
+@dataclass(frozen=True)
+class Method:
+    """A row: a recipe, with what is changed in it."""
+
+    name: str
+    title: str
+    recipe: str
+    changes: tuple[str, ...] = ()
+
+
+METHODS = (
+    Method("2dgs-no-nc", "2DGS without NC", "2dgs-no-nc"),
+    Method("2dgs", "2DGS", "2dgs"),
+    Method("2dgs-r", "2DGS-R", "2dgs-r"),
+    Method("2dgs-60k", "2DGS, as long as 2DGS-R", "2dgs-60k"),
+)
+LONG_STAGE_3 = ("appearance.iterations=1", "refine.iterations=2999")
+# Where the gain of stage 3 comes from. The numbers of iterations are for --scale 0.1.
+WHY = (
+    Method("60k-2000", "2DGS continued for as long as stage 3 alone", "2dgs-60k", ("continue.iterations=2000",)),
+    Method("r-2999", "2DGS-R, all but 1 of stage 2 given to stage 3", "2dgs-r", LONG_STAGE_3),
+    Method("r-free", "2DGS-R, opacity free in stage 3", "2dgs-r-freeze-none"),
+    Method("r-preserve", "2DGS-R, clones share the opacity", "2dgs-r-clone-preserve"),
+    Method("r-k30", "2DGS-R, K = 30", "2dgs-r-k30"),
+)
+
+
+def train_command(case: Case, method: Method, data: str, out: Path, scale: float, seed: int) -> list[str]:
     """The command of one run, as printed in the table."""
-    words = ["gs2d", "train", f"{data}/{case.folder}", "--out", str(out / f"{case.name}-{recipe}-s{seed}")]
-    words += ["--recipe", recipe, "--schedule-scale", str(scale), "--cache", str(out / "cache"), "--seed", str(seed)]
+    words = ["gs2d", "train", f"{data}/{case.folder}", "--out", str(out / f"{case.name}-{method.name}-s{seed}")]
+    words += ["--recipe", method.recipe, "--schedule-scale", str(scale)]
+    words += ["--cache", str(out / "cache"), "--seed", str(seed)]
+    for change in method.changes:
+        words += ["--set", change]
     if case.downscale > 1:
         words += ["--downscale", str(case.downscale)]
     return words
@@ -55,9 +83,9 @@ def execute(words: list[str]) -> None:
     subprocess.run([sys.executable, "-m", "gs2d", *words[1:], "--quiet"], check=True)
 
 
-def run_case(case: Case, recipe: str, data: str, out: Path, scale: float, seed: int) -> dict:
+def run_case(case: Case, method: Method, data: str, out: Path, scale: float, seed: int) -> dict:
     """Train and score one run unless it is done; return its metrics.json."""
-    words = train_command(case, recipe, data, out, scale, seed)
+    words = train_command(case, method, data, out, scale, seed)
     run = Path(words[words.index("--out") + 1])
     done = run / "metrics.json"
     if not (run / "mesh.ply").exists():
@@ -67,9 +95,10 @@ def run_case(case: Case, recipe: str, data: str, out: Path, scale: float, seed: 
     return dict(json.loads(done.read_text()))
 
 
-def rows_of(case: Case, recipe: str, metrics: dict) -> list[list[str]]:
+def rows_of(case: Case, method: Method, metrics: dict) -> list[list[str]]:
     """Table rows of one run: one a stage for 2DGS-R, the last stage for the others."""
-    stages = metrics["stages"] if recipe == "2dgs-r" else metrics["stages"][-1:]
+    by_stage = method.name == "2dgs-r"
+    stages = metrics["stages"] if by_stage else metrics["stages"][-1:]
     iterations, seconds = 0, 0.0
     rows = []
     for stage in metrics["stages"]:
@@ -79,7 +108,7 @@ def rows_of(case: Case, recipe: str, metrics: dict) -> list[list[str]]:
             continue
         image = stage.get(case.split) or {}
         surface = (metrics.get("surface") or {}) if stage is metrics["stages"][-1] else {}
-        title = TITLES[recipe] + (f", after {stage['name']}" if recipe == "2dgs-r" else "")
+        title = method.title + (f", after {stage['name']}" if by_stage else "")
         rows.append(
             [
                 case.name,
@@ -114,18 +143,20 @@ def main() -> None:
     parser.add_argument("--data", required=True)
     parser.add_argument("--out", type=Path, default=Path("runs/results"))
     parser.add_argument("--only", nargs="*", default=[case.name for case in CASES])
-    parser.add_argument("--recipes", nargs="*", default=list(RECIPES))
+    parser.add_argument("--why", action="store_true", help="the investigation of stage 3 instead of the main table")
     parser.add_argument("--scale", type=float, default=0.1)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     args = parser.parse_args()
     header = ["scene", "method", "iterations", "PSNR", "SSIM", "F-score", "Chamfer", "splats", "MB", "seconds"]
     table = [header, ["---"] * len(header)]
+    file = args.out / ("why.md" if args.why else "table.md")
+    args.out.mkdir(parents=True, exist_ok=True)
     for case in (c for c in CASES if c.name in args.only):
         for seed in args.seeds:
-            for recipe in args.recipes:
-                table += rows_of(case, recipe, run_case(case, recipe, args.data, args.out, args.scale, seed))
-                (args.out / "table.md").write_text("\n".join("| " + " | ".join(row) + " |" for row in table) + "\n")
-    print((args.out / "table.md").read_text())
+            for method in WHY if args.why else METHODS:
+                table += rows_of(case, method, run_case(case, method, args.data, args.out, args.scale, seed))
+                file.write_text("\n".join("| " + " | ".join(row) + " |" for row in table) + "\n")
+    print(file.read_text())
 
 
 if __name__ == "__main__":
