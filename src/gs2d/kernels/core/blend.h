@@ -143,6 +143,15 @@ GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const H
     sums.lowpass_x = fma(filtered, dx, sums.lowpass_x), sums.lowpass_y = fma(filtered, dy, sums.lowpass_y);
 }
 
+// The part of it that reaches the splat's colour: all that is needed while everything else is frozen.
+template <class V>
+GS2D_HD void composite_color_vjp(const Hit<V>& h, const BlendLimits<V>& k, Vec3<V> g_color, V& T, Vec3<V>& sum) {
+    const V alpha = min(h.alpha, k.alpha_max), after = fnma(alpha, T, T);
+    const auto goes_on = after >= k.transmittance_min;
+    sum = axpy(keep(goes_on, alpha * T), g_color, sum);
+    T = keep(goes_on, after);
+}
+
 // dL/d(record) from the sums, per lane (the sum over lanes is left to the caller).
 template <class V>
 GS2D_HD RecordGradient<V> finish(const Record<V>& s, const PairSums<V>& a, const BlendLimits<V>& k) {

@@ -81,7 +81,7 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
 // Gradients of the parameters of the same call's splats; `images` are that call's outputs.
 GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, const Images* images,
                                      const ImageGradients* upstream, const ParameterGradients* out) {
-    if (!blend_tiles_vjp(*frame, *images, *upstream, out->probe ? out->probe_columns : 0)) return NO_MEMORY;
+    if (!blend_tiles_vjp(*frame, *images, *upstream, *out)) return NO_MEMORY;
     project_splats_vjp(*frame, *splats, *out);
     return OK;
 }

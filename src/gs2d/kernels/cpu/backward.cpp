@@ -151,9 +151,34 @@ void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, cons
     }
 }
 
+// Only the colours' gradients: no geometry, no opacity.
+void tile_color_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
+    const V lx = lane_x(area.x0), ly = lane_y(area.y0);
+    const Entry* entry = &f.entries[f.tile_begin[tile]];
+    const int64_t end = f.slot_begin[tile + 1];
+    for (int64_t slot = f.slot_begin[tile]; slot < end; ++slot, ++entry) {
+        if (slot + AHEAD < end) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
+        const Record<V> splat = broadcast(&f.records[size_t(entry->splat) * RECORD]);
+        Vec3<V> sum = {V(0), V(0), V(0)};
+        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
+            const int b = __builtin_ctz(blocks);
+            const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
+            const V dx = lx + V(real(block_x(b))) - splat.cx, dy = ly + V(real(block_y(b))) - splat.cy;
+            V pixel_T = at(T);
+            composite_color_vjp(intersect(splat, dx, dy, limits), limits, {at(RED), at(GREEN), at(BLUE)}, pixel_T, sum);
+            store(&s[T][b * LANES], pixel_T);
+        }
+        const V fields[4] = {sum.x, sum.y, sum.z, V(0)};
+        real* to = &f.gradients[size_t(slot) * GRADIENT];
+        memset(to, 0, GRADIENT * sizeof(real));
+        transpose_reduce<4>(fields, to + 10);  // red, green, blue
+    }
+}
+
 using TileVjp = void (*)(const Frame&, int64_t, Planes, const TileArea&, const BlendLimits<V>&);
 
-TileVjp variant(bool geo, bool dist, bool abs) {
+TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
+    if (color_only) return tile_color_vjp;
     if (dist) return abs ? tile_vjp<true, true, true> : tile_vjp<true, true, false>;
     if (geo) return abs ? tile_vjp<true, false, true> : tile_vjp<true, false, false>;
     return abs ? tile_vjp<false, false, true> : tile_vjp<false, false, false>;
@@ -161,15 +186,15 @@ TileVjp variant(bool geo, bool dist, bool abs) {
 
 }  // namespace
 
-bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t probe_columns) {
-    f.probe = probe_columns > 0;
+bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, const ParameterGradients& out) {
+    f.probe = out.probe != nullptr;
     if (!index_slots(f)) return false;
     const int64_t slots = f.slot_begin[f.tiles];
     if (!f.gradients.reserve(slots * GRADIENT) || !f.extra_gradients.reserve(slots * GRADIENT_EXTRA) || !f.has_extra.reserve(slots))
         return false;
     const bool dist = g.distortion != nullptr;
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
-    const TileVjp vjp = variant(geo, dist, probe_columns == 4);
+    const TileVjp vjp = variant(geo, dist, f.probe && out.probe_columns == 4, !wants_geometry(out));
     const BlendLimits<V> limits = limits_of(f.view);
     parallel_ranges(f.tiles, 4, [&](int64_t begin, int64_t end) {
         for (int64_t tile = begin; tile < end; ++tile) {

@@ -68,6 +68,11 @@ struct ParameterGradients {  // null where not wanted
     int64_t probe_columns;  // 2 or 4
 };
 
+// Whether anything but colours is wanted.
+inline bool wants_geometry(const ParameterGradients& g) {
+    return g.means || g.quats || g.log_scales || g.opacity_logits || g.probe;
+}
+
 // Box tests per (tile, splat), in pixels: see Footprint.
 struct CullRecord {
     real ex, ey, a, b, c;
@@ -160,7 +165,7 @@ bool bin_splats(Frame& frame);
 bool blend_tiles(Frame& frame, const Images& images);
 // Gives each of the first tile_count entries of every tile a slot, and lists the slots of every splat in tile order.
 bool index_slots(Frame& frame);
-bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, int64_t probe_columns);
+bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, const ParameterGradients& out);
 bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 bool occluded_splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 void project_splats_vjp(Frame& frame, const Parameters& splats, const ParameterGradients& out);

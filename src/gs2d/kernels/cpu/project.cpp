@@ -196,6 +196,7 @@ void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients&
                 along[k] = fma(g_color.x, sh[3 * k], fma(g_color.y, sh[3 * k + 1], g_color.z * sh[3 * k + 2]));
             }
             write_sh(f, s, out, i, lanes, g_color, basis);
+            if (!wants_geometry(out)) continue;
 
             const ParameterGradient<V> d = project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
             const auto write = [&]<int K>(real* to, V (&values)[K]) {
