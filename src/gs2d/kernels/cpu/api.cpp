@@ -3,6 +3,7 @@
 
 #include "cpu/export.h"
 #include "cpu/frame.h"
+#include "cpu/stages.h"
 
 namespace gs2d {
 namespace {
@@ -12,11 +13,14 @@ Frame* free_frames = nullptr;
 int free_count = 0;
 constexpr int KEEP = 2;  // frames whose memory is kept for the next view
 
-template <class T> void release_all(T& f) {
-    f.records.release(), f.cull.release(), f.rects.release(), f.order.release(), f.ordered_rects.release();
-    f.sort_memory.release(), f.histogram.release(), f.tile_begin.release(), f.entries.release(), f.tile_count.release();
-    f.saved.release(), f.slot_begin.release(), f.gradients.release(), f.splat_begin.release(), f.splat_slots.release();
-    f.extra_gradients.release(), f.has_extra.release();
+template <class F> void for_each_buffer(Frame& f, F&& visit) {
+    visit(f.records), visit(f.cull), visit(f.rects), visit(f.order), visit(f.ordered_rects), visit(f.sort_memory);
+    visit(f.histogram), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.saved), visit(f.slot_begin);
+    visit(f.gradients), visit(f.extra_gradients), visit(f.has_extra), visit(f.splat_begin), visit(f.splat_slots);
+}
+
+void release_all(Frame& f) {
+    for_each_buffer(f, [](auto& buffer) { buffer.release(); });
 }
 
 void set_view(Frame& f, const View& v) {
@@ -72,7 +76,14 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
     if (!*frame) return NO_MEMORY;
     Frame& f = **frame;
     set_view(f, *view);
-    if (project_splats(f, *splats, Reach::BLEND, out->radii) && bin_splats(f) && blend_tiles(f, *out)) return OK;
+    StageClock clock;
+    bool ok = project_splats(f, *splats, Reach::BLEND, out->radii);
+    clock.done(PROJECT);
+    ok = ok && bin_splats(f);  // its own clock
+    StageClock blending;
+    ok = ok && blend_tiles(f, *out);
+    blending.done(BLEND_FORWARD);
+    if (ok) return OK;
     give_back(*frame);
     *frame = nullptr;
     return NO_MEMORY;
@@ -82,7 +93,9 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
 GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, const Images* images,
                                      const ImageGradients* upstream, const ParameterGradients* out) {
     if (!blend_tiles_vjp(*frame, *images, *upstream, *out)) return NO_MEMORY;
+    StageClock clock;
     project_splats_vjp(*frame, *splats, *out);
+    clock.done(PROJECT_BACKWARD);
     return OK;
 }
 
@@ -99,3 +112,25 @@ GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, co
 }
 
 GS2D_EXPORT void gs2d_frame_release(Frame* frame) { give_back(frame); }
+
+// Bytes of memory that a view holds from its forward to its backward pass.
+GS2D_EXPORT int64_t gs2d_frame_bytes(Frame* frame) {
+    size_t bytes = 0;
+    for_each_buffer(*frame, [&](auto& buffer) { bytes += buffer.capacity * sizeof(*buffer.data); });
+    return static_cast<int64_t>(bytes);
+}
+
+// Frees the memory that is kept for the next view.
+GS2D_EXPORT void gs2d_trim() {
+    pthread_mutex_lock(&free_lock);
+    Frame* f = free_frames;
+    free_frames = nullptr;
+    free_count = 0;
+    pthread_mutex_unlock(&free_lock);
+    while (f) {
+        Frame* next = f->next_free;
+        release_all(*f);
+        free(f);
+        f = next;
+    }
+}

@@ -1,6 +1,7 @@
 // Gradients of the blending, one tile per task: splat by splat, front to back, the sums over a splat's pixels in
 // registers. Every (tile, splat) has its own slot of gradients, so nothing depends on the order of the tiles.
 #include "cpu/frame.h"
+#include "cpu/stages.h"
 #include "cpu/threads.h"
 #include "cpu/tile.h"
 
@@ -188,7 +189,9 @@ TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
 
 bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, const ParameterGradients& out) {
     f.probe = out.probe != nullptr;
+    StageClock clock;
     if (!index_slots(f)) return false;
+    clock.done(INDEX_SLOTS);
     const int64_t slots = f.slot_begin[f.tiles];
     if (!f.gradients.reserve(slots * GRADIENT) || !f.extra_gradients.reserve(slots * GRADIENT_EXTRA) || !f.has_extra.reserve(slots))
         return false;
@@ -206,6 +209,7 @@ bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, co
             vjp(f, tile, planes, area, limits);
         }
     });
+    clock.done(BLEND_BACKWARD);
     return true;
 }
 

@@ -1,5 +1,6 @@
 // Depth order, then lists of splats per tile: a counting sort in depth order needs no key per entry.
 #include "cpu/frame.h"
+#include "cpu/stages.h"
 #include "cpu/threads.h"
 
 namespace gs2d {
@@ -73,7 +74,10 @@ bool sort_by_depth(Frame& f) {
 
 bool bin_splats(Frame& f) {
     const int64_t tiles = f.tiles;
-    if (!sort_by_depth(f) || !f.histogram.reserve(CHUNKS * tiles) || !f.tile_begin.reserve(tiles + 1)) return false;
+    StageClock clock;
+    if (!sort_by_depth(f)) return false;
+    clock.done(SORT);
+    if (!f.histogram.reserve(CHUNKS * tiles) || !f.tile_begin.reserve(tiles + 1)) return false;
     const int64_t grain = (f.visible + CHUNKS - 1) / CHUNKS;
     parallel_for(CHUNKS, [&](int64_t c) {
         uint32_t* h = &f.histogram[c * tiles];
@@ -109,6 +113,7 @@ bool bin_splats(Frame& f) {
                 }
         }
     });
+    clock.done(BIN);
     return true;
 }
 

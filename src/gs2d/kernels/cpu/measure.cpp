@@ -1,0 +1,73 @@
+// What benchmarks ask about the rasterizer: time by pass, work counted exactly, memory held. Nothing here is on the
+// path of rendering or training.
+#include <string.h>
+
+#include "cpu/export.h"
+#include "cpu/frame.h"
+#include "cpu/stages.h"
+#include "cpu/threads.h"
+#include "cpu/tile.h"
+
+namespace gs2d {
+
+__thread int64_t stage_ns[STAGES];
+
+namespace {
+
+struct PairCounts {
+    int64_t visible, lanes;
+};
+
+// Replays one tile as the backward pass does. A pair is visible where a pixel that has not stopped sees the splat.
+PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits) {
+    alignas(64) real T[BLOCKS][LANES];
+    const TileArea area = tile_area(f, tile);
+    for (int b = 0; b < BLOCKS; ++b)
+        store(T[b], keep(lanes_inside(block_x(b), block_y(b), area.width, area.height), V(1)));
+    PairCounts counts = {0, 0};
+    const Entry* entry = &f.entries[f.tile_begin[tile]];
+    for (int32_t i = 0; i < f.tile_count[tile]; ++i, ++entry) {
+        const Record<V> s = broadcast(&f.records[size_t(entry->splat) * RECORD]);
+        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
+            const int b = __builtin_ctz(blocks);
+            const V dx = lane_x(area.x0 + block_x(b)) - s.cx, dy = lane_y(area.y0 + block_y(b)) - s.cy;
+            const Hit<V> h = intersect(s, dx, dy, limits);
+            const V before = load(T[b]), after = fnma(min(h.alpha, limits.alpha_max), before, before);
+            counts.visible += __builtin_popcount(bits((h.alpha > V(0)) & (before > V(0))));
+            counts.lanes += LANES;
+            store(T[b], keep(after >= limits.transmittance_min, after));
+        }
+    }
+    return counts;
+}
+
+}  // namespace
+}  // namespace gs2d
+
+using namespace gs2d;
+
+// Nanoseconds of the last forward and backward pass of the calling thread, in the order of enum Stage; returns how many.
+GS2D_EXPORT int gs2d_stage_times(int64_t* ns) {
+    memcpy(ns, stage_ns, sizeof stage_ns);
+    return STAGES;
+}
+
+// Work in the view of a forward pass: visible pairs (pixel, splat); lane pairs that the backward pass computes;
+// entries (tile, splat) before and after the forward pass; splats in the view.
+GS2D_EXPORT int gs2d_frame_counts(Frame* frame, int64_t counts[5]) {
+    const Frame& f = *frame;
+    const BlendLimits<V> limits = limits_of(f.view);
+    Buffer<PairCounts> tiles;
+    if (!tiles.reserve(f.tiles)) return 1;
+    parallel_for(f.tiles, [&](int64_t tile) { tiles[tile] = count_tile(f, tile, limits); });
+    memset(counts, 0, 5 * sizeof(int64_t));
+    for (int64_t t = 0; t < f.tiles; ++t) {
+        counts[0] += tiles[t].visible;
+        counts[1] += tiles[t].lanes;
+        counts[3] += f.tile_count[t];
+    }
+    counts[2] = f.tile_begin[f.tiles];
+    counts[4] = f.visible;
+    tiles.release();
+    return 0;
+}
