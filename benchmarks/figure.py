@@ -1,0 +1,54 @@
+"""The pictures of the README and docs/results.md: one strip a run (photograph, colour, normal, depth, mesh).
+
+::
+
+    python -m benchmarks.figure docs/images/bottle.png runs/bottle-2dgs-no-nc runs/bottle-2dgs-r [--view 1]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from gs2d.camera import Camera
+from gs2d.images import write_image
+from gs2d.io.ply import read_mesh
+from gs2d.report_mesh import mesh_pictures
+
+
+def strip(run: Path, view: int, stage: str | None, size: int) -> list[np.ndarray]:
+    """The pictures of one view of a run, uint8 [size, size, 3] each."""
+    shown = json.loads((run / "renders" / "index.json").read_text())["views"][view]
+    stages = [entry["name"] for entry in json.loads((run / "metrics.json").read_text())["stages"]]
+    folder = run / "renders" / (stage or stages[-1])
+    files = [run / "renders" / "photos" / f"{shown['file']}.png"]
+    files += [folder / f"{shown['file']}.{kind}.png" for kind in ("color", "normal", "depth")]
+    pictures = [np.asarray(Image.open(file).convert("RGB")) for file in files]
+    saved = shown["camera"]
+    camera = Camera(**{**saved, "T_cam_world": np.asarray(saved["T_cam_world"])})
+    clay = mesh_pictures(read_mesh(run / "mesh.ply"), [camera], width=camera.width)[0].shape
+    pictures.append((clay * 255).round().astype(np.uint8))
+    return [np.asarray(Image.fromarray(p).resize((size, size), Image.Resampling.LANCZOS)) for p in pictures]
+
+
+def main() -> None:
+    """Write the strips of some runs under one another."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--view", type=int, default=0)
+    parser.add_argument("--stage")
+    parser.add_argument("--size", type=int, default=300)
+    args = parser.parse_args()
+    rows = [np.concatenate(strip(run, args.view, args.stage, args.size), axis=1) for run in args.runs]
+    picture = np.concatenate(rows, axis=0)
+    used = np.flatnonzero((picture != 255).any(axis=(1, 2)))  # white margins above and below say nothing
+    write_image(args.out, picture[used[0] : used[-1] + 1])
+
+
+if __name__ == "__main__":
+    main()
