@@ -1,0 +1,59 @@
+"""Compile CUDA sources for the CPU (emulator.h) and call their kernels on tensors in host memory."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+HERE = Path(__file__).parent
+# As the GPU build: no contraction, and every fused multiply-add written out. -march only makes fmaf fast.
+FLAGS = (
+    "-std=c++17",
+    "-O1",
+    "-fPIC",
+    "-shared",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-Wall",
+    "-Wno-unknown-pragmas",
+)
+KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
+
+
+class EmulatedKernels:
+    """The kernels of some CUDA sources, as functions that run on the CPU."""
+
+    def __init__(self, library: Path) -> None:
+        self._dll = ctypes.CDLL(str(library))
+
+    def launch(
+        self, name: str, grid: tuple[int, int], block: int, arguments: ctypes.Structure, *, descending: bool = False
+    ) -> None:
+        """Run a whole grid; RuntimeError with the emulator's words if threads do not meet at a collective."""
+        function = self._dll[f"launch_{name}"]
+        function.restype = ctypes.c_char_p
+        function.argtypes = [ctypes.c_uint] * 3 + [ctypes.c_int, ctypes.c_void_p]
+        error = function(grid[0], grid[1], block, int(descending), ctypes.byref(arguments))
+        if error is not None:
+            raise RuntimeError(f"{name}: {error.decode()}")
+
+
+def build(sources: Sequence[Path], include: Path, folder: Path, name: str) -> EmulatedKernels:
+    """Compile; the compiler gets two minutes. ``folder`` receives a wrapper and the library."""
+    names = [kernel for source in sources for kernel in KERNEL.findall(source.read_text())]
+    wrapper = folder / f"{name}.cpp"
+    lines = [f'#include "{HERE / "emulator.h"}"', *(f'#include "{source}"' for source in sources)]
+    signature = "(unsigned x, unsigned y, unsigned block, int descending, const void* a)"
+    for kernel in names:
+        body = f"return emulator::launch({kernel}, x, y, block, descending, a);"
+        lines.append(f'extern "C" const char* launch_{kernel}{signature} {{ {body} }}')
+    wrapper.write_text("\n".join(lines) + "\n")
+    library = folder / f"{name}.so"
+    command = ["g++", *FLAGS, f"-I{include}", str(wrapper), "-o", str(library)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"g++ failed on {', '.join(s.name for s in sources)}:\n{done.stderr[-4000:]}")
+    return EmulatedKernels(library)

@@ -1,0 +1,202 @@
+// Runs CUDA kernels on the CPU, for tests: blocks one after another, one fiber per thread, switched only at collectives.
+//
+// Stricter than a GPU: a warp collective wants all 32 lanes of the warp at the same call with the full mask, a block
+// barrier wants every thread, and what does not come together is an error with the lines, never a hang. Shared memory is
+// filled with NaN before each block. Threads run in ascending or descending order between collectives: a missing barrier
+// changes the result of one of the two. Data races proper are not found.
+#pragma once
+
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <ucontext.h>
+
+#define __global__
+#define __device__
+#define __host__
+#define __forceinline__ inline __attribute__((always_inline))
+#define __launch_bounds__(...)
+#define __shared__ static __attribute__((section("gs2d_shared")))
+
+struct dim3 {
+    unsigned x, y, z;
+};
+struct alignas(16) float4 {
+    float x, y, z, w;
+};
+inline dim3 threadIdx, blockIdx, blockDim, gridDim;
+
+extern "C" {
+extern char __start_gs2d_shared[] __attribute__((weak, visibility("hidden")));
+extern char __stop_gs2d_shared[] __attribute__((weak, visibility("hidden")));
+}
+
+namespace emulator {
+
+constexpr unsigned WARP = 32, MOST_THREADS = 1024;
+constexpr size_t STACK = 128 << 10;
+constexpr unsigned FULL = 0xffffffffu;
+
+enum class Op { NONE, BARRIER, SYNC_WARP, BALLOT, ANY, SHUFFLE_XOR };
+inline const char* name_of(Op op) {
+    static const char* const names[] = {"-", "__syncthreads", "__syncwarp", "__ballot_sync", "__any_sync", "__shfl_xor_sync"};
+    return names[static_cast<int>(op)];
+}
+
+struct Fiber {
+    ucontext_t context;
+    void* stack;
+    bool runnable, done;
+    Op op;  // waits here
+    int line, operand;
+    uint32_t value;
+};
+
+inline Fiber fibers[MOST_THREADS];
+inline ucontext_t scheduler;
+inline unsigned current, threads;
+inline char message[512];
+inline bool failed;
+inline void (*body)(const void*);
+inline const void* body_argument;
+
+inline void fail(const char* what, const Fiber& a, unsigned thread_a, const Fiber& b, unsigned thread_b) {
+    if (failed) return;
+    failed = true;
+    const auto where = [](const Fiber& f) { return f.done ? "has returned" : f.op == Op::NONE ? "runs" : name_of(f.op); };
+    snprintf(message, sizeof message, "%s in block (%u, %u, %u): thread %u %s (line %d), thread %u %s (line %d)", what, blockIdx.x,
+             blockIdx.y, blockIdx.z, thread_a, where(a), a.line, thread_b, where(b), b.line);
+}
+
+// Leaves the running thread until the scheduler has completed the collective; returns what it left in `value`.
+inline uint32_t wait(Op op, int line, unsigned mask, uint32_t value, int operand) {
+    Fiber& f = fibers[current];
+    f.op = op, f.line = line, f.value = value, f.operand = operand, f.runnable = false;
+    if (mask != FULL) fail("a collective without the full mask", f, current, f, current);
+    swapcontext(&f.context, &scheduler);
+    return f.value;
+}
+
+inline void enter() {
+    body(body_argument);
+    fibers[current].done = true, fibers[current].runnable = false;
+    swapcontext(&fibers[current].context, &scheduler);
+}
+
+inline bool together(unsigned first, unsigned count, const char* what) {
+    for (unsigned i = first + 1; i < first + count; ++i) {
+        const Fiber &a = fibers[first], &b = fibers[i];
+        if (a.done != b.done || a.op != b.op || a.line != b.line) {
+            fail(what, a, first, b, i);
+            return false;
+        }
+    }
+    return true;
+}
+
+inline void release(unsigned first, unsigned count) {
+    for (unsigned i = first; i < first + count; ++i) fibers[i].op = Op::NONE, fibers[i].runnable = true;
+}
+
+inline void complete_warp(unsigned first) {
+    uint32_t given[WARP], ballot = 0;
+    for (unsigned i = 0; i < WARP; ++i) given[i] = fibers[first + i].value, ballot |= uint32_t(given[i] != 0) << i;
+    for (unsigned i = 0; i < WARP; ++i) {
+        Fiber& f = fibers[first + i];
+        if (f.op == Op::BALLOT) f.value = ballot;
+        if (f.op == Op::ANY) f.value = ballot != 0;
+        if (f.op == Op::SHUFFLE_XOR) f.value = given[(i ^ unsigned(f.operand)) % WARP];
+    }
+    release(first, WARP);
+}
+
+// After every thread has run as far as it can: completes what came together. True when the block is finished.
+inline bool complete_collectives() {
+    bool all_done = true, barrier = true, progress = false;
+    for (unsigned i = 0; i < threads; ++i) all_done &= fibers[i].done, barrier &= fibers[i].op == Op::BARRIER;
+    if (all_done) return true;
+    if (barrier) {
+        if (together(0, threads, "different barriers")) release(0, threads);
+        return false;
+    }
+    for (unsigned w = 0; w < threads; w += WARP) {
+        const bool in_warp_op = !fibers[w].done && fibers[w].op != Op::BARRIER;
+        if (!together(w, WARP, "a divergent collective")) return false;
+        if (in_warp_op) complete_warp(w), progress = true;
+    }
+    if (!progress) together(0, threads, "a barrier that not all threads reach");
+    return false;
+}
+
+inline void run_block(bool descending) {
+    if (__start_gs2d_shared) memset(__start_gs2d_shared, 0xff, size_t(__stop_gs2d_shared - __start_gs2d_shared));
+    for (unsigned i = 0; i < threads; ++i) {
+        Fiber& f = fibers[i];
+        if (!f.stack) f.stack = malloc(STACK);
+        getcontext(&f.context);
+        f.context.uc_stack.ss_sp = f.stack, f.context.uc_stack.ss_size = STACK, f.context.uc_link = nullptr;
+        makecontext(&f.context, enter, 0);
+        f.runnable = true, f.done = false, f.op = Op::NONE, f.line = 0;
+    }
+    do {
+        for (unsigned k = 0; k < threads; ++k) {
+            current = descending ? threads - 1 - k : k;
+            if (!fibers[current].runnable) continue;
+            threadIdx = {current % blockDim.x, current / blockDim.x, 0};
+            swapcontext(&scheduler, &fibers[current].context);
+        }
+    } while (!failed && !complete_collectives());
+}
+
+// Null, or what went wrong (the rest of the grid is not run).
+template <class A>
+const char* launch(void (*kernel)(A), unsigned grid_x, unsigned grid_y, unsigned block_x, int descending, const void* arguments) {
+    static void (*the_kernel)(A);
+    the_kernel = kernel;
+    body = [](const void* a) { the_kernel(*static_cast<const A*>(a)); };
+    body_argument = arguments;
+    threads = block_x, failed = false;
+    if (block_x % WARP || block_x > MOST_THREADS) return "the block must be whole warps, at most 1024 threads";
+    gridDim = {grid_x, grid_y, 1}, blockDim = {block_x, 1, 1};
+    for (unsigned i = 0; i < grid_x * grid_y && !failed; ++i) {
+        blockIdx = {i % grid_x, i / grid_x, 0};
+        run_block(descending != 0);
+    }
+    return failed ? message : nullptr;
+}
+
+template <class T> inline uint32_t to_bits(T v) {
+    static_assert(sizeof(T) == 4);
+    uint32_t b;
+    memcpy(&b, &v, 4);
+    return b;
+}
+template <class T> inline T from_bits(uint32_t b) {
+    T v;
+    memcpy(&v, &b, 4);
+    return v;
+}
+
+}  // namespace emulator
+
+#define GS2D_LINE int line = __builtin_LINE()
+inline void __syncthreads(GS2D_LINE) { emulator::wait(emulator::Op::BARRIER, line, emulator::FULL, 0, 0); }
+inline void __syncwarp(unsigned mask = emulator::FULL, GS2D_LINE) { emulator::wait(emulator::Op::SYNC_WARP, line, mask, 0, 0); }
+inline unsigned __ballot_sync(unsigned mask, int p, GS2D_LINE) { return emulator::wait(emulator::Op::BALLOT, line, mask, p != 0, 0); }
+inline int __any_sync(unsigned mask, int p, GS2D_LINE) { return int(emulator::wait(emulator::Op::ANY, line, mask, p != 0, 0)); }
+template <class T> inline T __shfl_xor_sync(unsigned mask, T v, int lanes, GS2D_LINE) {
+    return emulator::from_bits<T>(emulator::wait(emulator::Op::SHUFFLE_XOR, line, mask, emulator::to_bits(v), lanes));
+}
+#undef GS2D_LINE
+
+template <class T> inline T atomicAdd(T* p, T v) {
+    const T old = *p;
+    *p = old + v;
+    return old;
+}
+inline int __popc(unsigned v) { return __builtin_popcount(v); }
+inline int __ffs(int v) { return __builtin_ffs(v); }
+inline int __float_as_int(float v) { return emulator::from_bits<int>(emulator::to_bits(v)); }
+inline float __int_as_float(int v) { return emulator::from_bits<float>(emulator::to_bits(v)); }

@@ -1,0 +1,101 @@
+"""The emulator that runs CUDA kernels on the CPU: it computes what a GPU would, and finds what would hang one."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+
+import emulate
+import pytest
+import torch
+from torch import Tensor
+
+pytestmark = pytest.mark.timeout(120)
+
+
+class _Arrays(ctypes.Structure):
+    _fields_ = (("input", ctypes.c_void_p), ("output", ctypes.c_void_p))
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> emulate.EmulatedKernels:
+    here = Path(__file__).parent
+    return emulate.build([here / "emulator_cases.cu"], here, tmp_path_factory.mktemp("emulator"), "cases")
+
+
+def run(
+    kernels: emulate.EmulatedKernels, name: str, given: Tensor, out: Tensor, blocks: int = 1, descending: bool = False
+) -> Tensor:
+    arrays = _Arrays(given.data_ptr(), out.data_ptr())
+    kernels.launch(name, (blocks, 1), len(given) // blocks, arrays, descending=descending)
+    return out
+
+
+def ints(n: int) -> Tensor:
+    return torch.arange(n, dtype=torch.int32)
+
+
+@pytest.mark.parametrize("descending", [False, True])
+def test_threads_and_blocks_are_numbered_as_on_a_gpu(cases: emulate.EmulatedKernels, descending: bool) -> None:
+    out = run(cases, "add_thread_index", torch.full((192,), 1000, dtype=torch.int32), ints(192), 3, descending)
+    assert out.tolist() == [1000 + i % 64 for i in range(192)]
+
+
+@pytest.mark.parametrize("descending", [False, True])
+def test_shared_memory_behind_a_barrier_is_seen_by_the_block(cases: emulate.EmulatedKernels, descending: bool) -> None:
+    out = run(cases, "reverse_block", ints(128), ints(128), 2, descending)
+    assert out.tolist() == [*range(63, -1, -1), *range(127, 63, -1)]
+
+
+def test_a_missing_barrier_gives_wrong_results(cases: emulate.EmulatedKernels) -> None:
+    results = [run(cases, "reverse_block_without_barrier", ints(64), ints(64), 1, d).tolist() for d in (False, True)]
+    assert results[0] != results[1]
+    assert all(result != list(range(63, -1, -1)) for result in results)
+
+
+def test_warp_collectives_stay_within_their_warp(cases: emulate.EmulatedKernels) -> None:
+    given = ints(64)
+    given[40] = -8
+    out = run(cases, "warp_collectives", given, torch.zeros(64, 3, dtype=torch.int32))
+    first, second = out[:32], out[32:]
+    odd = 0xAAAAAAAA - (1 << 32)
+    assert first.tolist() == [[sum(range(32)), odd, 0]] * 32
+    assert second.tolist() == [[sum(range(32, 64)) - 48, odd, 1]] * 32
+
+
+def test_atomics_count(cases: emulate.EmulatedKernels) -> None:
+    out = run(
+        cases,
+        "count_with_atomics",
+        torch.tensor([0, 1, 1, 2] * 16, dtype=torch.int32),
+        torch.zeros(3, dtype=torch.int32),
+    )
+    assert out.tolist() == [16, 32, 16]
+
+
+def test_unwritten_shared_memory_is_nan_in_every_block(cases: emulate.EmulatedKernels) -> None:
+    for _ in range(2):
+        assert bool(run(cases, "read_unwritten_shared", torch.zeros(32), torch.zeros(32)).isnan().all())
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("collective_in_a_branch", "divergent.*has returned.*__any_sync"),
+        ("different_collectives", "divergent.*__any_sync.*__ballot_sync"),
+        ("partial_mask", "full mask"),
+        ("barrier_of_one_warp", "barrier that not all threads reach.*__syncthreads.*has returned"),
+    ],
+)
+def test_threads_that_do_not_meet_are_an_error_with_words_not_a_hang(
+    cases: emulate.EmulatedKernels, name: str, words: str
+) -> None:
+    with pytest.raises(RuntimeError, match=words):
+        run(cases, name, ints(64), ints(64))
+
+
+def test_a_source_that_does_not_compile_is_reported(tmp_path: Path) -> None:
+    source = tmp_path / "broken.cu"
+    source.write_text('extern "C" __global__ void broken(int a) { this is not C++; }')
+    with pytest.raises(RuntimeError, match=r"broken\.cu"):
+        emulate.build([source], tmp_path, tmp_path, "broken")
