@@ -46,6 +46,7 @@ def build(sources: Sequence[Path], include: Path, folder: Path, name: str) -> Em
     names = [kernel for source in sources for kernel in KERNEL.findall(source.read_text())]
     wrapper = folder / f"{name}.cpp"
     lines = [f'#include "{HERE / "emulator.h"}"', *(f'#include "{source}"' for source in sources)]
+    lines.append("namespace gs2d {}\nusing namespace gs2d;")  # where our kernels live
     signature = "(unsigned x, unsigned y, unsigned block, int descending, const void* a)"
     for kernel in names:
         body = f"return emulator::launch({kernel}, x, y, block, descending, a);"

@@ -24,6 +24,7 @@ GS2D_HD float abs(float a) { return fabsf(a); }
 GS2D_HD float exp(float a) { return expf(a); }
 GS2D_HD float exp2(float a) { return exp2f(a); }
 GS2D_HD float log2(float a) { return log2f(a); }
+GS2D_HD float ceil(float a) { return ceilf(a); }
 #else
 GS2D_HD float fma(float a, float b, float c) { return __builtin_fmaf(a, b, c); }
 GS2D_HD float sqrt(float a) { return __builtin_sqrtf(a); }
@@ -31,6 +32,7 @@ GS2D_HD float abs(float a) { return __builtin_fabsf(a); }
 GS2D_HD float exp(float a) { return __builtin_expf(a); }
 GS2D_HD float exp2(float a) { return __builtin_exp2f(a); }
 GS2D_HD float log2(float a) { return __builtin_log2f(a); }
+GS2D_HD float ceil(float a) { return __builtin_ceilf(a); }
 GS2D_HD double fma(double a, double b, double c) { return __builtin_fma(a, b, c); }
 GS2D_HD double sqrt(double a) { return __builtin_sqrt(a); }
 GS2D_HD double abs(double a) { return __builtin_fabs(a); }

@@ -1,0 +1,41 @@
+// What the CUDA kernels share. Every kernel takes one struct by value (a ctypes structure on the Python side) and uses
+// only what the compiler has built in: no headers of the toolkit. Warp collectives stand in convergent code, with the
+// full mask: the tests run these sources on the CPU, where anything else is an error (tests/cuda/emulator.h).
+#pragma once
+
+#include "core/blend.h"
+#include "core/project.h"
+#include "core/tile.h"
+
+namespace gs2d {
+
+typedef unsigned int uint;
+typedef unsigned short ushort;
+typedef unsigned char uchar;
+typedef long long int64;
+
+constexpr uint FULL_MASK = 0xffffffffu;
+
+// One view, as the kernels take it.
+struct View {
+    PinholeCamera<float> camera;
+    float near, lowpass_px, inv_lowpass2, log2_alpha_min, alpha_max, transmittance_min;
+    float error_k2;          // error_cutoff^2
+    float distortion_scale;  // (far near / (far - near))^2
+    float background[3];
+    int width, height, tiles_x, tiles_y;
+    int sh_degree;
+};
+
+__device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
+    return {v.inv_lowpass2, v.near, v.log2_alpha_min, v.alpha_max, v.transmittance_min};
+}
+
+__device__ __forceinline__ bool is_finite(float a) { return abs(a) <= 3.402823466e38f; }  // false for NaN
+
+// A record or any other row of 16 floats on a 64-byte boundary, four at a time.
+__device__ __forceinline__ Record<float> record_of(const float4& a, const float4& b, const float4& c, const float4& d) {
+    return {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w, d.x, d.y, d.z, d.w};
+}
+
+}  // namespace gs2d

@@ -1,0 +1,234 @@
+"""Compile the CUDA kernels with NVRTC and keep the cubins.
+
+No toolkit and no host compiler: NVRTC comes as a wheel, with torch or by itself. It is imported only when something
+must be compiled. A cubin is cached under a key of everything it depends on (sources, options, architecture, NVRTC
+version), so a changed package cannot meet a stale one. It is written under another name and renamed, so that two
+processes or a killed one leave nothing or a whole file; it carries a digest, so that a damaged one is compiled again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from gs2d.disk import atomic_write
+from gs2d.errors import BackendError, DiskError
+
+__all__ = [
+    "ARCHITECTURES",
+    "Cubin",
+    "KernelUsage",
+    "cache_folder",
+    "compile_source",
+    "cubin",
+    "source_names",
+    "sources",
+]
+
+ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+# --fmad=false: every fused multiply-add is written out in core/, so that forward, backward and CPU decide alike.
+OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v", "--device-as-default-execution-space")
+REMEDY = "pip install nvidia-cuda-nvrtc cuda-bindings (torch's CUDA wheels bring both), or use --backend cpu"
+DIGEST_BYTES = 32
+
+
+@dataclass(frozen=True)
+class KernelUsage:
+    """What ptxas says about one kernel.
+
+    Attributes
+    ----------
+    registers : int
+        Per thread.
+    spilled_bytes, stack_bytes : int
+        Local memory per thread, stores and loads of spills together; 0 in a healthy kernel.
+    shared_bytes : int
+        Per block.
+    """
+
+    registers: int
+    spilled_bytes: int
+    stack_bytes: int
+    shared_bytes: int
+
+
+@dataclass(frozen=True)
+class Cubin:
+    """Machine code for one architecture, and the compiler's log ("" where it came from the cache)."""
+
+    code: bytes
+    log: str
+
+    def usage(self) -> dict[str, KernelUsage]:
+        """Registers, spills, stack and shared memory of each kernel, from the log."""
+        found: dict[str, KernelUsage] = {}
+        for part in self.log.split("Compiling entry function '")[1:]:
+            found[part.partition("'")[0]] = KernelUsage(
+                registers=_number(r"Used (\d+) registers", part),
+                spilled_bytes=_number(r"(\d+) bytes spill stores", part) + _number(r"(\d+) bytes spill loads", part),
+                stack_bytes=_number(r"(\d+) bytes stack frame", part),
+                shared_bytes=_number(r"(\d+) bytes smem", part, missing=0),
+            )
+        return found
+
+
+def _number(pattern: str, text: str, missing: int | None = None) -> int:
+    match = re.search(pattern, text)
+    if match is None:
+        if missing is not None:
+            return missing
+        raise BackendError(f"the CUDA compiler's log has no {pattern!r}: expected the format of CUDA 12 or 13")
+    return int(match.group(1))
+
+
+def sources() -> dict[str, str]:
+    """All sources by the name under which they include each other (``core/base.h``, ``cuda/project.cu``)."""
+    root = resources.files("gs2d.kernels")
+    found = {}
+    for folder in ("core", "cuda"):
+        for entry in sorted(root.joinpath(folder).iterdir(), key=lambda e: e.name):
+            if entry.name.endswith((".h", ".cu")):
+                found[f"{folder}/{entry.name}"] = entry.read_text(encoding="utf-8")
+    return found
+
+
+def source_names() -> tuple[str, ...]:
+    """The files that hold kernels: ``cuda/project.cu`` and so on."""
+    return tuple(name for name in sources() if name.endswith(".cu"))
+
+
+def _nvrtc() -> Any:
+    try:
+        from cuda.bindings import nvrtc
+
+        _check(nvrtc, nvrtc.nvrtcVersion()[0], "nvrtcVersion")  # finds the library only now
+    except (ImportError, RuntimeError, OSError) as error:
+        raise BackendError(f"the CUDA compiler NVRTC is not here ({error}); {REMEDY}") from error
+    return nvrtc
+
+
+def _check(nvrtc: Any, status: Any, what: str) -> None:
+    if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+        raise BackendError(f"the CUDA compiler failed in {what} ({status.name}); {REMEDY}")
+
+
+def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
+    """Compile one file, always.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`source_names`.
+    arch : str
+        ``"sm_90"`` and the like.
+    options : sequence of str
+        NVRTC options besides the architecture.
+
+    Raises
+    ------
+    BackendError
+        If NVRTC is missing, does not know the architecture, or refuses the source (with its first error).
+    """
+    nvrtc = _nvrtc()
+    files = sources()
+    headers = {key: text for key, text in files.items() if key.endswith(".h")}
+    status, program = nvrtc.nvrtcCreateProgram(
+        files[name].encode(),
+        name.encode(),
+        len(headers),
+        [t.encode() for t in headers.values()],
+        [k.encode() for k in headers],
+    )
+    _check(nvrtc, status, "nvrtcCreateProgram")
+    try:
+        given = [f"--gpu-architecture={arch}".encode(), *(option.encode() for option in options)]
+        (status,) = nvrtc.nvrtcCompileProgram(program, len(given), given)
+        log = _bytes(nvrtc, program, "ProgramLog").decode(errors="replace").rstrip("\0")
+        if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+            first = next((line for line in log.splitlines() if "error" in line), status.name)
+            raise BackendError(f"the CUDA compiler refused {name} for {arch}: {first.strip()}")
+        return Cubin(_bytes(nvrtc, program, "CUBIN"), log)
+    finally:
+        nvrtc.nvrtcDestroyProgram(program)
+
+
+def _bytes(nvrtc: Any, program: Any, what: str) -> bytes:
+    status, size = getattr(nvrtc, f"nvrtcGet{what}Size")(program)
+    _check(nvrtc, status, f"nvrtcGet{what}Size")
+    buffer = b"\0" * size
+    (status,) = getattr(nvrtc, f"nvrtcGet{what}")(program, buffer)
+    _check(nvrtc, status, f"nvrtcGet{what}")
+    return buffer
+
+
+def cache_folder() -> Path:
+    """``$GS2D_CACHE``, else ``$XDG_CACHE_HOME/gs2d``, else ``~/.cache/gs2d``; it need not exist."""
+    named = os.environ.get("GS2D_CACHE")
+    if named:
+        return Path(named)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path("~/.cache").expanduser()) / "gs2d"
+
+
+def _key(name: str, arch: str, version: tuple[int, int]) -> str:
+    """Of everything the machine code depends on; the length of each part separates it from the next."""
+    digest = hashlib.sha256()
+    for part in (name, arch, f"{version[0]}.{version[1]}", *OPTIONS, *(x for pair in sources().items() for x in pair)):
+        data = part.encode()
+        digest.update(len(data).to_bytes(8, "little") + data)
+    return digest.hexdigest()[:32]
+
+
+def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
+    """Machine code of one file for one architecture, from the cache if it is there.
+
+    A cache that cannot be read or written costs compile time, nothing else: a read-only home must not stop training.
+
+    Parameters
+    ----------
+    name, arch
+        As for :func:`compile_source`.
+    folder : Path, optional
+        Instead of :func:`cache_folder`.
+
+    Raises
+    ------
+    BackendError
+        As for :func:`compile_source`.
+    """
+    nvrtc = _nvrtc()
+    status, major, minor = nvrtc.nvrtcVersion()
+    _check(nvrtc, status, "nvrtcVersion")
+    stem = name.rpartition("/")[2].removesuffix(".cu")
+    path = (folder or cache_folder()) / f"{stem}-{arch}-{_key(name, arch, (major, minor))}.cubin"
+    code = _read(path)
+    if code is not None:
+        return Cubin(code, "")
+    fresh = compile_source(name, arch)
+    _write(path, fresh.code)
+    return fresh
+
+
+def _read(path: Path) -> bytes | None:
+    """The code of a whole file; None where there is none, or not a whole one."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    code = data[DIGEST_BYTES:]
+    return code if code and hashlib.sha256(code).digest() == data[:DIGEST_BYTES] else None
+
+
+def _write(path: Path, code: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as file:
+            file.write(hashlib.sha256(code).digest() + code)
+    except (OSError, DiskError):
+        return

@@ -1,0 +1,94 @@
+// From splats in depth order to one list of entries per tile: emission before the stable sort by tile, ranges after it.
+//
+// A candidate is a splat and a tile of its rectangle. Each is tested exactly against the eight 8x4 sub-blocks of the
+// tile; those that reach none get the sentinel key `tiles`, which sorts behind all tiles. Sub-block b covers columns
+// (b & 1) * 8 and rows (b >> 1) * 4 of its tile.
+#include "cuda/common.h"
+
+namespace gs2d {
+
+struct EmitArguments {
+    int width, height, tiles_x, tiles_y;
+    int64 candidates;    // ends[visible - 1]
+    int64 visible;
+    const int64* order;  // [visible]: splats by depth
+    const int64* ends;   // [visible]: running sum of tile_counts in that order
+    const float* cull;
+    const ushort* rects;
+    void* keys;          // [candidates] int16 or int32: tile, or the sentinel
+    uint* payloads;      // [candidates]: splat << 8 | mask of sub-blocks
+    int exact;           // 0: all sub-blocks of every candidate (tests)
+};
+
+struct RangeArguments {
+    int64 candidates;
+    const void* keys;        // sorted
+    const int64* permutation;  // of the sort
+    const uint* payloads;
+    uint* entries;           // [candidates]: payloads in sorted order
+    int64* ranges;           // [tiles + 1, 2]: begin and end of each tile's entries; zeros on entry
+};
+
+// First splat in depth order whose candidates end behind `candidate`.
+__device__ __forceinline__ int64 owner_of(const int64* ends, int64 visible, int64 candidate) {
+    int64 low = 0, high = visible - 1;
+    while (low < high) {
+        const int64 middle = (low + high) >> 1;
+        if (ends[middle] > candidate)
+            high = middle;
+        else
+            low = middle + 1;
+    }
+    return low;
+}
+
+template <class Key> __device__ __forceinline__ void emit(const EmitArguments& a) {
+    const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
+    if (i >= a.candidates) return;
+    const int64 place = owner_of(a.ends, a.visible, i), splat = a.order[place];
+    const int from_last = int(a.ends[place] - 1 - i);
+    const ushort* rect = a.rects + 4 * splat;
+    const int x0 = rect[0], y0 = rect[1], columns = rect[2] - x0, rows = rect[3] - y0;
+    const int j = columns * rows - 1 - from_last;
+    const int tile_x = x0 + j % columns, tile_y = y0 + j / columns;
+    const int left = tile_x * TILE_PX, top = tile_y * TILE_PX;
+
+    float cull[8];
+    const float4* from = reinterpret_cast<const float4*>(a.cull + 8 * splat);
+    const float4 lo = from[0], hi = from[1];
+    // Relative to the tile, so that large coordinates do not cost digits.
+    cull[0] = lo.x - float(left), cull[1] = lo.y - float(top), cull[2] = lo.z, cull[3] = lo.w;
+    cull[4] = hi.x, cull[5] = hi.y - float(left), cull[6] = hi.z - float(top), cull[7] = hi.w;
+    const BoxTest<float> test = box_test(cull);
+    uint mask = 0;
+#pragma unroll
+    for (int b = 0; b < 8; ++b) {
+        const int bx = (b & 1) * 8, by = (b >> 1) * 4;
+        const bool inside = left + bx < a.width && top + by < a.height;
+        const float x = float(bx) + 0.5f, y = float(by) + 0.5f;
+        const bool touched = !a.exact || reaches(test, x, y, x + 7.f, y + 3.f);
+        mask |= uint(inside && touched) << b;
+    }
+    static_cast<Key*>(a.keys)[i] = Key(mask ? tile_y * a.tiles_x + tile_x : a.tiles_x * a.tiles_y);
+    a.payloads[i] = uint(splat) << 8 | mask;
+}
+
+template <class Key> __device__ __forceinline__ void find_ranges(const RangeArguments& a) {
+    const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
+    if (i >= a.candidates) return;
+    const Key* keys = static_cast<const Key*>(a.keys);
+    a.entries[i] = a.payloads[a.permutation[i]];
+    const int key = keys[i];
+    if (i == 0 || keys[i - 1] != key) {
+        a.ranges[2 * int64(key)] = i;
+        if (i > 0) a.ranges[2 * int64(keys[i - 1]) + 1] = i;
+    }
+    if (i == a.candidates - 1) a.ranges[2 * int64(key) + 1] = a.candidates;
+}
+
+extern "C" __global__ void __launch_bounds__(128) emit_entries_16(EmitArguments a) { emit<short>(a); }
+extern "C" __global__ void __launch_bounds__(128) emit_entries_32(EmitArguments a) { emit<int>(a); }
+extern "C" __global__ void __launch_bounds__(128) find_ranges_16(RangeArguments a) { find_ranges<short>(a); }
+extern "C" __global__ void __launch_bounds__(128) find_ranges_32(RangeArguments a) { find_ranges<int>(a); }
+
+}  // namespace gs2d

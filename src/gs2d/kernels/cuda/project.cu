@@ -1,0 +1,88 @@
+// Projection of all splats: activations, SH colour, record, cull record, tile rectangle, depth key, radius.
+#include "cuda/common.h"
+
+namespace gs2d {
+
+struct ProjectArguments {
+    View view;
+    int64 count, sh_rest;  // N; coefficients stored in shN per splat
+    const float *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
+    float* records;    // [N, 16]
+    float* cull;       // [N, 8], see box_test
+    int* depth_keys;   // [N]; the bits of z_c, which sort as integers; those of infinity where culled
+    ushort* rects;     // [N, 4]: x0, y0, x1, y1 in tiles
+    int* tile_counts;  // [N]: tiles in the rectangle
+    float* radii;      // [N]
+    int errors;        // 1: the footprint is rho <= error_k2, whatever the opacity
+};
+
+__device__ __forceinline__ SplatParameters<float> load_parameters(const ProjectArguments& a, int64 i) {
+    const float *m = a.means + 3 * i, *q = a.quats + 4 * i, *l = a.log_scales + 2 * i;
+    return {{m[0], m[1], m[2]}, q[0], q[1], q[2], q[3], l[0], l[1], a.opacity_logits[i]};
+}
+
+// SH colour + 1/2, not clamped; `size` is finite only if every coefficient is.
+template <int DEGREE>
+__device__ __forceinline__ Vec3<float> color_of(const ProjectArguments& a, int64 i, Vec3<float> direction, float& size) {
+    constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1);
+    float basis[COUNT], sh[3 * COUNT];
+    sh_basis(direction, DEGREE, basis);
+    for (int k = 0; k < 3; ++k) sh[k] = a.sh0[3 * i + k];
+    const float* rest = a.shN + 3 * a.sh_rest * i;
+#pragma unroll
+    for (int k = 3; k < 3 * COUNT; ++k) sh[k] = rest[k - 3];
+    Vec3<float> c = {0.5f, 0.5f, 0.5f};
+    size = 0.f;
+#pragma unroll
+    for (int k = 0; k < COUNT; ++k) {
+        size = size + (abs(sh[3 * k]) + abs(sh[3 * k + 1]) + abs(sh[3 * k + 2]));
+        c = axpy(basis[k], Vec3<float>{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}, c);
+    }
+    return c;
+}
+
+__device__ __forceinline__ Vec3<float> color_of(const ProjectArguments& a, int64 i, Vec3<float> direction, float& size) {
+    switch (a.view.sh_degree) {
+        case 0: return color_of<0>(a, i, direction, size);
+        case 1: return color_of<1>(a, i, direction, size);
+        case 2: return color_of<2>(a, i, direction, size);
+        default: return color_of<3>(a, i, direction, size);
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArguments a) {
+    const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
+    if (i >= a.count) return;
+    const View& v = a.view;
+    a.depth_keys[i] = 0x7f800000, a.tile_counts[i] = 0, a.radii[i] = 0.f;
+
+    const SplatParameters<float> p = load_parameters(a, i);
+    const Frame3<float> frame = frame_of(p, v.camera);
+    Record<float> r = project(p, frame, v.camera);
+    // A sum of absolute values is finite only if every term is.
+    const float size = abs(p.mean.x) + abs(p.mean.y) + abs(p.mean.z) + abs(p.logit) + abs(p.qw) + abs(p.qx) + abs(p.qy) +
+                       abs(p.qz) + abs(p.log_su) + abs(p.log_sv) + exp(p.log_su) + exp(p.log_sv) + frame.inverse_norm;
+    if (!is_finite(size) || !(r.zc > v.near)) return;
+    if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
+    float sh_size;
+    const Vec3<float> c = color_of(a, i, frame.to_splat, sh_size);
+    if (!is_finite(sh_size)) return;
+    r.red = max(c.x, 0.f), r.green = max(c.y, 0.f), r.blue = max(c.z, 0.f);
+
+    const float k2 = a.errors ? v.error_k2 : max(float(2 * LN2) * (r.log2_opacity - v.log2_alpha_min), 0.f);
+    const Footprint<float> o = footprint(frame, r, k2, v.lowpass_px, v.camera);
+    const TileRectangle rect = tile_rectangle(o, v.width, v.height, v.tiles_x, v.tiles_y);
+    a.radii[i] = clipped_radius(o, v.width, v.height);
+    const int tiles = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
+    if (tiles == 0) return;
+    float4* to = reinterpret_cast<float4*>(a.records + RECORD * i);
+    to[0] = {r.cx, r.cy, r.au, r.bu}, to[1] = {r.av, r.bv, r.az, r.bz};
+    to[2] = {r.zc, r.log2_opacity, r.red, r.green}, to[3] = {r.blue, r.nx, r.ny, r.nz};
+    float4* cull = reinterpret_cast<float4*>(a.cull + 8 * i);
+    cull[0] = {o.ex, o.ey, o.a, o.b}, cull[1] = {o.c, r.cx, r.cy, o.unbounded ? -1.f : o.disc2};
+    ushort* rows = a.rects + 4 * i;
+    rows[0] = rect.x0, rows[1] = rect.y0, rows[2] = rect.x1, rows[3] = rect.y1;
+    a.depth_keys[i] = __float_as_int(r.zc), a.tile_counts[i] = tiles;
+}
+
+}  // namespace gs2d

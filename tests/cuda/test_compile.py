@@ -1,0 +1,187 @@
+"""NVRTC: every kernel for every architecture without spills, and a cache that nothing can corrupt."""
+
+from __future__ import annotations
+
+import multiprocessing
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda import compile as nvrtc_compile
+from gs2d.kernels.cuda.compile import ARCHITECTURES, Cubin, compile_source, cubin, source_names
+
+pytestmark = pytest.mark.timeout(120)
+
+
+def _absent() -> str:
+    try:
+        nvrtc_compile._nvrtc()
+    except BackendError as error:
+        return str(error)
+    return ""
+
+
+needs_nvrtc = pytest.mark.skipif(bool(_absent()), reason=_absent() or "NVRTC is here")
+
+
+@needs_nvrtc
+@pytest.mark.parametrize("name", source_names())
+@pytest.mark.parametrize("arch", ARCHITECTURES)
+def test_every_kernel_compiles_without_spills_or_stack(name: str, arch: str) -> None:
+    compiled = compile_source(name, arch)
+    usage = compiled.usage()
+    assert usage
+    assert compiled.code.startswith(b"\x7fELF")
+    assert "warning" not in compiled.log
+    for kernel, used in usage.items():
+        assert used.spilled_bytes == 0, kernel
+        assert used.stack_bytes == 0, kernel
+
+
+@needs_nvrtc
+def test_the_spill_gate_sees_spills(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nvrtc_compile, "sources", lambda: {"cuda/greedy.cu": GREEDY})
+    usage = compile_source("cuda/greedy.cu", "sm_90").usage()["greedy"]
+    assert usage.spilled_bytes > 0
+    assert usage.stack_bytes > 0
+    assert usage.registers <= 32
+
+
+GREEDY = """
+extern "C" __global__ void __launch_bounds__(1024, 2) greedy(float* p) {
+    float v[96];
+    #pragma unroll
+    for (int i = 0; i < 96; ++i) v[i] = p[i * 1024 + threadIdx.x];
+    __syncthreads();
+    #pragma unroll
+    for (int i = 0; i < 96; ++i) p[(95 - i) * 1024 + threadIdx.x] = v[i] * v[(i * 7) % 96];
+}
+"""
+
+
+@needs_nvrtc
+def test_contraction_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = 'extern "C" __global__ void f(float* p) { p[0] = p[1] * p[2] + p[3]; }'
+    monkeypatch.setattr(nvrtc_compile, "sources", lambda: {"cuda/f.cu": source})
+    fused = compile_source("cuda/f.cu", "sm_90", ("--fmad=true", "--ptxas-options=-v"))
+    assert compile_source("cuda/f.cu", "sm_90").code != fused.code
+
+
+@needs_nvrtc
+def test_a_source_that_does_not_compile_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nvrtc_compile, "sources", lambda: {"cuda/bad.cu": "__global__ void f() { nonsense; }"})
+    with pytest.raises(BackendError, match=r"refused cuda/bad\.cu for sm_90: .*nonsense") as error:
+        compile_source("cuda/bad.cu", "sm_90")
+    assert "\n" not in str(error.value)
+
+
+@needs_nvrtc
+def test_an_unknown_architecture_is_reported() -> None:
+    with pytest.raises(BackendError, match=r"sm_1\b"):
+        compile_source(source_names()[0], "sm_1")
+
+
+@needs_nvrtc
+def test_the_second_call_reads_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = cubin("cuda/emit.cu", "sm_90", tmp_path / "cache")
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+    def compile_again(name: str, arch: str) -> Cubin:
+        raise AssertionError("compiled again")
+
+    monkeypatch.setattr(nvrtc_compile, "compile_source", compile_again)
+    assert cubin("cuda/emit.cu", "sm_90", tmp_path / "cache").code == first.code
+
+
+@needs_nvrtc
+def test_a_changed_source_architecture_or_option_is_another_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cubin("cuda/emit.cu", "sm_90", tmp_path)
+    cubin("cuda/emit.cu", "sm_80", tmp_path)
+    files = nvrtc_compile.sources()
+    monkeypatch.setattr(
+        nvrtc_compile, "sources", lambda: files | {"core/base.h": files["core/base.h"] + "// changed\n"}
+    )
+    cubin("cuda/emit.cu", "sm_90", tmp_path)
+    monkeypatch.setattr(nvrtc_compile, "OPTIONS", (*nvrtc_compile.OPTIONS, "--ftz=true"))
+    cubin("cuda/emit.cu", "sm_90", tmp_path)
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+@needs_nvrtc
+@pytest.mark.parametrize("damage", ["empty", "cut", "flipped"])
+def test_a_damaged_entry_is_compiled_again(tmp_path: Path, damage: str) -> None:
+    whole = cubin("cuda/emit.cu", "sm_90", tmp_path).code
+    (path,) = tmp_path.iterdir()
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes({"empty": b"", "cut": bytes(data[:1000]), "flipped": bytes(data)}[damage])
+    again = cubin("cuda/emit.cu", "sm_90", tmp_path)
+    assert again.code == whole
+    assert again.log
+    assert cubin("cuda/emit.cu", "sm_90", tmp_path).log == ""
+
+
+@needs_nvrtc
+def test_a_read_only_home_costs_time_only(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")  # also for root, who may write anywhere
+    assert cubin("cuda/emit.cu", "sm_90", blocked / "cache").log
+    assert blocked.read_text() == "not a folder"
+
+
+def _compile_in(folder: Path) -> int:
+    return len(cubin("cuda/emit.cu", "sm_90", folder).code)
+
+
+@needs_nvrtc
+def test_two_processes_at_once_share_one_cache(tmp_path: Path) -> None:
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        sizes = pool.map(_compile_in, [tmp_path] * 2)
+    assert sizes[0] == sizes[1] > 0
+    (entry,) = tmp_path.iterdir()
+    assert entry.suffix == ".cubin"
+    assert cubin("cuda/emit.cu", "sm_90", tmp_path).log == ""
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from gs2d.kernels.cuda import compile as c
+os.fsync = lambda fd: os.kill(os.getpid(), signal.SIGKILL)  # after the bytes were written, before the rename
+c.cubin("cuda/emit.cu", "sm_90", Path(sys.argv[1]))
+"""
+
+
+@needs_nvrtc
+def test_a_killed_compile_leaves_nothing_under_the_name(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], timeout=60, check=False)
+    assert done.returncode == -9
+    assert not list(tmp_path.glob("[!.]*"))
+    assert cubin("cuda/emit.cu", "sm_90", tmp_path).log
+
+
+def test_without_nvrtc_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cuda.bindings", None)
+    with pytest.raises(BackendError, match="pip install nvidia-cuda-nvrtc cuda-bindings"):
+        compile_source("cuda/emit.cu", "sm_90")
+
+
+def test_importing_the_module_does_not_import_cuda() -> None:
+    code = "import sys, gs2d.kernels.cuda.compile as c; c.sources(); assert 'cuda' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
+
+
+def test_the_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GS2D_CACHE", "/somewhere")
+    assert nvrtc_compile.cache_folder() == Path("/somewhere")
+    monkeypatch.delenv("GS2D_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/base")
+    assert nvrtc_compile.cache_folder() == Path("/base/gs2d")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", "/home/someone")
+    assert nvrtc_compile.cache_folder() == Path("/home/someone/.cache/gs2d")
