@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gs2d.errors import DataError, DiskError
-from gs2d.io.ply import read_mesh, read_points, read_splats, triangulate, write_mesh, write_splats
+from gs2d.io.ply import ply_kind, read_mesh, read_points, read_splats, triangulate, write_mesh, write_splats
 from gs2d.io.ply_format import PlyList, read_ply, write_ply
 from gs2d.splats import Splats
 from gs2d.triangles import Mesh
@@ -81,6 +81,7 @@ def test_a_3dgs_file_a_mesh_and_points_are_told_apart(tmp_path: Path) -> None:
     points = np.zeros(3, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
     write_ply(tmp_path / "points.ply", {"vertex": points})
     write_ply(tmp_path / "empty.ply", {"camera": points})
+    assert [ply_kind(tmp_path / f"{name}.ply") for name in ("3dgs", "mesh", "points")] == ["3dgs", "mesh", "points"]
     cases = {"3dgs": "3DGS splats with three", "mesh": "got a mesh", "points": "got a point cloud", "empty": "without"}
     for name, words in cases.items():
         with pytest.raises(DataError, match=words) as error:
@@ -226,6 +227,31 @@ def test_a_malformed_file_is_a_data_error_in_one_line(tmp_path: Path, text: byte
     with pytest.raises(DataError, match=words) as error:
         read_ply(tmp_path / "a.ply")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "words"),
+    [
+        ("ascii", b"0 0 0\nnan 0 0\n", "a list of length nan"),
+        ("ascii", b"0 0 0\n2.5 0 0\n", "a list of length 2.5"),
+        ("ascii", b"0 0 0\n1 3e9\n", "a number that is no int"),
+        ("binary_little_endian", bytes(12) + b"\xff\xff\xff\x7f" + bytes(8), "it ends early"),
+    ],
+)
+def test_a_count_or_number_that_cannot_be_is_a_data_error(tmp_path: Path, kind: str, body: bytes, words: str) -> None:
+    file = tmp_path / "x.ply"
+    header = f"ply\nformat {kind} 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "element face 1\nproperty list int int vertex_indices\nend_header\n"
+    file.write_bytes(header.encode() + body)
+    with pytest.raises(DataError, match=words):
+        read_mesh(file)
+
+
+def test_an_empty_mesh_comes_back_empty(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "x.ply", Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))
+    mesh = read_mesh(tmp_path / "x.ply")
+    assert (len(mesh.vertices), len(mesh.faces)) == (0, 0)
+    assert ply_kind(tmp_path / "x.ply") == "mesh"
 
 
 def test_a_missing_file_is_a_data_error(tmp_path: Path) -> None:

@@ -110,6 +110,26 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
     )
 
 
+def ply_kind(path: str | os.PathLike[str]) -> str:
+    """What a PLY file holds: "2dgs", "3dgs" or "compressed" splats, a "mesh" (any face), or "points".
+
+    Raises
+    ------
+    DataError
+        If the file is no PLY or is broken.
+    """
+    file = read_ply(path)
+    vertex = file.elements.get("vertex")
+    names = set(vertex.properties) if vertex else set()
+    if "chunk" in file.elements or "packed_position" in names:
+        return "compressed"
+    if "scale_0" in names:
+        return "3dgs" if "scale_2" in names else "2dgs"
+    faces = file.elements.get("face")
+    empty = vertex is not None and vertex.count == 0
+    return "mesh" if faces is not None and (faces.count > 0 or empty) else "points"
+
+
 def _scalar(vertex: PlyElement, name: str) -> np.ndarray:
     column = vertex.properties[name]
     assert isinstance(column, np.ndarray), name  # its callers have looked
@@ -169,7 +189,7 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     Raises
     ------
     DataError
-        If the file is broken, has no faces, or a face names a vertex that does not exist.
+        If the file is broken, has vertices but no faces, or a face names a vertex that does not exist.
     """
     if os.fspath(path).lower().endswith(".obj"):
         return read_obj(path)
@@ -178,7 +198,7 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     positions = vertex.scalars("x", "y", "z") if vertex else None
     if vertex is None or positions is None:
         raise DataError(f"{path}: a mesh was expected, got a PLY without vertex positions; give a triangle mesh")
-    if face is None or face.count == 0:
+    if face is None or (face.count == 0 and vertex.count > 0):  # nothing at all is an empty mesh
         raise DataError(f"{path}: a mesh was expected, got a PLY without faces (points or splats); give a mesh")
     lists = face.properties.get("vertex_indices", face.properties.get("vertex_index"))
     if not isinstance(lists, PlyList):

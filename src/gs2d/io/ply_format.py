@@ -172,13 +172,18 @@ class _BinaryReader:
         start = self.offset
         lengths = self._first_row_lengths(element)
         fields: list = []
+        row = 0  # bytes; added up here, because numpy refuses a type of 2 GiB, which a broken count may ask for
         for p in element.properties:
+            row += np.dtype(p.dtype).itemsize * lengths.get(p.name, 1)
+            if row > len(self.data):
+                return None
             if p.count_dtype is None:
                 fields.append((p.name, self.order + p.dtype))
             else:
+                row += np.dtype(p.count_dtype).itemsize
                 fields.append((f"{p.name} count", self.order + p.count_dtype))
                 fields.append((p.name, self.order + p.dtype, (lengths[p.name],)))
-        if element.count * np.dtype(fields).itemsize > len(self.data) - start:
+        if element.count * row > len(self.data) - start:
             return None
         rows = self._rows(element, fields)
         if any((rows[f"{name} count"] != length).any() for name, length in lengths.items()):
@@ -252,25 +257,38 @@ class _AsciiReader:
         except ValueError as error:
             raise _broken(self.path, f"it has a word that is no number ({error})") from error
 
+    def _length(self) -> int:
+        length = float(self._take(1)[0])
+        if not (length >= 0 and length.is_integer()):
+            raise _broken(self.path, f"it has a list of length {length:g}")
+        return int(length)
+
+    def _cast(self, values: np.ndarray, dtype: str) -> np.ndarray:
+        """Numbers as the type that the header says."""
+        if dtype[0] in "iu":
+            limits = np.iinfo(dtype)
+            if not ((values >= limits.min) & (values <= limits.max)).all():
+                raise _broken(self.path, f"it has a number that is no {_NAMES[dtype]}")
+        with np.errstate(over="ignore"):  # a double beyond float32 is infinite
+            return values.astype(dtype)
+
     def element(self, element: _Element) -> PlyElement:
         if all(p.count_dtype is None for p in element.properties):
             width = len(element.properties)
             table = self._take(element.count * width).reshape(element.count, width)
             return PlyElement(
-                element.count, {p.name: table[:, i].astype(p.dtype) for i, p in enumerate(element.properties)}
+                element.count, {p.name: self._cast(table[:, i], p.dtype) for i, p in enumerate(element.properties)}
             )
         values: dict[str, list[np.ndarray]] = {p.name: [] for p in element.properties}
         counts: dict[str, list[int]] = {p.name: [] for p in element.properties}
         for _ in range(element.count):
             for p in element.properties:
-                n = 1 if p.count_dtype is None else int(self._take(1)[0])
-                if n < 0:
-                    raise _broken(self.path, "it has a list of negative length")
+                n = 1 if p.count_dtype is None else self._length()
                 counts[p.name].append(n)
                 values[p.name].append(self._take(n))
         properties: dict[str, np.ndarray | PlyList] = {}
         for p in element.properties:
-            flat = np.concatenate(values[p.name]).astype(p.dtype) if element.count else np.zeros(0, p.dtype)
+            flat = self._cast(np.concatenate(values[p.name]), p.dtype) if element.count else np.zeros(0, p.dtype)
             properties[p.name] = flat if p.count_dtype is None else PlyList(np.array(counts[p.name], np.int64), flat)
         return PlyElement(element.count, properties)
 

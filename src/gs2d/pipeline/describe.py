@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.data import detect_format, load_scene
-from gs2d.errors import DataError
-from gs2d.io.ply import read_mesh, read_points, read_splats
+from gs2d.io.ply import ply_kind, read_mesh, read_points, read_splats
+from gs2d.io.ply_format import read_ply
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
@@ -37,22 +37,21 @@ def describe_capture(path: Path) -> dict[str, Any]:
 
 
 def describe_ply(path: Path) -> dict[str, Any]:
-    """Facts of a PLY file: splats, a mesh or points.
+    """Facts of a PLY file: splats of either layout, a mesh or points.
 
     Raises
     ------
     DataError
-        None of these; the reason is that of the reader of splats.
+        The file is no PLY, is broken, or holds compressed splats.
     """
-    try:
-        splats = read_splats(path)
-        return {"splats": len(splats), "SH degree": splats.sh_degree, "bytes": path.stat().st_size}
-    except DataError as not_splats:
-        try:
-            mesh = read_mesh(path)
-            return {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "bytes": path.stat().st_size}
-        except DataError:
-            try:
-                return {"points": len(read_points(path).points), "bytes": path.stat().st_size}
-            except DataError:
-                raise not_splats from None
+    kind, size = ply_kind(path), path.stat().st_size
+    if kind == "3dgs":
+        count = read_ply(path).elements["vertex"].count
+        return {"splats": count, "layout": "3dgs (three scales, for viewers)", "bytes": size}
+    if kind == "mesh":
+        mesh = read_mesh(path)
+        return {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "bytes": size}
+    if kind == "points":
+        return {"points": len(read_points(path).points), "bytes": size}
+    splats = read_splats(path)  # names a compressed file
+    return {"splats": len(splats), "layout": "2dgs", "SH degree": splats.sh_degree, "bytes": size}
