@@ -17,14 +17,15 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
-from gs2d.io.ply import read_mesh, read_splats
+from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, RecipeError, RunError
+from gs2d.io.ply import read_mesh, read_splats, write_mesh
 from gs2d.io.run import RunFolder, open_run
 from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.events import Event, Notice, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
 from gs2d.pipeline.train import train
+from gs2d.triangles import Mesh
 from tiny import write_ball_mesh, write_capture
 
 SMALL = ("init_points=150", "surface.densify.max_splats=250")
@@ -206,7 +207,7 @@ def test_resume_goes_back_one_checkpoint_when_the_last_is_damaged_and_says_so(
         ({"seed": 1}, r"another recipe \(seed: 0, now 1\)"),
         ({"overrides": (*SMALL, "refine.iterations=25")}, r"recipe \(stages.refine.iterations: 20, now 25\)"),
         ({"protocol": "generic"}, r"another protocol \(name: nerf-synthetic, now generic\)"),
-        ({"downscale": 2}, "another scene"),
+        ({"downscale": 2}, r"another downscale \(1, now 2\)"),
     ],
 )
 def test_resuming_with_other_options_is_refused_and_names_the_difference(
@@ -309,10 +310,20 @@ def test_a_recipe_that_names_an_unknown_group_fails_before_the_capture_is_read(t
 
 
 @pytest.mark.parametrize(
-    "changes", [{"downscale": 0}, {"checkpoint_every": 0}, {"threads": 0}, {"schedule_scale": 0.0}]
+    ("changes", "got"),
+    [
+        ({"downscale": 0}, "got 0"),
+        ({"checkpoint_every": 0}, "got 0"),
+        ({"checkpoint_seconds": float("nan")}, "got nan"),
+        ({"threads": 0}, "got 0"),
+        ({"threads": 1_000_000}, "from 1 to 1024, got 1000000"),
+        ({"schedule_scale": 0.0}, "got 0"),
+        ({"seed": 2**63}, "at most 2.63 - 1"),
+        ({"overrides": ("name=",)}, "must have a name"),
+    ],
 )
-def test_numbers_out_of_range_are_refused(capture: Path, tmp_path: Path, changes: dict[str, Any]) -> None:
-    with pytest.raises(RecipeError, match="got 0"):
+def test_numbers_out_of_range_are_refused(capture: Path, tmp_path: Path, changes: dict[str, Any], got: str) -> None:
+    with pytest.raises(RecipeError, match=got):
         train(options(capture, tmp_path / "run", **changes))
     assert list(tmp_path.iterdir()) == []
 
@@ -328,11 +339,108 @@ def test_meshing_again_keeps_to_the_box_and_the_voxel(undisturbed: RunFolder, tm
         assert mesh.vertices.min(axis=0)[2] > -0.2
 
 
-@pytest.mark.parametrize("bad", [{"voxel": -1.0}, {"keep_components": -1}, {"bbox": (1, 1, 1, 0, 0, 0)}])
-def test_meshing_with_senseless_limits_is_refused(undisturbed: RunFolder, tmp_path: Path, bad: dict[str, Any]) -> None:
-    with pytest.raises(ProtocolError):
-        mesh_run(undisturbed.path, MeshOptions(**bad), out=tmp_path / "x.ply")
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"voxel": -1.0},
+        {"voxel": 0.0},
+        {"truncation": 0.0},
+        {"depth_limit": float("nan")},
+        {"keep_components": -1},
+        {"bbox": (1, 1, 1, 0, 0, 0)},
+    ],
+)
+def test_meshing_with_senseless_limits_is_refused_before_anything_is_rendered(
+    undisturbed: RunFolder, tmp_path: Path, bad: dict[str, Any]
+) -> None:
+    heard: list[Event] = []
+    with pytest.raises(ProtocolError, match=f"--{next(iter(bad)).replace('_', '-')} must be"):
+        mesh_run(undisturbed.path, MeshOptions(**bad), heard.append, out=tmp_path / "x.ply")
     assert list(tmp_path.iterdir()) == []
+    assert not any(isinstance(event, Step) for event in heard)
+
+
+def test_a_finished_run_whose_checkpoints_were_deleted_is_never_touched_by_resume(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(undisturbed.path, copy)
+    shutil.rmtree(copy / "checkpoints")  # to save space
+    for changes, words in (({}, "finished and its checkpoints are gone"), ({"seed": 1}, "another recipe")):
+        with pytest.raises(RunError, match=words):
+            train(options(capture, copy, resume=True, **changes))
+        for name in ("splats.ply", "mesh.ply", "metrics.json", "report.html"):
+            assert (copy / name).read_bytes() == undisturbed.file(name).read_bytes()
+
+
+def test_resuming_a_finished_run_keeps_the_scores_of_its_mesh(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    surface = {"chamfer": 0.5, "thresholds": []}
+    run.write_metrics({**run.metrics(), "surface": surface})
+    assert train(options(capture, run.path, resume=True)).metrics()["surface"] == surface
+
+
+def test_splats_that_give_no_mesh_still_give_a_report(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gs2d.pipeline import train as train_module
+
+    def nothing(*_args: Any, **_kwargs: Any) -> None:
+        raise ProtocolError("depth was expected, got none")
+
+    monkeypatch.setattr(train_module, "extract_mesh", nothing)
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    for name in ("mesh.ply", "report.html"):
+        (copy / name).unlink()
+    with pytest.raises(ProtocolError, match="no mesh of .*: depth was expected, got none; splats and report"):
+        train(options(capture, copy, resume=True))
+    assert "There is no mesh.ply" in (copy / "report.html").read_text()
+
+
+def test_an_empty_mesh_is_said_to_be_empty_in_the_report(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    write_mesh(copy / "mesh.ply", Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))
+    report_run(copy)
+    assert "mesh.ply has no faces" in (copy / "report.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["protocol", "raster", "backend", "downscale"])
+def test_a_damaged_definition_is_named_when_the_run_is_used(
+    undisturbed: RunFolder, tmp_path: Path, name: str
+) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    data = json.loads((copy / "run.json").read_text())
+    (copy / "run.json").write_text(json.dumps({key: value for key, value in data.items() if key != name}))
+    with pytest.raises(RunError, match=name):
+        render_run(copy)
+
+
+@pytest.mark.parametrize(("text", "kind"), [("splats.ply", "splats"), ("bad", "vertex indices below 1")])
+def test_a_ground_truth_of_another_kind_is_refused_before_the_run_is_read(
+    undisturbed: RunFolder, tmp_path: Path, text: str, kind: str
+) -> None:
+    file = undisturbed.file("splats.ply")
+    if text == "bad":  # a mesh whose face names no vertex is a broken mesh, never a point cloud
+        file = tmp_path / "bad.ply"
+        header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        file.write_text(header + "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 7\n")
+    with pytest.raises(DataError, match=kind):
+        evaluate_run(tmp_path / "no run", EvaluateOptions(ground_truth=file))
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_threshold_that_is_no_distance_is_refused_first(tmp_path: Path, threshold: float) -> None:
+    with pytest.raises(DataError, match="--thresholds must be positive distances"):
+        evaluate_run(tmp_path / "no run", EvaluateOptions(thresholds=(0.1, threshold)))
+
+
+def test_a_shorter_orbit_leaves_no_frame_of_a_longer_one(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    for frames in (3, 2):
+        render_run(copy, orbit=frames)
+    assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 2
 
 
 def test_rendering_writes_one_png_for_each_view(undisturbed: RunFolder, tmp_path: Path) -> None:

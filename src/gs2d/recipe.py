@@ -18,6 +18,7 @@ from gs2d.errors import RecipeError
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
 LOSS_KINDS = ("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion")
+LARGEST_SEED = 2**63 - 1  # torch takes no larger one
 DEPTH_KINDS = ("mean", "median")
 
 
@@ -248,7 +249,9 @@ def validate(recipe: Recipe) -> Recipe:
     """
     where = f"recipe {recipe.name!r}"
     _require(bool(recipe.stages), f"{where}: expected at least one stage, got none")
+    _require(recipe.name != "", "a recipe must have a name, got an empty one")
     _integer(f"{where}: seed", recipe.seed, low=0)
+    _require(recipe.seed <= LARGEST_SEED, f"{where}: seed must be at most 2^63 - 1, got {recipe.seed}")
     _require(recipe.sh_degree in (0, 1, 2, 3), f"{where}: sh_degree must be 0, 1, 2 or 3, got {recipe.sh_degree!r}")
     _integer(f"{where}: init_points", recipe.init_points, low=1)
     names = [stage.name for stage in recipe.stages]

@@ -337,7 +337,7 @@ def story(events: Sequence[Mapping[str, Any]]) -> str:
             )
     grown = [
         f"{stage}: densification cloned {clone:,}, split {split:,} and pruned {prune:,} splats"
-        + (f"; {resets[stage]} opacity resets." if stage in resets else ".")
+        + (f"; {resets[stage]} opacity reset{'s' * (resets[stage] != 1)}." if stage in resets else ".")
         for stage, (clone, split, prune) in densified.items()
     ]
     lines = [*lines[:1], *grown, *lines[1:]]

@@ -15,7 +15,8 @@ from gs2d.errors import DiskError, RunError
 from gs2d.io import run as run_module
 from gs2d.io.run import CheckpointFile, EventLog, RunFolder, claim_run, load_tensors, open_run, save_tensors
 
-DEFINITION = {"recipe": {"name": "2dgs-r"}}
+SCENE = {"name": "ball", "path": "ball", "format": "blender", "train": 6, "test": 2}
+DEFINITION = {"recipe": {"name": "2dgs-r"}, "scene": SCENE}
 
 
 def new_run(path: Path) -> RunFolder:
@@ -95,6 +96,36 @@ def test_a_run_of_a_later_format_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text(json.dumps({"format": 99}))
     with pytest.raises(RunError, match="format 99, expected 1"):
         run.definition()
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"format": 1}', '{"format": 1, "recipe": 3, "scene": {}}', "3"])
+def test_a_damaged_definition_is_one_line(tmp_path: Path, text: str) -> None:
+    run = new_run(tmp_path)
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(RunError, match=r"run\.json (must hold|has format)"):
+        run.definition()
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"stages": 3}', '{"stages": [{}]}', '{"stages": [1]}'])
+def test_damaged_metrics_are_one_line(tmp_path: Path, text: str) -> None:
+    run = new_run(tmp_path)
+    (tmp_path / "metrics.json").write_text(text)
+    with pytest.raises(RunError, match=r"metrics\.json must hold"):
+        run.metrics()
+
+
+@pytest.mark.parametrize("line", ["nonsense", "3", '{"kind": "st'])
+def test_a_damaged_line_of_the_log_is_named(tmp_path: Path, line: str) -> None:
+    run = new_run(tmp_path)
+    run.events.append({"kind": "a"})
+    run.events.path.write_text(run.events.path.read_text() + line + "\n")
+    with pytest.raises(RunError, match=r"events\.jsonl line 2 must be a JSON object"):
+        run.events.read()
+
+
+def test_a_name_that_is_too_long_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DiskError, match="choose a shorter name"):
+        claim_run(tmp_path / ("x" * 300), resume=False, overwrite=False)
 
 
 def test_the_log_is_cut_to_the_checkpoint_and_loses_a_half_written_line(tmp_path: Path) -> None:

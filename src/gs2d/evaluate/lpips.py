@@ -108,7 +108,8 @@ def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu")
         try:
             state = torch.load(file, map_location=device, weights_only=True)
         except (OSError, RuntimeError, UnpicklingError, EOFError, ValueError) as error:
-            first = str(error).splitlines()[0] if str(error) else type(error).__name__
+            first = (str(error).splitlines() or [type(error).__name__])[0]
+            first = first.split(".")[0] if isinstance(error, UnpicklingError) else first  # torch's advice is long
             raise DataError(f"{file} is not a readable PyTorch state dict ({first}); {REMEDY}") from error
         if not isinstance(state, Mapping):
             raise DataError(f"{file} must hold a state dict, got {type(state).__name__}; {REMEDY}")

@@ -41,6 +41,10 @@ KEPT_CHECKPOINTS = 2
 _CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
 
 
+_SCENE = {"name", "path", "format", "train", "test"}  # of run.json, at least
+_STAGE = {"name", "iterations", "seconds", "splats", "bytes"}  # of each entry of metrics.json, at least
+
+
 @dataclass(frozen=True)
 class CheckpointFile:
     """A checkpoint on disk; they sort by how far training had come."""
@@ -104,11 +108,26 @@ class EventLog:
                 os.fsync(file.fileno())
 
     def read(self) -> list[dict[str, Any]]:
-        """All whole events."""
+        """All whole events.
+
+        Raises
+        ------
+        RunError
+            A line is no JSON object.
+        """
         if not self.path.exists():
             return []
-        text = self.path.read_text()
-        return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+        text = self.path.read_text(encoding="utf-8", errors="replace")
+        events = []
+        for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
+            try:
+                events.append(dict(json.loads(line)))
+            except (ValueError, TypeError) as error:
+                raise RunError(
+                    f"{self.path} line {number} must be a JSON object, got {line[:40]!r}; "
+                    "the log was damaged: remove that line"
+                ) from error
+        return events
 
 
 class RunFolder:
@@ -135,19 +154,40 @@ class RunFolder:
         Raises
         ------
         RunError
-            Written by a later gs2d.
+            Written by a later gs2d, or damaged.
         """
-        data = dict(read_json(self.file(RUN_JSON)))
+        data = _object(self.file(RUN_JSON))
         if data.get("format") != FORMAT:
             raise RunError(
                 f"{self.file(RUN_JSON)} has format {data.get('format')!r}, expected {FORMAT}; use the gs2d that made it"
             )
+        for name, keys in (("recipe", {"name"}), ("scene", _SCENE)):
+            if not isinstance(data.get(name), dict) or not data[name].keys() >= keys:
+                raise RunError(
+                    f"{self.file(RUN_JSON)} must hold {name!r} with {', '.join(sorted(keys))}, "
+                    f"got {str(data.get(name))[:40]}; it was damaged: restore it, or train again with --overwrite"
+                )
         return data
 
     def metrics(self) -> dict[str, Any]:
-        """What ``metrics.json`` holds; ``{"stages": []}`` before the first stage is finished."""
+        """What ``metrics.json`` holds; ``{"stages": []}`` before the first stage is finished.
+
+        Raises
+        ------
+        RunError
+            Damaged.
+        """
         path = self.file(METRICS)
-        return dict(read_json(path)) if path.exists() else {"stages": []}
+        if not path.exists():
+            return {"stages": []}
+        data = _object(path)
+        stages = data.get("stages")
+        if not isinstance(stages, list) or not all(isinstance(s, dict) and s.keys() >= _STAGE for s in stages):
+            raise RunError(
+                f"{path} must hold a list 'stages', each with {', '.join(sorted(_STAGE))}; it was damaged: delete it "
+                "and go on with --resume"
+            )
+        return data
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Replace ``metrics.json``."""
@@ -218,6 +258,14 @@ class RunFolder:
                 folder.rmdir()
 
 
+def _object(path: Path) -> dict[str, Any]:
+    """A JSON file that holds an object."""
+    data = read_json(path)
+    if not isinstance(data, dict):
+        raise RunError(f"{path} must hold a JSON object, got {type(data).__name__}; it was damaged: restore it")
+    return data
+
+
 def is_run(path: Path) -> bool:
     """Whether a folder holds a run."""
     return (path / RUN_JSON).is_file()
@@ -249,8 +297,12 @@ def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tup
     path = Path(path)
     if resume and overwrite:
         raise RunError("--resume and --overwrite exclude each other; give one")
-    if not path.exists():
+    try:
+        path.stat()
+    except FileNotFoundError:
         return
+    except OSError as error:  # a name that is too long, a file in the middle of the path
+        raise disk_error(path, error) from error
     if not path.is_dir():
         raise RunError(f"--out must be a folder, {path} is a file")
     if is_run(path):

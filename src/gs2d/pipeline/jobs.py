@@ -102,6 +102,9 @@ def render_run(
         raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
     folder = out or run.file(RENDERS) / ("orbit" if orbit else split)
     make_folder(folder)
+    if orbit and out is None:  # the run's own folder: no frame of a longer circle stays among these
+        for old in folder.glob("*.png"):
+            old.unlink()
     for name, view in counted(views, "rendering", len(views), on_event):
         color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
         write_image(folder / f"{name}.png", color.numpy())
@@ -144,8 +147,9 @@ def evaluate_run(
     ------
     RunError, DataError
     """
-    from gs2d.pipeline.truth import read_truth, score_surface
+    from gs2d.pipeline.truth import check_thresholds, read_truth, score_surface
 
+    check_thresholds(options.thresholds)
     truth = None if options.ground_truth is None else read_truth(options.ground_truth)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, job, splats = _open(path, threads, on_event)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.errors import RecipeError, RunError
-from gs2d.io.run import RunFolder, versions
+from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
@@ -56,6 +56,7 @@ class Job:
         return {
             "recipe": to_json(self.recipe),
             "protocol": asdict(self.protocol),
+            "downscale": self.downscale,  # before the scene: it decides the photographs
             "scene": {
                 "name": self.scene.name,
                 "path": str(Path(self.scene.root or ".").resolve()),
@@ -66,7 +67,6 @@ class Job:
                 "skipped": list(self.scene.skipped),
                 "digest": self.pictures_digest,
             },
-            "downscale": self.downscale,
             "raster": asdict(self.settings),
             "seed": self.recipe.seed,
             "backend": backend_facts(self.backend.name),
@@ -113,6 +113,8 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     if options.checkpoint_every < 1:
         raise RecipeError(f"--checkpoint-every must be a whole number >= 1, got {options.checkpoint_every}")
+    if not options.checkpoint_seconds > 0:
+        raise RecipeError(f"--checkpoint-seconds must be a positive number, got {options.checkpoint_seconds}")
     named = options.protocol
     if isinstance(named, str) and named != "auto":
         named = get_protocol(named)
@@ -202,17 +204,24 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
     where = Path(data["scene"]["path"])
     if not where.exists():
         raise RunError(f"the capture of {run.path} was at {where}, which is not there; put it back or link it there")
-    recipe, protocol = from_json(data["recipe"]), protocol_from_json(data["protocol"])
-    scene = read_scene(where, data["scene"]["format"], data["downscale"], protocol, on_event)
+    try:
+        recipe, protocol = from_json(data["recipe"]), protocol_from_json(data["protocol"])
+        settings = RasterSettings(**{**data["raster"], "background": tuple(data["raster"]["background"])})
+        named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
+    except (KeyError, TypeError) as error:
+        raise RunError(
+            f"{run.file(RUN_JSON)} must hold recipe, protocol, raster, backend, downscale and scene as gs2d writes "
+            f"them, got another entry ({error}); restore it, or train again with --overwrite"
+        ) from error
+    scene = read_scene(where, data["scene"]["format"], downscale, protocol, on_event)
     names = (len(scene.train), len(scene.test))
     if names != (data["scene"]["train"], data["scene"]["test"]):
         raise RunError(
             f"the capture at {where} has {names[0]} + {names[1]} views, the run was made with "
             f"{data['scene']['train']} + {data['scene']['test']}; restore it or train again"
         )
-    raster = {**data["raster"], "background": tuple(data["raster"]["background"])}
-    chosen = get_backend(data["backend"]["name"] if backend == "auto" else backend)
-    return Job(recipe, protocol, scene, chosen, RasterSettings(**raster), data["downscale"], data["scene"]["digest"])
+    chosen = get_backend(named if backend == "auto" else backend)
+    return Job(recipe, protocol, scene, chosen, settings, downscale, digest)
 
 
 def protocol_from_json(data: dict[str, Any]) -> Protocol:
@@ -232,12 +241,15 @@ def check_same_run(run: RunFolder, job: Job) -> None:
     before, after = run.definition(), json.loads(json.dumps(job.definition()))
     for name, value in after.items():
         old = before.get(name)
+        where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]
-            name = "scene (its photographs, cameras or points)"
+            name = "scene: its photographs, cameras or points changed"
+        else:
+            where = _difference(old, value)
         if old != value:
             raise RunError(
-                f"{run.path} was made with another {name}{_difference(old, value)}; "
+                f"{run.path} was made with another {name}{where}; "
                 "resume with the same options, or choose another --out"
             )
 

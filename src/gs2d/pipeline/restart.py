@@ -57,7 +57,7 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
         ``start_from`` has no stage in common with this run, or no checkpoint is readable.
     """
     if run.checkpoints():
-        return _resume(run, on_event)
+        return _resume(run, job, on_event)
     run.events.cut(0)
     found = [
         stage
@@ -73,7 +73,7 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
     return _adopt(run, job, max(found, key=lambda stage: stage.index), on_event)
 
 
-def _resume(run: RunFolder, on_event: OnEvent) -> Start:
+def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> Start:
     checkpoints = run.checkpoints()
     for checkpoint in reversed(checkpoints):
         try:
@@ -85,7 +85,9 @@ def _resume(run: RunFolder, on_event: OnEvent) -> Start:
         run.events.cut(payload["events_bytes"])
         finished = checkpoint.stage_index + (checkpoint.iteration is None)
         metrics = run.metrics()
-        run.write_metrics({"stages": metrics["stages"][:finished], "surface": None})
+        unchanged = finished == len(job.recipe.stages)  # then the scores of the mesh still hold
+        surface = metrics.get("surface") if unchanged else None
+        run.write_metrics({"stages": metrics["stages"][:finished], "surface": surface})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
         extra = json.loads(payload["extra"])
         return Start(state, extra["seconds"], extra["peak_memory"], extra["at_entry"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -42,6 +43,7 @@ def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_e
         raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
+    check_mesh_options(options)
     depth = options.depth or job.protocol.depth
     result = _extract(job, splats, options, depth, on_event)
     write_mesh(out, result.mesh)
@@ -66,11 +68,30 @@ def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_e
     }
 
 
+def check_mesh_options(options: MeshOptions) -> None:
+    """Raise for limits that are none, before anything is rendered.
+
+    Raises
+    ------
+    ProtocolError
+    """
+    for name in ("voxel", "truncation", "depth_limit"):
+        value = getattr(options, name)
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise ProtocolError(f"--{name.replace('_', '-')} must be a positive number of world units, got {value}")
+    if options.bbox is not None:
+        low, high = np.asarray(options.bbox, np.float64).reshape(2, 3)
+        if not (np.isfinite(options.bbox).all() and (low < high).all()):
+            raise ProtocolError(f"--bbox must be a lower corner and a higher one, got {low.tolist()} {high.tolist()}")
+    if options.keep_components is not None and options.keep_components < 0:
+        raise ProtocolError(
+            f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}"
+        )
+
+
 def _extract(job: Job, splats: Splats, options: MeshOptions, depth: str, on_event: OnEvent) -> Extraction:
     fusion = job.protocol.fusion
     keep = fusion.clusters if options.keep_components is None else options.keep_components
-    if keep < 0:
-        raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {keep}")
     # A box or a voxel of the user's own makes the protocol's other limits meaningless.
     own = options.bbox is not None
     result = extract(

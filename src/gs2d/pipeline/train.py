@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import torch
 
-from gs2d.errors import RecipeError
+from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run
 from gs2d.pipeline.events import OnEvent, Phase, ignore
@@ -49,6 +49,11 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     with run.locked(), undone_if_worthless(run):
         if is_run(run.path):
             check_same_run(run, job)
+            if run.file(SPLATS).exists() and not run.checkpoints():
+                raise RunError(
+                    f"{run.path} is finished and its checkpoints are gone: nothing to resume; "
+                    "train it again with --overwrite, or choose another --out"
+                )
         else:
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale})
         start = choose_start(run, job, options, on_event)
@@ -57,27 +62,30 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     return run
 
 
+MOST_THREADS = 1024  # each has a stack: far more of them end in errors that name anything but the cause
+
+
 def use_threads(threads: int | None) -> None:
     """Set the CPU threads of torch and of the native kernels.
 
     Raises
     ------
     RecipeError
-        Not a positive number.
+        Not a number from 1 to ``MOST_THREADS``.
     """
     if threads is not None:
-        if threads < 1:
-            raise RecipeError(f"--threads must be a whole number >= 1, got {threads}")
+        if not 1 <= threads <= MOST_THREADS:
+            raise RecipeError(f"--threads must be a whole number from 1 to {MOST_THREADS}, got {threads}")
         torch.set_num_threads(threads)
 
 
 @contextmanager
 def undone_if_worthless(run: RunFolder) -> Iterator[None]:
-    """Delete a run that fails before it has a checkpoint: there is nothing in it to go on from."""
+    """Delete a run that fails before it has a checkpoint or a result: there is nothing in it to go on from."""
     try:
         yield
     except BaseException:
-        if not run.checkpoints():
+        if not run.checkpoints() and not run.file(SPLATS).exists():
             run.discard()
         raise
 
@@ -103,11 +111,15 @@ def train_stages(run: RunFolder, job: Job, options: TrainOptions, start: Start, 
 
 
 def finish(run: RunFolder, job: Job, splats: Splats, on_event: OnEvent) -> None:
-    """Write what the user came for."""
+    """Write what the user came for. Splats that give no mesh still give a report, before the error."""
     from gs2d.pipeline.jobs import report_run
 
     write_splats(run.file(SPLATS), splats)
-    if not run.file(MESH).exists():
-        extract_mesh(job, splats, MeshOptions(), run.file(MESH), on_event)
+    try:
+        if not run.file(MESH).exists():
+            extract_mesh(job, splats, MeshOptions(), run.file(MESH), on_event)
+    except ProtocolError as error:
+        report_run(run.path)
+        raise ProtocolError(f"no mesh of {run.path}: {error}; splats and report are written") from error
     on_event(Phase("writing the report", 0))
     report_run(run.path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from gs2d.errors import DataError
 from gs2d.evaluate.surface import evaluate_surface
-from gs2d.io.ply import read_mesh, read_points
+from gs2d.io.ply import ply_kind, read_mesh, read_points
 from gs2d.pipeline.events import Notice, OnEvent, Phase
 from gs2d.pipeline.options import EvaluateOptions
 from gs2d.pipeline.prepare import Job
@@ -37,20 +38,18 @@ class Truth:
 
 
 def read_truth(path: Path) -> Truth:
-    """Read a ground truth: a PLY mesh (with the counts of ``NAME_seen.npy``, if that lies beside it) or PLY points.
+    """Read a ground truth: a PLY or OBJ mesh (with the counts of ``NAME_seen.npy`` beside it, if any) or PLY points.
 
     Raises
     ------
     DataError
     """
-    try:
-        mesh = read_mesh(path)
-    except DataError as not_mesh:
-        try:
-            points = read_points(path).points
-        except DataError:
-            raise not_mesh from None
-        return Truth(path, np.asarray(points, np.float64), None)
+    kind = "mesh" if path.suffix.lower() == ".obj" else ply_kind(path)
+    if kind == "points":
+        return Truth(path, np.asarray(read_points(path).points, np.float64), None)
+    if kind != "mesh":
+        raise DataError(f"{path}: a mesh or points were expected, got {kind} splats; give the true surface")
+    mesh = read_mesh(path)
     counts = path.with_name(path.stem + SEEN_SUFFIX)
     if not counts.exists():
         return Truth(path, mesh, None)
@@ -63,6 +62,17 @@ def read_truth(path: Path) -> Truth:
     return Truth(path, mesh, seen)
 
 
+def check_thresholds(thresholds: tuple[float, ...]) -> None:
+    """Raise for a threshold that is no distance, before anything slow happens.
+
+    Raises
+    ------
+    DataError
+    """
+    if not all(t > 0 and math.isfinite(t) for t in thresholds):
+        raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, thresholds))}")
+
+
 def score_surface(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, on_event: OnEvent) -> dict[str, Any]:
     """Chamfer distance, precision, recall and F-score of a mesh, over what the training views see.
 
@@ -70,8 +80,6 @@ def score_surface(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, 
     ------
     DataError
     """
-    if any(not t > 0 for t in options.thresholds):
-        raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, options.thresholds))}")
     on_event(Phase("scoring the surface", 0))
     if truth.seen is not None:
         on_event(Notice(f"which true faces count is taken from {truth.path.stem}{SEEN_SUFFIX}"))
