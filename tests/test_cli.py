@@ -53,6 +53,8 @@ def one_line(text: str) -> str:
         (["train", "here", "--out", "there", "--nonsense"], "--nonsense"),
         (["train", "here", "--out", "there", "--backend", "gpu"], "--backend"),
         (["paint"], "paint"),
+        (["paint"], "see `gs2d --help`"),
+        (["mesh", "here", "--bbox", "1", "2", "3"], "input length 3 did not match expected argument count 6 of `FLOAT"),
         (["train", "here", "--out", "there", "--resume", "--overwrite"], "exclude each other"),
     ],
 )
@@ -151,15 +153,20 @@ def test_asking_for_a_backend_that_is_not_here_is_one_line(
 
 
 def test_info_describes_a_run_a_capture_and_a_ply(
-    trained: Path, capture: Path, capsys: pytest.CaptureFixture[str]
+    trained: Path, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     facts = {}
-    for name, path in {"run": trained, "capture": capture, "ply": trained / "splats.ply"}.items():
+    viewer = tmp_path / "viewer.ply"
+    assert run(["export", str(trained), "--out", str(viewer), "--quiet"]) == 0
+    paths = {"run": trained, "capture": capture, "ply": trained / "splats.ply", "viewer": viewer}
+    for name, path in paths.items():
         assert run(["info", str(path), "--json"]) == 0
         facts[name] = json.loads(capsys.readouterr().out)
     assert facts["capture"]["format"] == "blender"
     assert facts["capture"]["training views"] == 3
     assert facts["run"]["stages"][-1]["splats"] == facts["ply"]["splats"]
+    assert (facts["ply"]["layout"], facts["viewer"]["layout"][:4]) == ("2dgs", "3dgs")
+    assert facts["viewer"]["splats"] == facts["ply"]["splats"]
     assert facts["run"]["definition"]["recipe"]["name"] == "2dgs-r"
 
 

@@ -7,6 +7,7 @@ import errno
 import importlib
 import io
 import os
+import re
 import shlex
 import signal
 import sys
@@ -16,7 +17,7 @@ from types import FrameType
 from typing import NoReturn
 
 import gs2d
-from gs2d.cli.commands import Command, Common, Demo, Train
+from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Train
 from gs2d.cli.console import Console
 from gs2d.errors import Gs2dError
 
@@ -30,7 +31,14 @@ _MENDABLE = {
     errno.EROFS,
     errno.EMFILE,
     errno.ENOMEM,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EIO,
 }
+_COMMANDS = {command.__name__.lower() for command in COMMANDS}
+_MARKUP = re.compile(r"\[/?bold\]")  # tyro shows its own markup in one of its messages
 _BOX = str.maketrans(dict.fromkeys("╭╮╰╯│─", " "))
 
 
@@ -38,7 +46,12 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Entry point of the command."""
     # Before torch loads: its OpenMP threads would spin at every barrier, which costs 3x where the cores are shared.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    sys.exit(run(sys.argv[1:] if argv is None else argv))
+    try:
+        code = run(sys.argv[1:] if argv is None else argv)
+    except KeyboardInterrupt:  # while the arguments were read, or once more while the first was handled
+        print("interrupted", file=sys.stderr)
+        code = INTERRUPTED
+    sys.exit(code)
 
 
 def run(argv: Sequence[str]) -> int:
@@ -114,8 +127,8 @@ def _one_line(box: str, argv: Sequence[str]) -> str:
             if line.startswith(stop):
                 body = body[:i]
                 break
-    words = " ".join(body) or "the arguments do not parse"
-    topic = next((word for word in argv if not word.startswith("-")), "")
+    words = " ".join(_MARKUP.sub("", " ".join(body)).split()) or "the arguments do not parse"
+    topic = argv[0] if argv[0] in _COMMANDS else ""
     return f"{words}; see `gs2d {topic + ' ' if topic else ''}--help`".replace(" (required)", "")
 
 

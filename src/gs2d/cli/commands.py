@@ -185,6 +185,9 @@ class Info(Common):
     """Run folder, capture folder or PLY file."""
 
 
+COMMANDS: tuple[type[Common], ...] = (
+    Demo, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Doctor, Info
+)  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
     | Annotated[Train, subcommand("train")]
