@@ -17,7 +17,7 @@ def limits(half: float, voxel: float, truncation: float | None = None, depth_lim
     """A cube of half side ``half`` around the origin."""
     trunc = truncation if truncation is not None else 5 * voxel
     low, high = (-half, -half, -half), (half, half, half)
-    return FusionLimits(low, high, voxel, trunc, depth_limit, 1.0, 1.0, voxel, 0.0)
+    return FusionLimits(low, high, 2 * half, voxel, trunc, depth_limit, 1.0, 1.0, voxel, 0.0)
 
 
 def volume_of(field: Callable[[np.ndarray], np.ndarray], lim: FusionLimits, blocks: int) -> Volume:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.frames import Frame, Spool
 from gs2d.mesh.fuse import fuse
-from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths
+from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths, widen_truncation
 from gs2d.mesh.surface import components, keep_components, marching_cubes
 from gs2d.triangles import Mesh
 
@@ -53,7 +54,8 @@ def extract(
         Read once (a generator is fine) and kept in a temporary file.
     limits : FusionLimits, optional
         Default: ``derive_limits`` from the frames, with ``resolution``, ``bbox``, ``voxel``, ``truncation``,
-        ``depth_limit`` and ``points`` as it takes them (they may not be given together with ``limits``).
+        ``depth_limit`` and ``points`` as it takes them (they may not be given together with ``limits``); a truncation
+        that is not given grows with the disagreement of the depth maps (``consistency.depth_noise``).
     min_weight : float
         See ``marching_cubes``.
     min_faces, keep : int
@@ -78,9 +80,10 @@ def extract(
     with Spool(folder) as spool:
         spool.extend(frames)
         if limits is None:
+            samples = [sample_depths(item) for item in spool]
             limits = derive_limits(
-                [sample_depths(item) for item in spool],
-                [item.camera for item in spool],
+                samples,
+                spool.cameras,
                 resolution=resolution,
                 bbox=bbox,
                 voxel=voxel,
@@ -88,6 +91,8 @@ def extract(
                 depth_limit=depth_limit,
                 points=points,
             )
+            if truncation is None:
+                limits = widen_truncation(limits, depth_noise(spool, samples, limits))
         volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads)
     whole = marching_cubes(volume, min_weight=min_weight)
     mesh = keep_components(whole, min_faces=min_faces, keep=keep)

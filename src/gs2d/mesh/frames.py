@@ -140,6 +140,11 @@ class Spool:
         for frame in frames:
             self.append(depth_map(frame))
 
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of the depth maps, in order."""
+        return [slot.camera for slot in self._slots]
+
     def __len__(self) -> int:
         return len(self._slots)
 

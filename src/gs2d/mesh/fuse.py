@@ -80,7 +80,6 @@ def fuse(
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    sampling: str = "plane",
 ) -> Volume:
     """Fuse depth maps.
 
@@ -93,8 +92,6 @@ def fuse(
         The volume will not grow beyond this.
     threads : int, optional
         Default: as many as the machine has. The result does not depend on it.
-    sampling : "plane", "bilinear" or "nearest"
-        How depth is read between pixel centres (see ``sampling.py``).
 
     Raises
     ------
@@ -129,7 +126,7 @@ def fuse(
     )
     with ThreadPoolExecutor(threads) as pool:
         for item in frames:
-            _integrate(volume, prepare(item, limits, sampling), pool)
+            _integrate(volume, prepare(item, limits), pool)
     return volume
 
 

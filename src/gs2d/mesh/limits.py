@@ -7,7 +7,7 @@ of the depth maps over all views, so a walk along a wall is fused as well as an 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,10 @@ FAR_FACTOR = 4.0  # times the median depth; beyond it a pixel is wider than four
 BOX_PERCENTILES = (1.0, 99.0)
 DEPTH_PERCENTILE = 99.5
 BOX_MARGIN = 0.25  # of the robust box's longest side, on every side: room for what percentiles cut off
-VOXELS_PER_TRUNCATION = 5.0
+MIN_VOXELS_PER_TRUNCATION = 5.0
+MAX_VOXELS_PER_TRUNCATION = 20.0
+MAX_TRUNCATION_OF_SIDE = 0.03  # a band wider than this rounds the object itself
+NOISE_PER_TRUNCATION = 10.0  # times the depth noise: maps that disagree need a wider band to average in
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,8 @@ class FusionLimits:
     ----------
     lower, upper : tuple of 3 floats, wu
         Box outside which nothing is fused.
+    side : float, wu
+        Longest side of the box that holds the 1st to 99th percentile of the points (or of the given bbox).
     voxel, truncation, depth_limit : float, wu
         Depths beyond ``depth_limit`` carry nothing.
     depth_median, depth_high : float, wu
@@ -38,10 +43,13 @@ class FusionLimits:
         Median width of a pixel on the surface.
     cut_fraction : float
         Part of the seen pixels that depth limit or box leave out. Large: the scene has a background that is not fused.
+    depth_noise : float or None, wu
+        How far views look through what their neighbours see (``consistency.depth_noise``), where it was measured.
     """
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
+    side: float
     voxel: float
     truncation: float
     depth_limit: float
@@ -49,6 +57,7 @@ class FusionLimits:
     depth_high: float
     pixel_footprint: float
     cut_fraction: float
+    depth_noise: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +67,7 @@ class DepthSample:
     points: np.ndarray  # [P, 3] float64 wu
     depths: np.ndarray  # [P] wu
     footprints: np.ndarray  # [P] wu, depth / focal length
+    center: np.ndarray  # [3] wu, of the camera
 
 
 def backproject(camera: Camera, depth: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -75,7 +85,7 @@ def sample_depths(item: DepthMap, count: int = 4096) -> DepthSample:
     depth = item.depth[rows, columns].astype(np.float64)
     camera = item.camera
     footprint = depth / np.sqrt(camera.fx * camera.fy)
-    return DepthSample(backproject(camera, depth, rows, columns), depth, footprint)
+    return DepthSample(backproject(camera, depth, rows, columns), depth, footprint, camera.center)
 
 
 def derive_limits(
@@ -140,14 +150,24 @@ def derive_limits(
     return FusionLimits(
         lower=_triple(lower),
         upper=_triple(upper),
+        side=side,
         voxel=float(size),
-        truncation=float(truncation if truncation is not None else VOXELS_PER_TRUNCATION * size),
+        truncation=float(truncation if truncation is not None else MIN_VOXELS_PER_TRUNCATION * size),
         depth_limit=float(limit),
         depth_median=median,
         depth_high=high,
         pixel_footprint=footprint,
         cut_fraction=float(1.0 - kept.mean()),
     )
+
+
+def widen_truncation(limits: FusionLimits, noise: float | None) -> FusionLimits:
+    """The limits with a truncation of ten times the depth noise if that is more; at most 20 voxels, 3 % of the box."""
+    if noise is None:
+        return limits
+    most = min(MAX_VOXELS_PER_TRUNCATION * limits.voxel, MAX_TRUNCATION_OF_SIDE * limits.side)
+    wide = min(NOISE_PER_TRUNCATION * noise, most)
+    return replace(limits, truncation=max(limits.truncation, wide), depth_noise=noise)
 
 
 def _widened(

@@ -27,7 +27,6 @@ class View:
     height: int
     focal: float  # px, the larger of the two
     principal: tuple[float, float]  # px, with the border
-    sampling: str
     depth: np.ndarray  # [P] float32, UNSEEN where nothing was seen
     slope_x: np.ndarray  # [P] float32 wu/px
     slope_y: np.ndarray
@@ -45,38 +44,19 @@ class View:
         pixel += column.astype(np.int64)
         x -= column
         y -= row
-        if self.sampling == "bilinear":
-            return self._bilinear(pixel, x - np.float32(0.5), y - np.float32(0.5)) - z, pixel
+        x -= np.float32(0.5)
+        y -= np.float32(0.5)
+        x *= self.slope_x[pixel]
+        y *= self.slope_y[pixel]
         depth = self.depth[pixel]
-        if self.sampling == "plane":
-            x -= np.float32(0.5)
-            y -= np.float32(0.5)
-            x *= self.slope_x[pixel]
-            y *= self.slope_y[pixel]
-            depth += x
-            depth += y
+        depth += x
+        depth += y
         depth -= z
         return depth, pixel
 
-    def _bilinear(self, pixel: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Bilinear where all four pixels are seen and differ little (slopes of neighbours agree), else nearest."""
-        own = self.depth[pixel]
-        step_x, step_y = np.where(x < 0, -1, 1), np.where(y < 0, -self.width, self.width)
-        inside = (pixel > self.width) & (pixel < len(self.depth) - self.width - 1)
-        safe = np.where(inside, pixel, self.width + 1)
-        dx = self.depth[safe + step_x] - own
-        dy = self.depth[safe + step_y] - own
-        dxy = self.depth[safe + step_x + step_y] - own
-        x, y = np.abs(x), np.abs(y)
-        value = x * (1 - y) * dx + y * (1 - x) * dy + x * y * dxy
-        largest = np.maximum(np.maximum(np.abs(dx), np.abs(dy)), np.abs(dxy))
-        return own + np.where(inside & (largest < self.slope_x[0]), value, 0)
 
-
-def prepare(item: DepthMap, limits: FusionLimits, sampling: str = "plane") -> View:
+def prepare(item: DepthMap, limits: FusionLimits) -> View:
     """Make a depth map ready: cut at the depth limit, pad, take slopes, build the pyramid of farthest depths."""
-    if sampling not in ("plane", "bilinear", "nearest"):
-        raise ValueError(f"sampling must be 'plane', 'bilinear' or 'nearest', got {sampling!r}")
     camera = item.camera
     K = camera.K.copy()
     K[:2, 2] += 1.0  # the border
@@ -85,8 +65,6 @@ def prepare(item: DepthMap, limits: FusionLimits, sampling: str = "plane") -> Vi
     # A slope moves depth by at most half a truncation within the pixel; steeper is an edge, not a surface.
     slope_x = _minmod(seen, axis=1, largest=limits.truncation)
     slope_y = _minmod(seen, axis=0, largest=limits.truncation)
-    if sampling == "bilinear":
-        slope_x = np.full_like(slope_x, limits.truncation)
     color = None if item.color is None else np.pad(item.color, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
     return View(
         projection=K @ camera.T_cam_world[:3],
@@ -94,7 +72,6 @@ def prepare(item: DepthMap, limits: FusionLimits, sampling: str = "plane") -> Vi
         height=camera.height + 2,
         focal=max(camera.fx, camera.fy),
         principal=(K[0, 2], K[1, 2]),
-        sampling=sampling,
         depth=np.where(depth > 0, depth, UNSEEN).reshape(-1),
         slope_x=slope_x.reshape(-1),
         slope_y=slope_y.reshape(-1),

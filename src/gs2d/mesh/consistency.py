@@ -1,0 +1,58 @@
+"""How much depth maps of neighbouring views contradict each other.
+
+A seen point of one view that another view looks *through* (that sees farther, at the same pixel) is a contradiction
+whatever the shape of the scene; a view that sees nearer may just see something in front. So the positive residuals
+measure the error of the depth maps, without ground truth and without a guess about occlusion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gs2d.mesh.frames import DepthMap
+from gs2d.mesh.limits import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionLimits
+from gs2d.mesh.sampling import UNSEEN, prepare
+
+NEIGHBOURS = 8  # views compared with each
+PERCENTILE = 75.0  # of the positive residuals
+_ENOUGH = 100  # residuals, below which there is no estimate
+
+
+def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits: FusionLimits) -> float | None:
+    """75th percentile, wu, of how far views look through points that their neighbours see.
+
+    Parameters
+    ----------
+    maps : iterable of DepthMap
+    samples : sequence of DepthSample
+        One for each map, in order.
+    limits : FusionLimits
+        Steeper slopes than its largest truncation in a pixel are depth edges; deeper pixels than its limit are unseen.
+
+    Returns
+    -------
+    float or None
+        None where too few points are seen twice.
+    """
+    if not samples:
+        return None
+    edge = replace(limits, truncation=MAX_VOXELS_PER_TRUNCATION * limits.voxel)
+    centers = np.array([s.center for s in samples])
+    distance = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    neighbours = np.argsort(distance, axis=1, kind="stable")[:, : min(NEIGHBOURS, len(samples) - 1)]
+    residuals: list[np.ndarray] = [np.zeros(0)]
+    for j, item in enumerate(maps):
+        view = prepare(item, edge)
+        for i in np.flatnonzero((neighbours == j).any(axis=1)).tolist():
+            projected = samples[i].points @ view.projection[:, :3].T + view.projection[:, 3]
+            projected = projected[projected[:, 2] > 0]
+            z = projected[:, 2].copy()
+            farther, _ = view.signed_distance(projected[:, 0] / z, projected[:, 1] / z, z)
+            residuals.append(farther[farther > UNSEEN / 2])
+    everything = np.concatenate(residuals)
+    positive = everything[everything > 0]
+    return float(np.percentile(positive, PERCENTILE)) if len(positive) >= _ENOUGH else None
