@@ -18,7 +18,6 @@ from __future__ import annotations
 import contextlib
 import datetime
 import importlib.metadata
-import json
 import os
 import platform
 import re
@@ -31,6 +30,7 @@ from typing import Any
 
 from gs2d.disk import atomic_write, disk_error
 from gs2d.errors import RunError
+from gs2d.io.event_log import EventLog
 from gs2d.io.files import read_json, write_json
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
@@ -58,76 +58,6 @@ class CheckpointFile:
     def progress(self) -> tuple[int, float]:
         """Sort key."""
         return self.stage_index, float("inf") if self.iteration is None else float(self.iteration)
-
-
-class EventLog:
-    """``events.jsonl``: append-only, one JSON object a line, flushed at each line."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def append(self, event: dict[str, Any]) -> None:
-        """Write one event.
-
-        Raises
-        ------
-        DiskError
-            The line did not fit; the log is cut back to its last whole line.
-        """
-        line = (json.dumps(event, allow_nan=False, sort_keys=True) + "\n").encode()
-        self.append_text(line)
-
-    def append_text(self, lines: bytes) -> None:
-        """Write whole lines at once (the log of a cached stage)."""
-        start = self.size
-        try:
-            with open(self.path, "ab") as file:
-                file.write(lines)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                self.cut(start)
-            raise disk_error(self.path, error) from error
-
-    @property
-    def size(self) -> int:
-        """Bytes of the log."""
-        return self.path.stat().st_size if self.path.exists() else 0
-
-    def cut(self, size: int) -> None:
-        """Forget everything after ``size`` bytes (and an unfinished last line)."""
-        if not self.path.exists():
-            return
-        with open(self.path, "r+b") as file:
-            kept = file.read(size)
-            file.truncate(kept.rfind(b"\n") + 1)
-
-    def sync(self) -> None:
-        """Bring the log to the disk, before a checkpoint that refers to it."""
-        if self.path.exists():
-            with open(self.path, "rb") as file:
-                os.fsync(file.fileno())
-
-    def read(self) -> list[dict[str, Any]]:
-        """All whole events.
-
-        Raises
-        ------
-        RunError
-            A line is no JSON object.
-        """
-        if not self.path.exists():
-            return []
-        text = self.path.read_text(encoding="utf-8", errors="replace")
-        events = []
-        for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
-            try:
-                events.append(dict(json.loads(line)))
-            except (ValueError, TypeError) as error:
-                raise RunError(
-                    f"{self.path} line {number} must be a JSON object, got {line[:40]!r}; "
-                    "the log was damaged: remove that line"
-                ) from error
-        return events
 
 
 class RunFolder:
