@@ -60,7 +60,9 @@ PEERS = {
 RENDER = {
     "api": 4,
     "backend": 3,
+    "cpu_cached": 3,
     "cpu": 2,
+    "cuda": 2,
     "reference_errors": 2,
     "reference": 1,
     "projection_reference": 0,

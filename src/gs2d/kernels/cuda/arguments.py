@@ -1,0 +1,102 @@
+"""The structures that the CUDA kernels take, field for field as in the ``.cu`` files; change both."""
+
+from __future__ import annotations
+
+import ctypes
+
+__all__ = [
+    "BlendArguments",
+    "BlendVjpArguments",
+    "EmitArguments",
+    "ProjectArguments",
+    "ProjectVjpArguments",
+    "RangeArguments",
+    "View",
+]
+
+_Field = tuple[str, type]
+PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
+
+
+def _all(kind: type, *names: str) -> tuple[_Field, ...]:
+    return tuple((name, kind) for name in names)
+
+
+def _pointers(*names: str) -> tuple[_Field, ...]:
+    return _all(ctypes.c_void_p, *names)
+
+
+class View(ctypes.Structure):
+    """``struct View`` of common.h."""
+
+    _fields_ = (
+        ("R", ctypes.c_float * 9),
+        ("t", ctypes.c_float * 3),
+        ("center", ctypes.c_float * 3),
+        *_all(ctypes.c_float, "fx", "fy", "cx", "cy"),
+        *_all(ctypes.c_float, "near", "lowpass_px", "inv_lowpass2", "log2_alpha_min", "alpha_max", "transmittance_min"),
+        *_all(ctypes.c_float, "error_k2", "distortion_scale"),
+        ("background", ctypes.c_float * 3),
+        *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y", "sh_degree"),
+    )
+
+
+class ProjectArguments(ctypes.Structure):
+    """Of project.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_all(ctypes.c_int64, "count", "sh_rest"),
+        *_pointers(*PARAMETERS, "records", "cull", "depth_keys", "rects", "tile_counts", "radii"),
+        ("errors", ctypes.c_int32),
+    )
+
+
+class EmitArguments(ctypes.Structure):
+    """Of emit.cu."""
+
+    _fields_ = (
+        *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y"),
+        *_all(ctypes.c_int64, "candidates", "visible"),
+        *_pointers("order", "ends", "cull", "rects", "keys", "payloads"),
+        ("exact", ctypes.c_int32),
+    )
+
+
+class RangeArguments(ctypes.Structure):
+    """Of emit.cu."""
+
+    _fields_ = (("candidates", ctypes.c_int64), *_pointers("keys", "permutation", "payloads", "entries", "ranges"))
+
+
+class BlendArguments(ctypes.Structure):
+    """Of blend.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_pointers("records", "entries", "ranges", "tiles", *IMAGES, "final_T", "moments", "seen"),
+    )
+
+
+class BlendVjpArguments(ctypes.Structure):
+    """Of blend_vjp.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_pointers("records", "entries", "ranges", "tiles", "seen"),
+        *_pointers("color", "alpha", "normal", "depth_mean", "distortion", "final_T", "moments"),
+        *_pointers(*(f"g_{name}" for name in IMAGES), "gradients", "extras"),
+    )
+
+
+class ProjectVjpArguments(ctypes.Structure):
+    """Of project_vjp.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_all(ctypes.c_int64, "count", "sh_rest"),
+        *_pointers(*PARAMETERS, "tile_counts", "gradients", "extras"),
+        *_pointers(*(f"g_{name}" for name in PARAMETERS), "g_probe"),
+        ("probe_columns", ctypes.c_int64),
+    )

@@ -1,0 +1,101 @@
+// Blending, front to back: one block of four warps per 16x16 tile, a warp owns 8x8 pixels, a thread two of them.
+//
+// Nothing but the warp's own votes: the warps of a block never wait for each other. Per chunk of 32 entries a lane reads
+// one entry; the masks of sub-blocks say which splats the warp must look at; the lanes of those fetch the records into
+// shared memory, so that one memory latency serves the chunk.
+#include "cuda/pixels.h"
+
+namespace gs2d {
+
+struct BlendArguments {
+    View view;
+    const float* records;  // [N, 16]
+    const uint* entries;   // splat << 8 | mask of sub-blocks
+    const int64* ranges;   // [tiles + 1, 2]
+    const int* tiles;      // [tiles]: which tile a block takes, or null
+    float *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;  // [H, W (, 3)]
+    float* final_T;        // [H, W]
+    float* moments;        // [H, W, 3]: M1, M2, inverse depth of the first pair; written with the distortion
+    uint* seen;            // [words, 8] or null: bit j of a word: some live pixel of the sub-block saw entry j of the chunk
+};
+
+template <bool DIST>
+__device__ __forceinline__ void write_pixel(const BlendArguments& a, int x, int y, const Pixel<float>& p) {
+    const View& v = a.view;
+    const int64 at = int64(y) * v.width + x;
+    a.color[3 * at] = fma(p.T, v.background[0], p.red);
+    a.color[3 * at + 1] = fma(p.T, v.background[1], p.green);
+    a.color[3 * at + 2] = fma(p.T, v.background[2], p.blue);
+    a.alpha[at] = p.alpha, a.final_T[at] = p.T;
+    a.normal[3 * at] = p.nx, a.normal[3 * at + 1] = p.ny, a.normal[3 * at + 2] = p.nz;
+    a.depth_mean[at] = p.alpha > 0.f ? p.depth / p.alpha : 0.f;
+    a.depth_median[at] = p.median;
+    if constexpr (DIST) {
+        a.distortion[at] = p.distortion * v.distortion_scale;
+        a.moments[3 * at] = p.M1, a.moments[3 * at + 1] = p.M2, a.moments[3 * at + 2] = p.inverse_depth0;
+    }
+}
+
+template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments& a, float4 (*records)[32]) {
+    const Place at = place_of(a.view, a.tiles);
+    const BlendLimits<float> limits = limits_of(a.view);
+    Pixel<float> p[HALVES];
+#pragma unroll
+    for (int h = 0; h < HALVES; ++h)
+        p[h] = {1.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, at.inside[h]};
+    const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
+    const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];
+
+    for (int64 i = begin; i < end; i += 32) {
+        const uint entry = i + at.lane < end ? a.entries[i + at.lane] : 0u;
+        uint hits[HALVES];  // of this warp: all its lanes agree
+#pragma unroll
+        for (int h = 0; h < HALVES; ++h) {
+            const bool live = __any_sync(FULL_MASK, p[h].live);
+            const uint touched = __ballot_sync(FULL_MASK, entry >> at.sub_block[h] & 1u);
+            hits[h] = live ? touched : 0u;
+        }
+        if (!__any_sync(FULL_MASK, p[0].live || p[1].live)) break;
+        const uint wanted = hits[0] | hits[1];
+        if (wanted >> at.lane & 1u) fetch_record(a.records, entry >> 8, records, at.lane);
+        __syncwarp();
+        uint seen[HALVES] = {0u, 0u};
+        for (uint todo = wanted; todo; todo &= todo - 1) {
+            const int j = __ffs(int(todo)) - 1;
+            const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
+            const float inverse_zc = DIST ? 1.f / s.zc : 0.f;
+#pragma unroll
+            for (int h = 0; h < HALVES; ++h) {
+                if (!(hits[h] >> j & 1u)) continue;  // the same for all lanes
+                const Hit<float> hit = intersect(s, x - s.cx, y + float(4 * h) - s.cy, limits);
+                const bool saw = composite(s, hit.alpha, s.zc * hit.rq, inverse_zc * hit.Q, limits, p[h]);
+                seen[h] |= uint(saw) << j;
+            }
+        }
+        __syncwarp();  // before the records are overwritten
+        if (a.seen) {
+            const int64 words = word_of(begin, at.tile, (i - begin) >> 5);
+#pragma unroll
+            for (int h = 0; h < HALVES; ++h) {
+                const uint word = or_over_warp(seen[h]);
+                if (at.lane == 0) a.seen[words + at.sub_block[h]] = word;
+            }
+        }
+    }
+#pragma unroll
+    for (int h = 0; h < HALVES; ++h)
+        if (at.inside[h]) write_pixel<DIST>(a, at.x, at.y + 4 * h, p[h]);
+}
+
+// The distortion's three moments cost registers and time; without it `distortion` and `moments` are not touched.
+extern "C" __global__ void __launch_bounds__(128) blend_forward(BlendArguments a) {
+    __shared__ float4 records[4][4][32];  // warp, quarter of a record, entry
+    blend<false>(a, records[threadIdx.x >> 5]);
+}
+
+extern "C" __global__ void __launch_bounds__(128) blend_forward_distortion(BlendArguments a) {
+    __shared__ float4 records[4][4][32];
+    blend<true>(a, records[threadIdx.x >> 5]);
+}
+
+}  // namespace gs2d

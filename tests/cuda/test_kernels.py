@@ -1,0 +1,322 @@
+"""The CUDA kernels, executed on the CPU by the emulator, against the reference: images, radii and every gradient."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import emulate
+import numpy as np
+import pytest
+import render_oracle
+import torch
+from render_scenes import (
+    IMAGES,
+    KINDS,
+    contraction,
+    front_camera,
+    random_camera,
+    random_cotangents,
+    random_splats,
+    requiring_grad,
+    splat,
+    stack,
+)
+from torch import Tensor
+
+import gs2d.kernels
+from gs2d.camera import Camera
+from gs2d.render import cuda, reference, reference_errors
+from gs2d.render.api import rasterize
+from gs2d.render.backend import Backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import ATTRIBUTES, Splats
+
+pytestmark = pytest.mark.timeout(120)  # a kernel that does not end
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
+FOLDER = Path(gs2d.kernels.__file__).parent
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """A launcher for :mod:`gs2d.render.cuda`."""
+
+    kernels: emulate.EmulatedKernels
+    descending: bool = False
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
+        self.kernels.launch(name, (blocks, 1), threads, arguments, descending=self.descending)
+
+
+@pytest.fixture(scope="session")
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
+    sources = sorted((FOLDER / "cuda").glob("*.cu"))
+    return Emulator(emulate.build(sources, FOLDER, tmp_path_factory.mktemp("kernels"), "kernels"))
+
+
+def render(
+    launcher: Emulator,
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    probe: Tensor | None = None,
+    exact_masks: bool = True,
+) -> RenderOutput:
+    """Through the public function, as a backend."""
+
+    def run(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
+        return cuda.rasterize_with(launcher, s, c, r, p, exact_masks=exact_masks)
+
+    backend = Backend("cuda", run, reference_errors.splat_errors)  # its own splat errors do not exist yet
+    return rasterize(splats, camera, settings, backend=backend, screen_probe=probe)
+
+
+@dataclass(frozen=True)
+class Case:
+    seed: int
+    splats: Splats
+    camera: Camera
+
+
+def cases(count: int, kinds: tuple[str, ...] = KINDS) -> Iterator[Case]:
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        camera = random_camera(rng)
+        splats = random_splats(rng, camera, int(rng.integers(1, 60)), kinds)
+        splats = replace(splats, log_scales=splats.log_scales + 0.7 * (seed % 3))
+        yield Case(seed, splats.to(dtype=torch.float32), camera)
+
+
+def double(splats: Splats) -> Splats:
+    return splats.to(dtype=torch.float64)
+
+
+def quantile(values: Tensor, q: float) -> float:
+    return float(np.quantile(values.numpy(), q))
+
+
+def test_images_and_radii_agree_with_the_reference_on_random_scenes(emulator: Emulator) -> None:
+    differences: dict[str, list[Tensor]] = {name: [] for name in IMAGES}
+    radii = []
+    for case in cases(30):
+        low = render(emulator, case.splats, case.camera, SETTINGS)
+        high = reference.rasterize(double(case.splats), case.camera, SETTINGS)
+        for name in IMAGES:
+            a, b = getattr(low, name).double(), getattr(high, name)
+            assert a.shape == b.shape
+            assert bool(a.isfinite().all()), name
+            if name.startswith("depth"):
+                a, b = a / b.clamp(min=0.1), b / b.clamp(min=0.1)
+            differences[name].append((a - b).abs().flatten())
+        radii.append((low.radii.double() - high.radii).abs() / (1 + high.radii))
+    for name, parts in differences.items():
+        merged = torch.cat(parts)
+        assert quantile(merged, 0.5) < 1e-6, name
+        assert quantile(merged, 0.998) < 1e-4, name
+        assert float((merged > 2 / 255).double().mean()) < 2e-4, name
+    assert float((torch.cat(radii) > 1e-3).double().mean()) <= 2e-3
+
+
+@pytest.fixture(scope="module")
+def clear_cases() -> list[Case]:
+    """Small scenes in which no decision is within 1e-4 of its threshold."""
+    clear = []
+    for case in cases(60, tuple(kind for kind in KINDS if kind != "twins")):
+        camera = case.camera.resized(min(case.camera.width, 8), min(case.camera.height, 8))
+        splats = case.splats.rows(torch.arange(min(len(case.splats), 12)))
+        if render_oracle.render(splats, camera, SETTINGS).margin >= 1e-4:
+            clear.append(Case(case.seed, splats, camera))
+    assert len(clear) >= 12
+    return clear
+
+
+def gradients(
+    launcher: Emulator | None,
+    splats: Splats,
+    camera: Camera,
+    cotangents: dict[str, Tensor],
+    columns: int,
+    exact_masks: bool = True,
+) -> dict[str, Tensor]:
+    """Vector-Jacobian products of all parameters and the probe; None is the reference."""
+    scene = requiring_grad(splats)
+    probe = torch.zeros(len(splats), columns, dtype=splats.dtype, requires_grad=True)
+    output: RenderOutput
+    if launcher is None:
+        output = rasterize(scene, camera, SETTINGS, backend="reference", screen_probe=probe)
+    else:
+        output = render(launcher, scene, camera, SETTINGS, probe, exact_masks)
+    contraction(output, cotangents).backward()
+    assert probe.grad is not None
+    grads = {name: tensor.grad for name, tensor in scene.items()} | {"signed": probe.grad[:, :2]}
+    if columns == 4:
+        grads["absolute"] = probe.grad[:, 2:]
+    assert all(grad is not None and bool(grad.isfinite().all()) for grad in grads.values())
+    return {name: grad for name, grad in grads.items() if grad is not None}
+
+
+@pytest.mark.parametrize("columns", [2, 4])
+def test_gradients_agree_where_every_decision_has_a_margin(
+    emulator: Emulator, clear_cases: list[Case], columns: int
+) -> None:
+    errors: dict[str, list[float]] = {name: [] for name in (*ATTRIBUTES, "signed", "absolute")}
+    for case in clear_cases:
+        cotangents = random_cotangents(np.random.default_rng(case.seed), case.camera)
+        low = gradients(emulator, case.splats, case.camera, cotangents, columns)
+        high = gradients(None, double(case.splats), case.camera, cotangents, columns)
+        for name, expected in high.items():
+            norm = float(expected.norm())
+            if norm > 1e-3:
+                errors[name].append(float((low[name].double() - expected).norm()) / norm)
+    for name, values in errors.items():
+        assert len(values) >= 8 or (name == "absolute" and columns == 2), name
+        if values:
+            assert np.median(values) < 1e-5, (name, np.median(values))
+            assert max(values) < 2e-3, (name, max(values))
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_gradients_of_each_image_alone_agree(emulator: Emulator, clear_cases: list[Case], name: str) -> None:
+    """Each kernel variant, and no wrong sign drowned by a large channel."""
+    errors = []
+    for case in clear_cases[:8]:
+        cotangents = {name: random_cotangents(np.random.default_rng(case.seed), case.camera)[name]}
+        low = gradients(emulator, case.splats, case.camera, cotangents, 2)
+        high = gradients(None, double(case.splats), case.camera, cotangents, 2)
+        a = torch.cat([low[attribute].double().flatten() for attribute in ATTRIBUTES])
+        b = torch.cat([high[attribute].flatten() for attribute in ATTRIBUTES])
+        if float(b.norm()) > 1e-3:
+            errors.append(float((a - b).norm() / b.norm()))
+    assert len(errors) >= 4
+    assert np.median(errors) < 2e-5, errors
+    assert max(errors) < 2e-3, errors
+
+
+def layers(count: int) -> Splats:
+    """Faint splats one behind another, all seen by every pixel of a small image."""
+    parts = [splat((0.0, 0.0, 2.0 + 0.01 * i), (3.0, 3.0), 0.02, (i % 3 / 2, 0.5, 0.2)) for i in range(count)]
+    return stack(*parts)
+
+
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 65])
+def test_lists_around_the_chunk_size_agree(emulator: Emulator, count: int) -> None:
+    camera = front_camera(5, 3)
+    scene = layers(count)
+    low = render(emulator, scene, camera, SETTINGS)
+    high = rasterize(double(scene), camera, SETTINGS, backend="reference")
+    assert float((low.color.double() - high.color).abs().max()) < 1e-5
+    cotangents = random_cotangents(np.random.default_rng(count), camera)
+    low_grads = gradients(emulator, scene, camera, cotangents, 2)
+    high_grads = gradients(None, double(scene), camera, cotangents, 2)
+    for name in ("means", "opacity_logits", "sh0"):
+        error = (low_grads[name].double() - high_grads[name]).norm() / high_grads[name].norm()
+        assert float(error) < 1e-4, name
+
+
+def test_a_pixel_that_stops_on_the_last_bit_of_a_chunk_stays_stopped(emulator: Emulator) -> None:
+    """Entry 31 stops every pixel; 32 opaque splats behind it must change nothing, forward or backward."""
+    front = stack(*(splat((0.0, 0.0, 2.0 + 0.01 * i), (3.0, 3.0), 0.25) for i in range(31)))
+    behind = stack(*(splat((0.0, 0.0, 3.0 + 0.01 * i), (3.0, 3.0), 0.98, (0.0, 1.0, 0.0)) for i in range(33)))
+    camera = front_camera(5, 3)
+    settings = replace(SETTINGS, transmittance_min=1e-4)
+    before = render(emulator, front, camera, settings)
+    assert float(1 - before.alpha.max()) > 1e-4
+    scene = stack(front, behind)
+    after = render(emulator, scene, camera, settings)
+    assert torch.equal(before.color, after.color)
+    grads = gradients(emulator, scene, camera, random_cotangents(np.random.default_rng(0), camera), 2)
+    assert float(grads["sh0"][:31].abs().max()) > 0
+    assert float(grads["sh0"][31:].abs().max()) == 0
+    assert float(grads["opacity_logits"][31:].abs().max()) == 0
+
+
+def many_tiles() -> Case:
+    rng = np.random.default_rng(5)
+    camera = random_camera(rng).resized(70, 45)  # no multiple of 16, 8 or 4
+    splats = random_splats(rng, camera, 150)
+    return Case(5, replace(splats, log_scales=splats.log_scales - 0.7).to(dtype=torch.float32), camera)
+
+
+def test_culling_inside_tiles_changes_no_bit_of_the_image_and_no_gradient(emulator: Emulator) -> None:
+    case = many_tiles()
+    exact = render(emulator, case.splats, case.camera, SETTINGS)
+    everything = render(emulator, case.splats, case.camera, SETTINGS, exact_masks=False)
+    for name in (*IMAGES, "radii"):
+        assert torch.equal(getattr(exact, name), getattr(everything, name)), name
+    cotangents = random_cotangents(np.random.default_rng(1), case.camera)
+    a = gradients(emulator, case.splats, case.camera, cotangents, 4)
+    b = gradients(emulator, case.splats, case.camera, cotangents, 4, exact_masks=False)
+    for name in a:  # the lengths of the lists change the order of the blocks, and so that of the additions
+        assert float((a[name] - b[name]).norm()) <= 1e-5 * float(a[name].norm()), name
+
+
+def test_the_order_of_threads_does_not_change_images(emulator: Emulator) -> None:
+    """A missing barrier would."""
+    case = many_tiles()
+    upwards = render(emulator, case.splats, case.camera, SETTINGS)
+    downwards = render(replace(emulator, descending=True), case.splats, case.camera, SETTINGS)
+    for name in (*IMAGES, "radii"):
+        assert torch.equal(getattr(upwards, name), getattr(downwards, name)), name
+    cotangents = random_cotangents(np.random.default_rng(1), case.camera)
+    a = gradients(emulator, case.splats, case.camera, cotangents, 4)
+    b = gradients(replace(emulator, descending=True), case.splats, case.camera, cotangents, 4)
+    for name in a:  # gradients are sums in the order of the threads
+        assert float((a[name] - b[name]).norm()) <= 1e-5 * float(a[name].norm()), name
+
+
+def test_many_tiles_agree_with_the_reference(emulator: Emulator) -> None:
+    case = many_tiles()
+    low = render(emulator, case.splats, case.camera, SETTINGS)
+    high = reference.rasterize(double(case.splats), case.camera, SETTINGS)
+    assert float(high.alpha.mean()) > 0.3
+    for name in ("color", "alpha", "normal"):
+        difference = (getattr(low, name).double() - getattr(high, name)).abs()
+        assert quantile(difference, 0.5) < 1e-6, name
+        assert quantile(difference, 0.999) < 2e-3, name
+
+
+def test_without_splats_there_is_the_background_and_no_gradient(emulator: Emulator) -> None:
+    camera = front_camera(20, 18)
+    scene = requiring_grad(splat().rows(torch.arange(0)))
+    output = render(emulator, scene, camera, SETTINGS)
+    assert torch.equal(output.color, torch.tensor(SETTINGS.background).expand(18, 20, 3))
+    for name in ("alpha", "normal", "depth_mean", "depth_median", "distortion"):
+        assert not getattr(output, name).any(), name
+    output.color.sum().backward()
+    assert scene.means.grad is not None
+    assert scene.means.grad.shape == (0, 3)
+
+
+def test_bad_splats_change_no_pixel_and_get_zero_gradients(emulator: Emulator) -> None:
+    good = splat((0.1, 0.0, 2.0), degrees=20)
+    bad = [replace(good, means=good.means * float("nan")), replace(good, quats=good.quats * 0)]
+    bad += [replace(good, sh0=good.sh0 + float("inf")), replace(good, log_scales=good.log_scales + 200)]
+    camera = front_camera()
+    alone = render(emulator, good, camera, SETTINGS)
+    scene = stack(good, *bad)
+    together = render(emulator, scene, camera, SETTINGS)
+    assert torch.equal(alone.color, together.color)
+    assert together.radii[1:].tolist() == [0.0] * 4
+    grads = gradients(emulator, scene, camera, random_cotangents(np.random.default_rng(0), camera), 4)
+    assert all(float(grad[1:].abs().sum()) == 0 for grad in grads.values())
+    assert float(grads["means"][0].abs().sum()) > 0
+
+
+@pytest.mark.parametrize(("held", "degree"), [(0, 0), (3, 1), (15, 0), (15, 2), (8, 2)])
+def test_unused_degrees_and_missing_coefficients_agree(emulator: Emulator, held: int, degree: int) -> None:
+    case = next(cases(1, ("plain",)))
+    part = replace(case.splats, shN=case.splats.shN[:, :held].contiguous())
+    settings = replace(SETTINGS, sh_degree=degree)
+    a, b = requiring_grad(part), requiring_grad(double(part))
+    low = render(emulator, a, case.camera, settings).color
+    high = rasterize(b, case.camera, settings, backend="reference").color
+    assert quantile((low.double() - high).detach().abs(), 0.99) < 1e-4
+    low.sum().backward()
+    high.sum().backward()
+    for name, tensor in a.items():
+        expected = getattr(b, name).grad
+        assert tensor.grad is not None
+        if expected is not None and expected.numel():
+            assert float((tensor.grad.double() - expected).norm()) <= 1e-3 * float(expected.norm()) + 1e-6, name
