@@ -1,1 +1,1 @@
-"""Seeded benchmarks: `python -m benchmarks.<name>`; results with machine and versions go to `benchmarks/results/`."""
+"""Seeded benchmarks: `python -m benchmarks --out FILE.json`; committed results are in `benchmarks/results/`."""

@@ -14,6 +14,7 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -114,13 +115,13 @@ def run(sizes: Sequence[int], threads: Sequence[int], repeats: int) -> list[Row]
     rows: list[Row] = []
     for size in sizes:
         frame = make_frame(size)
-        cases: dict[str, tuple[Callable[[], None], Callable[[], None] | None]] = {
-            "L1 + SSIM": (lambda f=frame: photometric_step(f), lambda f=frame: torch_photometric_step(f)),
-            "L1 + SSIM, target mean cached": (lambda f=frame: photometric_step(f, None, f.mean), None),
-            "L1 + SSIM, masked": (lambda f=frame: photometric_step(f, f.mask), None),
-            "SSIM, value only": (lambda f=frame: ssim_value(f), lambda f=frame: torch_ssim_value(f)),
-            "normal consistency": (lambda f=frame: normal_step(f), lambda f=frame: torch_normal_step(f)),
-            "distortion mean": (lambda f=frame: ops.masked_mean(f.alpha), None),
+        cases: dict[str, tuple[Callable[[], object], Callable[[], object] | None]] = {
+            "L1 + SSIM": (partial(photometric_step, frame), partial(torch_photometric_step, frame)),
+            "L1 + SSIM, target mean cached": (partial(photometric_step, frame, None, frame.mean), None),
+            "L1 + SSIM, masked": (partial(photometric_step, frame, frame.mask), None),
+            "SSIM, value only": (partial(ssim_value, frame), partial(torch_ssim_value, frame)),
+            "normal consistency": (partial(normal_step, frame), partial(torch_normal_step, frame)),
+            "distortion mean": (partial(ops.masked_mean, frame.alpha), None),
         }
         for n in threads:
             for name, (native, slow) in cases.items():

@@ -1,4 +1,4 @@
-"""Times the CPU rasterizer, forward and backward of all outputs, beside what the machine can do at that moment.
+"""Times the CPU rasterizer alone, forward and backward of all outputs, beside what the machine can do at that moment.
 
     python benchmarks/raster.py [--threads 2] [--repeats 15] [--json FILE]
 
@@ -9,21 +9,20 @@ same seconds. On a shared machine compare ratios and minimums, not medians.
 from __future__ import annotations
 
 import argparse
-import ctypes
 import json
-import platform
 import statistics
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from workload import camera, room
-
+from benchmarks.timing import machine, probe
+from benchmarks.workload import camera, room
 from gs2d.kernels.library import Library, load
 from gs2d.render.cpu import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings
@@ -37,30 +36,6 @@ PAIRS = {(20_000, 400): 28.7, (100_000, 400): 29.6, (100_000, 800): 28.4}
 DESIGN = {(20_000, 400): (15.5, 30.4), (100_000, 400): (35.0, 40.6), (100_000, 800): (82.2, 38.9)}
 # gradients that reach the rasterizer: all of them, or what L1 + SSIM alone sends
 UPSTREAM = {"all": IMAGES, "color": ("color",)}
-
-
-def machine() -> dict[str, object]:
-    """What the numbers depend on."""
-    model = platform.processor()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
-        ]
-        model = names[0] if names else model
-    return {
-        "cpu": model,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "system": platform.platform(),
-    }
-
-
-def probe(library: Library) -> dict[str, float]:
-    """Peak multiply-add rate and copy bandwidth right now, the better of three."""
-    fma = library.function("gs2d_probe_fma", ctypes.c_double, [])
-    copy = library.function("gs2d_probe_copy", ctypes.c_double, [])
-    return {"fma_gflops": round(max(fma() for _ in range(3)), 1), "copy_gb_s": round(max(copy() for _ in range(3)), 1)}
 
 
 def timed(library: Library, splats: Splats, size: int, upstream: tuple[str, ...], repeats: int) -> dict[str, float]:
@@ -111,8 +86,15 @@ def main() -> None:
         before = probe(library)
         times = timed(library, room(n), size, UPSTREAM[arguments.upstream], arguments.repeats)
         after = probe(library)
-        peak = {key: max(before[key], after[key]) for key in before}
-        row = {"splats": n, "size": size, "threads": arguments.threads, "upstream": arguments.upstream, **times, **peak}
+        peak = {key: round(value, 1) for key, value in asdict(before.better(after)).items()}
+        row: dict[str, object] = {
+            "splats": n,
+            "size": size,
+            "threads": arguments.threads,
+            "upstream": arguments.upstream,
+            **times,
+            **peak,
+        }
         pairs = PAIRS.get((n, size))
         if pairs is not None:
             row["ns_per_pair"] = round(1e6 * times["total_min"] / (pairs * size * size), 2)

@@ -1,13 +1,20 @@
-"""The synthetic room that the rasterizer is timed on: two spheres, a floor and a wall, seeded."""
+"""What is timed: the synthetic room (two spheres, a floor and a wall, seeded), or splats that were trained."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
 from gs2d.camera import Camera, look_at
+from gs2d.data import load_scene
+from gs2d.io.ply import read_splats
 from gs2d.splats import Splats
+
+PLACES = ((0.3, -0.5, -4.0), (-0.9, -0.8, -3.8), (1.2, -0.3, -3.9), (0.0, -1.4, -4.2))
 
 
 def room(n: int, seed: int = 0) -> Splats:
@@ -21,7 +28,7 @@ def room(n: int, seed: int = 0) -> Splats:
     counts = (quarter, quarter, quarter, n - 3 * quarter)
 
     def sphere(count: int, center: tuple[float, float, float], radius: float) -> tuple[np.ndarray, np.ndarray]:
-        direction = rng.normal(size=(count, 3))
+        direction = np.asarray(rng.normal(size=(count, 3)))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return np.asarray(center) + radius * direction, direction
 
@@ -37,11 +44,11 @@ def room(n: int, seed: int = 0) -> Splats:
         plane(counts[3], np.array([-3.0, -2.6, 1.6]), np.array([6.0, 0, 0]), np.array([0, 3.4, 0])),
     ]
     points = np.concatenate([p for p, _ in parts])
-    normals = np.concatenate([m for _, m in parts]) + 0.15 * rng.normal(size=(n, 3))
+    normals = np.concatenate([m for _, m in parts]) + 0.15 * np.asarray(rng.normal(size=(n, 3)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     distances, _ = cKDTree(points).query(points, k=4)
-    spacing = distances[:, 1:].mean(axis=1)
-    scales = 0.9 * spacing[:, None] * np.exp(0.4 * rng.normal(size=(n, 2)))
+    spacing = np.asarray(distances)[:, 1:].mean(axis=1)
+    scales = 0.9 * spacing[:, None] * np.exp(0.4 * np.asarray(rng.normal(size=(n, 2))))
     opacity = np.where(rng.random(n) < 0.5, rng.uniform(0.1, 0.5, n), rng.uniform(0.5, 0.95, n))
     order = rng.permutation(n)  # nothing is sorted in space
 
@@ -70,13 +77,60 @@ def _quats_of(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack([w * c - q * s, x * c + y * s, y * c - x * s, w * s + q * c], axis=1)
 
 
-def camera(size: int) -> Camera:
-    """A square image with focal length 0.9 x its side, looking at the room."""
+def camera(width: int, height: int | None = None, place: tuple[float, float, float] = (0.3, -0.5, -4.0)) -> Camera:
+    """A view of the room, square without a height; the focal length is 0.9 x the width."""
     return look_at(
-        np.array([0.3, -0.5, -4.0]),
+        np.array(place),
         np.array([0.0, 0.0, 0.2]),
         np.array([0.0, -1.0, 0.0]),
-        width=size,
-        height=size,
-        fx=0.9 * size,
+        width=width,
+        height=width if height is None else height,
+        fx=0.9 * width,
     )
+
+
+def places(width: int, height: int) -> tuple[Camera, ...]:
+    """The four training views of the room."""
+    return tuple(camera(width, height, place) for place in PLACES)
+
+
+@dataclass(frozen=True, eq=False)
+class Workload:
+    """Splats and the cameras that look at them; the first camera is the one the rasterizer is timed on."""
+
+    name: str
+    splats: Splats
+    cameras: tuple[Camera, ...]
+
+
+FULL = (
+    (20_000, 400, 400),
+    (50_000, 400, 400),
+    (100_000, 400, 400),
+    (100_000, 800, 800),
+    (300_000, 800, 800),
+    (300_000, 1600, 1060),
+    (1_000_000, 1600, 1060),
+    (5_000_000, 1600, 1060),
+)
+QUICK = ((2_000, 96, 96), (4_000, 160, 106))
+
+
+def name_of(count: int, width: int, height: int) -> str:
+    """For instance "room-100k-800x800"."""
+    size = f"{count // 1_000_000}M" if count % 1_000_000 == 0 else f"{count // 1000}k"
+    return f"room-{size}-{width}x{height}"
+
+
+def room_workload(count: int, width: int, height: int) -> Workload:
+    """The room with four views."""
+    return Workload(name_of(count, width, height), room(count), places(width, height))
+
+
+def trained_workload(splats_file: Path, capture: Path, downscale: int) -> Workload:
+    """Splats that were trained on photographs (a PLY, or a run folder with its splats.ply), seen by its cameras."""
+    file = splats_file / "splats.ply" if splats_file.is_dir() else splats_file
+    splats = read_splats(file)
+    views = load_scene(capture, downscale=downscale).train
+    cameras = tuple(view.camera for view in views[:: max(1, len(views) // 4)][:4])
+    return Workload(f"{capture.resolve().name}-{len(splats)}-{cameras[0].width}x{cameras[0].height}", splats, cameras)

@@ -1,0 +1,103 @@
+"""The benchmark suite.
+
+::
+
+    python -m benchmarks --out FILE.json [--quick] [--threads 2] [--only 20k 100k-800] [--variant v3]
+                         [--splats RUN_OR_PLY --capture FOLDER [--downscale N]]
+    python -m benchmarks compare A.json B.json
+
+The first form times every workload stage by stage; ``--quick`` takes a few seconds and only shows that everything
+works. ``--splats`` adds splats trained on photographs, seen by the cameras of their capture. The second form exits with
+1 if B is slower than A by more than noise (the rule: benchmarks/compare.py), with 2 if they cannot be compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+
+from benchmarks.compare import NotComparable, compare
+from benchmarks.suite import run_suite
+from benchmarks.workload import FULL, QUICK, name_of, room_workload, trained_workload
+
+
+def report(path: Path, name: str, document: dict[str, Any]) -> None:
+    """A few figures of a workload as soon as it is done; the file holds all that is done."""
+    result = document["workloads"][name]
+    ms, share, iteration = result["best_ms"], result["fma_fraction"], result["iteration_ms"]
+    print(
+        f"{name}: best forward {ms['raster_forward']} + backward {ms['raster_backward']} ms, of peak FMA "
+        f"{share['forward']:.3f} / {share['backward']:.3f}, iteration "
+        f"{' / '.join(str(iteration[f'stage{i}']) for i in (1, 2, 3))} ms, "
+        f"{result['bytes_per_splat']} bytes a splat, probe {result['probe']['fma_gflops']} GFLOP/s",
+        flush=True,
+    )
+    path.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the suite, or compare two results; returns the exit status."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["compare"]:
+        return compare_files(words[1:])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=6.0, help="for each group of steps")
+    parser.add_argument("--only", nargs="+", help="workloads whose name contains one of these")
+    parser.add_argument("--variant", help="instruction set: v4, v3 or portable (default: the best)")
+    parser.add_argument("--splats", type=Path, help="a run folder or a PLY of trained splats")
+    parser.add_argument("--capture", type=Path, help="the photographs they were trained on")
+    parser.add_argument("--downscale", type=int, default=1)
+    args = parser.parse_args(words)
+    if (args.splats is None) != (args.capture is None):
+        parser.error("--splats and --capture belong together")
+    if args.variant:
+        os.environ["GS2D_CPU_VARIANT"] = args.variant  # losses and training take it from here
+    sizes = [s for s in (QUICK if args.quick else FULL) if not args.only or any(o in name_of(*s) for o in args.only)]
+    workloads = [partial(room_workload, *size) for size in sizes]
+    if args.splats is not None:
+        workloads.append(partial(trained_workload, args.splats, args.capture, args.downscale))
+    if not workloads:
+        there = ", ".join(name_of(*size) for size in (QUICK if args.quick else FULL))
+        parser.error(f"no workload is called {' or '.join(args.only)}; there are {there}")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    run_suite(
+        workloads,
+        threads=args.threads,
+        seconds=0.05 if args.quick else args.seconds,
+        least=2 if args.quick else 5,
+        on_result=partial(report, args.out),
+    )
+    return 0
+
+
+def compare_files(words: Sequence[str]) -> int:
+    """0: no regression; 1: regression; 2: not comparable."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks compare")
+    parser.add_argument("before", type=Path)
+    parser.add_argument("after", type=Path)
+    args = parser.parse_args(words)
+    try:
+        changes = compare(json.loads(args.before.read_text()), json.loads(args.after.read_text()))
+    except NotComparable as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    for change in changes:
+        print(change)
+    return int(any(change.regressed for change in changes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,96 @@
+"""All workloads, stage by stage, with whole iterations, as one JSON document."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from benchmarks.flops import BACKWARD, FORWARD, fraction
+from benchmarks.iteration import iteration_times
+from benchmarks.memory import view_bytes
+from benchmarks.stages import measure_stages
+from benchmarks.timing import machine
+from benchmarks.workload import Workload
+from gs2d.kernels.library import Library, load
+
+FORMAT = 1
+DIGITS = 4  # of every figure
+
+
+def rounded(value: float) -> float:
+    """Four significant digits."""
+    return float(f"{value:.{DIGITS}g}")
+
+
+def workload_result(library: Library, workload: Workload, seconds: float, least: int) -> dict[str, Any]:
+    """One entry of ``workloads``. All times in ms; fractions use the best times and the best probe (see docs)."""
+    measured = measure_stages(library, workload, seconds, least)
+    steps, work, peak = measured.steps, measured.work, measured.probe
+    repeats = max(least, min(30, round(1e3 * seconds / max(steps["raster_backward"].median * 2, 1.0))))
+    iterations = iteration_times(workload, library, repeats)
+    stages = {f"stage{index + 1}": timing for index, (timing, _) in enumerate(iterations.values())}
+    return {
+        "splats": work.splats,
+        "width": work.width,
+        "height": work.height,
+        "ms": {name: rounded(timing.median) for name, timing in steps.items()},
+        "best_ms": {name: rounded(timing.best) for name, timing in steps.items()},
+        "spread_ms": {name: rounded(timing.spread) for name, timing in steps.items()},
+        "repeats": {name: timing.repeats for name, timing in steps.items()},
+        "iteration_ms": {name: rounded(timing.median) for name, timing in stages.items()},
+        "iteration_best_ms": {name: rounded(timing.best) for name, timing in stages.items()},
+        "iteration_spread_ms": {name: rounded(timing.spread) for name, timing in stages.items()},
+        "iteration_fma_gflops": {
+            f"stage{index + 1}": rounded(rate) for index, (_, rate) in enumerate(iterations.values())
+        },
+        "fma_fraction": {
+            "forward": rounded(fraction(FORWARD, work.pairs, steps["blend_forward"].best, peak.fma_gflops)),
+            "backward": rounded(fraction(BACKWARD, work.pairs, steps["blend_backward"].best, peak.fma_gflops)),
+        },
+        "probe": {name: rounded(value) for name, value in asdict(peak).items()},
+        "bytes_per_splat": rounded(measured.frame_bytes / work.splats),
+        "memory": {"frame_bytes": measured.frame_bytes, "predicted_bytes": view_bytes(work)},
+        "work": asdict(work)
+        | {
+            "pairs_per_pixel": rounded(work.pairs / (work.width * work.height)),
+            "lane_use": rounded(work.pairs / max(work.lane_pairs, 1)),
+        },
+    }
+
+
+def run_suite(
+    workloads: Sequence[Callable[[], Workload]],
+    *,
+    threads: int,
+    seconds: float,
+    least: int,
+    on_result: Callable[[str, dict[str, Any]], None] = lambda name, document: None,
+    variant: str | None = None,
+) -> dict[str, Any]:
+    """Measure every workload on ``threads`` threads; torch's number of threads is put back afterwards.
+
+    ``on_result`` gets the name of each workload when it is done, and the document as it is then.
+    """
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        library = load(variant)
+        library.use_threads(threads)
+        document: dict[str, Any] = {
+            "format": FORMAT,
+            "date": time.strftime("%Y-%m-%d"),
+            "machine": machine() | {"variant": library.variant, "lanes": library.lanes, "threads": threads},
+            "flops_per_visible_pair": {"forward": FORWARD, "backward": BACKWARD},
+            "workloads": {},
+        }
+        for make in workloads:
+            workload = make()
+            document["workloads"][workload.name] = workload_result(library, workload, seconds, least)
+            on_result(workload.name, document)
+    finally:
+        torch.set_num_threads(before)
+    return document
