@@ -28,6 +28,7 @@ from torch import Tensor
 
 import gs2d.kernels
 from gs2d.camera import Camera
+from gs2d.errors import ShapeError
 from gs2d.render import cuda, reference, reference_errors
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
@@ -320,3 +321,58 @@ def test_unused_degrees_and_missing_coefficients_agree(emulator: Emulator, held:
         assert tensor.grad is not None
         if expected is not None and expected.numel():
             assert float((tensor.grad.double() - expected).norm()) <= 1e-3 * float(expected.norm()) + 1e-6, name
+
+
+def test_splat_errors_agree_with_the_reference(emulator: Emulator) -> None:
+    relative = []
+    for case in cases(12):
+        rng = np.random.default_rng(case.seed)
+        H, W = case.camera.height, case.camera.width
+        image = torch.tensor(rng.uniform(size=(H, W, 3)), dtype=torch.float32)
+        mask = torch.tensor(rng.uniform(size=(H, W)) < 0.8) if case.seed % 2 else None
+        low = cuda.splat_errors_with(emulator, case.splats, case.camera, image, SETTINGS, mask).double()
+        high = reference_errors.splat_errors(double(case.splats), case.camera, image.double(), SETTINGS, mask, False)
+        assert low.shape == high.shape
+        relative.append((low - high).abs() / high.clamp(min=1))
+    merged = torch.cat(relative)
+    assert quantile(merged, 0.5) < 1e-6
+    assert quantile(merged, 0.97) < 1e-4
+    assert float((merged > 0.05).double().mean()) < 0.01
+
+
+def test_more_than_32767_tiles_use_wide_keys(emulator: Emulator) -> None:
+    """3200 x 3200 px are 40000 tiles; only the lists are made, and each names the splats that lie there."""
+    launched = []
+
+    class ListsOnly:
+        def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
+            launched.append(name)
+            if not name.startswith("blend"):
+                emulator.launch(name, blocks, threads, arguments)
+
+    camera = front_camera(3200, 3200, 1600.0)
+
+    def at(x: float, y: float) -> Splats:  # at depth 2, some 2 px wide
+        return splat(((x - 1600) / 800, (y - 1600) / 800, 2.0), (1e-3, 1e-3))
+
+    scene = stack(at(3195.0, 3195.0), at(5.0, 5.0), at(3100.0, 8.0), at(3195.0, 3196.0))
+    view = cuda._view(camera, replace(SETTINGS, sh_degree=0))
+    frame = cuda.forward(ListsOnly(), view, [t for _, t in scene.items()])
+    assert "emit_entries_32" in launched
+    assert "find_ranges_32" in launched
+    filled = {
+        tile: [int(entry) >> 8 for entry in frame.entries[begin:end]]
+        for tile, (begin, end) in enumerate(frame.ranges[:-1].tolist())
+        if end > begin
+    }
+    assert filled == {39999: [0, 3], 0: [1], 3100 // 16: [2]}
+
+
+def test_what_would_read_beyond_an_array_is_refused(emulator: Emulator) -> None:
+    camera, scene = front_camera(), splat()
+    with pytest.raises(ShapeError, match="sh_degree"):
+        cuda.rasterize_with(emulator, scene, camera, SETTINGS)  # degree 3, but no coefficients beyond the first
+    with pytest.raises(ShapeError, match="float32"):
+        cuda.rasterize_with(emulator, double(scene), camera, replace(SETTINGS, sh_degree=0))
+    with pytest.raises(ShapeError, match="image"):
+        cuda.splat_errors_with(emulator, scene, camera, torch.zeros(9, 8, 3), replace(SETTINGS, sh_degree=0))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,6 +24,7 @@ from gs2d.kernels.cuda.arguments import (
     BlendArguments,
     BlendVjpArguments,
     EmitArguments,
+    ErrorArguments,
     ProjectArguments,
     ProjectVjpArguments,
     RangeArguments,
@@ -32,10 +33,11 @@ from gs2d.kernels.cuda.arguments import (
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
 
-__all__ = ["Launcher", "rasterize_with"]
+__all__ = ["Launcher", "rasterize_with", "splat_errors_with"]
 
 TILE = 16
 THREADS = 128
+PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MOST_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MOST_CANDIDATES = 1 << 31
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
@@ -128,7 +130,37 @@ def _blocks(count: int) -> int:
     return -(-count // THREADS)
 
 
-PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
+@dataclass(frozen=True, eq=False)
+class _Projected:
+    """What project.cu writes; records, cull and rects of splats without tiles are garbage."""
+
+    records: Tensor  # [N, 16] float32
+    cull: Tensor  # [N, 8] float32
+    rects: Tensor  # [N, 4] int16
+    depth_keys: Tensor  # [N] int32
+    tile_counts: Tensor  # [N] int32
+    radii: Tensor  # [N] float32
+
+
+def _project(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, errors: bool) -> _Projected:
+    """Records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
+    count, device = parameters[0].shape[0], parameters[0].device
+    if count >= MOST_SPLATS:
+        raise BackendError(f"the cuda backend takes fewer than {MOST_SPLATS} splats, got {count}")
+    shapes = {"records": (count, 16), "cull": (count, 8), "rects": (count, 4)}
+    types = {"rects": torch.int16, "depth_keys": torch.int32, "tile_counts": torch.int32}
+    arrays = {
+        field.name: torch.empty(
+            shapes.get(field.name, (count,)), dtype=types.get(field.name, torch.float32), device=device
+        )
+        for field in fields(_Projected)
+    }
+    if count > 0:
+        project = ProjectArguments(view=view, count=count, sh_rest=parameters[5].shape[1], errors=int(errors))
+        _fill(project, dict(zip(PARAMETERS, parameters, strict=True)))
+        _fill(project, dict(arrays))
+        launcher.launch("project_splats", _blocks(count), THREADS, project)
+    return _Projected(**arrays)
 
 
 def forward(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, exact: bool = True) -> Frame:
@@ -136,27 +168,13 @@ def forward(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, exa
 
     The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device.
     """
-    means = parameters[0]
-    count, device = means.shape[0], means.device
-    if count >= MOST_SPLATS:
-        raise BackendError(f"the cuda backend takes fewer than {MOST_SPLATS} splats, got {count}")
+    device = parameters[0].device
 
     def floats(*shape: int) -> Tensor:
         return torch.empty(shape, dtype=torch.float32, device=device)
 
-    def ints(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
-        return torch.empty(shape, dtype=dtype, device=device)
-
-    splats: dict[str, Tensor | None] = dict(zip(PARAMETERS, parameters, strict=True))
-    records, cull, radii = floats(count, 16), floats(count, 8), floats(count)
-    depth_keys, tile_counts, rects = ints(count), ints(count), ints(count, 4, dtype=torch.int16)
-    if count > 0:
-        project = ProjectArguments(view=view, count=count, sh_rest=parameters[5].shape[1])
-        _fill(project, {**splats, "records": records, "cull": cull, "depth_keys": depth_keys, "rects": rects})
-        _fill(project, {"tile_counts": tile_counts, "radii": radii})
-        launcher.launch("project_splats", _blocks(count), THREADS, project)
-
-    entries, ranges = _bin(launcher, view, depth_keys, tile_counts, cull, rects, exact)
+    projected = _project(launcher, view, parameters, errors=False)
+    entries, ranges = _bin(launcher, view, projected, exact)
     tiles = torch.argsort(ranges[:-1, 1] - ranges[:-1, 0], descending=True, stable=True).to(torch.int32)
     words = (len(entries) >> 5) + len(tiles) + 1
     seen = torch.zeros(words, 8, dtype=torch.int32, device=device)
@@ -164,19 +182,21 @@ def forward(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, exa
     images = {name: floats(H, W, 3) if name in ("color", "normal") else floats(H, W) for name in IMAGES}
     images |= {"final_T": floats(H, W), "moments": floats(H, W, 3)}
     blend = BlendArguments(view=view)
-    _fill(blend, {"records": records, "entries": entries, "ranges": ranges, "tiles": tiles, "seen": seen, **images})
+    _fill(
+        blend,
+        {"records": projected.records, "entries": entries, "ranges": ranges, "tiles": tiles, "seen": seen, **images},
+    )
     launcher.launch("blend_forward_distortion", len(tiles), THREADS, blend)
-    return Frame(view, records, tile_counts, entries, ranges, tiles, seen, images, radii)
+    hidden = (entries, ranges, tiles, seen, images)
+    return Frame(view, projected.records, projected.tile_counts, *hidden, projected.radii)
 
 
-def _bin(
-    launcher: Launcher, view: View, depth_keys: Tensor, tile_counts: Tensor, cull: Tensor, rects: Tensor, exact: bool
-) -> tuple[Tensor, Tensor]:
+def _bin(launcher: Launcher, view: View, projected: _Projected, exact: bool) -> tuple[Tensor, Tensor]:
     """Entries and ranges: a stable sort by depth, emission of candidates, a stable sort by tile."""
-    device = depth_keys.device
+    device = projected.records.device
     tiles = int(view.tiles_x) * int(view.tiles_y)
-    order = torch.sort(depth_keys, stable=True).indices
-    ends = torch.cumsum(tile_counts[order], 0, dtype=torch.int64)
+    order = torch.sort(projected.depth_keys, stable=True).indices
+    ends = torch.cumsum(projected.tile_counts[order], 0, dtype=torch.int64)
     candidates = int(ends[-1]) if len(ends) else 0  # the one host synchronisation of an iteration
     if candidates >= MOST_CANDIDATES:
         raise BackendError(
@@ -192,7 +212,8 @@ def _bin(
     emit = EmitArguments(candidates=candidates, visible=len(order), exact=int(exact))
     for name in ("width", "height", "tiles_x", "tiles_y"):
         setattr(emit, name, getattr(view, name))
-    _fill(emit, {"order": order, "ends": ends, "cull": cull, "rects": rects, "keys": keys, "payloads": payloads})
+    _fill(emit, {"order": order, "ends": ends, "cull": projected.cull, "rects": projected.rects})
+    _fill(emit, {"keys": keys, "payloads": payloads})
     launcher.launch(f"emit_entries_{bits}", _blocks(candidates), THREADS, emit)
     sorted_keys, permutation = torch.sort(keys, stable=True)
     find = RangeArguments(candidates=candidates)
@@ -313,3 +334,51 @@ def rasterize_with(
     parameters = [t for _, t in splats.items()]
     *images, radii = _Rasterize.apply(launcher, _view(camera, settings), exact_masks, screen_probe, *parameters)
     return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
+
+
+def splat_errors_with(
+    launcher: Launcher,
+    splats: Splats,
+    camera: Camera,
+    image: Tensor,
+    settings: RasterSettings,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Inner sum of the paper's E_i for one view [N]; rule 17 of the contract, without ``occlusion``. Deterministic.
+
+    Parameters
+    ----------
+    launcher, splats, camera, settings
+        As for :func:`rasterize_with`.
+    image : Tensor [H, W, 3] float32
+    mask : Tensor [H, W] bool, optional
+        False = ignore.
+
+    Raises
+    ------
+    ShapeError, BackendError
+        As for :func:`rasterize_with`; also for an image or a mask of another shape or dtype.
+    """
+    _check_tensors(splats, settings)
+    size = (camera.height, camera.width)
+    if tuple(image.shape) != (*size, 3) or image.dtype != torch.float32 or image.device != splats.device:
+        raise ShapeError(
+            f"image must be {[*size, 3]} float32 on {splats.device}, got {list(image.shape)} {image.dtype} "
+            f"on {image.device}"
+        )
+    if mask is not None and (tuple(mask.shape) != size or mask.dtype != torch.bool or mask.device != splats.device):
+        raise ShapeError(
+            f"mask must be {list(size)} bool on {splats.device}, got {list(mask.shape)} {mask.dtype} on {mask.device}"
+        )
+    view, count = _view(camera, settings), len(splats)
+    parameters = [t.detach().contiguous() for _, t in splats.items()]
+    projected = _project(launcher, view, parameters, errors=True)
+    errors = torch.empty(count, dtype=torch.float32, device=splats.device)
+    if count == 0:
+        return errors
+    image, mask = image.detach().contiguous(), None if mask is None else mask.contiguous()
+    arguments = ErrorArguments(view=view, count=count)
+    _fill(arguments, {name: getattr(projected, name) for name in ("records", "cull", "rects", "tile_counts")})
+    _fill(arguments, {"image": image, "mask": mask, "errors": errors})
+    launcher.launch("splat_errors", _blocks(32 * count), THREADS, arguments)
+    return errors

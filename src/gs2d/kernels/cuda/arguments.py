@@ -8,6 +8,7 @@ __all__ = [
     "BlendArguments",
     "BlendVjpArguments",
     "EmitArguments",
+    "ErrorArguments",
     "ProjectArguments",
     "ProjectVjpArguments",
     "RangeArguments",
@@ -99,4 +100,14 @@ class ProjectVjpArguments(ctypes.Structure):
         *_pointers(*PARAMETERS, "tile_counts", "gradients", "extras"),
         *_pointers(*(f"g_{name}" for name in PARAMETERS), "g_probe"),
         ("probe_columns", ctypes.c_int64),
+    )
+
+
+class ErrorArguments(ctypes.Structure):
+    """Of errors.cu."""
+
+    _fields_ = (
+        ("view", View),
+        ("count", ctypes.c_int64),
+        *_pointers("records", "cull", "rects", "tile_counts", "image", "mask", "errors"),
     )

@@ -1,0 +1,58 @@
+// Splat errors (rule 17): one warp per splat, over the pixels of its rectangle of tiles, in a fixed order.
+#include "cuda/common.h"
+
+namespace gs2d {
+
+struct ErrorArguments {
+    View view;
+    int64 count;
+    const float* records;
+    const float* cull;
+    const ushort* rects;
+    const int* tile_counts;
+    const float* image;  // [H, W, 3]
+    const uchar* mask;   // [H, W], 0 = ignore; or null
+    float* errors;       // [N]
+};
+
+// Records are those of a projection with `errors` set: the footprint is rho <= error_k2.
+extern "C" __global__ void __launch_bounds__(128) splat_errors(ErrorArguments a) {
+    const int64 splat = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
+    const int lane = threadIdx.x & 31;
+    if (splat >= a.count) return;  // the whole warp
+    const View& v = a.view;
+    float total = 0.f;
+    const int tiles = a.tile_counts[splat];
+    if (tiles > 0) {
+        const BlendLimits<float> limits = limits_of(v);
+        const float4* from = reinterpret_cast<const float4*>(a.records + RECORD * splat);
+        const Record<float> s = record_of(from[0], from[1], from[2], from[3]);
+        const ushort* rect = a.rects + 4 * splat;
+        const int x0 = rect[0], y0 = rect[1], columns = rect[2] - x0;
+        for (int t = 0; t < tiles; ++t) {
+            const int left = (x0 + t % columns) * TILE_PX, top = (y0 + t / columns) * TILE_PX;
+            const float fx = float(left), fy = float(top);
+            const float cull[8] = {a.cull[8 * splat] - fx,     a.cull[8 * splat + 1] - fy, a.cull[8 * splat + 2], a.cull[8 * splat + 3],
+                                   a.cull[8 * splat + 4], a.cull[8 * splat + 5] - fx, a.cull[8 * splat + 6] - fy, a.cull[8 * splat + 7]};
+            const BoxTest<float> test = box_test(cull);
+            for (int b = 0; b < 8; ++b) {
+                const int bx = (b & 1) * 8, by = (b >> 1) * 4;
+                const float cx = float(bx) + 0.5f, cy = float(by) + 0.5f;
+                if (!reaches(test, cx, cy, cx + 7.f, cy + 3.f)) continue;
+                const int x = left + bx + (lane & 7), y = top + by + (lane >> 3);
+                if (x >= v.width || y >= v.height) continue;
+                const int64 at = int64(y) * v.width + x;
+                if (a.mask && !a.mask[at]) continue;
+                const Hit<float> h = intersect(s, float(x) + 0.5f - s.cx, float(y) + 0.5f - s.cy, limits);
+                if (!(h.rho <= v.error_k2 && s.zc * h.rq >= v.near)) continue;
+                const float* c = a.image + 3 * at;
+                total = total + (abs(s.red - c[0]) + abs(s.green - c[1]) + abs(s.blue - c[2]));
+            }
+        }
+    }
+#pragma unroll
+    for (int step = 16; step > 0; step >>= 1) total = total + __shfl_xor_sync(FULL_MASK, total, step);
+    if (lane == 0) a.errors[splat] = total;
+}
+
+}  // namespace gs2d
