@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-CREAM, COBALT, SKY, OCHRE = (0.93, 0.91, 0.85), (0.09, 0.20, 0.50), (0.45, 0.64, 0.84), (0.88, 0.62, 0.16)
-CLAY, SOOT, IVORY, RUST = (0.77, 0.43, 0.24), (0.13, 0.10, 0.10), (0.94, 0.86, 0.72), (0.60, 0.21, 0.13)
+CREAM, COBALT, SKY, OCHRE = (0.80, 0.77, 0.69), (0.09, 0.20, 0.50), (0.45, 0.64, 0.84), (0.88, 0.62, 0.16)
+CLAY, SOOT, IVORY, RUST = (0.77, 0.43, 0.24), (0.13, 0.10, 0.10), (0.86, 0.78, 0.64), (0.60, 0.21, 0.13)
 
 # Letters of five columns and seven rows, one string per row.
 _LETTERS = {
@@ -97,7 +97,7 @@ def _terrazzo_ring(image: np.ndarray, radius: np.ndarray, rng: np.random.Generat
     for color, level in (
         ((0.35, 0.33, 0.33), 1.45),
         ((0.74, 0.42, 0.32), 1.5),
-        ((0.97, 0.95, 0.92), 1.3),
+        ((0.84, 0.82, 0.78), 1.3),
         (OCHRE, 1.7),
     ):
         _paint(image, ring & (noise(rng, size, size, 30, 75) > level), color)
@@ -109,7 +109,7 @@ def plinth_side(rng: np.random.Generator, *, aspect: float) -> np.ndarray:
     rows, columns = 64, 2048
     image = np.empty((rows, columns, 3))
     image[:] = (0.87, 0.83, 0.77)
-    for color, level in (((0.35, 0.33, 0.33), 1.45), ((0.74, 0.42, 0.32), 1.5), ((0.97, 0.95, 0.92), 1.3)):
+    for color, level in (((0.35, 0.33, 0.33), 1.45), ((0.74, 0.42, 0.32), 1.5), ((0.84, 0.82, 0.78), 1.3)):
         _paint(image, noise(rng, rows, columns, 90, 230, aspect=aspect) > level, color)
     return _finish(image, 0.04 * noise(rng, rows, columns, 10, 120, aspect=aspect))
 
