@@ -21,9 +21,10 @@ from gs2d.errors import DataError, DiskError, DivergedError, ProtocolError, Reci
 from gs2d.io.ply import read_mesh, read_splats, write_mesh
 from gs2d.io.run import RunFolder, open_run
 from gs2d.pipeline.demo import DemoOptions, demo
-from gs2d.pipeline.events import Event, Notice, StageDone, Step
+from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
+from gs2d.pipeline.prepare import prepare
 from gs2d.pipeline.train import train
 from gs2d.triangles import Mesh
 from tiny import write_ball_mesh, write_capture
@@ -208,6 +209,7 @@ def test_resume_goes_back_one_checkpoint_when_the_last_is_damaged_and_says_so(
         ({"overrides": (*SMALL, "refine.iterations=25")}, r"recipe \(stages.refine.iterations: 20, now 25\)"),
         ({"protocol": "generic"}, r"another protocol \(name: nerf-synthetic, now generic\)"),
         ({"downscale": 2}, r"another downscale \(1, now 2\)"),
+        ({"stage2_cache_mb": 0}, r"another stage2_cache_bytes \(1073741824, now 0\)"),
     ],
 )
 def test_resuming_with_other_options_is_refused_and_names_the_difference(
@@ -243,6 +245,20 @@ def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: P
     train(replace(first, out=tmp_path / "d", downscale=2))
     assert len(list(cache.glob("*.pt"))) == 4
     assert all("reused_from" not in open_run(tmp_path / x).metrics()["stages"][0] for x in "abcd")
+
+
+def test_runs_share_stages_with_and_without_cached_views_up_to_the_one_that_uses_them(
+    capture: Path, tmp_path: Path
+) -> None:
+    jobs = [
+        prepare(options(capture, tmp_path, overrides=(*SMALL, f"appearance.iterations={iterations}"), **more), ignore)
+        for iterations in (11, 12)  # six views: cached from twelve iterations
+        for more in ({}, {"stage2_cache_mb": 0})
+    ]
+    with_cache = jobs[0].backend.name == "cpu"
+    same_key = [[a.stage_key(i) == b.stage_key(i) for i in range(3)] for a, b in (jobs[:2], jobs[2:])]
+    assert same_key == [[True] * 3, [True, not with_cache, not with_cache]]
+    assert [job.definition()["stage2_cache_bytes"] for job in jobs] == [1 << 30, 0, 1 << 30, 0]
 
 
 def test_a_run_starts_from_the_stages_it_shares_with_another(
@@ -314,6 +330,7 @@ def test_a_recipe_that_names_an_unknown_group_fails_before_the_capture_is_read(t
     [
         ({"downscale": 0}, "got 0"),
         ({"checkpoint_every": 0}, "got 0"),
+        ({"stage2_cache_mb": -1}, "got -1"),
         ({"checkpoint_seconds": float("nan")}, "got nan"),
         ({"threads": 0}, "got 0"),
         ({"threads": 1_000_000}, "from 1 to 1024, got 1000000"),

@@ -52,6 +52,7 @@ def _train_options(command: c.Train) -> Any:
         threads=command.threads,
         checkpoint_every=command.checkpoint_every,
         checkpoint_seconds=command.checkpoint_seconds,
+        stage2_cache_mb=command.stage2_cache_mb,
     )
 
 

@@ -41,6 +41,9 @@ class TrainOptions:
         CPU threads; None = all that this process may use.
     checkpoint_every, checkpoint_seconds : int, float
         A checkpoint is written after so many iterations, or so many seconds, whichever comes first.
+    stage2_cache_mb : int
+        MiB for cached views in stages that train only the colours of a row group (cpu backend); 0 = none. A part of
+        the run's definition: which views are cached decides the rounding.
     shown_views : int
         Views that are rendered after each stage for the report.
     allowed : tuple of str
@@ -64,6 +67,7 @@ class TrainOptions:
     threads: int | None = None
     checkpoint_every: int = 1000
     checkpoint_seconds: float = 120.0
+    stage2_cache_mb: int = 1024
     shown_views: int = 3
     allowed: tuple[str, ...] = ()
 

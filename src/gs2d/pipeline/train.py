@@ -103,6 +103,7 @@ def train_stages(run: RunFolder, job: Job, options: TrainOptions, start: Start, 
         on_event=recorder.on_training_event,
         state=start.state,
         progress_every=recorder.progress_every,
+        stage2_cache_bytes=job.stage2_cache_bytes,
     )
     recorder.begin(trainer)
     with recorder.naming_the_last_checkpoint():

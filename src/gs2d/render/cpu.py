@@ -124,6 +124,20 @@ def _check_tensors(splats: Splats, settings: RasterSettings, dtype: torch.dtype)
         raise BackendError(f"the cpu backend takes fewer than 2^31 splats, got {len(splats)}")
 
 
+def _forward(library: Library, view: _View, tensors: Sequence[Tensor]) -> tuple[dict[str, Tensor], Tensor, _Frame]:
+    """Images, radii and what the backward pass needs; the tensors are contiguous."""
+    H, W = int(view.height), int(view.width)
+    options: dict[str, Any] = {"dtype": library.dtype}
+    images = {name: torch.empty((H, W, 3) if name in ("color", "normal") else (H, W), **options) for name in IMAGES}
+    radii = torch.empty(len(tensors[0]), **options)
+    forward = library.function("gs2d_raster_forward", ctypes.c_int, [ctypes.c_void_p] * 4)
+    pointer = ctypes.c_void_p()
+    native_images = _Images(*(_address(t) for t in images.values()), _address(radii))
+    native_splats = _parameters(tensors)
+    _check(forward(*(ctypes.byref(x) for x in (view, native_splats, native_images, pointer))))
+    return images, radii, _Frame(library, pointer)
+
+
 class _Rasterize(torch.autograd.Function):
     """Images and radii from the six parameter tensors; the seventh input is the screen probe or None."""
 
@@ -132,16 +146,7 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, library: Library, view: _View, probe: Tensor | None, *parameters: Tensor
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
-        H, W = int(view.height), int(view.width)
-        options: dict[str, Any] = {"dtype": library.dtype}
-        images = {name: torch.empty((H, W, 3) if name in ("color", "normal") else (H, W), **options) for name in IMAGES}
-        radii = torch.empty(len(tensors[0]), **options)
-        forward = library.function("gs2d_raster_forward", ctypes.c_int, [ctypes.c_void_p] * 4)
-        pointer = ctypes.c_void_p()
-        native_images = _Images(*(_address(t) for t in images.values()), _address(radii))
-        native_splats = _parameters(tensors)
-        _check(forward(*(ctypes.byref(x) for x in (view, native_splats, native_images, pointer))))
-        frame = _Frame(library, pointer)
+        images, radii, frame = _forward(library, view, tensors)
         if any(ctx.needs_input_grad):
             ctx.library, ctx.frame = library, frame
             ctx.probe_shape = None if probe is None else tuple(probe.shape)

@@ -7,46 +7,31 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RunError
-from gs2d.losses import compute_losses
 from gs2d.protocols import Protocol
 from gs2d.recipe import CloneInPlace, RankByError, Recipe, Stage, validate
-from gs2d.render.api import rasterize, splat_errors
+from gs2d.render.api import splat_errors
 from gs2d.render.backend import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.splats import Splats
 from gs2d.train import events
 from gs2d.train.actions import clone_in_place, rank_by_error
+from gs2d.train.cached_views import choose_evaluator
 from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
 from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
 from gs2d.train.state import Statistics, TrainState
-from gs2d.train.targets import Target, Targets
+from gs2d.train.targets import Targets
+from gs2d.train.views import Evaluated, Evaluator, WholeViews, diverged, finite, raster_settings
+
+__all__ = ["OnEvent", "Trainer", "raster_settings"]
 
 OnEvent = Callable[[events.Event], None]
-
-
-def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
-    """The rasterizer's constants for a scene of this extent (wu) under a protocol."""
-    return RasterSettings(near=protocol.near_for(extent), background=protocol.background, sh_degree=sh_degree)
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluated:
-    """Loss terms of one iteration with the gradients of the trained attributes and, if gathered, screen gradients."""
-
-    losses: Mapping[str, float]
-    gradients: Mapping[str, Tensor]
-    signal: Tensor | None
-    radii: Tensor
 
 
 class Trainer:
@@ -67,6 +52,9 @@ class Trainer:
         Iterations between Progress events (the last of a stage always sends one).
     target_bytes : int
         Memory for photographs as float tensors.
+    stage2_cache_bytes : int
+        Memory for cached views (cpu backend, stages that train only the colours of a row group); 0 = none. The first
+        views that fit are cached. The result depends on it, by rounding.
     dtype : torch.dtype
         Of a new start.
 
@@ -87,6 +75,7 @@ class Trainer:
         state: TrainState | None = None,
         progress_every: int = 10,
         target_bytes: int = 1 << 29,
+        stage2_cache_bytes: int = 1 << 30,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if not scene.train:
@@ -105,6 +94,9 @@ class Trainer:
             device=self.state.splats.device,
             limit_bytes=target_bytes,
         )
+        self._whole = WholeViews(scene, self.recipe, protocol, self.backend, self._targets)
+        self._stage2_cache_bytes = stage2_cache_bytes
+        self._evaluator: Evaluator | None = None  # of the stage under way, from its first iteration here
 
     @property
     def splats(self) -> Splats:
@@ -136,6 +128,7 @@ class Trainer:
         """Run the entry actions of a stage and prepare its first iteration."""
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
+        self._evaluator = None
         while self._pending:
             self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
@@ -159,13 +152,16 @@ class Trainer:
         state = self.state
         stage, iteration = self.recipe.stages[state.stage], state.step + 1
         index = state.next_view(len(self.scene.train))
-        result = self._evaluate(stage, iteration, self.scene.train[index].camera, self._targets[index])
+        if self._evaluator is None:
+            self._evaluator = choose_evaluator(self._whole, state, stage, self._stage2_cache_bytes)
+        result = self._evaluator.evaluate(state, stage, iteration, index)
         rates = rates_at(stage.rates, iteration, self.scene.extent)
         happened = self._densify(stage, iteration, result)
         rebuilt = any(isinstance(event, events.Densified) for event in happened)
         if not rebuilt:
             limited = any(isinstance(event, events.OpacityLimited) for event in happened)
-            adam_step(state, stage, result.gradients, rates, skip=("opacity_logits",) if limited else ())
+            skip = ("opacity_logits",) if limited else ()
+            adam_step(state, stage, result.gradients, rates, skip=skip, rows=result.rows)
         state.step = iteration
         for event in happened:
             self._on_event(event)
@@ -209,41 +205,6 @@ class Trainer:
             )
         return state
 
-    def _evaluate(self, stage: Stage, iteration: int, camera: Camera, target: Target) -> Evaluated:
-        """Render one view; loss and gradients, checked to be finite."""
-        splats, densify = self.state.splats, stage.densify
-        leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
-        gather = densify is not None and iteration < densify.stop
-        probe = None
-        if gather:
-            columns = 4 if densify is not None and densify.absolute else 2
-            probe = splats.means.new_zeros(len(splats), columns, requires_grad=True)
-        degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
-        settings = raster_settings(self.protocol, self.scene.extent, degree)
-        output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe)
-        terms = compute_losses(
-            output,
-            target.image,
-            target.mask,
-            camera,
-            self.protocol.resolve(stage.losses),
-            iteration=iteration,
-            depth_kind=self.protocol.depth,
-            backend_name=self.backend.name,
-            target_cache=target.maps,
-        )
-        loss = torch.stack(list(terms.values())).sum()
-        values = {kind: float(value.detach()) for kind, value in terms.items()}
-        if not bool(torch.isfinite(loss)):
-            raise self._diverged(stage, iteration, f"the loss ({', '.join(f'{k} {v:g}' for k, v in values.items())})")
-        if loss.requires_grad:  # not where no splat is in the picture
-            loss.backward()
-        gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
-        for name, gradient in gradients.items():
-            if not _finite(gradient):
-                raise self._diverged(stage, iteration, f"the gradient of {name}")
-        return Evaluated(values, gradients, None if probe is None else _gradient(probe), output.radii)
-
     def _densify(self, stage: Stage, iteration: int, result: Evaluated) -> list[events.Event]:
         """Statistics, densification and opacity resets of one iteration."""
         state, densify, white = self.state, stage.densify, self.protocol.white
@@ -252,6 +213,7 @@ class Trainer:
             return happened
         assert state.statistics is not None
         assert result.signal is not None
+        assert result.radii is not None
         accumulate(state.statistics, result.signal, result.radii)
         if densify.densifies(iteration):
             try:
@@ -294,6 +256,7 @@ class Trainer:
         """Point the state at the next stage and say that this one is done."""
         state, index = self.state, self.state.stage
         state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
+        self._evaluator = None
         self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats)))
 
     def _progress(
@@ -317,28 +280,5 @@ class Trainer:
     def _check_parameters(self, stage: Stage, names: tuple[str, ...]) -> None:
         """Raise DivergedError if a parameter is not finite: the rasterizer would quietly leave such a splat out."""
         for name, tensor in self.state.splats.items():
-            if name in names and not _finite(tensor):
-                raise self._diverged(stage, self.state.step, name)
-
-    def _diverged(self, stage: Stage, iteration: int, what: str) -> DivergedError:
-        return DivergedError(
-            f"training diverged at iteration {iteration} of stage {stage.name!r}: {what} is NaN or infinite; "
-            f"lower a rate (--set {stage.name}.rates.means=...) or check the cameras and photographs"
-        )
-
-
-def _gradient(leaf: Tensor) -> Tensor:
-    """The gradient of a leaf; zero where nothing depends on it."""
-    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-
-
-def _finite(tensor: Tensor) -> bool:
-    """Whether all of a tensor is finite: a sum costs one pass, and cannot be finite if a term is not.
-
-    On the CPU numpy sums: it wakes no threads, which costs more than the sum where cores are busy.
-    """
-    detached = tensor.detach()
-    if detached.device.type != "cpu":
-        return bool(torch.isfinite(detached.sum()))
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(detached.numpy().sum()))
+            if name in names and not finite(tensor):
+                raise diverged(stage, self.state.step, name)

@@ -40,6 +40,7 @@ def adam_step(
     rates: Mapping[str, float],
     *,
     skip: Collection[str] = (),
+    rows: Tensor | None = None,
 ) -> None:
     """One Adam update, in place, of the rows and attributes that the stage trains.
 
@@ -48,9 +49,11 @@ def adam_step(
     state : TrainState
     stage : Stage
     gradients : mapping of attribute to Tensor
-        Like the attributes; rows outside a row group are not read.
+        Like the attributes; rows outside a row group are not read. With ``rows``, only of those, in their order.
     rates : mapping of attribute to float
     skip : attributes that are left alone this time
+    rows : Tensor [M] int64, optional
+        The rows of the group that the stage trains, where the gradients are of those alone.
     """
     for name, parameter in state.splats.items():
         if name not in stage.train or name in skip or parameter.numel() == 0:
@@ -60,13 +63,15 @@ def adam_step(
         if group == "all":
             _update(parameter, gradients[name], moments.mean, moments.square, moments.steps, rates[name], stage.rates)
             continue
-        rows = state.groups[group].nonzero().squeeze(1)  # [M]
-        if len(rows) == 0:
+        trained = state.groups[group].nonzero().squeeze(1) if rows is None else rows  # [M]
+        if len(trained) == 0:
             continue
-        compact = [tensor[rows] for tensor in (parameter, gradients[name], moments.mean, moments.square)]
-        _update(compact[0], compact[1], compact[2], compact[3], moments.steps, rates[name], stage.rates)
-        for whole, part in zip((parameter, moments.mean, moments.square), (compact[0], *compact[2:]), strict=True):
-            whole[rows] = part
+        gradient = gradients[name][trained] if rows is None else gradients[name]
+        whole = (parameter, moments.mean, moments.square)
+        parts = [tensor[trained] for tensor in whole]
+        _update(parts[0], gradient, parts[1], parts[2], moments.steps, rates[name], stage.rates)
+        for tensor, part in zip(whole, parts, strict=True):
+            tensor[trained] = part
 
 
 def _update(

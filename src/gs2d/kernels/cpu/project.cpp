@@ -140,26 +140,6 @@ inline void prefetch_slots(const Frame& f, int64_t first, int64_t last) {
     }
 }
 
-inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
-    if (p) memset(p + first * stride, 0, size_t(lanes * stride) * sizeof(real));
-}
-
-inline void write_sh(const Frame& f, const Parameters& s, const ParameterGradients& out, int64_t i, int lanes,
-                     const Vec3<V>& g_color, const V* basis) {
-    V g[3 * SH_MAX];
-    const int count = sh_count(f.view.sh_degree);
-    for (int k = 0; k < count; ++k)
-        g[3 * k] = basis[k] * g_color.x, g[3 * k + 1] = basis[k] * g_color.y, g[3 * k + 2] = basis[k] * g_color.z;
-    if (out.sh0) store_rows<3>(out.sh0 + 3 * i, 3, lanes, g);
-    if (!out.shN) return;
-    const int64_t stride = 3 * s.sh_rest;
-    real* rest = out.shN + stride * i;
-    if (s.sh_rest > count - 1) zero_rows(rest, 0, stride, lanes);
-    if (count == 4) store_rows<9>(rest, stride, lanes, g + 3);
-    if (count == 9) store_rows<24>(rest, stride, lanes, g + 3);
-    if (count == 16) store_rows<45>(rest, stride, lanes, g + 3);
-}
-
 }  // namespace
 
 void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out) {
@@ -195,7 +175,7 @@ void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients&
                 basis[k] = keep(seen, basis[k]);
                 along[k] = fma(g_color.x, sh[3 * k], fma(g_color.y, sh[3 * k + 1], g_color.z * sh[3 * k + 2]));
             }
-            write_sh(f, s, out, i, lanes, g_color, basis);
+            write_sh(degree, s.sh_rest, out, i, lanes, g_color, basis);
             if (!wants_geometry(out)) continue;
 
             const ParameterGradient<V> d = project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);

@@ -74,4 +74,25 @@ inline Vec3<V> sh_color(const V* sh, const V* basis, int degree) {
     return c;
 }
 
+inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
+    if (p) memset(p + first * stride, 0, size_t(lanes * stride) * sizeof(real));
+}
+
+// Gradients of the coefficients of LANES splats from those of their colours.
+inline void write_sh(int degree, int64_t sh_rest, const ParameterGradients& out, int64_t i, int lanes, const Vec3<V>& g_color,
+                     const V* basis) {
+    V g[3 * SH_MAX];
+    const int count = sh_count(degree);
+    for (int k = 0; k < count; ++k)
+        g[3 * k] = basis[k] * g_color.x, g[3 * k + 1] = basis[k] * g_color.y, g[3 * k + 2] = basis[k] * g_color.z;
+    if (out.sh0) store_rows<3>(out.sh0 + 3 * i, 3, lanes, g);
+    if (!out.shN) return;
+    const int64_t stride = 3 * sh_rest;
+    real* rest = out.shN + stride * i;
+    if (sh_rest > count - 1) zero_rows(rest, 0, stride, lanes);
+    if (count == 4) store_rows<9>(rest, stride, lanes, g + 3);
+    if (count == 9) store_rows<24>(rest, stride, lanes, g + 3);
+    if (count == 16) store_rows<45>(rest, stride, lanes, g + 3);
+}
+
 }  // namespace gs2d

@@ -1,0 +1,201 @@
+"""Cached views of the native CPU backend: geometry and opacity are frozen, and only some splats' colours learn.
+
+Then the image is affine in those colours, ``color = frozen + sum_k w_k max(0, c_k)``. A :class:`CachedView` keeps the
+frozen image and every weight w_k > 0 of one view; rendering it and its gradients never blend again. The weights are
+those of the blending, bit for bit; images equal :func:`gs2d.render.api.rasterize` to the rounding of another order of
+sums, and are bit-identical for any number of threads (``docs/math.md``, "Cached views").
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.errors import ShapeError
+from gs2d.kernels.library import Library, prepare
+from gs2d.render.cpu import _address, _check_tensors, _forward, _ParameterGradients, _parameters, _view
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+__all__ = ["CachedView", "cache_view"]
+
+TILE, SH_MAX = 16, 16  # px per side of a tile; basis functions of degree 3 (kernels/core/sh.h)
+ARRAYS = (
+    *("tile_entries", "tile_blocks", "entry_row", "entry_blocks", "row_begin", "row_entries"),
+    *("weights", "frozen", "basis"),
+)
+
+
+class _CachedView(ctypes.Structure):
+    """``struct CachedView`` of kernels/cpu/cached.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("width", "height", "tiles_x", "tiles", "rows", "degree")),
+        *((name, ctypes.c_void_p) for name in ARRAYS),
+    )
+
+
+class CachedView:
+    """One view for splats of which only the colours of some rows change.
+
+    Attributes
+    ----------
+    arrays : dict of name to Tensor
+        What ``struct CachedView`` points to; the layout belongs to the library's instruction set.
+    height, width : int
+    rows : int
+        M, the number of splats whose colours change.
+    """
+
+    def __init__(
+        self, library: Library, size: tuple[int, int], degree: int, rows: int, arrays: dict[str, Tensor]
+    ) -> None:
+        self.library = library
+        self.height, self.width = size
+        self.rows, self.arrays = rows, arrays
+        tiles_x = -(-self.width // TILE)
+        numbers = (self.width, self.height, tiles_x, len(arrays["tile_entries"]) - 1, rows, degree)
+        self._native = _CachedView(*numbers, *(_address(arrays[name]) for name in ARRAYS))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        return sum(array.nbytes for array in self.arrays.values())
+
+    def render(self, sh0: Tensor, shN: Tensor) -> Tensor:
+        """The image [H, W, 3], differentiable in the rows' coefficients.
+
+        Parameters
+        ----------
+        sh0 : Tensor [M, 1, 3]
+        shN : Tensor [M, K - 1, 3]
+
+        Raises
+        ------
+        ShapeError
+            Another number of rows or of coefficients than the view was made for, or another dtype.
+        """
+        check_shapes({"sh0": (sh0, "M 1 3"), "shN": (shN, "M K 3")})
+        degree = int(self._native.degree)
+        if len(sh0) != self.rows or shN.shape[1] + 1 < (degree + 1) ** 2:
+            raise ShapeError(
+                f"the cached view holds {self.rows} rows of degree {degree}, got {len(sh0)} rows with "
+                f"{1 + shN.shape[1]} coefficients; make it anew with cache_view"
+            )
+        for name, tensor in (("sh0", sh0), ("shN", shN)):
+            if tensor.dtype != self.library.dtype or tensor.device.type != "cpu":
+                raise ShapeError(
+                    f"{name} must be {self.library.dtype} on the CPU, got {tensor.dtype} on {tensor.device}"
+                )
+        image: Tensor = _Render.apply(self, sh0, shN)
+        return image
+
+    def _render(self, sh0: Tensor, shN: Tensor) -> tuple[Tensor, Tensor]:
+        """The image and the rows' colours [M, 4]."""
+        image = torch.empty(self.height, self.width, 3, dtype=sh0.dtype)
+        colors = torch.empty(self.rows, 4, dtype=sh0.dtype)
+        splats = _parameters((sh0, sh0, sh0, sh0, sh0, shN))  # only the coefficients are read
+        render = self.library.function("gs2d_cached_render", None, [ctypes.c_void_p] * 4)
+        render(ctypes.byref(self._native), ctypes.byref(splats), _address(colors), _address(image))
+        return image, colors
+
+    def _gradients(self, upstream: Tensor, colors: Tensor, shN: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradients of sh0 and shN from that of the image."""
+        sh0_gradient = torch.empty(self.rows, 1, 3, dtype=shN.dtype)
+        shN_gradient = torch.empty_like(shN)
+        slots = torch.empty(len(self.arrays["entry_row"]), 4, dtype=shN.dtype)
+        out = _ParameterGradients(sh0=_address(sh0_gradient), shN=_address(shN_gradient))
+        types = [*[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_void_p] * 2]
+        gradients = self.library.function("gs2d_cached_gradients", None, types)
+        given = (_address(upstream), _address(colors), shN.shape[1], _address(slots))
+        gradients(ctypes.byref(self._native), *given, ctypes.byref(out))
+        return sh0_gradient, shN_gradient
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, view: CachedView, sh0: Tensor, shN: Tensor) -> Tensor:
+        tensors = (sh0.detach().contiguous(), shN.detach().contiguous())
+        image, colors = view._render(*tensors)
+        ctx.view = view
+        ctx.save_for_backward(colors, tensors[1])
+        return image
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, *ctx.view._gradients(upstream.contiguous(), *ctx.saved_tensors))
+
+
+def cache_view(
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    rows: Tensor,
+    *,
+    limit_bytes: int,
+    library: Library | None = None,
+) -> CachedView | None:
+    """Cache one view for splats of which only the colours of ``rows`` change.
+
+    Parameters
+    ----------
+    splats : Splats
+        N splats; the colours of ``rows`` do not matter.
+    camera : Camera
+    settings : RasterSettings
+    rows : Tensor [M] int64
+        Rows whose colours change, each once.
+    limit_bytes : int
+    library : Library, optional
+        By default this machine's best, on as many threads as torch uses.
+
+    Returns
+    -------
+    CachedView or None
+        None where it would take more than ``limit_bytes``, which depends on nothing but the arguments.
+
+    Raises
+    ------
+    ShapeError, BackendError
+        As for :func:`gs2d.render.cpu.rasterize`.
+    """
+    library = library or prepare()
+    _check_tensors(splats, settings, library.dtype)
+    height, width, count = camera.height, camera.width, len(rows)
+    view = _view(camera, settings, True)
+    tensors = [t.detach().contiguous() for _, t in splats.items()]
+    frame = _forward(library, view, tensors)[-1]
+    row_of = torch.full((len(splats),), -1, dtype=torch.int32)
+    row_of[rows] = torch.arange(count, dtype=torch.int32)
+
+    tiles = -(-width // TILE) * -(-height // TILE)
+    tile_entries, tile_blocks = (torch.empty(tiles + 1, dtype=torch.int64) for _ in range(2))
+    measure = library.function("gs2d_cached_measure", None, [ctypes.c_void_p] * 4)
+    measure(frame.pointer, *(_address(t) for t in (row_of, tile_entries, tile_blocks)))
+    entries, blocks = int(tile_entries[-1]), int(tile_blocks[-1])
+    sizes: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
+        "entry_row": ((entries,), torch.int32),
+        "entry_blocks": ((entries,), torch.int32),
+        "row_begin": ((count + 1,), torch.int64),
+        "row_entries": ((entries,), torch.int32),
+        "weights": ((blocks, library.lanes), library.dtype),
+        "frozen": ((tiles, 3, TILE * TILE), library.dtype),
+        "basis": ((-(-count // library.lanes), SH_MAX, library.lanes), library.dtype),
+    }
+    wanted = sum(torch.Size(shape).numel() * dtype.itemsize for shape, dtype in sizes.values())
+    if wanted + tile_entries.nbytes + tile_blocks.nbytes > limit_bytes:
+        return None
+    arrays = {name: torch.empty(shape, dtype=dtype) for name, (shape, dtype) in sizes.items()}
+    arrays |= {"tile_entries": tile_entries, "tile_blocks": tile_blocks}
+    cached = CachedView(library, (height, width), settings.sh_degree, count, arrays)
+    fill = library.function("gs2d_cached_fill", None, [ctypes.c_void_p] * 4)
+    learning = [t[rows] for t in tensors]
+    fill(frame.pointer, _address(row_of), ctypes.byref(_parameters(learning)), ctypes.byref(cached._native))
+    return cached

@@ -1,0 +1,93 @@
+"""Loss and gradients from cached views, for a stage in which only the colours of a row group learn (stage 2).
+
+Each view is then affine in those colours (:mod:`gs2d.render.cpu_cached`). Everything in the cache depends on what is
+frozen alone, so a resumed run builds the same cache. Which views have a place is decided when the stage begins, by
+their order and size: the same for any number of threads, and after any resume.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from gs2d.recipe import Recipe, Stage
+from gs2d.render.cpu_cached import CachedView, cache_view
+from gs2d.render.types import RenderOutput
+from gs2d.train.state import TrainState
+from gs2d.train.views import Evaluated, Evaluator, WholeViews
+
+COLORS = frozenset({"sh0", "shN"})
+OF_COLOR = frozenset({"l1", "ssim"})  # losses that see nothing but the colour image
+WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
+
+
+def is_cacheable(recipe: Recipe, stage: Stage, *, backend_name: str, views: int) -> bool:
+    """Whether a stage can train from cached views, and is long enough to gain by it.
+
+    It trains the colours of one row group and nothing else, at one SH degree, by losses of the colour image.
+    """
+    groups = set(stage.train.values())
+    return (
+        backend_name == "cpu"
+        and COLORS.issuperset(stage.train)
+        and len(groups) == 1
+        and "all" not in groups
+        and stage.densify is None
+        and OF_COLOR.issuperset(term.kind for term in stage.losses)
+        and stage.active_sh_degree(1, recipe.sh_degree) == stage.active_sh_degree(stage.iterations, recipe.sh_degree)
+        and stage.iterations >= WORTH * views
+    )
+
+
+def choose_evaluator(whole: WholeViews, state: TrainState, stage: Stage, limit_bytes: int) -> Evaluator:
+    """Cached views where the stage allows them and ``limit_bytes`` > 0, else ``whole``."""
+    name, views = whole.backend.name, len(whole.scene.train)
+    if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend_name=name, views=views):
+        return CachedViews(whole, state, stage, limit_bytes)
+    return whole
+
+
+class CachedViews:
+    """The first training views that fit in ``limit_bytes`` are cached; ``whole`` evaluates the others.
+
+    Parameters
+    ----------
+    whole : WholeViews
+    state : TrainState
+        The geometry, the opacity and the colours outside the group stay as they are here.
+    stage : Stage
+        One that ``is_cacheable``.
+    limit_bytes : int
+        Of all cached views together.
+
+    Attributes
+    ----------
+    rows : Tensor [M] int64
+        The group.
+    views : list of CachedView
+        Of training views 0, 1, ...
+    """
+
+    def __init__(self, whole: WholeViews, state: TrainState, stage: Stage, limit_bytes: int) -> None:
+        self._whole = whole
+        (group,) = set(stage.train.values())
+        self.rows: Tensor = state.groups[group].nonzero().squeeze(1)
+        self.views: list[CachedView] = []
+        settings, room = whole.settings(stage, 1), limit_bytes
+        for view in whole.scene.train:
+            cached = cache_view(state.splats, view.camera, settings, self.rows, limit_bytes=room)
+            if cached is None:
+                break
+            room -= cached.nbytes
+            self.views.append(cached)
+
+    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
+        """Loss and gradients of training view ``index``, checked to be finite (DivergedError)."""
+        if index >= len(self.views):
+            return self._whole.evaluate(state, stage, iteration, index)
+        parameters = dict(state.splats.items())
+        leaves = {name: parameters[name][self.rows].requires_grad_(name in stage.train) for name in sorted(COLORS)}
+        color = self.views[index].render(leaves["sh0"], leaves["shN"])
+        unseen = color.new_empty(0)  # the losses of such a stage look at nothing else
+        output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
+        losses, gradients = self._whole.differentiate(stage, iteration, index, output, leaves)
+        return Evaluated(losses, gradients, None, None, self.rows)

@@ -1,0 +1,144 @@
+"""Loss and gradients of one training view, by rendering all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol as Interface
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.data.scene import Scene
+from gs2d.errors import DivergedError
+from gs2d.losses import compute_losses
+from gs2d.protocols import Protocol
+from gs2d.recipe import Recipe, Stage
+from gs2d.render.api import rasterize
+from gs2d.render.backend import Backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import Splats
+from gs2d.train.state import TrainState
+from gs2d.train.targets import Targets
+
+
+def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
+    """The rasterizer's constants for a scene of this extent (wu) under a protocol."""
+    return RasterSettings(near=protocol.near_for(extent), background=protocol.background, sh_degree=sh_degree)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """Loss terms of one iteration with the gradients of the trained attributes and, if gathered, screen gradients.
+
+    Attributes
+    ----------
+    losses : mapping of kind to float
+        Weighted.
+    gradients : mapping of attribute to Tensor
+        Like the attributes; only of ``rows``, in their order, where those are given.
+    signal : Tensor [N, 2] or [N, 4], or None
+    radii : Tensor [N] px or None
+        None where nothing was projected.
+    rows : Tensor [M] int64 or None
+    """
+
+    losses: Mapping[str, float]
+    gradients: Mapping[str, Tensor]
+    signal: Tensor | None
+    radii: Tensor | None
+    rows: Tensor | None = None
+
+
+class Evaluator(Interface):
+    """How a stage gets the loss and the gradients of a view."""
+
+    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
+        """Loss and gradients of training view ``index``, checked to be finite (DivergedError)."""
+
+
+class WholeViews:
+    """Every splat is rendered each time."""
+
+    def __init__(self, scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, targets: Targets) -> None:
+        self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
+        self._targets = targets
+
+    def settings(self, stage: Stage, iteration: int) -> RasterSettings:
+        """The rasterizer's constants at an iteration (1-based)."""
+        degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
+        return raster_settings(self.protocol, self.scene.extent, degree)
+
+    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
+        """Render one view; loss and gradients, checked to be finite (DivergedError)."""
+        splats, densify = state.splats, stage.densify
+        leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
+        gather = densify is not None and iteration < densify.stop
+        probe = None
+        if gather:
+            columns = 4 if densify is not None and densify.absolute else 2
+            probe = splats.means.new_zeros(len(splats), columns, requires_grad=True)
+        camera, settings = self.scene.train[index].camera, self.settings(stage, iteration)
+        output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe)
+        losses, gradients = self.differentiate(stage, iteration, index, output, dict(leaves.items()))
+        return Evaluated(losses, gradients, None if probe is None else _gradient(probe), output.radii)
+
+    def differentiate(
+        self, stage: Stage, iteration: int, index: int, output: RenderOutput, leaves: Mapping[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
+
+        Raises
+        ------
+        DivergedError
+            If one of them is not finite.
+        """
+        target = self._targets[index]
+        terms = compute_losses(
+            output,
+            target.image,
+            target.mask,
+            self.scene.train[index].camera,
+            self.protocol.resolve(stage.losses),
+            iteration=iteration,
+            depth_kind=self.protocol.depth,
+            backend_name=self.backend.name,
+            target_cache=target.maps,
+        )
+        loss = torch.stack(list(terms.values())).sum()
+        values = {kind: float(value.detach()) for kind, value in terms.items()}
+        if not bool(torch.isfinite(loss)):
+            raise diverged(stage, iteration, f"the loss ({', '.join(f'{k} {v:g}' for k, v in values.items())})")
+        if loss.requires_grad:  # not where no splat is in the picture
+            loss.backward()
+        gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
+        for name, gradient in gradients.items():
+            if not finite(gradient):
+                raise diverged(stage, iteration, f"the gradient of {name}")
+        return values, gradients
+
+
+def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
+    """The error for something that is not finite."""
+    return DivergedError(
+        f"training diverged at iteration {iteration} of stage {stage.name!r}: {what} is NaN or infinite; "
+        f"lower a rate (--set {stage.name}.rates.means=...) or check the cameras and photographs"
+    )
+
+
+def _gradient(leaf: Tensor) -> Tensor:
+    """The gradient of a leaf; zero where nothing depends on it."""
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+
+def finite(tensor: Tensor) -> bool:
+    """Whether all of a tensor is finite: a sum costs one pass, and cannot be finite if a term is not.
+
+    On the CPU numpy sums: it wakes no threads, which costs more than the sum where cores are busy.
+    """
+    detached = tensor.detach()
+    if detached.device.type != "cpu":
+        return bool(torch.isfinite(detached.sum()))
+    with np.errstate(all="ignore"):
+        return bool(np.isfinite(detached.numpy().sum()))

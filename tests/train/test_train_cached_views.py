@@ -1,0 +1,195 @@
+"""Stage 2 from cached views: the same training to rounding, the same bytes for any threads and after any resume."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from train_toys import SIZE, VIEWS, backends, random_splats, same
+
+from gs2d.data.scene import Scene, View
+from gs2d.protocols import GENERIC
+from gs2d.recipe import Recipe, Stage
+from gs2d.recipes import appearance, refine
+from gs2d.train import events
+from gs2d.train.cached_views import CachedViews, is_cacheable
+from gs2d.train.loop import Trainer
+from gs2d.train.state import TrainState
+from gs2d.train.views import WholeViews
+
+needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
+ROOM = 1 << 30
+
+
+@pytest.fixture(autouse=True)
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def masked(scene: Scene) -> Scene:
+    """The toy, with a corner of every other view to be ignored."""
+    views = []
+    for i, view in enumerate(scene.train):
+        mask = np.ones((SIZE, SIZE), bool)
+        mask[: SIZE // 2, : SIZE // 3] = False
+        views.append(View.from_arrays(view.name, view.camera, view.image(), mask=mask if i % 2 else None))
+    return replace(scene, train=tuple(views))
+
+
+def recipe(iterations: int = 3 * VIEWS, k: float = 20.0) -> Recipe:
+    """Stage 2 alone, then a little of stage 3."""
+    return Recipe("colors", (replace(appearance(k=k), iterations=iterations), replace(refine(), iterations=2)))
+
+
+def trainer(
+    scene: Scene, room: int, *, iterations: int = 3 * VIEWS, state: TrainState | None = None, **options: object
+) -> Trainer:
+    if state is None:
+        state = TrainState(random_splats(90, seed=5), torch.Generator().manual_seed(0))
+    return Trainer(scene, recipe(iterations), GENERIC, backend="cpu", state=state, stage2_cache_bytes=room, **options)  # type: ignore[arg-type]
+
+
+def entered(scene: Scene, room: int = ROOM, **options: object) -> Trainer:
+    made = trainer(scene, room, **options)  # type: ignore[arg-type]
+    made.enter(0)
+    return made
+
+
+def views_of(made: Trainer, room: int = ROOM) -> CachedViews:
+    return CachedViews(made._whole, made.state, made.recipe.stages[0], room)
+
+
+@needs_cpu
+def test_every_view_has_the_losses_and_gradients_of_the_plain_path(masked: Scene) -> None:
+    made = entered(masked)
+    stage, cached = made.recipe.stages[0], views_of(made)
+    assert len(cached.views) == VIEWS
+    assert len(cached.rows) == 18
+    for index in range(VIEWS):
+        a, b = (e.evaluate(made.state, stage, 1, index) for e in (cached, made._whole))
+        assert a.losses == pytest.approx(b.losses, rel=1e-6)
+        for name in ("sh0", "shN"):
+            plain = b.gradients[name][cached.rows]
+            assert a.gradients[name].shape == plain.shape
+            error = (a.gradients[name] - plain).abs().max() / plain.abs().max()
+            assert error <= 3e-6, (index, name)  # the SSIM amplifies the rounding of the image
+            assert plain.abs().max() > 0
+
+
+@needs_cpu
+def test_two_hundred_iterations_end_where_the_plain_path_ends(masked: Scene) -> None:
+    ends = []
+    for room in (0, ROOM):
+        made = entered(masked, room, iterations=200)
+        start = made.splats.clone()
+        for _ in range(200):
+            made.step()
+        assert isinstance(made._evaluator, CachedViews if room else WholeViews)
+        ends.append(made.splats)
+    moved = (ends[0].sh0 - start.sh0).abs().max()
+    assert moved > 0.1
+    for name, plain in ends[0].items():
+        assert (dict(ends[1].items())[name] - plain).abs().max() <= 1e-3 * moved, name
+    assert torch.equal(ends[0].means, start.means)
+    frozen = ~made.state.groups["high_error"]
+    assert torch.equal(ends[1].sh0[frozen], start.sh0[frozen])
+
+
+@needs_cpu
+def test_the_first_views_that_fit_are_cached_and_the_others_are_evaluated_plainly(masked: Scene) -> None:
+    made = entered(masked)
+    sizes = [view.nbytes for view in views_of(made).views]
+    two = sizes[0] + sizes[1]
+    assert len(views_of(made, two).views) == 2
+    assert len(views_of(made, two - 1).views) == 1
+    assert len(views_of(made, sizes[0] - 1).views) == 0
+    cached = views_of(made, two)
+    stage = made.recipe.stages[0]
+    assert cached.evaluate(made.state, stage, 1, 1).rows is not None
+    a, b = (e.evaluate(made.state, stage, 1, 2) for e in (cached, made._whole))
+    assert a.rows is None
+    assert torch.equal(a.gradients["sh0"], b.gradients["sh0"])
+
+
+@needs_cpu
+@pytest.mark.parametrize("part", [False, True])
+def test_the_bytes_do_not_depend_on_threads_or_on_where_a_run_resumes(masked: Scene, part: bool) -> None:
+    room = views_of(entered(masked)).views[0].nbytes * 5 // 2 if part else ROOM
+    kept: list[tuple[events.Event, bytes]] = []
+
+    def keep(event: events.Event) -> None:
+        file = io.BytesIO()
+        torch.save(made.state.state_dict(), file)
+        kept.append((event, file.getvalue()))
+
+    torch.set_num_threads(1)
+    made = trainer(masked, room, on_event=keep, progress_every=1)
+    end = made.run()
+    assert any(isinstance(event, events.Progress) for event, _ in kept)
+    torch.set_num_threads(2)
+    assert same(trainer(masked, room).run(), end)
+    torch.set_num_threads(3)
+    for event, data in kept[::3]:
+        state = TrainState.from_state_dict(torch.load(io.BytesIO(data), weights_only=True))
+        assert same(trainer(masked, room, state=state).run(), end), event
+
+
+@needs_cpu
+def test_an_empty_group_changes_nothing_and_still_has_its_losses(masked: Scene) -> None:
+    made = entered(masked)
+    made.state.groups["high_error"][:] = False
+    before = made.splats.clone()
+    for _ in range(3):
+        made.step()
+    assert isinstance(made._evaluator, CachedViews)
+    assert same(made.splats, before)
+    stage = made.recipe.stages[0]
+    a, b = (e.evaluate(made.state, stage, 1, 0) for e in (made._evaluator, made._whole))
+    assert a.losses == b.losses  # the frozen image is the plain one, to the bit
+
+
+@needs_cpu
+def test_views_that_show_no_splat_of_the_group_have_losses_and_zero_gradients(masked: Scene) -> None:
+    made = entered(masked)
+    made.state.splats.means[made.state.groups["high_error"]] = torch.tensor([0.0, 0.0, 50.0])
+    stage = made.recipe.stages[0]
+    a, b = (e.evaluate(made.state, stage, 1, 3) for e in (views_of(made), made._whole))
+    assert a.losses == b.losses
+    assert all(bool((gradient == 0).all()) for gradient in a.gradients.values())
+
+
+@needs_cpu
+def test_the_cache_is_freed_at_the_end_of_its_stage(masked: Scene) -> None:
+    seen: list[tuple[type, type]] = []
+    made = trainer(
+        masked, ROOM, progress_every=99, on_event=lambda event: seen.append((type(event), type(made._evaluator)))
+    )
+    made.run()
+    assert [used for event, used in seen if event is events.Progress] == [CachedViews, WholeViews]
+    assert {used for event, used in seen if event is not events.Progress} == {type(None)}
+    assert made._evaluator is None
+
+
+def test_only_stages_that_train_colours_of_a_group_by_colour_losses_on_the_native_backend_are_cached() -> None:
+    plain = replace(appearance(), iterations=100)
+
+    def cacheable(stage: Stage, backend_name: str = "cpu", views: int = 50) -> bool:
+        return is_cacheable(Recipe("x", (stage,)), stage, backend_name=backend_name, views=views)
+
+    assert cacheable(plain)
+    assert cacheable(replace(plain, train={"sh0": "high_error"}))
+    assert not cacheable(plain, backend_name="reference")
+    assert not cacheable(plain, views=51)  # two visits of each view pay for filling
+    assert not cacheable(replace(plain, train=dict.fromkeys(("sh0", "shN"), "all")))
+    assert not cacheable(replace(plain, train={"sh0": "high_error", "shN": "clones"}))
+    assert not cacheable(replace(plain, train={**plain.train, "opacity_logits": "high_error"}))
+    assert not cacheable(replace(plain, losses=refine().losses))
+    assert not cacheable(replace(plain, sh_interval=40))
+    assert not cacheable(replace(refine(), iterations=100))
