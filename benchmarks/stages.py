@@ -27,7 +27,7 @@ from gs2d.train.state import Statistics, TrainState
 
 NATIVE = ("project", "sort", "bin", "blend_forward", "index_slots", "blend_backward", "project_backward")
 FORWARD_STAGES = 4  # of NATIVE; the others belong to the backward pass
-LIMIT_REPEATS = 40
+LIMIT_REPEATS = 200
 
 
 @dataclass(frozen=True)
