@@ -24,6 +24,7 @@ from gs2d.recipes import get_recipe
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.schedule import scale_schedule
+from gs2d.train.cached_views import is_cacheable
 from gs2d.train.loop import raster_settings
 
 DECODE_THREADS = 2
@@ -41,6 +42,8 @@ class Job:
     downscale : int
     pictures_digest : str
         Of every decoded photograph, mask and camera, and of the points: the scene as training sees it.
+    stage2_cache_bytes : int
+        For cached views; see ``Trainer``.
     """
 
     recipe: Recipe
@@ -50,6 +53,7 @@ class Job:
     settings: RasterSettings
     downscale: int
     pictures_digest: str
+    stage2_cache_bytes: int
 
     def definition(self) -> dict[str, Any]:
         """What ``run.json`` says and a resume compares."""
@@ -70,6 +74,7 @@ class Job:
             "raster": asdict(self.settings),
             "seed": self.recipe.seed,
             "backend": backend_facts(self.backend.name),
+            "stage2_cache_bytes": self.stage2_cache_bytes,
         }
 
     def stage_key(self, index: int) -> str:
@@ -84,8 +89,14 @@ class Job:
             "versions": {name: versions()[name] for name in ("2dgs-r", "torch")},
             "start": [recipe["init_points"], recipe["sh_degree"]],
             "stages": recipe["stages"][: index + 1],
+            "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+    def _uses_cached_views(self, index: int) -> bool:
+        """Whether stage ``index`` or one before it can train from cached views."""
+        name, views, stages = self.backend.name, len(self.scene.train), self.recipe.stages[: index + 1]
+        return any(is_cacheable(self.recipe, stage, backend_name=name, views=views) for stage in stages)
 
 
 def build_recipe(recipe: str | Recipe, *, schedule_scale: float, seed: int, overrides: tuple[str, ...]) -> Recipe:
@@ -115,6 +126,8 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
         raise RecipeError(f"--checkpoint-every must be a whole number >= 1, got {options.checkpoint_every}")
     if not options.checkpoint_seconds > 0:
         raise RecipeError(f"--checkpoint-seconds must be a positive number, got {options.checkpoint_seconds}")
+    if options.stage2_cache_mb < 0:
+        raise RecipeError(f"--stage2-cache-mb must be a whole number >= 0, got {options.stage2_cache_mb}")
     named = options.protocol
     if isinstance(named, str) and named != "auto":
         named = get_protocol(named)
@@ -126,7 +139,7 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
         on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
-    return Job(recipe, protocol, scene, backend, settings, options.downscale, digest)
+    return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, options.stage2_cache_mb << 20)
 
 
 def choose_backend(name: str, on_event: OnEvent) -> Backend:
@@ -208,6 +221,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
         recipe, protocol = from_json(data["recipe"]), protocol_from_json(data["protocol"])
         settings = RasterSettings(**{**data["raster"], "background": tuple(data["raster"]["background"])})
         named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
+        cache_bytes = int(data.get("stage2_cache_bytes", 0))  # runs of before there were cached views had none
     except (KeyError, TypeError) as error:
         raise RunError(
             f"{run.file(RUN_JSON)} must hold recipe, protocol, raster, backend, downscale and scene as gs2d writes "
@@ -221,7 +235,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
             f"{data['scene']['train']} + {data['scene']['test']}; restore it or train again"
         )
     chosen = get_backend(named if backend == "auto" else backend)
-    return Job(recipe, protocol, scene, chosen, settings, downscale, digest)
+    return Job(recipe, protocol, scene, chosen, settings, downscale, digest, cache_bytes)
 
 
 def protocol_from_json(data: dict[str, Any]) -> Protocol:
