@@ -155,7 +155,7 @@ NERF_SYNTHETIC = Protocol(
     near=0.2,  # [c]
     test_every=0,  # the data set has its own split
     use_mask_in_training=False,  # the images are composited on the background instead
-    fusion=FusionLimits(clusters=1),  # [d] no script meshes this set: one object, limits from the scene
+    fusion=FusionLimits(),  # [d] no script meshes this set: limits from the scene; some objects come in pieces
 )
 MIP_NERF_360 = Protocol(
     "mip-nerf-360",
