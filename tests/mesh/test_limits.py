@@ -174,21 +174,21 @@ def test_one_view_gives_no_estimate_and_leaves_the_truncation() -> None:
     assert widen_truncation(lim, None) is lim
 
 
-def test_the_truncation_is_twenty_times_the_noise_within_five_and_twenty_voxels_and_3_percent_of_the_box() -> None:
+def test_the_truncation_is_twenty_times_the_noise_within_five_and_twenty_voxels_and_a_40th_of_the_box() -> None:
     lim = replace(limits_of(orbit_maps(0.0)), voxel=0.01, truncation=0.05, side=10.0)
     assert widen_truncation(lim, 0.001).truncation == 0.05
     assert widen_truncation(lim, 0.006).truncation == pytest.approx(0.12)
     assert widen_truncation(lim, 0.05).truncation == pytest.approx(0.20)
-    assert widen_truncation(replace(lim, side=3.0), 0.05).truncation == pytest.approx(0.09)
+    assert widen_truncation(replace(lim, side=3.6), 0.05).truncation == pytest.approx(0.09)
     assert widen_truncation(replace(lim, side=1.0), 0.05).truncation == 0.05
     assert widen_truncation(lim, 0.006).depth_noise == 0.006
 
 
 def test_noisy_maps_are_fused_better_with_the_widened_truncation() -> None:
     frames = [Frame(m.camera, m.depth) for m in orbit_maps(0.02)]
-    wide = extract(frames, voxel=0.009, threads=1)
-    narrow = extract(frames, voxel=0.009, truncation=0.045, threads=1)
-    assert wide.limits.truncation == pytest.approx(0.03 * wide.limits.side)  # 0.059
+    wide = extract(frames, voxel=0.007, threads=1)
+    narrow = extract(frames, voxel=0.007, truncation=0.035, threads=1)
+    assert wide.limits.truncation == pytest.approx(0.025 * wide.limits.side)  # 0.049
 
     def error(mesh_vertices: np.ndarray) -> float:
         return float(np.abs(np.linalg.norm(mesh_vertices, axis=1) - 1).mean())

@@ -21,7 +21,7 @@ DEPTH_PERCENTILE = 99.5
 BOX_MARGIN = 0.25  # of the robust box's longest side, on every side: room for what percentiles cut off
 MIN_VOXELS_PER_TRUNCATION = 5.0
 MAX_VOXELS_PER_TRUNCATION = 20.0
-MAX_TRUNCATION_OF_SIDE = 0.03  # a band wider than this rounds the object itself
+MAX_TRUNCATION_OF_SIDE = 0.025  # a wider band swallows thin parts
 NOISE_PER_TRUNCATION = 20.0  # times the depth noise: maps that disagree need a wider band to average in
 
 
@@ -162,7 +162,7 @@ def derive_limits(
 
 
 def widen_truncation(limits: FusionLimits, noise: float | None) -> FusionLimits:
-    """The limits with a truncation of 20 times the depth noise, if that is more: up to 20 voxels and 3 % of the box."""
+    """The limits with a truncation of 20 times the depth noise, if that is more; at most 20 voxels, a 40th of the box."""
     if noise is None:
         return limits
     most = min(MAX_VOXELS_PER_TRUNCATION * limits.voxel, MAX_TRUNCATION_OF_SIDE * limits.side)
