@@ -126,6 +126,6 @@ def backend_report() -> tuple[BackendStatus, ...]:
         cpu = BackendStatus("cpu", True, "", "", details)
     except BackendError as error:
         cpu = BackendStatus("cpu", False, str(error).partition(";")[0], REMEDY, "")
-    cuda = BackendStatus("cuda", False, NO_CUDA, "nothing yet; kernels exist, a launcher does not (docs/kernels.md)", "")
+    cuda = BackendStatus("cuda", False, NO_CUDA, "nothing yet: kernels are there, a launcher is not", "")
     reference = BackendStatus("reference", True, "", "", "plain torch, slow; float32 and float64, any device")
     return cpu, cuda, reference
