@@ -162,7 +162,7 @@ def derive_limits(
 
 
 def widen_truncation(limits: FusionLimits, noise: float | None) -> FusionLimits:
-    """The limits with a truncation of 20 times the depth noise, if more; at most 20 voxels, a 40th of the box."""
+    """The limits with a truncation of 20 times the depth noise, if that is more: up to 20 voxels, a 40th of the box."""
     if noise is None:
         return limits
     most = min(MAX_VOXELS_PER_TRUNCATION * limits.voxel, MAX_TRUNCATION_OF_SIDE * limits.side)
