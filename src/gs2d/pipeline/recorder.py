@@ -13,6 +13,7 @@ from typing import Any
 from gs2d.errors import DivergedError
 from gs2d.evaluate.images import mean_metrics
 from gs2d.io.run import RunFolder, load_tensors
+from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
@@ -47,6 +48,7 @@ class Recorder:
         self._at_entry = dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self._trainer: Trainer | None = None
+        self._before: Snapshot | None = None  # of the last step line, until it is compared with the next progress
 
     # -- called by the pipeline ----------------------------------------------------------------------------------------
     def begin(self, trainer: Trainer) -> None:
@@ -56,6 +58,8 @@ class Recorder:
         if state.step == 0 and not state.entered:
             self._finish_reused(state)
             self._seconds, self._peak, self._at_entry = 0.0, 0, {}
+        elif state.step and self._step_line_due(state.step, self._stage(state.stage).iterations):
+            self._before = take_snapshot(state.splats, state.step)  # as the run that was broken off had it
         self._saved_iteration = state.step
         self._phase()
         self._start_clock()
@@ -87,6 +91,8 @@ class Recorder:
             self._log("stage_end", event)
             self._finish_stage(event.index)
         else:
+            if isinstance(event, train_events.Densified | train_events.OpacityLimited):
+                self._before = None  # other rows, or a jump that no gradient made
             if isinstance(event, train_events.Initialised):
                 self._on_event(Notice(start_text(event)))
             self._log(_KINDS[type(event)], event)
@@ -99,7 +105,8 @@ class Recorder:
     def _on_progress(self, event: train_events.Progress) -> None:
         state = self._state
         last = event.iteration == event.iterations
-        if last or _due(event.iteration, event.iterations, LOG_LINES, self.progress_every):
+        self._log_changes(event)
+        if last or self._step_line_due(event.iteration, event.iterations):
             extra: dict[str, Any] = {"total_iteration": self._iterations_before(event.index) + event.iteration}
             extra["mean_area"] = event.mean_k_a
             if last or _due(event.iteration, event.iterations, PROBES, self.progress_every):
@@ -107,6 +114,10 @@ class Recorder:
                 if psnr is not None:
                     extra["psnr"] = psnr
             self._log("step", event, **extra)
+            if not last:
+                self._stop_clock()
+                self._before = take_snapshot(state.splats, event.iteration)
+                self._start_clock()
         detail = (
             f"{event.stage} {event.iteration:,}/{event.iterations:,}  {event.splats:,} splats  loss {event.loss:.4f}"
         )
@@ -117,6 +128,21 @@ class Recorder:
             self._stop_clock()
             self._save(event.index, event.iteration)
             self._start_clock()
+
+    def _step_line_due(self, iteration: int, iterations: int) -> bool:
+        return _due(iteration, iterations, LOG_LINES, self.progress_every)
+
+    def _log_changes(self, event: train_events.Progress) -> None:
+        """What the iterations since the last step line changed, if that was one progress ago."""
+        before, self._before = self._before, None
+        if before is None:
+            return
+        self._stop_clock()
+        over = event.iteration - before.iteration
+        changes = mean_changes(before, self._state.splats, iterations=over, extent=self._job.scene.extent)
+        fact = {"stage": event.stage, "iteration": event.iteration, "over": over}
+        self._run.events.append({"kind": "changes", **fact, **changes})
+        self._start_clock()
 
     def _probe_psnr(self, splats: Splats) -> float | None:
         """Mean PSNR over a few fixed views (test views where there are any)."""

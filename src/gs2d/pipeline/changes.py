@@ -1,0 +1,68 @@
+"""How much each attribute of the splats changes in an iteration: the traces of the paper's attribute figure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gs2d.geometry import quats_to_matrices
+from gs2d.splats import Splats
+
+SAMPLE = 20_000  # splats: enough for a mean
+CHANGES = ("mean", "covariance", "opacity", "sh")  # mu, Sigma, alpha and SHs in the paper
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Every so many-th splat as it was after an iteration of a stage."""
+
+    iteration: int
+    rows: Tensor  # [n] int64
+    splats: Splats  # [n]
+
+
+def take_snapshot(splats: Splats, iteration: int) -> Snapshot:
+    """A copy of at most ``SAMPLE`` evenly spaced splats, to compare with later."""
+    rows = torch.arange(0, len(splats), max(1, -(-len(splats) // SAMPLE)), device=splats.device)
+    return Snapshot(iteration, rows, splats.rows(rows))
+
+
+@torch.no_grad()
+def mean_changes(snapshot: Snapshot, splats: Splats, *, iterations: int, extent: float) -> dict[str, float]:
+    """Mean over the sampled splats of how far each attribute moved in one of ``iterations`` iterations.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    splats : Splats
+        The same splats (no row came or went) after so many iterations more.
+    iterations : int
+    extent : float
+        Of the scene, wu.
+
+    Returns
+    -------
+    dict
+        ``mean``: |change of mu| as a share of the extent; ``covariance``: Frobenius norm of the change of
+        Sigma = s_u^2 t_u t_u' + s_v^2 t_v t_v' as a share of that of Sigma; ``opacity``: |change of o|; ``sh``:
+        Euclidean norm of the change of all SH coefficients.
+    """
+    before, after = snapshot.splats, splats.rows(snapshot.rows)
+    sigma = _covariances(before)
+    turned = (_covariances(after) - sigma).flatten(1).norm(dim=1) / sigma.flatten(1).norm(dim=1).clamp(min=1e-300)
+    color = ((after.sh0 - before.sh0).square().sum((1, 2)) + (after.shN - before.shN).square().sum((1, 2))).sqrt()
+    moved = {
+        "mean": (after.means - before.means).norm(dim=1) / extent,
+        "covariance": turned,
+        "opacity": (after.opacities - before.opacities).abs(),
+        "sh": color,
+    }
+    return {name: float(change.double().mean()) / iterations for name, change in moved.items()}
+
+
+def _covariances(splats: Splats) -> Tensor:
+    """Sigma [N, 3, 3] wu^2, in double: its changes are small."""
+    axes = quats_to_matrices(splats.quats.double())[:, :, :2] * splats.scales.double()[:, None]
+    return axes @ axes.transpose(1, 2)
