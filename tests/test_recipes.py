@@ -22,7 +22,7 @@ def test_every_named_recipe_is_valid_and_carries_its_name(name: str) -> None:
 
 
 def test_every_row_of_every_table_names_a_recipe() -> None:
-    assert set(TABLES) == {"regularizers", "benchmark", "k", "freeze", "modules", "absgs"}
+    assert set(TABLES) == {"regularisation", "benchmark", "k", "freeze", "modules", "absgs"}
     for rows in TABLES.values():
         for name in rows.values():
             assert name in RECIPES
