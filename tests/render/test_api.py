@@ -11,8 +11,9 @@ from render_scenes import front_camera, splat
 
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels import library
+from gs2d.render import backend
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.backend import backend_report, get_backend
+from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 
 
@@ -86,13 +87,36 @@ def test_splat_errors_checks_image_and_mask() -> None:
 def test_unknown_backends_and_cuda_are_refused_with_a_remedy() -> None:
     with pytest.raises(BackendError, match="backend must be one of auto, cpu, cuda, reference, got 'gpu'"):
         get_backend("gpu")
-    with pytest.raises(BackendError, match="no CUDA backend yet; use --backend cpu"):
-        rasterize(splat(), front_camera(), backend="cuda")
+    cuda = next(status for status in backend_report() if status.name == "cuda")
+    if not cuda.available:
+        with pytest.raises(BackendError, match=r"backend 'cuda' cannot run: .*; .*use --backend cpu"):
+            rasterize(splat(), front_camera(), backend="cuda")
 
 
-def test_auto_takes_the_kernels_if_they_load_and_says_so() -> None:
-    reports = {status.name: status for status in backend_report()}
-    assert get_backend("auto").name == ("cpu" if reports["cpu"].available else "reference")
+def test_auto_takes_the_first_that_the_report_calls_available() -> None:
+    first = next(status.name for status in backend_report() if status.available)
+    assert get_backend("auto").name == first
+
+
+def test_for_tensors_auto_follows_their_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gpu() -> Backend:
+        return replace(get_backend("reference"), name="cuda")
+
+    monkeypatch.setattr(backend, "_cuda", gpu)
+    assert get_backend("auto").name == "cuda"
+    assert get_backend("auto", "cuda").name == "cuda"
+    assert get_backend("auto", "cpu").name in ("cpu", "reference")
+    assert get_backend("auto", "meta").name == "reference"
+
+
+def test_tensors_on_a_gpu_never_fall_back_to_a_slower_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> Backend:
+        raise BackendError("no compiler; install it")
+
+    monkeypatch.setattr(backend, "_cuda", broken)
+    with pytest.raises(BackendError, match="no compiler"):
+        get_backend("auto", "cuda")
+    assert get_backend("auto").name in ("cpu", "reference")
 
 
 def test_without_the_native_library_cpu_is_an_error_and_auto_is_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +126,7 @@ def test_without_the_native_library_cpu_is_an_error_and_auto_is_the_reference(mo
     monkeypatch.setattr(library, "load", missing)
     with pytest.raises(BackendError, match="found none; do this"):
         get_backend("cpu")
-    assert get_backend("auto").name == "reference"
+    assert get_backend("auto", "cpu").name == "reference"
     status = next(status for status in backend_report() if status.name == "cpu")
     assert not status.available
     assert "found none" in status.reason
@@ -113,7 +137,7 @@ def test_the_report_names_every_backend_with_a_reason_or_details() -> None:
     for status in backend_report():
         assert status.available == (status.reason == "") == (status.remedy == "")
         assert status.available == (status.details != "")
-    assert [status.name for status in backend_report()] == ["cpu", "cuda", "reference"]
+    assert [status.name for status in backend_report()] == ["cuda", "cpu", "reference"]
 
 
 def test_the_ray_plane_depth_of_filtered_pairs_is_refused_by_the_kernels(cpu: Any) -> None:

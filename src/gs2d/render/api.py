@@ -85,9 +85,10 @@ def rasterize(
     camera : Camera
     settings : RasterSettings
     backend : str or Backend
-        "auto", "cpu", "cuda" or "reference" (``gs2d.render.backend``).
+        "auto" (by the device of the splats), "cpu", "cuda" or "reference" (``gs2d.render.backend``).
     screen_probe : Tensor [N, 2] or [N, 4], optional
-        Zeros with ``requires_grad``; its gradient is the densification signal (rule 13).
+        Zeros with ``requires_grad``; its gradient is the densification signal (rule 13). That it is zeros is checked
+        on the CPU only.
 
     Returns
     -------
@@ -101,7 +102,7 @@ def rasterize(
     BackendError
         If the backend cannot run here, or not with these inputs.
     """
-    chosen = backend if isinstance(backend, Backend) else get_backend(backend)
+    chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
     settings = _checked(splats, settings, chosen)
     if screen_probe is not None:
         columns = screen_probe.shape[1] if screen_probe.dim() == 2 else 0
@@ -113,7 +114,8 @@ def rasterize(
                 f"screen_probe must be {splats.dtype} on {splats.device} like the splats, "
                 f"got {screen_probe.dtype} on {screen_probe.device}"
             )
-        if bool((screen_probe.detach() != 0).any()):
+        # On a GPU the look would make the host wait in every iteration.
+        if screen_probe.device.type == "cpu" and bool((screen_probe.detach() != 0).any()):
             raise ShapeError("screen_probe must be all zeros (its gradient is what matters), got other values")
     return chosen.rasterize(splats, camera, settings, screen_probe)
 
@@ -151,7 +153,7 @@ def splat_errors(
     ShapeError, BackendError
         As for :func:`rasterize`.
     """
-    chosen = backend if isinstance(backend, Backend) else get_backend(backend)
+    chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
     settings = _checked(splats, settings, chosen)
     H, W = camera.height, camera.width
     arrays: dict[str, tuple[Tensor, str]] = {"image": (image, f"{H} {W} 3")}

@@ -17,8 +17,6 @@ __all__ = ["BACKENDS", "Backend", "BackendStatus", "backend_report", "get_backen
 
 BACKENDS = ("cpu", "cuda", "reference")
 
-NO_CUDA = "this version has no CUDA backend yet"
-
 
 class _Rasterize(Protocol):
     def __call__(
@@ -40,11 +38,20 @@ class _SplatErrors(Protocol):
 
 @dataclass(frozen=True)
 class Backend:
-    """A rasterizer by name. Its functions trust their arguments: :mod:`gs2d.render.api` checks them first."""
+    """A rasterizer by name. Its functions trust their arguments: :mod:`gs2d.render.api` checks them first.
+
+    Attributes
+    ----------
+    name : str
+    rasterize, splat_errors : callable
+    device : str
+        Where a program that has no tensors yet should make them: training, scoring and meshing do.
+    """
 
     name: str
     rasterize: _Rasterize
     splat_errors: _SplatErrors
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)
@@ -86,20 +93,29 @@ def _cpu() -> Backend:
 
 
 def _cuda() -> Backend:
-    raise BackendError(f"backend 'cuda' cannot run: {NO_CUDA}; use --backend cpu")
+    from gs2d.kernels.cuda.diagnose import gather, missing
+    from gs2d.render import cuda
+
+    lacking = missing(gather())
+    if lacking is not None:
+        raise BackendError(f"backend 'cuda' cannot run: {lacking.reason}; {lacking.remedy}")
+    return Backend("cuda", cuda.rasterize, cuda.splat_errors, "cuda")
 
 
 _LOADERS: dict[str, Callable[[], Backend]] = {"cpu": _cpu, "cuda": _cuda, "reference": _reference}
 
 
-def get_backend(name: str) -> Backend:
+def get_backend(name: str, device: str | None = None) -> Backend:
     """The backend of this name, ready to run.
 
     Parameters
     ----------
     name : str
-        "auto" (the native CPU kernels if their library loads, else the reference: ``.name`` says which), "cpu",
-        "cuda" or "reference".
+        "cpu", "cuda", "reference", or "auto": the fastest that this machine can run, in the order cuda, cpu, reference
+        (``.name`` says which; ``backend_report`` why not another).
+    device : str, optional
+        Type of the device on which the tensors already lie. It decides for "auto": "cuda" is the cuda backend or an
+        error, "cpu" the native kernels or the reference, any other the reference.
 
     Raises
     ------
@@ -107,17 +123,26 @@ def get_backend(name: str) -> Backend:
         If a backend asked for by name cannot run here, or the name is unknown.
     """
     if name == "auto":
-        try:
-            return _cpu()
-        except BackendError:
-            return _reference()
+        return _auto(device)
     if name not in _LOADERS:
         raise BackendError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
     return _LOADERS[name]()
 
 
+def _auto(device: str | None) -> Backend:
+    if device == "cuda":
+        return _cuda()
+    for load in {None: (_cuda, _cpu), "cpu": (_cpu,)}.get(device, ()):
+        try:
+            return load()
+        except BackendError:
+            continue
+    return _reference()
+
+
 def backend_report() -> tuple[BackendStatus, ...]:
-    """What this machine can run and why not, in the order of preference."""
+    """What this machine can run and why not, in the order in which "auto" prefers it."""
+    from gs2d.kernels.cuda import diagnose
     from gs2d.kernels.library import REMEDY, available_variants, prepare
 
     try:
@@ -126,6 +151,11 @@ def backend_report() -> tuple[BackendStatus, ...]:
         cpu = BackendStatus("cpu", True, "", "", details)
     except BackendError as error:
         cpu = BackendStatus("cpu", False, str(error).partition(";")[0], REMEDY, "")
-    cuda = BackendStatus("cuda", False, NO_CUDA, "nothing yet: kernels are there, a launcher is not", "")
+    facts = diagnose.gather()
+    lacking = diagnose.missing(facts)
+    if lacking is None:
+        cuda = BackendStatus("cuda", True, "", "", diagnose.describe(facts))
+    else:
+        cuda = BackendStatus("cuda", False, lacking.reason, lacking.remedy, "")
     reference = BackendStatus("reference", True, "", "", "plain torch, slow; float32 and float64, any device")
-    return cpu, cuda, reference
+    return cuda, cpu, reference

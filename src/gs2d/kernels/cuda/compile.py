@@ -24,9 +24,13 @@ __all__ = [
     "ARCHITECTURES",
     "Cubin",
     "KernelUsage",
+    "architecture_for",
     "cache_folder",
     "compile_source",
     "cubin",
+    "is_writable",
+    "kernel_sources",
+    "nvrtc_version",
     "source_names",
     "sources",
 ]
@@ -36,6 +40,8 @@ ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120"
 OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v", "--device-as-default-execution-space")
 REMEDY = "pip install nvidia-cuda-nvrtc cuda-bindings (torch's CUDA wheels bring both), or use --backend cpu"
 DIGEST_BYTES = 32
+LEAST_CAPABILITY = (7, 5)
+KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
 
 
 @dataclass(frozen=True)
@@ -103,6 +109,11 @@ def source_names() -> tuple[str, ...]:
     return tuple(name for name in sources() if name.endswith(".cu"))
 
 
+def kernel_sources() -> dict[str, str]:
+    """The file of each kernel: ``{"project_splats": "cuda/project.cu", ...}``."""
+    return {kernel: name for name, text in sources().items() if name.endswith(".cu") for kernel in KERNEL.findall(text)}
+
+
 def _nvrtc() -> Any:
     try:
         from cuda.bindings import nvrtc
@@ -116,6 +127,49 @@ def _nvrtc() -> Any:
 def _check(nvrtc: Any, status: Any, what: str) -> None:
     if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
         raise BackendError(f"the CUDA compiler failed in {what} ({status.name}); {REMEDY}")
+
+
+def nvrtc_version() -> tuple[int, int]:
+    """Of the compiler, (major, minor).
+
+    Raises
+    ------
+    BackendError
+        NVRTC is missing.
+    """
+    nvrtc = _nvrtc()
+    status, major, minor = nvrtc.nvrtcVersion()
+    _check(nvrtc, status, "nvrtcVersion")
+    return int(major), int(minor)
+
+
+def architecture_for(capability: tuple[int, int]) -> str:
+    """What to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
+
+    A device newer than the compiler runs code for an older one of the same major version.
+
+    Raises
+    ------
+    BackendError
+        The device is too old, or newer than anything that NVRTC knows.
+    """
+    if capability < LEAST_CAPABILITY:
+        raise BackendError(
+            f"the GPU must have compute capability 7.5 or more (Turing, 2018), got {capability[0]}.{capability[1]}; "
+            "use --backend cpu"
+        )
+    nvrtc = _nvrtc()
+    status, known = nvrtc.nvrtcGetSupportedArchs()
+    _check(nvrtc, status, "nvrtcGetSupportedArchs")
+    wanted = 10 * capability[0] + capability[1]
+    fitting = [arch for arch in known if arch <= wanted and arch // 10 == wanted // 10]
+    if not fitting:
+        raise BackendError(
+            f"the CUDA compiler knows architectures up to sm_{max(known)}, the GPU has compute capability "
+            f"{capability[0]}.{capability[1]}; install the NVRTC of the driver's CUDA version: pip install -U "
+            "nvidia-cuda-nvrtc"
+        )
+    return f"sm_{max(fitting)}"
 
 
 def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
@@ -176,6 +230,12 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path("~/.cache").expanduser()) / "gs2d"
 
 
+def is_writable(folder: Path) -> bool:
+    """Whether cubins can be kept there; nothing is written."""
+    there = next((part for part in (folder, *folder.parents) if part.exists()), None)
+    return there is not None and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+
+
 def _key(name: str, arch: str, version: tuple[int, int]) -> str:
     """Of everything the machine code depends on; the length of each part separates it from the next."""
     digest = hashlib.sha256()
@@ -202,11 +262,8 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
     BackendError
         As for :func:`compile_source`.
     """
-    nvrtc = _nvrtc()
-    status, major, minor = nvrtc.nvrtcVersion()
-    _check(nvrtc, status, "nvrtcVersion")
     stem = name.rpartition("/")[2].removesuffix(".cu")
-    path = (folder or cache_folder()) / f"{stem}-{arch}-{_key(name, arch, (major, minor))}.cubin"
+    path = (folder or cache_folder()) / f"{stem}-{arch}-{_key(name, arch, nvrtc_version())}.cubin"
     code = _read(path)
     if code is not None:
         return Cubin(code, "")

@@ -1,0 +1,172 @@
+"""Whether this machine can run the CUDA kernels, and the first thing that is missing if not.
+
+Facts are gathered first and judged afterwards, in the order in which a user would have to mend them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda import compile as nvrtc
+from gs2d.kernels.cuda.driver import BINDINGS_REMEDY, DRIVER_REMEDY, OLD_DRIVER, driver_version, load_driver
+
+__all__ = ["Facts", "Missing", "describe", "gather", "missing"]
+
+ANYWAY = "or use --backend cpu"
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the CUDA backend needs of a machine, as found.
+
+    Attributes
+    ----------
+    torch_version : str
+    torch_cuda : (int, int) or None
+        The CUDA version that torch was built with; None = built without.
+    bindings_error, nvrtc_error, driver_error : str
+        Why each cannot be used; "" where it can.
+    nvrtc, driver : (int, int) or None
+        CUDA versions of the compiler, and the newest that the driver supports.
+    devices : tuple of (str, (int, int))
+        Name and compute capability of every device that torch sees, the current one first.
+    torch_error : str
+        What torch said when it was asked for devices.
+    architecture_error : str
+        Why nothing can be compiled for the current device; "" where it can.
+    cache : Path
+        Where machine code is kept.
+    cache_writable : bool
+    """
+
+    torch_version: str
+    torch_cuda: tuple[int, int] | None
+    bindings_error: str = ""
+    nvrtc_error: str = ""
+    nvrtc: tuple[int, int] | None = None
+    driver_error: str = ""
+    driver: tuple[int, int] | None = None
+    devices: tuple[tuple[str, tuple[int, int]], ...] = ()
+    torch_error: str = ""
+    architecture_error: str = ""
+    cache: Path = Path()
+    cache_writable: bool = True
+
+
+@dataclass(frozen=True)
+class Missing:
+    """The first thing that is missing, and what to do about it."""
+
+    reason: str
+    remedy: str
+
+
+def missing(facts: Facts) -> Missing | None:
+    """What keeps the backend from running; None if nothing does."""
+    if facts.torch_cuda is None:
+        return Missing(
+            f"torch {facts.torch_version} is built without CUDA",
+            f"install a CUDA build of torch (on Linux plain `pip install torch` brings one), {ANYWAY}",
+        )
+    if facts.bindings_error:
+        return Missing(f"the Python package cuda.bindings is not here ({facts.bindings_error})", BINDINGS_REMEDY)
+    if facts.nvrtc_error:
+        return Missing(f"the CUDA compiler NVRTC is not here ({facts.nvrtc_error})", nvrtc.REMEDY)
+    if facts.driver_error or facts.driver is None:
+        return Missing(f"no NVIDIA driver is here ({facts.driver_error})", DRIVER_REMEDY)
+    for name, needs in (("torch", facts.torch_cuda), ("NVRTC", facts.nvrtc)):
+        if needs is not None and facts.driver[0] < needs[0]:  # within a major version newer code runs on older drivers
+            return Missing(
+                f"the driver supports CUDA {_dotted(facts.driver)}, but {name} is of CUDA {_dotted(needs)}",
+                f"{OLD_DRIVER}, {ANYWAY}",
+            )
+    if not facts.devices:
+        said = f" ({facts.torch_error})" if facts.torch_error else ""
+        return Missing(f"torch sees no CUDA device{said}", f"check `nvidia-smi` and CUDA_VISIBLE_DEVICES, {ANYWAY}")
+    if facts.architecture_error:
+        reason, _, remedy = facts.architecture_error.partition("; ")
+        return Missing(f"{facts.devices[0][0]}: {reason}", remedy)
+    return None
+
+
+def describe(facts: Facts) -> str:
+    """One line about a machine that can run the backend."""
+    names = [f"{name} (sm_{major}{minor})" for name, (major, minor) in facts.devices]
+    versions = f"driver CUDA {_dotted(facts.driver)}, NVRTC {_dotted(facts.nvrtc)}"
+    kept = "" if facts.cache_writable else f"; {facts.cache} cannot be written: kernels are compiled at every start"
+    return f"{', '.join(names)}; {versions}{kept}"
+
+
+def gather() -> Facts:
+    """The facts of this machine; only the first where torch is built without CUDA. Makes no context on a GPU."""
+    cuda = torch.version.cuda
+    if cuda is None:
+        return Facts(torch.__version__, None)
+    bindings_error = nvrtc_error = driver_error = architecture_error = ""
+    compiler = driver = None
+    try:
+        bindings = load_driver()
+    except BackendError as error:
+        bindings_error = _inner(error)
+    else:
+        try:
+            driver = driver_version(bindings)
+        except BackendError as error:
+            driver_error = _inner(error)
+    try:
+        compiler = nvrtc.nvrtc_version()
+    except BackendError as error:
+        nvrtc_error = _inner(error)
+    devices, torch_error = _devices()
+    if devices and compiler is not None:
+        try:
+            nvrtc.architecture_for(devices[0][1])
+        except BackendError as error:
+            architecture_error = str(error)
+    folder = nvrtc.cache_folder()
+    return Facts(
+        torch.__version__,
+        _version(cuda),
+        bindings_error,
+        nvrtc_error,
+        compiler,
+        driver_error,
+        driver,
+        devices,
+        torch_error,
+        architecture_error,
+        folder,
+        nvrtc.is_writable(folder),
+    )
+
+
+def _devices() -> tuple[tuple[tuple[str, tuple[int, int]], ...], str]:
+    """Devices that torch sees, the current one first, and what it said where it sees none."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        usable = torch.cuda.is_available()
+    if not usable:
+        return (), str(said[0].message).splitlines()[0] if said else ""
+    first = torch.cuda.current_device()
+    order = sorted(range(torch.cuda.device_count()), key=lambda index: index != first)
+    return tuple((torch.cuda.get_device_name(i), torch.cuda.get_device_capability(i)) for i in order), ""
+
+
+def _version(text: str) -> tuple[int, int]:
+    major, _, rest = text.partition(".")
+    return int(major), int(rest.partition(".")[0] or 0)
+
+
+def _dotted(version: tuple[int, int] | None) -> str:
+    return "?" if version is None else f"{version[0]}.{version[1]}"
+
+
+def _inner(error: BackendError) -> str:
+    """What lies between the brackets of an error's message: the library's own words, one line of them."""
+    text = str(error.__cause__ if error.__cause__ is not None else error).strip().splitlines()
+    return text[0] if text else type(error).__name__

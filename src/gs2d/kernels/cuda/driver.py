@@ -1,0 +1,89 @@
+"""The CUDA driver through ``cuda.bindings``, imported when first used, and its errors in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gs2d.errors import BackendError
+
+__all__ = ["call", "driver_version", "load_driver"]
+
+BINDINGS_REMEDY = "pip install cuda-bindings (torch's CUDA wheels for Linux bring it), or use --backend cpu"
+DRIVER_REMEDY = "install NVIDIA's driver (`nvidia-smi` must list the GPU), or use --backend cpu"
+OLD_DRIVER = "update NVIDIA's driver, or install the torch build and NVRTC of the driver's CUDA version"
+RESTART = "results of this process cannot be trusted: start it again; if it happens again, please report it"
+REMEDIES = {
+    "CUDA_ERROR_OUT_OF_MEMORY": "use fewer splats or --downscale, or free the GPU's memory",
+    "CUDA_ERROR_NO_DEVICE": "check `nvidia-smi` and CUDA_VISIBLE_DEVICES, or use --backend cpu",
+    "CUDA_ERROR_NO_BINARY_FOR_GPU": OLD_DRIVER,
+    "CUDA_ERROR_INVALID_IMAGE": OLD_DRIVER,
+    "CUDA_ERROR_UNSUPPORTED_PTX_VERSION": OLD_DRIVER,
+    "CUDA_ERROR_SYSTEM_DRIVER_MISMATCH": "driver and kernel module differ: reboot",
+    "CUDA_ERROR_SYSTEM_NOT_READY": "the GPU's fabric or service is not up: check `nvidia-smi`",
+    "CUDA_ERROR_NOT_FOUND": "the kernels and the Python package are of different versions: install gs2d again",
+    "CUDA_ERROR_INVALID_HANDLE": "the GPU was reset under this process: start it again",
+    "CUDA_ERROR_CONTEXT_IS_DESTROYED": "the GPU was reset under this process: start it again",
+    "CUDA_ERROR_LAUNCH_OUT_OF_RESOURCES": "a kernel is too large for this GPU; please report it",
+    "CUDA_ERROR_ILLEGAL_ADDRESS": RESTART,
+    "CUDA_ERROR_MISALIGNED_ADDRESS": RESTART,
+    "CUDA_ERROR_LAUNCH_FAILED": RESTART,
+    "CUDA_ERROR_LAUNCH_TIMEOUT": "the display's watchdog stopped a kernel: use a GPU without a display, or --downscale",
+    "CUDA_ERROR_ECC_UNCORRECTABLE": "the GPU's memory is failing: reset it, or use another one",
+}
+
+
+def load_driver() -> Any:
+    """``cuda.bindings.driver``.
+
+    Raises
+    ------
+    BackendError
+        It is not installed.
+    """
+    try:
+        from cuda.bindings import driver
+    except (ImportError, RuntimeError, OSError) as error:
+        raise BackendError(f"the Python package cuda.bindings is not here ({error}); {BINDINGS_REMEDY}") from error
+    return driver
+
+
+def driver_version(driver: Any) -> tuple[int, int]:
+    """The newest CUDA version that the installed driver supports, (major, minor).
+
+    Raises
+    ------
+    BackendError
+        There is no driver.
+    """
+    try:
+        number = int(call(driver, "cuDriverGetVersion"))
+    except (ImportError, RuntimeError, OSError) as error:  # the library is looked for only now
+        raise BackendError(f"no NVIDIA driver is here ({one_line(error)}); {DRIVER_REMEDY}") from error
+    return number // 1000, number % 1000 // 10
+
+
+def call(driver: Any, name: str, *arguments: Any) -> Any:
+    """Call a function of the driver and return its value (None where it has none).
+
+    Raises
+    ------
+    BackendError
+        It failed: the function, the error's name and what to do.
+    """
+    status, *values = getattr(driver, name)(*arguments)
+    if status != driver.CUresult.CUDA_SUCCESS:
+        raise failure(name, status)
+    return values[0] if values else None
+
+
+def failure(what: str, status: Any) -> BackendError:
+    """The error for a status that is not success."""
+    name = str(getattr(status, "name", status))
+    remedy = REMEDIES.get(name, "check `nvidia-smi` and the driver, or use --backend cpu")
+    return BackendError(f"the CUDA driver failed in {what} ({name}); {remedy}")
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of an error's words."""
+    words = str(error).strip().splitlines()
+    return words[0] if words else type(error).__name__

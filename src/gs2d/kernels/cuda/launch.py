@@ -1,0 +1,176 @@
+"""Launch the CUDA kernels on a GPU: torch owns memory, streams and contexts, the driver only loads and launches.
+
+A kernel runs on the stream that is current in torch for its device, in torch's (the primary) context of that device,
+so launches fit in between torch's own operations, under ``torch.cuda.stream``, on several devices, in the threads of
+the backward pass and in a captured graph. Nothing here waits for the device.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Protocol
+
+import torch
+
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.cuda import compile as nvrtc
+from gs2d.kernels.cuda.driver import call, failure, load_driver
+
+__all__ = ["GpuLauncher", "Launcher", "launcher_for"]
+
+STATIC_SHARED_BYTES = 48 << 10  # what a block may have without asking
+MOST_BLOCKS = (1 << 31) - 1
+
+
+class Launcher(Protocol):
+    """Runs one kernel; the structure's pointers are those of tensors that outlive the call.
+
+    ``shared_bytes`` is dynamic shared memory. A launch of no blocks does nothing.
+    """
+
+    def launch(
+        self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0
+    ) -> None: ...
+
+
+def _stream_of(device: torch.device) -> int:
+    return int(torch.cuda.current_stream(device).cuda_stream)
+
+
+def _architecture_of(device: torch.device) -> str:
+    return nvrtc.architecture_for(torch.cuda.get_device_capability(device))
+
+
+class GpuLauncher:
+    """Launches kernels on one device; a source file is compiled and loaded when one of its kernels is first wanted.
+
+    Parameters
+    ----------
+    device : torch.device
+        With an index.
+    driver : module, optional
+        ``cuda.bindings.driver``; the tests give their own.
+    stream_of, architecture_of : callable
+        The current stream's handle, and the architecture (``"sm_90"``), of a device.
+    code_of : callable
+        Machine code of a source file for an architecture.
+
+    Raises
+    ------
+    BackendError
+        The driver or its context of the device is not there.
+    """
+
+    def __init__(
+        self,
+        device: torch.device,
+        *,
+        driver: Any = None,
+        stream_of: Callable[[torch.device], int] = _stream_of,
+        architecture_of: Callable[[torch.device], str] = _architecture_of,
+        code_of: Callable[[str, str], bytes] = lambda name, arch: nvrtc.cubin(name, arch).code,
+    ) -> None:
+        self.device = device
+        self._driver = load_driver() if driver is None else driver
+        self._stream_of, self._code_of = stream_of, code_of
+        self.architecture = architecture_of(device)
+        call(self._driver, "cuInit", 0)
+        self._handle = call(self._driver, "cuDeviceGet", device.index or 0)
+        self._context = call(self._driver, "cuDevicePrimaryCtxRetain", self._handle)  # torch's; for good
+        self._source_of = nvrtc.kernel_sources()
+        self._libraries: dict[str, tuple[Any, bytes]] = {}  # by source; the code stays alive beside its library
+        self._functions: dict[str, Any] = {}  # by kernel
+        self._allowed: dict[str, int] = {}  # dynamic shared memory asked for so far, by kernel
+        self._lock = threading.Lock()  # the backward pass runs in a thread of its own
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+        """Start a kernel on the current stream, and return at once.
+
+        Raises
+        ------
+        BackendError
+            Too many blocks, a kernel that does not compile or load, or a launch that the driver refuses; also an error
+            that an earlier kernel left behind.
+        """
+        if blocks == 0:
+            return
+        if blocks > MOST_BLOCKS:
+            raise BackendError(f"{name} needs {blocks} blocks, expected at most 2^31 - 1; use fewer splats or pixels")
+        driver = self._driver
+        with self._in_context():
+            function = self._functions.get(name) or self._load(name)
+            if shared_bytes > STATIC_SHARED_BYTES and shared_bytes > self._allowed.get(name, 0):
+                self._allow(name, shared_bytes)
+            stream = driver.CUstream(self._stream_of(self.device))
+            pointers = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))  # the driver copies what they point to
+            grid, block = (blocks, 1, 1), (threads, 1, 1)
+            (status,) = driver.cuLaunchKernel(
+                function, *grid, *block, shared_bytes, stream, ctypes.addressof(pointers), 0
+            )
+        if status != driver.CUresult.CUDA_SUCCESS:
+            raise failure(f"the launch of {name} ({blocks} blocks of {threads})", status)
+
+    @contextmanager
+    def _in_context(self) -> Iterator[None]:
+        """The device's context is current: a thread that has only used torch's cached memory may have none."""
+        driver = self._driver
+        if int(call(driver, "cuCtxGetCurrent")) == int(self._context):
+            yield
+            return
+        call(driver, "cuCtxPushCurrent", self._context)
+        try:
+            yield
+        finally:
+            call(driver, "cuCtxPopCurrent")
+
+    def _load(self, name: str) -> Any:
+        """The handle of a kernel, loading its file if need be."""
+        with self._lock:
+            if name in self._functions:
+                return self._functions[name]
+            source = self._source_of.get(name)
+            if source is None:
+                raise BackendError(
+                    f"kernel must be one of {', '.join(self._source_of)}, got {name!r}; install gs2d again"
+                )
+            if source not in self._libraries:
+                code = self._code_of(source, self.architecture)
+                library = call(self._driver, "cuLibraryLoadData", code, [], [], 0, [], [], 0)
+                self._libraries[source] = library, code
+            kernel = call(self._driver, "cuLibraryGetKernel", self._libraries[source][0], name.encode())
+            # A kernel's handle may be launched as a function's, in any context.
+            self._functions[name] = self._driver.CUfunction(int(kernel))
+            return self._functions[name]
+
+    def _allow(self, name: str, shared_bytes: int) -> None:
+        attribute = self._driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+        kernel = self._driver.CUkernel(int(self._functions[name]))
+        call(self._driver, "cuKernelSetAttribute", attribute, shared_bytes, kernel, self._handle)
+        self._allowed[name] = shared_bytes
+
+
+@cache
+def _of_device(index: int) -> GpuLauncher:
+    return GpuLauncher(torch.device("cuda", index))
+
+
+def launcher_for(device: torch.device) -> Launcher:
+    """The launcher of the device on which tensors lie; one for each device of this process.
+
+    Raises
+    ------
+    ShapeError
+        The device is no CUDA device.
+    BackendError
+        It cannot run kernels here.
+    """
+    if device.type != "cuda":
+        raise ShapeError(
+            f"tensors must be on a CUDA device for the cuda backend, got {device}; "
+            "move them with .to('cuda'), or use --backend cpu"
+        )
+    return _of_device(torch.cuda.current_device() if device.index is None else device.index)
