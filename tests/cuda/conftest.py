@@ -1,9 +1,19 @@
-"""What the CUDA tests share: the emulator's folder and the rasterizer tests' scenes on the path."""
+"""What the CUDA tests share: the emulator with all kernels, and the rasterizer tests' scenes on the path."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "render"))  # render_scenes
+
+import emulate
+
+
+@pytest.fixture(scope="session")
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> emulate.Emulator:
+    """A launcher that runs the package's kernels on the CPU."""
+    return emulate.Emulator(tmp_path_factory.mktemp("kernels"))

@@ -7,11 +7,15 @@ import re
 import shutil
 import subprocess
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
+import gs2d.kernels
+
 HERE = Path(__file__).parent
+KERNELS = Path(gs2d.kernels.__file__).parent
 # As the GPU build: no contraction, and every fused multiply-add written out. -march only makes fmaf fast.
 FLAGS = (
     "-std=c++17",
@@ -63,3 +67,25 @@ def build(sources: Sequence[Path], include: Path, folder: Path, name: str) -> Em
     if done.returncode != 0:
         raise RuntimeError(f"g++ failed on {', '.join(s.name for s in sources)}:\n{done.stderr[-4000:]}")
     return EmulatedKernels(library)
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """A launcher (``gs2d.kernels.cuda.launch``) that runs the package's kernels on tensors in host memory.
+
+    A source file is compiled, into ``folder``, when one of its kernels is first wanted.
+    """
+
+    folder: Path
+    descending: bool = False
+    _built: dict[str, EmulatedKernels] = field(default_factory=dict)
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+        assert shared_bytes == 0, "the emulator has no dynamic shared memory"
+        if blocks == 0:
+            return
+        if name not in self._built:
+            source = next(s for s in sorted((KERNELS / "cuda").glob("*.cu")) if name in KERNEL.findall(s.read_text()))
+            built = build([source], KERNELS, self.folder, source.stem)
+            self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
+        self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending)

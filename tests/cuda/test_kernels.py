@@ -5,13 +5,12 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-import emulate
 import numpy as np
 import pytest
 import render_oracle
 import torch
+from emulate import Emulator
 from render_scenes import (
     IMAGES,
     KINDS,
@@ -26,7 +25,6 @@ from render_scenes import (
 )
 from torch import Tensor
 
-import gs2d.kernels
 from gs2d.camera import Camera
 from gs2d.errors import ShapeError
 from gs2d.render import cuda, reference, reference_errors
@@ -37,24 +35,6 @@ from gs2d.splats import ATTRIBUTES, Splats
 
 pytestmark = pytest.mark.timeout(120)  # a kernel that does not end
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
-FOLDER = Path(gs2d.kernels.__file__).parent
-
-
-@dataclass(frozen=True)
-class Emulator:
-    """A launcher for :mod:`gs2d.render.cuda`."""
-
-    kernels: emulate.EmulatedKernels
-    descending: bool = False
-
-    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure) -> None:
-        self.kernels.launch(name, (blocks, 1), threads, arguments, descending=self.descending)
-
-
-@pytest.fixture(scope="session")
-def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
-    sources = sorted((FOLDER / "cuda").glob("*.cu"))
-    return Emulator(emulate.build(sources, FOLDER, tmp_path_factory.mktemp("kernels"), "kernels"))
 
 
 def render(
