@@ -1,4 +1,4 @@
-"""Curves of a run for the report: losses, PSNR, splat count, mean opacity and mean K_a, as SVG text."""
+"""Curves of a run for the report, and of several runs side by side: losses, PSNR, K_a, opacity, changes; SVG text."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 _INK = "#858b94"  # readable on white and on black
 _COLORS = ("#3f86d6", "#e0893a", "#46a56b", "#c6509f", "#8a74d8", "#b9a02d", "#50a9b8")
 _STEP_KINDS = ("step", "progress")
+_CHANGES = ("mean", "covariance", "opacity", "sh")
 _AREA_NAMES = ("mean_area", "mean_k_a", "mean_Ka")
 
 
@@ -32,7 +33,8 @@ class History:
     ----------
     stages : tuple of StageSpan
     series : mapping of name to (iterations, values)
-        "splats", "mean_opacity", "mean_area", "psnr", and "loss/<term>" for each term.
+        "splats", "mean_opacity", "mean_area", "psnr", "loss/<term>" for each term, and "change/<attribute>" for each
+        attribute whose change in an iteration was logged.
     """
 
     stages: tuple[StageSpan, ...] = ()
@@ -58,7 +60,7 @@ def read_history(events: Sequence[Mapping[str, Any]]) -> History:
         total += lengths[stage]
     points: dict[str, list[tuple[float, float]]] = {}
     for event in events:
-        if _kind(event) in _STEP_KINDS and event.get("stage") in starts and "iteration" in event:
+        if _kind(event) in (*_STEP_KINDS, "changes") and event.get("stage") in starts and "iteration" in event:
             iteration = starts[event["stage"]] + _whole(event["iteration"])
             for name, value in _figures(event).items():
                 points.setdefault(name, []).append((iteration, value))
@@ -76,7 +78,10 @@ def _whole(value: Any) -> int:
 
 
 def _figures(event: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of one step that are finite."""
+    """The numbers of one step, or of what changed after it, that are finite."""
+    if _kind(event) == "changes":
+        changes = {f"change/{name}": event.get(name) for name in _CHANGES}
+        return {name: float(v) for name, v in changes.items() if isinstance(v, int | float) and np.isfinite(v)}
     named: dict[str, Any] = {name: event.get(name) for name in ("psnr", "splats", "mean_opacity")}
     named["mean_area"] = next((event[name] for name in _AREA_NAMES if name in event), None)
     losses = event.get("losses")
@@ -122,6 +127,80 @@ def curves(history: History, stage_psnr: Mapping[str, float], split: str) -> dic
     return drawn
 
 
+@dataclass(frozen=True)
+class Panel:
+    """One diagram of a comparison: the series that every run contributes a line to."""
+
+    series: str
+    title: str
+    log: bool = False
+    smooth: bool = False
+
+
+def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str | None:
+    """Runs side by side: a diagram for each panel, a line for each run, one key for all.
+
+    Parameters
+    ----------
+    histories : mapping of label to History
+    panels : sequence of Panel
+        At most four, in one row; those for which no run has figures are left out.
+
+    Returns
+    -------
+    str or None
+        SVG; None if nothing is left to draw.
+    """
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    shown = [panel for panel in panels if any(panel.series in history.series for history in histories.values())]
+    if not shown:
+        return None
+    rows = -(-len(shown) // 2)
+    columns = -(-len(shown) // rows)
+    figure = Figure(figsize=(4.6 * columns, 2.7 * rows + 0.3), layout="constrained")
+    FigureCanvasSVG(figure)
+    longest = max(histories.values(), key=lambda history: max((span.stop for span in history.stages), default=0))
+    for axes, panel in zip(figure.subplots(rows, columns, squeeze=False).flat, shown, strict=False):
+        for k, (label, history) in enumerate(histories.items()):
+            _draw_stages(axes, history, panel.series, label=label, smooth=panel.smooth, **_style(k))
+        _dress(axes, longest, log=panel.log, legend=False)
+        axes.set_title(panel.title, fontsize=9, color=_INK, pad=16 if len(longest.stages) > 1 else 6)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(4, len(labels)),
+        fontsize=8,
+        frameon=False,
+        labelcolor=_INK,
+    )
+    return _svg(figure)
+
+
+def _style(k: int) -> dict[str, Any]:
+    """Colour and dashes of line ``k``: no two of 28 lines are alike, and the first is on top where they meet."""
+    dashes = ("-", "--", ":", "-.")[k // len(_COLORS) % 4]
+    return {"color": _COLORS[k % len(_COLORS)], "linestyle": dashes, "order": 3 - 0.01 * k}
+
+
+def _draw_stages(
+    axes: Any, history: History, name: str, *, label: str, smooth: bool, color: str, linestyle: str, order: float
+) -> None:
+    """One line a stage: nothing is drawn or averaged across a boundary."""
+    for span in history.stages if name in history.series else ():
+        x, y = _within(history, name, span)
+        if not len(x):
+            continue
+        if smooth and len(x) > 30:
+            axes.plot(x, y, color=color, linewidth=0.6, alpha=0.25, zorder=order)
+            y = smoothed(y)
+        axes.plot(x, y, color=color, linewidth=1.5, linestyle=linestyle, zorder=order)
+    axes.plot([], [], color=color, linewidth=1.5, linestyle=linestyle, label=label)
+
+
 def _figure(
     history: History,
     lines: Mapping[str, str],
@@ -130,7 +209,6 @@ def _figure(
     smooth: bool = False,
     marks: tuple[str, Mapping[int, float]] | None = None,
 ) -> str:
-    import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -138,16 +216,7 @@ def _figure(
     FigureCanvasSVG(figure)
     axes = figure.add_subplot()
     for k, (label, name) in enumerate(lines.items()):
-        color = _COLORS[k % len(_COLORS)]
-        for span in history.stages:  # one line a stage: nothing is drawn or averaged across a boundary
-            x, y = _within(history, name, span)
-            if not len(x):
-                continue
-            if smooth and len(x) > 30:
-                axes.plot(x, y, color=color, linewidth=0.6, alpha=0.25)
-                y = smoothed(y)
-            axes.plot(x, y, color=color, linewidth=1.5)
-        axes.plot([], [], color=color, linewidth=1.5, label=label)
+        _draw_stages(axes, history, name, label=label, smooth=smooth, **_style(k))
     if marks and marks[1]:
         x_marks, y_marks = list(marks[1]), list(marks[1].values())
         axes.plot(x_marks, y_marks, "o", color=_COLORS[1], markersize=5, label=marks[0], clip_on=False)
@@ -162,6 +231,12 @@ def _figure(
                 color=_INK,
             )
     _dress(axes, history, log=log, legend=any(lines) or bool(marks and marks[1]))
+    return _svg(figure)
+
+
+def _svg(figure: Any) -> str:
+    import matplotlib
+
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "gs2d"}):  # the same run gives the same bytes
         figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})

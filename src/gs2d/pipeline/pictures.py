@@ -104,11 +104,16 @@ def render_view(splats: Splats, view: View, settings: RasterSettings, backend: B
 
 
 def share_of_group(splats: Splats, group: Tensor, view: View, settings: RasterSettings, backend: Backend) -> np.ndarray:
-    """How much of each pixel the splats of a row group make up: their blending weights, summed; [H, W] in [0, 1].
+    """How much of each pixel the splats of a row group make up: their blending weights, summed; [H, W] in [0, 1]."""
+    return splatted(splats, group, view, settings, backend)
 
-    Drawn as a scene in which they are white and all others black.
+
+def splatted(splats: Splats, values: Tensor, view: View, settings: RasterSettings, backend: Backend) -> np.ndarray:
+    """The sum over splats of blending weight times ``values`` [N] (>= 0) in each pixel, [H, W].
+
+    Drawn as a scene in which each splat is as grey as its value says, over black.
     """
-    white = group.to(splats.dtype)[:, None].expand(-1, 3)
-    marked = Splats(**{**dict(splats.items()), "sh0": rgb_to_sh0(white), "shN": torch.zeros_like(splats.shN)})
+    grey = values.to(splats.dtype)[:, None].expand(-1, 3)
+    marked = Splats(**{**dict(splats.items()), "sh0": rgb_to_sh0(grey), "shN": torch.zeros_like(splats.shN)})
     settings = replace(settings, background=(0.0, 0.0, 0.0))
     return np.asarray(render_view(marked, view, settings, backend).color[..., 0].numpy())

@@ -1,0 +1,285 @@
+"""The paper's figures from finished runs: K_a and opacity with and without NC, attribute traces, E_i maps."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.data import View
+from gs2d.disk import atomic_write
+from gs2d.errors import Gs2dError
+from gs2d.io.run import RunFolder, load_tensors, make_folder, open_run
+from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
+from gs2d.pipeline.jobs import finished_splats
+from gs2d.pipeline.pictures import choose_views, render_view, share_of_group, splatted
+from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.recipe import RankByError, Recipe
+from gs2d.recipe_json import from_json
+from gs2d.render.api import splat_errors
+from gs2d.report_curves import Panel, compared, read_history
+from gs2d.report_images import ERROR_TOP, error_picture, error_scale, highlight_picture
+from gs2d.splats import Splats
+from gs2d.train.actions import worst
+from gs2d.train.state import TrainState
+
+TRACES = (
+    Panel("mean_area", r"Mean $K_a = s_u s_v$, square world units", log=True),
+    Panel("mean_opacity", "Mean opacity"),
+)
+CHANGES = (
+    Panel("change/mean", r"$\mu$: shift an iteration, share of the scene's extent", log=True, smooth=True),
+    Panel("change/covariance", r"$\Sigma$: relative change an iteration", log=True, smooth=True),
+    Panel("change/opacity", r"$\alpha$: change an iteration", log=True, smooth=True),
+    Panel("change/sh", "SHs: change an iteration, norm of all coefficients", log=True, smooth=True),
+)
+MAP_PERCENTILES = (50.0, 99.9)  # of E_i: the ends of the colour scale, which is logarithmic
+DEFAULT_RANK = RankByError()  # of runs whose recipe ranks nothing
+
+
+def write_figures(
+    runs: Mapping[str, Path],
+    out: Path,
+    on_event: OnEvent = ignore,
+    *,
+    maps: Sequence[str] | None = None,
+    views: int = 3,
+    backend: str = "auto",
+) -> tuple[Path, ...]:
+    """Draw the paper's figures from finished runs.
+
+    ``traces.svg``: mean K_a and mean opacity over the iterations, a line for each run. ``changes.svg``: how much mu,
+    Sigma, alpha and SHs change an iteration. ``errors-LABEL.png``: for a few views the photograph, the rendering, its
+    error, E_i splatted, and the high-error splats. A figure that the runs have no data for, or whose capture cannot be
+    read, is left out with a notice.
+
+    Parameters
+    ----------
+    runs : mapping of label to Path
+        Run folders; the labels name the lines.
+    out : Path
+        Folder; made if it does not exist.
+    on_event : callable
+        Gets notices and progress.
+    maps : sequence of str, optional
+        Labels of the runs to draw E_i maps of; default: those whose recipe ranks splats by error.
+    views : int
+        How many views each map shows: test views where there are any.
+    backend : str
+        Renders the maps; "auto" is the run's own.
+
+    Returns
+    -------
+    tuple of Path
+        The files, in the order above.
+
+    Raises
+    ------
+    RunError, DiskError
+    """
+    folders = {label: open_run(path) for label, path in runs.items()}
+    make_folder(out)
+    histories = {label: read_history(run.events.read()) for label, run in folders.items()}
+    files = []
+    for name, panels in (("traces.svg", TRACES), ("changes.svg", CHANGES)):
+        drawing = compared(histories, panels) if histories else None
+        if drawing is None:
+            on_event(Notice(f"no figure {name}: the logs of these runs do not hold its numbers"))
+            continue
+        with atomic_write(out / name, "w") as file:
+            file.write(drawing)
+        files.append(out / name)
+    for label, run in folders.items():
+        if label not in maps if maps is not None else not _ranks(run):
+            continue
+        path = out / f"errors-{re.sub(r'[^A-Za-z0-9._-]+', '-', label)}.png"
+        try:
+            draw_error_maps(run, path, on_event, title=label, views=views, backend=backend)
+        except Gs2dError as error:
+            on_event(Notice(f"no E_i map of {label}: {error}"))
+            continue
+        files.append(path)
+    return tuple(files)
+
+
+def _ranks(run: RunFolder) -> bool:
+    stages = from_json(run.definition()["recipe"]).stages
+    return any(isinstance(action, RankByError) for stage in stages for action in stage.on_enter)
+
+
+# -- E_i maps ----------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """Splats with their E_i.
+
+    Attributes
+    ----------
+    splats : Splats
+        As they were when the recipe ranked them, if that checkpoint is still there; else the final ones.
+    errors : Tensor [N] float64
+        E_i over all training views.
+    worst : Tensor [N] bool
+        The high-error splats.
+    when : str
+        Which splats these are, in words.
+    """
+
+    splats: Splats
+    errors: Tensor
+    worst: Tensor
+    when: str
+
+
+def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
+    """E_i (paper Eq. 8) of the splats that the recipe ranked, summed over all training views.
+
+    Raises
+    ------
+    RunError
+        The run is not finished, or its checkpoint is broken.
+    """
+    index, action = _first_ranking(job.recipe)
+    ends = {c.stage_index: c.path for c in run.checkpoints() if c.iteration is None}
+    if index - 1 in ends:
+        splats = TrainState.from_state_dict(load_tensors(ends[index - 1])["state"]).splats
+        when = f"after {job.recipe.stages[index - 1].name}"
+    else:
+        splats, when = finished_splats(run), "final splats"
+    total = torch.zeros(len(splats), dtype=torch.float64)
+    views = job.scene.train
+    for view in counted(views, "errors of each splat", len(views), on_event):
+        image = torch.from_numpy(view.target(job.settings.background)).to(splats.dtype)
+        mask = view.mask() if job.protocol.use_mask_in_training else None
+        errors = splat_errors(
+            splats,
+            view.camera,
+            image,
+            job.settings,
+            backend=job.backend,
+            mask=None if mask is None else torch.from_numpy(mask),
+            occlusion=action.occlusion,
+        )
+        total += errors.cpu()
+    group = torch.zeros(len(splats), dtype=torch.bool)
+    group[worst(total, action.top_percent)] = True
+    return Ranking(splats, total, group, when)
+
+
+def _first_ranking(recipe: Recipe) -> tuple[int, RankByError]:
+    """The stage that first ranks, and how; (0, default) where none does."""
+    for index, stage in enumerate(recipe.stages):
+        for action in stage.on_enter:
+            if isinstance(action, RankByError):
+                return index, action
+    return 0, DEFAULT_RANK
+
+
+def map_limits(errors: Tensor) -> tuple[float, float]:
+    """E_i at the ends of the colour scale: the median and the 99.9th percentile of those above 0."""
+    seen = errors[errors > 0].numpy()
+    if not len(seen):
+        return 1.0, 10.0
+    low, high = (float(value) for value in np.percentile(seen, MAP_PERCENTILES))
+    return low, max(high, low * (1 + 1e-6))
+
+
+def error_positions(errors: Tensor, limits: tuple[float, float]) -> Tensor:
+    """Where each E_i stands on the logarithmic scale between the limits, [N] in [0, 1]."""
+    low, high = limits
+    return ((errors.clamp(min=1e-300) / low).log() / np.log(high / low)).clamp(0, 1)
+
+
+def map_picture(splats: Splats, positions: Tensor, view: View, job: Job, alpha: np.ndarray) -> np.ndarray:
+    """E_i splatted: each pixel has the colour of the mean position of its splats, over white; [H, W, 3]."""
+    weighted = splatted(splats, positions, view, job.settings, job.backend)
+    steps = error_scale(256)
+    where = np.clip(weighted / np.maximum(alpha, 1e-6), 0, 1)
+    cover = np.clip(alpha, 0, 1)[..., None]
+    return np.asarray(cover * steps[np.rint(255 * where).astype(int)] + (1 - cover), np.float32)
+
+
+def draw_error_maps(
+    run: RunFolder, path: Path, on_event: OnEvent = ignore, *, title: str = "", views: int = 3, backend: str = "auto"
+) -> None:
+    """Write the E_i map of one run as a PNG: a row for each view.
+
+    Raises
+    ------
+    RunError, DataError, BackendError, DiskError
+    """
+    job = reload_job(run, on_event, backend=backend)
+    ranking = rank_run(run, job, on_event)
+    limits = map_limits(ranking.errors)
+    positions = error_positions(ranking.errors, limits)
+    rows: list[tuple[str, list[np.ndarray]]] = []
+    for split, view in choose_views(job.scene, views):
+        output = render_view(ranking.splats, view, job.settings, job.backend)
+        color, alpha = np.clip(output.color.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
+        photo = view.target(job.settings.background)
+        share = share_of_group(ranking.splats, ranking.worst, view, job.settings, job.backend)
+        pictures = [
+            photo,
+            color,
+            error_picture(color, photo, view.mask()),
+            map_picture(ranking.splats, positions, view, job, alpha),
+            highlight_picture(color, share),
+        ]
+        rows.append((f"{Path(view.name).stem} ({split})", pictures))
+    count = int(ranking.worst.sum())
+    share_of_all = float(ranking.errors[ranking.worst].sum() / ranking.errors.sum().clamp(min=1e-300))
+    head = (
+        f"{title}: $E_i$ {ranking.when}; {count:,} of {len(ranking.splats):,} splats are high-error, "
+        f"with {share_of_all:.0%} of the sum"
+    )
+    _write_grid(path, rows, head, limits)
+
+
+COLUMNS = (
+    "photograph",
+    "rendering",
+    f"error of the pixel, 0 to {ERROR_TOP}",
+    "$E_i$ of the splats",
+    "high-error splats",
+)
+
+
+def _write_grid(
+    path: Path, rows: Sequence[tuple[str, Sequence[np.ndarray]]], head: str, limits: tuple[float, float]
+) -> None:
+    """Pictures in rows under their names, with the scale of E_i."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, LogNorm
+    from matplotlib.figure import Figure
+
+    height, width = rows[0][1][0].shape[:2]
+    tall = 2.4 * height / width
+    figure = Figure(figsize=(2.4 * len(COLUMNS), tall * len(rows) + 0.9), layout="constrained", dpi=110)
+    FigureCanvasAgg(figure)
+    grid: Any = figure.subplots(len(rows), len(COLUMNS), squeeze=False)
+    for i, (name, pictures) in enumerate(rows):
+        for j, (axes, picture) in enumerate(zip(grid[i], pictures, strict=True)):
+            axes.imshow(np.clip(picture, 0, 1), interpolation="none" if height > 100 else "nearest")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.spines[:].set_visible(False)
+            if i == 0:
+                axes.set_title(COLUMNS[j], fontsize=8)
+            if j == 0:
+                axes.set_ylabel(name, fontsize=7)
+    scale = ScalarMappable(LogNorm(*limits), ListedColormap(error_scale(256)))
+    bar = figure.colorbar(scale, ax=grid, location="bottom", shrink=0.4, aspect=50, pad=0.02)
+    bar.set_label("$E_i$: colour error summed over the footprint in all training views", fontsize=7)
+    ticks = np.geomspace(*limits, 5).tolist()
+    bar.set_ticks(ticks, labels=[f"{value:.3g}" for value in ticks])
+    bar.ax.minorticks_off()
+    bar.ax.tick_params(labelsize=7)
+    figure.suptitle(head, fontsize=9)
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})
