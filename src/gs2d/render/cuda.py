@@ -14,8 +14,9 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.camera import Camera
 from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
-from gs2d.kernels.cuda.launch import Launcher, launcher_for
+from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.cuda_passes import IMAGES, PARAMETERS, Frame, backward, errors, forward
 from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -120,7 +121,7 @@ def rasterize(
     splats: Splats, camera: Camera, settings: RasterSettings, screen_probe: Tensor | None = None
 ) -> RenderOutput:
     """:func:`rasterize_with` on the device on which the splats lie, on torch's current stream there."""
-    return rasterize_with(launcher_for(splats.device), splats, camera, settings, screen_probe)
+    return rasterize_with(launch.launcher_for(splats.device), splats, camera, settings, screen_probe)
 
 
 def splat_errors_with(
@@ -179,4 +180,4 @@ def splat_errors(
     """
     if occlusion:
         raise BackendError("the cuda backend has no splat errors with occlusion; use --backend cpu for this recipe")
-    return splat_errors_with(launcher_for(splats.device), splats, camera, image, settings, mask)
+    return splat_errors_with(launch.launcher_for(splats.device), splats, camera, image, settings, mask)

@@ -1,0 +1,121 @@
+"""A CUDA driver for the launcher's tests: it records calls, fails when told to, and may run kernels in the emulator."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+import torch
+from emulate import Emulator
+
+from gs2d.kernels.cuda.launch import GpuLauncher
+
+
+class Result(IntEnum):
+    CUDA_SUCCESS = 0
+    CUDA_ERROR_OUT_OF_MEMORY = 2
+    CUDA_ERROR_INVALID_IMAGE = 200
+    CUDA_ERROR_INVALID_CONTEXT = 201
+    CUDA_ERROR_NO_BINARY_FOR_GPU = 209
+    CUDA_ERROR_NOT_FOUND = 500
+    CUDA_ERROR_ILLEGAL_ADDRESS = 700
+    CUDA_ERROR_SOMETHING_NEW = 9999
+
+
+class Attribute(IntEnum):
+    CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES = 8
+
+
+@dataclass(frozen=True)
+class Launch:
+    """One launch as the driver saw it."""
+
+    kernel: str
+    grid: tuple[int, int, int]
+    block: tuple[int, int, int]
+    shared: int
+    stream: int
+    context: int
+    argument: bytes
+
+
+@dataclass
+class FakeDriver:
+    """The functions of ``cuda.bindings.driver`` that the launcher calls."""
+
+    emulator: Emulator | None = None  # runs what is launched, if given
+    argument_bytes: int = 0  # how many bytes of the argument to keep
+    failing: dict[str, Result] = field(default_factory=dict)
+    current: list[int] = field(default_factory=lambda: [0])  # stack of contexts of the calling thread
+    loaded: list[bytes] = field(default_factory=list)
+    launches: list[Launch] = field(default_factory=list)
+    attributes: list[tuple[int, int, int, int]] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)  # by handle - 1
+
+    CUresult = Result
+    CUfunction_attribute = Attribute
+    CUstream = CUfunction = CUkernel = staticmethod(int)
+
+    def _done(self, name: str, *values: Any) -> tuple[Any, ...]:
+        return (self.failing.get(name, Result.CUDA_SUCCESS), *values)
+
+    def cuInit(self, flags: int) -> tuple[Any, ...]:
+        return self._done("cuInit")
+
+    def cuDriverGetVersion(self) -> tuple[Any, ...]:
+        return self._done("cuDriverGetVersion", 12080)
+
+    def cuDeviceGet(self, ordinal: int) -> tuple[Any, ...]:
+        return self._done("cuDeviceGet", ordinal)
+
+    def cuDevicePrimaryCtxRetain(self, device: int) -> tuple[Any, ...]:
+        return self._done("cuDevicePrimaryCtxRetain", 1000 + device)
+
+    def cuCtxGetCurrent(self) -> tuple[Any, ...]:
+        return self._done("cuCtxGetCurrent", self.current[-1])
+
+    def cuCtxPushCurrent(self, context: int) -> tuple[Any, ...]:
+        self.current.append(context)
+        return self._done("cuCtxPushCurrent")
+
+    def cuCtxPopCurrent(self) -> tuple[Any, ...]:
+        return self._done("cuCtxPopCurrent", self.current.pop())
+
+    def cuLibraryLoadData(self, code: bytes, *nothing: Any) -> tuple[Any, ...]:
+        assert nothing == ([], [], 0, [], [], 0)
+        self.loaded.append(code)
+        return self._done("cuLibraryLoadData", len(self.loaded))
+
+    def cuLibraryGetKernel(self, library: int, name: bytes) -> tuple[Any, ...]:
+        assert library == len(self.loaded)
+        self.names.append(name.decode())
+        return self._done("cuLibraryGetKernel", len(self.names))
+
+    def cuKernelSetAttribute(self, attribute: int, value: int, kernel: int, device: int) -> tuple[Any, ...]:
+        self.attributes.append((attribute, value, kernel, device))
+        return self._done("cuKernelSetAttribute")
+
+    def cuLaunchKernel(self, function: int, *rest: int) -> tuple[Any, ...]:
+        gx, gy, gz, bx, by, bz, shared, stream, parameters, extra = rest
+        assert extra == 0
+        name = self.names[function - 1]
+        address = ctypes.cast(parameters, ctypes.POINTER(ctypes.c_void_p))[0]
+        assert address is not None
+        argument = ctypes.string_at(address, self.argument_bytes)
+        self.launches.append(Launch(name, (gx, gy, gz), (bx, by, bz), shared, stream, self.current[-1], argument))
+        if self.emulator is not None:
+            self.emulator.launch(name, gx, bx, ctypes.c_char.from_address(address))  # type: ignore[arg-type]
+        return self._done("cuLaunchKernel")
+
+
+def launcher(driver: FakeDriver, index: int = 0, stream: int = 0, code: bytes = b"\x7fELF") -> GpuLauncher:
+    """The real launcher over a fake driver."""
+    return GpuLauncher(
+        torch.device("cuda", index),
+        driver=driver,
+        stream_of=lambda device: stream,
+        architecture_of=lambda device: "sm_90",
+        code_of=lambda name, arch: code + name.encode() + arch.encode(),
+    )

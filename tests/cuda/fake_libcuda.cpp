@@ -1,0 +1,95 @@
+// Stands in for libcuda.so.1, so that the real cuda.bindings can be called without a GPU: it counts contexts, keeps what
+// was loaded, and writes one line of JSON for each launch to the file named by FAKE_CUDA_LOG.
+//
+// FAKE_CUDA_FAIL=name:code makes one function fail. A kernel's first argument is logged as its first 8 bytes.
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <map>
+#include <string>
+
+namespace {
+
+int fails(const char* name) {
+    const char* wanted = getenv("FAKE_CUDA_FAIL");
+    const size_t n = strlen(name);
+    return wanted && !strncmp(wanted, name, n) && wanted[n] == ':' ? atoi(wanted + n + 1) : 0;
+}
+
+void say(const std::string& line) {
+    if (FILE* f = fopen(getenv("FAKE_CUDA_LOG"), "a")) fprintf(f, "%s\n", line.c_str()), fclose(f);
+}
+
+thread_local void* current = nullptr;
+thread_local void* before = nullptr;
+std::map<std::string, void*> kernels;
+char contexts[8], library;
+
+}  // namespace
+
+extern "C" {
+
+int cuDriverGetVersion(int* v) { return *v = 13020, fails("cuDriverGetVersion"); }
+int cuInit(unsigned) { return fails("cuInit"); }
+int cuDeviceGet(int* device, int ordinal) { return *device = ordinal, fails("cuDeviceGet"); }
+int cuDevicePrimaryCtxRetain(void** context, int device) { return *context = contexts + device, fails("cuDevicePrimaryCtxRetain"); }
+int cuCtxGetCurrent(void** context) { return *context = current, fails("cuCtxGetCurrent"); }
+int cuCtxPushCurrent_v2(void* context) { return before = current, current = context, fails("cuCtxPushCurrent"); }
+int cuCtxPopCurrent_v2(void** context) { return *context = current, current = before, fails("cuCtxPopCurrent"); }
+
+int cuLibraryLoadData(void** out, const void* code, void*, void*, unsigned options, void*, void*, unsigned library_options) {
+    if (options || library_options || memcmp(code, "\x7f" "ELF", 4)) return 200;
+    say("{\"call\": \"load\"}");
+    return *out = &library, fails("cuLibraryLoadData");
+}
+
+int cuLibraryGetKernel(void** kernel, void* from, const char* name) {
+    if (from != &library) return 400;
+    void*& found = kernels[name];
+    if (!found) found = strdup(name);
+    return *kernel = found, fails("cuLibraryGetKernel");
+}
+
+int cuKernelSetAttribute(int attribute, int value, void* kernel, int device) {
+    say("{\"call\": \"attribute\", \"attribute\": " + std::to_string(attribute) + ", \"value\": " + std::to_string(value) +
+        ", \"kernel\": \"" + static_cast<char*>(kernel) + "\", \"device\": " + std::to_string(device) + "}");
+    return fails("cuKernelSetAttribute");
+}
+
+int cuLaunchKernel(void* f, unsigned gx, unsigned gy, unsigned gz, unsigned bx, unsigned by, unsigned bz, unsigned shared,
+                   void* stream, void** parameters, void** extra) {
+    if (!current) return 201;  // CUDA_ERROR_INVALID_CONTEXT
+    if (extra) return 1;
+    unsigned long long first;
+    memcpy(&first, parameters[0], 8);
+    char line[512];
+    snprintf(line, sizeof line,
+             "{\"call\": \"launch\", \"kernel\": \"%s\", \"grid\": [%u, %u, %u], \"block\": [%u, %u, %u], \"shared\": %u, "
+             "\"stream\": %llu, \"first\": %llu, \"device\": %d}",
+             static_cast<char*>(f), gx, gy, gz, bx, by, bz, shared, (unsigned long long)(uintptr_t)stream, first,
+             int(static_cast<char*>(current) - contexts));
+    say(line);
+    return fails("cuLaunchKernel");
+}
+
+// How cuda.bindings finds the functions.
+#define NAME(shown, real) \
+    if (!strcmp(name, #shown)) return *out = reinterpret_cast<void*>(&real), 0
+int cuGetProcAddress_v2(const char* name, void** out, int, uint64_t, void* status) {
+    if (status) *static_cast<int*>(status) = 0;
+    NAME(cuDriverGetVersion, cuDriverGetVersion);
+    NAME(cuInit, cuInit);
+    NAME(cuDeviceGet, cuDeviceGet);
+    NAME(cuDevicePrimaryCtxRetain, cuDevicePrimaryCtxRetain);
+    NAME(cuCtxGetCurrent, cuCtxGetCurrent);
+    NAME(cuCtxPushCurrent, cuCtxPushCurrent_v2);
+    NAME(cuCtxPopCurrent, cuCtxPopCurrent_v2);
+    NAME(cuLibraryLoadData, cuLibraryLoadData);
+    NAME(cuLibraryGetKernel, cuLibraryGetKernel);
+    NAME(cuKernelSetAttribute, cuKernelSetAttribute);
+    NAME(cuLaunchKernel, cuLaunchKernel);
+    *out = nullptr;
+    return 500;
+}
+}

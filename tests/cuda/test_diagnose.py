@@ -1,0 +1,125 @@
+"""Why the CUDA backend cannot run, in the order in which a user would mend it, and what to do each time."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda import compile as nvrtc
+from gs2d.kernels.cuda import diagnose
+from gs2d.kernels.cuda.diagnose import Facts, describe, missing
+from gs2d.render.backend import backend_report, get_backend
+
+H200 = ("NVIDIA H200", (9, 0))
+WORKS = Facts("2.15.0", (13, 0), nvrtc=(13, 0), driver=(13, 2), devices=(H200,))
+# Everything is wrong; each line of the table mends one thing more.
+BROKEN = Facts(
+    "2.15.0+cpu",
+    None,
+    bindings_error="No module named 'cuda'",
+    nvrtc_error="libnvrtc not found",
+    driver_error="libcuda not found",
+    torch_error="no NVIDIA driver",
+    architecture_error="the GPU must have compute capability 7.5 or more (Turing, 2018), got 6.1; use --backend cpu",
+    cache_writable=False,
+)
+MENDING = (
+    ({}, "torch 2.15.0+cpu is built without CUDA", "CUDA build of torch"),
+    ({"torch_cuda": (13, 0)}, "cuda.bindings is not here (No module named 'cuda')", "pip install cuda-bindings"),
+    ({"bindings_error": ""}, "NVRTC is not here (libnvrtc not found)", "pip install nvidia-cuda-nvrtc"),
+    ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is here (libcuda not found)", "install NVIDIA's driver"),
+    ({"driver_error": "", "driver": (12, 4)}, "driver supports CUDA 12.4, but torch is of CUDA 13.0", "update"),
+    ({"torch_cuda": (12, 8)}, "driver supports CUDA 12.4, but NVRTC is of CUDA 13.0", "update"),
+    ({"nvrtc": (12, 9)}, "torch sees no CUDA device (no NVIDIA driver)", "CUDA_VISIBLE_DEVICES"),
+    ({"devices": (H200,)}, "NVIDIA H200: the GPU must have compute capability 7.5", "--backend cpu"),
+)
+
+
+def test_each_missing_piece_is_named_in_order_with_its_remedy() -> None:
+    facts = BROKEN
+    for change, reason, remedy in MENDING:
+        facts = replace(facts, **change)  # type: ignore[arg-type]
+        lacking = missing(facts)
+        assert lacking is not None, change
+        assert reason in lacking.reason
+        assert remedy in lacking.remedy
+    assert missing(replace(facts, architecture_error="")) is None
+
+
+def test_a_newer_minor_version_than_the_drivers_is_no_obstacle() -> None:
+    """Code of one major version of CUDA runs on every driver of that version."""
+    assert missing(replace(WORKS, driver=(13, 0), nvrtc=(13, 3))) is None
+
+
+def test_a_read_only_cache_is_no_obstacle_but_is_said() -> None:
+    facts = replace(WORKS, cache=Path("/home/x/.cache/gs2d"), cache_writable=False)
+    assert missing(facts) is None
+    assert "/home/x/.cache/gs2d cannot be written: kernels are compiled at every start" in describe(facts)
+    assert describe(WORKS) == "NVIDIA H200 (sm_90); driver CUDA 13.2, NVRTC 13.0"
+
+
+def test_whether_the_cache_can_be_written_is_found_without_writing(tmp_path: Path) -> None:
+    assert nvrtc.is_writable(tmp_path / "not" / "there" / "yet")
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert not nvrtc.is_writable(blocked / "cache")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
+def test_without_a_cuda_build_of_torch_nothing_else_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnose, "load_driver", lambda: pytest.fail("asked"))
+    assert diagnose.gather() == Facts(torch.__version__, None)
+
+
+@pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
+def test_facts_are_gathered_to_the_end_whatever_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CUDA torch on a machine like this one: no driver, no device, and every line filled in."""
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    facts = diagnose.gather()
+    assert facts.torch_cuda == (13, 0)
+    assert facts.devices == ()
+    assert bool(facts.driver_error) or bool(facts.bindings_error)
+    lacking = missing(facts)
+    assert lacking is not None
+    with pytest.raises(BackendError, match="backend 'cuda' cannot run"):
+        get_backend("cuda")
+    status = next(status for status in backend_report() if status.name == "cuda")
+    assert (status.reason, status.remedy) == (lacking.reason, lacking.remedy)
+    assert "\n" not in status.reason
+
+
+@pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
+def test_missing_bindings_are_told_from_a_missing_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.version, "cuda", "12.8")
+    monkeypatch.setitem(sys.modules, "cuda.bindings", None)
+    facts = diagnose.gather()
+    assert "cuda.bindings" in facts.bindings_error
+    assert facts.nvrtc_error
+
+
+def test_a_device_newer_than_the_compiler_takes_the_newest_code_of_its_major_version(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Compiler:
+        class nvrtcResult:
+            NVRTC_SUCCESS = 0
+
+        @staticmethod
+        def nvrtcGetSupportedArchs() -> tuple[int, list[int]]:
+            return 0, [75, 80, 86, 90, 100, 103, 120]
+
+    monkeypatch.setattr(nvrtc, "_nvrtc", Compiler)
+    assert nvrtc.architecture_for((9, 0)) == "sm_90"
+    assert nvrtc.architecture_for((8, 9)) == "sm_86"
+    assert nvrtc.architecture_for((12, 1)) == "sm_120"
+    assert nvrtc.architecture_for((7, 5)) == "sm_75"
+    with pytest.raises(BackendError, match=r"7\.5 or more \(Turing, 2018\), got 7\.0"):
+        nvrtc.architecture_for((7, 0))
+    with pytest.raises(BackendError, match=r"up to sm_120, the GPU has compute capability 13\.0"):
+        nvrtc.architecture_for((13, 0))

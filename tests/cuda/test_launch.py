@@ -1,0 +1,236 @@
+"""The launcher over a driver that records: streams, contexts, packing, caching, errors; and over the real bindings."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import fake_driver
+import numpy as np
+import pytest
+import torch
+from emulate import Emulator
+from fake_driver import FakeDriver, Result
+from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
+
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.cuda import arguments, launch
+from gs2d.kernels.cuda.compile import kernel_sources
+from gs2d.render import cuda
+from gs2d.render.types import RasterSettings
+
+pytestmark = pytest.mark.timeout(120)
+
+
+class Numbers(ctypes.Structure):
+    _fields_ = (("a", ctypes.c_int64), ("b", ctypes.c_float), ("c", ctypes.c_void_p))
+
+
+def numbers() -> Numbers:
+    return Numbers(7, 0.5, 0xABCDEF)
+
+
+def test_a_launch_passes_the_structure_as_it_is_on_the_current_stream_in_the_devices_context() -> None:
+    driver = FakeDriver(argument_bytes=ctypes.sizeof(Numbers))
+    fake_driver.launcher(driver, index=2, stream=0x77).launch("project_splats", 5, 128, numbers())
+    (done,) = driver.launches
+    assert (done.kernel, done.grid, done.block, done.shared) == ("project_splats", (5, 1, 1), (128, 1, 1), 0)
+    assert (done.stream, done.context) == (0x77, 1002)  # the fake context of device 2 is 1002
+    assert done.argument == bytes(numbers())
+
+
+def test_the_context_that_was_current_is_current_again_also_after_an_error() -> None:
+    driver = FakeDriver(current=[5])
+    launcher = fake_driver.launcher(driver)
+    launcher.launch("project_splats", 1, 128, numbers())
+    assert driver.current == [5]
+    with pytest.raises(BackendError, match="kernel must be one of"):
+        launcher.launch("no_such_kernel", 1, 128, numbers())
+    assert driver.current == [5]
+
+
+def test_the_stream_is_asked_for_at_each_launch() -> None:
+    driver, streams = FakeDriver(), [1, 2, 3]
+    launcher = launch.GpuLauncher(
+        torch.device("cuda", 0),
+        driver=driver,
+        stream_of=lambda device: streams.pop(0),
+        architecture_of=lambda device: "sm_90",
+        code_of=lambda name, arch: b"",
+    )
+    for _ in range(3):
+        launcher.launch("project_splats", 1, 128, numbers())
+    assert [done.stream for done in driver.launches] == [1, 2, 3]
+
+
+def test_a_file_is_loaded_once_for_all_of_its_kernels() -> None:
+    driver = FakeDriver()
+    launcher = fake_driver.launcher(driver)
+    for name in ("emit_entries_16", "find_ranges_16", "emit_entries_16", "project_splats", "find_ranges_16"):
+        launcher.launch(name, 1, 128, numbers())
+    assert driver.loaded == [b"\x7fELFcuda/emit.cusm_90", b"\x7fELFcuda/project.cusm_90"]
+    assert driver.names == ["emit_entries_16", "find_ranges_16", "project_splats"]
+
+
+def test_two_threads_that_want_a_kernel_at_once_load_it_once() -> None:
+    driver = FakeDriver()
+    launcher = fake_driver.launcher(driver)
+    start = threading.Barrier(4)
+
+    def run() -> None:
+        start.wait()
+        launcher._load("project_splats")
+
+    threads = [threading.Thread(target=run) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(driver.loaded) == len(driver.names) == 1
+
+
+def test_a_launch_of_no_blocks_does_nothing_and_one_of_too_many_is_refused() -> None:
+    driver = FakeDriver()
+    launcher = fake_driver.launcher(driver)
+    launcher.launch("project_splats", 0, 128, numbers())
+    assert driver.launches == []
+    with pytest.raises(BackendError, match=r"project_splats needs 2147483648 blocks, expected at most 2\^31 - 1"):
+        launcher.launch("project_splats", 1 << 31, 128, numbers())
+
+
+def test_dynamic_shared_memory_beyond_48_kib_is_asked_for_once() -> None:
+    driver = FakeDriver()
+    launcher = fake_driver.launcher(driver, index=1)
+    for size in (48 << 10, 60_000, 60_000, 50_000, 70_000):
+        launcher.launch("project_splats", 1, 128, numbers(), size)
+    assert driver.attributes == [(8, 60_000, 1, 1), (8, 70_000, 1, 1)]  # attribute, bytes, kernel, device
+    assert [done.shared for done in driver.launches] == [49152, 60_000, 60_000, 50_000, 70_000]
+
+
+@pytest.mark.parametrize(
+    ("function", "result", "words"),
+    [
+        ("cuLaunchKernel", Result.CUDA_ERROR_ILLEGAL_ADDRESS, r"\(3 blocks of 128\).*ILLEGAL.*start it again"),
+        ("cuLaunchKernel", Result.CUDA_ERROR_OUT_OF_MEMORY, "OUT_OF_MEMORY.*--downscale"),
+        ("cuLaunchKernel", Result.CUDA_ERROR_SOMETHING_NEW, "SOMETHING_NEW.*nvidia-smi"),
+        ("cuLibraryLoadData", Result.CUDA_ERROR_NO_BINARY_FOR_GPU, "LoadData.*NO_BINARY.*update NVIDIA's driver"),
+        ("cuLibraryLoadData", Result.CUDA_ERROR_INVALID_IMAGE, "INVALID_IMAGE.*update NVIDIA's driver"),
+        ("cuLibraryGetKernel", Result.CUDA_ERROR_NOT_FOUND, "NOT_FOUND.*install gs2d again"),
+    ],
+)  # fmt: skip
+def test_an_error_of_the_driver_is_one_line_with_its_name_and_a_remedy(
+    function: str, result: Result, words: str
+) -> None:
+    launcher = fake_driver.launcher(FakeDriver(failing={function: result}))
+    with pytest.raises(BackendError, match=words) as error:
+        launcher.launch("project_splats", 3, 128, numbers())
+    assert "\n" not in str(error.value)
+
+
+def test_a_device_that_cannot_be_opened_is_an_error_at_once() -> None:
+    with pytest.raises(BackendError, match="cuDevicePrimaryCtxRetain.*OUT_OF_MEMORY"):
+        fake_driver.launcher(FakeDriver(failing={"cuDevicePrimaryCtxRetain": Result.CUDA_ERROR_OUT_OF_MEMORY}))
+
+
+def test_every_argument_structure_fits_a_kernels_four_kilobytes() -> None:
+    sizes = {
+        name: ctypes.sizeof(value)
+        for name, value in vars(arguments).items()
+        if isinstance(value, type) and issubclass(value, ctypes.Structure)
+    }
+    assert len(sizes) >= 8
+    assert max(sizes.values()) <= 4096, sizes
+
+
+def test_tensors_that_are_not_on_a_gpu_are_refused_with_the_way_out() -> None:
+    splats = random_splats(np.random.default_rng(0), random_camera(np.random.default_rng(0)), 3)
+    with pytest.raises(ShapeError, match=r"tensors must be on a CUDA device.*got cpu; move them with \.to\('cuda'\)"):
+        cuda.rasterize(
+            splats.to(dtype=torch.float32), random_camera(np.random.default_rng(0)), RasterSettings(sh_degree=0)
+        )
+
+
+def test_a_scene_through_launcher_and_driver_is_what_the_kernels_make_of_it(emulator: Emulator) -> None:
+    """The whole path of a GPU, but for torch's memory and the GPU: pointers reach the kernels through the driver."""
+    rng = np.random.default_rng(3)
+    camera = random_camera(rng)
+    splats = random_splats(rng, camera, 40).to(dtype=torch.float32)
+    cotangents = random_cotangents(rng, camera)
+    results = []
+    for runner in (emulator, fake_driver.launcher(FakeDriver(emulator=emulator))):
+        scene = requiring_grad(splats)
+        output = cuda.rasterize_with(runner, scene, camera, RasterSettings())
+        contraction(output, cotangents).backward()
+        results.append([getattr(output, name).detach() for name in IMAGES] + [t.grad for _, t in scene.items()])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    assert any(float(a.abs().sum()) > 0 for a in results[0][len(IMAGES) :])
+
+
+SCRIPT = """
+import ctypes, sys
+import torch
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda.launch import GpuLauncher
+
+class Numbers(ctypes.Structure):
+    _fields_ = (("a", ctypes.c_int64), ("b", ctypes.c_float))
+
+try:
+    launcher = GpuLauncher(
+        torch.device("cuda", 1), stream_of=lambda d: 0x1234, architecture_of=lambda d: "sm_90",
+        code_of=lambda name, arch: b"\\x7fELF" + bytes(100),
+    )
+    launcher.launch("project_splats", 5, 128, Numbers(77, 0.5))
+    launcher.launch("project_splats", 6, 128, Numbers(78, 0.5), 60000)
+except BackendError as error:
+    print(error)
+"""
+
+
+def with_fake_libcuda(folder: Path, **environment: str) -> tuple[str, list[dict[str, object]]]:
+    """What the script prints, and what the fake library saw."""
+    pytest.importorskip("cuda.bindings", reason="cuda-bindings is not here")
+    if shutil.which("g++") is None or sys.platform != "linux":
+        pytest.skip("no g++ on Linux here to build a fake libcuda")
+    source = Path(__file__).with_name("fake_libcuda.cpp")
+    library, log = folder / "libcuda.so.1", folder / "log"
+    command = ["g++", "-std=c++17", "-O1", "-fPIC", "-shared", "-Wall", f"-Wl,-soname,{library.name}"]
+    subprocess.run([*command, "-o", str(library), str(source)], check=True, timeout=60)
+    settings = {**os.environ, "LD_LIBRARY_PATH": str(folder), "FAKE_CUDA_LOG": str(log), **environment}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=settings, check=True, timeout=60, capture_output=True, text=True
+    )
+    lines = log.read_text().splitlines() if log.exists() else []
+    return done.stdout, [json.loads(line) for line in lines]
+
+
+def test_the_real_bindings_hand_a_launch_on_as_it_was_meant(tmp_path: Path) -> None:
+    """Only libcuda is fake here: the library says what arrived, and refuses a launch without a current context."""
+    said, seen = with_fake_libcuda(tmp_path)
+    assert said == ""
+    launched = {"call": "launch", "kernel": "project_splats", "block": [128, 1, 1], "stream": 0x1234, "device": 1}
+    assert seen == [
+        {"call": "load"},
+        {**launched, "grid": [5, 1, 1], "shared": 0, "first": 77},
+        {"call": "attribute", "attribute": 8, "value": 60000, "kernel": "project_splats", "device": 1},
+        {**launched, "grid": [6, 1, 1], "shared": 60000, "first": 78},
+    ]
+
+
+def test_the_real_bindings_errors_are_one_line_too(tmp_path: Path) -> None:
+    said, _ = with_fake_libcuda(tmp_path, FAKE_CUDA_FAIL="cuLaunchKernel:700")
+    assert "launch of project_splats (5 blocks of 128)" in said
+    assert "CUDA_ERROR_ILLEGAL_ADDRESS" in said
+    assert said.count("\n") == 1
+
+
+def test_every_kernel_of_the_sources_has_a_file() -> None:
+    found = kernel_sources()
+    assert {"project_splats", "emit_entries_32", "blend_vjp_distortion_abs", "splat_errors"} <= set(found)
+    assert found["emit_entries_32"] == "cuda/emit.cu"
