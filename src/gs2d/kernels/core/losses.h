@@ -1,12 +1,17 @@
 // The losses of one pixel, and their vector-Jacobian products (docs/math.md has the same formulas in words).
 #pragma once
 
-#include "base.h"
+#include "core/base.h"
 
 namespace gs2d {
 
 constexpr double SSIM_C1 = 0.01 * 0.01;
 constexpr double SSIM_C2 = 0.03 * 0.03;
+
+// The window: exp(-k^2 / 4.5), k = 0..5, divided by the sum over k = -5..5.
+constexpr int SSIM_RADIUS = 5, SSIM_TAPS = 2 * SSIM_RADIUS + 1;
+constexpr double SSIM_WINDOW[SSIM_RADIUS + 1] = {0.2660117248617943,   0.21300553771125366,   0.1093606895097,
+                                                 0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
 
 // SSIM of one pixel and channel, and its derivatives by the blurred moments that depend on the rendered image x:
 // a = B(x), s = B(x^2 + y^2), p = B(x y); b = B(y) is the target's. The sum of both second moments is enough, because

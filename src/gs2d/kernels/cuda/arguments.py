@@ -4,20 +4,37 @@ from __future__ import annotations
 
 import ctypes
 
+from torch import Tensor
+
 __all__ = [
+    "AdamArguments",
+    "AdamAttribute",
     "BlendArguments",
     "BlendVjpArguments",
+    "BlurArguments",
     "EmitArguments",
     "ErrorArguments",
+    "FinishArguments",
+    "MeanArguments",
+    "NormalArguments",
+    "PhotometricArguments",
+    "PhotometricVjpArguments",
     "ProjectArguments",
     "ProjectVjpArguments",
     "RangeArguments",
     "View",
+    "fill",
 ]
 
 _Field = tuple[str, type]
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
+
+
+def fill(arguments: ctypes.Structure, **tensors: Tensor | None) -> None:
+    """Set the structure's pointers; None is a null pointer."""
+    for name, tensor in tensors.items():
+        setattr(arguments, name, None if tensor is None else tensor.data_ptr())
 
 
 def _all(kind: type, *names: str) -> tuple[_Field, ...]:
@@ -110,4 +127,80 @@ class ErrorArguments(ctypes.Structure):
         ("view", View),
         ("count", ctypes.c_int64),
         *_pointers("records", "cull", "rects", "tile_counts", "image", "mask", "errors"),
+    )
+
+
+class PhotometricArguments(ctypes.Structure):
+    """Of photometric.cu."""
+
+    _fields_ = (
+        *_all(ctypes.c_int64, "height", "width"),
+        *_pointers("rendered", "target", "mask", "target_mean", "maps", "partials"),
+    )
+
+
+class PhotometricVjpArguments(ctypes.Structure):
+    """Of photometric.cu."""
+
+    _fields_ = (
+        *_all(ctypes.c_int64, "height", "width"),
+        *_pointers("rendered", "target", "mask", "maps", "means", "g_l1", "g_ssim", "gradient"),
+    )
+
+
+class BlurArguments(ctypes.Structure):
+    """Of photometric.cu."""
+
+    _fields_ = (*_all(ctypes.c_int64, "height", "width"), *_pointers("image", "out"))
+
+
+class NormalArguments(ctypes.Structure):
+    """Of losses.cu."""
+
+    _fields_ = (
+        *_all(ctypes.c_int64, "height", "width"),
+        *_all(ctypes.c_float, "fx", "fy", "cx", "cy"),
+        ("rotation", ctypes.c_float * 9),
+        ("per_splat", ctypes.c_int32),
+        *_pointers("normal", "depth", "alpha", "mask", "partials", "means", "cotangent"),
+        *_pointers("g_normal", "g_depth", "g_alpha"),
+    )
+
+
+class MeanArguments(ctypes.Structure):
+    """Of losses.cu."""
+
+    _fields_ = (*_all(ctypes.c_int64, "height", "width"), *_pointers("values", "mask", "partials"))
+
+
+class FinishArguments(ctypes.Structure):
+    """Of losses.cu."""
+
+    _fields_ = (
+        *_pointers("partials"),
+        ("blocks", ctypes.c_int64),
+        *_all(ctypes.c_int32, "values", "complement"),
+        *_pointers("means"),
+    )
+
+
+class AdamAttribute(ctypes.Structure):
+    """Of adam.cu."""
+
+    _fields_ = (
+        *_pointers("parameter", "mean", "square", "gradient", "trained", "rows"),
+        *_all(ctypes.c_int64, "elements", "first_block"),
+        *_all(ctypes.c_int32, "columns", "compact"),
+        *_all(ctypes.c_float, "step_size", "root_2"),
+    )
+
+
+class AdamArguments(ctypes.Structure):
+    """Of adam.cu."""
+
+    _fields_ = (
+        ("attributes", AdamAttribute * 6),
+        ("count", ctypes.c_int32),
+        *_all(ctypes.c_float, "weight_1", "beta2", "weight_2", "eps"),
+        *_pointers("skip"),
     )

@@ -1,0 +1,129 @@
+"""Adam on a GPU: all attributes in one launch, and what is not trained is not written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gs2d.errors import ShapeError
+from gs2d.kernels.cuda.arguments import AdamArguments, fill
+from gs2d.kernels.cuda.ops import ready
+
+if TYPE_CHECKING:
+    from gs2d.kernels.cuda.launch import Launcher
+
+__all__ = ["AdamUpdate", "adam_step"]
+
+THREADS = 128
+BLOCK_ELEMENTS = 512  # adam.cu
+
+
+@dataclass(frozen=True, eq=False)
+class AdamUpdate:
+    """One attribute's part of a step.
+
+    Attributes
+    ----------
+    parameter, mean, square : Tensor [N, ...] float32
+        Contiguous; changed in place.
+    gradient : Tensor
+        Like the parameter; with ``compact``, of ``rows`` alone and in their order.
+    rate : float
+    step : int
+        Of the bias correction, counted from 1 and with this one.
+    trained : Tensor [N] bool, optional
+        Rows that are False are not written, and their gradients are not read.
+    rows : Tensor [M] int64, optional
+        Only these rows, each once; instead of ``trained``.
+    compact : bool
+    """
+
+    parameter: Tensor
+    mean: Tensor
+    square: Tensor
+    gradient: Tensor
+    rate: float
+    step: int
+    trained: Tensor | None = None
+    rows: Tensor | None = None
+    compact: bool = False
+
+
+def _check_update(update: AdamUpdate) -> None:
+    parameter = update.parameter
+    for name in ("mean", "square", *(() if update.compact else ("gradient",))):
+        if getattr(update, name).shape != parameter.shape:
+            raise ShapeError(f"{name} must be {list(parameter.shape)}, got {list(getattr(update, name).shape)}")
+    for name in ("parameter", "mean", "square"):
+        if not getattr(update, name).is_contiguous():
+            raise ShapeError(f"{name} must be contiguous to be changed in place")
+    if update.trained is not None and update.rows is not None:
+        raise ShapeError("an AdamUpdate takes trained or rows, got both")
+    if update.trained is not None and (update.trained.dtype != torch.bool or len(update.trained) != len(parameter)):
+        raise ShapeError(
+            f"trained must be bool [{len(parameter)}], got {update.trained.dtype} {list(update.trained.shape)}"
+        )
+    if update.rows is not None and update.rows.dtype != torch.int64:
+        raise ShapeError(f"rows must be int64, got {update.rows.dtype}")
+    if update.compact and (update.rows is None or len(update.gradient) != len(update.rows)):
+        raise ShapeError("a compact gradient needs rows, one for each of its own")
+
+
+@torch.no_grad()
+def adam_step(
+    updates: Sequence[AdamUpdate],
+    *,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    launcher: Launcher,
+    skip: Tensor | None = None,
+) -> None:
+    """One Adam step of up to six attributes, in place, in one launch; the arithmetic of torch's fused Adam.
+
+    Parameters
+    ----------
+    updates : sequence of AdamUpdate
+    beta1, beta2, eps : float
+    launcher : Launcher
+        Of the tensors' device.
+    skip : Tensor [] int32, optional
+        On the device: where it is not 0, nothing is changed.
+
+    Raises
+    ------
+    ShapeError
+        If something has another shape, dtype or device.
+    """
+    if len(updates) > 6:
+        raise ShapeError(f"adam_step takes up to 6 attributes, got {len(updates)}")
+    arguments = AdamArguments(weight_1=1 - beta1, beta2=beta2, weight_2=1 - beta2, eps=eps)
+    fill(arguments, skip=skip)
+    alive = []  # what the pointers belong to
+    blocks = 0
+    for update in updates:
+        _check_update(update)
+        tensors = {"parameter": update.parameter, "mean": update.mean, "square": update.square}
+        *_, gradient = ready(**tensors, gradient=update.gradient)
+        trained = None if update.trained is None else update.trained.contiguous()
+        rows = None if update.rows is None else update.rows.contiguous()
+        columns = math.prod(update.parameter.shape[1:])
+        elements = columns * (len(update.parameter) if rows is None else len(rows))
+        if elements == 0:
+            continue
+        slot = arguments.attributes[arguments.count]
+        fill(slot, **tensors, gradient=gradient, trained=trained, rows=rows)
+        slot.elements, slot.first_block, slot.columns, slot.compact = elements, blocks, columns, int(update.compact)
+        slot.step_size = update.rate / (1 - beta1**update.step)
+        slot.root_2 = math.sqrt(1 - beta2**update.step)
+        arguments.count += 1
+        blocks += -(-elements // BLOCK_ELEMENTS)
+        alive += [gradient, trained, rows]
+    if blocks > 0:
+        launcher.launch("adam_step", blocks, THREADS, arguments)
+    del alive

@@ -1,0 +1,152 @@
+// Normal consistency, means over valid pixels, and the last step of every mean.
+//
+// Two forms of normal consistency: the official mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat
+// mean(alpha - <n, N>) with nothing detached. N comes from the depths of the four neighbours, so a depth's gradient is
+// gathered from the four pixels beside it: no atomics.
+#include "core/losses.h"
+#include "cuda/means.h"
+
+namespace gs2d {
+
+constexpr int MEAN_PIXELS = 1024;             // of a block; ops.py has the same
+constexpr int NORMAL_W = 32, NORMAL_H = 8;    // tile of a block in the backward pass; ops.py has the same
+constexpr int HALO = 2;                       // depths that a depth's gradient depends on, on each side
+
+struct NormalArguments {
+    int64 height, width;
+    float fx, fy, cx, cy;
+    float rotation[9];    // world to camera
+    int per_splat;
+    const float *normal, *depth, *alpha;  // [H, W, 3] world frame, [H, W], [H, W]
+    const uchar* mask;                    // or null
+    float* partials;                      // [2, blocks]: valid pixels; sum of alpha <n, N>, or of alpha - <n, N>
+    const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels
+    float *g_normal, *g_depth, *g_alpha;  // null where not wanted
+};
+
+struct MeanArguments {
+    int64 height, width;
+    const float* values;  // [H, W]
+    const uchar* mask;
+    float* partials;      // [2, blocks]: valid pixels, sum
+};
+
+struct FinishArguments {
+    const float* partials;  // [1 + values, blocks]; the first row counts
+    int64 blocks;
+    int values, complement;  // complement: the mean of 1 - value
+    float* means;            // [1 + values]: 1 / count, means; a count of 0 is taken as 1
+};
+
+__device__ __forceinline__ bool was_hit(float depth) { return !(depth <= 0.f); }  // NaN too: it must reach the loss
+
+// Depth of a pixel; 0 outside the image, at ignored pixels and in the background.
+__device__ __forceinline__ float depth_at(const NormalArguments& a, int64 x, int64 y) {
+    if (x < 0 || y < 0 || x >= a.width || y >= a.height) return 0.f;
+    const int64 at = y * a.width + x;
+    const float z = a.depth[at];
+    return (!a.mask || a.mask[at]) && was_hit(z) ? z : 0.f;
+}
+
+// One pixel: its normal from the depths around it, and the rendered one in the camera frame.
+struct Centre {
+    bool defined;
+    DepthNormal<float> from_depth;
+    Vec3<float> rendered;
+    float offset_x, offset_y, alpha, cosine;
+};
+
+__device__ __forceinline__ Centre centre_of(const NormalArguments& a, int64 x, int64 y, float left, float right, float up, float down) {
+    Centre c;
+    const int64 at = y * a.width + x;
+    c.defined = was_hit(left) && was_hit(right) && was_hit(up) && was_hit(down) && (!a.mask || a.mask[at]);
+    c.offset_x = float(x) + 0.5f - a.cx, c.offset_y = float(y) + 0.5f - a.cy;
+    c.from_depth = depth_normal(left, right, up, down, c.offset_x, c.offset_y, a.fx, a.fy);
+    c.rendered = rotate(a.rotation, Vec3<float>{a.normal[3 * at], a.normal[3 * at + 1], a.normal[3 * at + 2]});
+    c.alpha = a.alpha[at], c.cosine = dot(c.rendered, c.from_depth.direction);
+    return c;
+}
+
+extern "C" __global__ void __launch_bounds__(128) normal_consistency(NormalArguments a) {
+    float sums[2] = {0.f, 0.f};
+    for (int i = 0; i < MEAN_PIXELS; i += MEAN_THREADS) {
+        const int64 at = int64(blockIdx.x) * MEAN_PIXELS + i + threadIdx.x;
+        if (at >= a.height * a.width || (a.mask && !a.mask[at])) continue;
+        const int64 x = at % a.width, y = at / a.width;
+        const Centre c = centre_of(a, x, y, depth_at(a, x - 1, y), depth_at(a, x + 1, y), depth_at(a, x, y - 1), depth_at(a, x, y + 1));
+        sums[0] = sums[0] + 1.f;
+        sums[1] = sums[1] + keep(c.defined, a.per_splat ? c.alpha - c.cosine : c.alpha * c.cosine);
+    }
+    leave_sums(sums, a.partials);
+}
+
+extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalArguments a) {
+    constexpr int DW = NORMAL_W + 2 * HALO, DH = NORMAL_H + 2 * HALO, CW = NORMAL_W + 2, CH = NORMAL_H + 2;
+    __shared__ float depth[DH][DW], pull_x[CH][CW], pull_y[CH][CW];  // pulls: see depth_normal_vjp
+    const int64 across = (a.width + NORMAL_W - 1) / NORMAL_W;
+    const int64 left = blockIdx.x % across * NORMAL_W, top = blockIdx.x / across * NORMAL_H;
+    const float scale = *a.cotangent * a.means[0];
+    for (int i = threadIdx.x; i < DH * DW; i += MEAN_THREADS)
+        depth[i / DW][i % DW] = depth_at(a, left + i % DW - HALO, top + i / DW - HALO);
+    __syncthreads();
+    for (int i = threadIdx.x; i < CH * CW; i += MEAN_THREADS) {
+        const int cx = i % CW, cy = i / CW;  // the centre's depth is depth[cy + 1][cx + 1]
+        const int64 x = left + cx - 1, y = top + cy - 1, at = y * a.width + x;
+        DepthNormalGrad<float> pull = {0.f, 0.f};
+        if (x >= 0 && y >= 0 && x < a.width && y < a.height) {
+            const Centre c = centre_of(a, x, y, depth[cy + 1][cx], depth[cy + 1][cx + 2], depth[cy][cx + 1], depth[cy + 2][cx + 1]);
+            const float weight = a.per_splat ? -scale : -(scale * c.alpha);
+            if (c.defined) pull = depth_normal_vjp(c.from_depth, weight * c.rendered, c.offset_x, c.offset_y, a.fx, a.fy);
+            if (cx > 0 && cx <= NORMAL_W && cy > 0 && cy <= NORMAL_H) {
+                const Vec3<float> n = rotate_back(a.rotation, weight * c.from_depth.direction);
+                if (a.g_normal) {
+                    a.g_normal[3 * at] = keep(c.defined, n.x), a.g_normal[3 * at + 1] = keep(c.defined, n.y);
+                    a.g_normal[3 * at + 2] = keep(c.defined, n.z);
+                }
+                if (a.g_alpha) a.g_alpha[at] = keep(c.defined && a.per_splat, scale);
+            }
+        }
+        pull_x[cy][cx] = pull.x, pull_y[cy][cx] = pull.y;
+    }
+    __syncthreads();
+    if (!a.g_depth) return;
+    for (int i = threadIdx.x; i < NORMAL_H * NORMAL_W; i += MEAN_THREADS) {
+        const int dx = i % NORMAL_W, dy = i / NORMAL_W;  // its own depth is depth[dy + 2][dx + 2], its pull pull[dy + 1][dx + 1]
+        if (left + dx >= a.width || top + dy >= a.height) continue;
+        const float from_left = pull_x[dy + 1][dx] * depth[dy + 2][dx], from_right = pull_x[dy + 1][dx + 2] * depth[dy + 2][dx + 4];
+        const float from_above = pull_y[dy][dx + 1] * depth[dy][dx + 2], from_below = pull_y[dy + 2][dx + 1] * depth[dy + 4][dx + 2];
+        a.g_depth[(top + dy) * a.width + left + dx] = (from_left - from_right) + (from_above - from_below);
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(128) masked_mean(MeanArguments a) {
+    float sums[2] = {0.f, 0.f};
+    for (int i = 0; i < MEAN_PIXELS; i += MEAN_THREADS) {
+        const int64 at = int64(blockIdx.x) * MEAN_PIXELS + i + threadIdx.x;
+        if (at >= a.height * a.width || (a.mask && !a.mask[at])) continue;
+        sums[0] = sums[0] + 1.f, sums[1] = sums[1] + a.values[at];
+    }
+    leave_sums(sums, a.partials);
+}
+
+// One block.
+extern "C" __global__ void __launch_bounds__(128) finish_means(FinishArguments a) {
+    __shared__ double sums[MEAN_THREADS];
+    double count = 1., raw_count = 0.;
+    for (int row = 0; row <= a.values; ++row) {
+        double mine = 0.;
+        for (int64 i = threadIdx.x; i < a.blocks; i += MEAN_THREADS) mine += double(a.partials[row * a.blocks + i]);
+        sums[threadIdx.x] = mine;
+        __syncthreads();
+        for (int half = MEAN_THREADS / 2; half > 0; half >>= 1) {
+            if (int(threadIdx.x) < half) sums[threadIdx.x] += sums[threadIdx.x + half];
+            __syncthreads();
+        }
+        const double total = sums[0];
+        __syncthreads();
+        if (row == 0) raw_count = total, count = total > 0. ? total : 1.;
+        if (threadIdx.x == 0) a.means[row] = float(row == 0 ? 1. / count : (a.complement ? raw_count - total : total) / count);
+    }
+}
+
+}  // namespace gs2d

@@ -1,0 +1,323 @@
+"""The image losses on a GPU: the functions of ``kernels/ops.py`` over a launcher; nothing waits for the host.
+
+Values are reduced in a fixed order, so they are the same from run to run. Unlike the native ones, gradients wait for
+the backward pass: their cotangents are read on the device, and nothing has to be guessed (``expected`` is accepted and
+not needed). The formulas are in ``kernels/core/losses.h``; ``losses_reference`` has the same in torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gs2d.camera import Camera
+from gs2d.check import check_shapes
+from gs2d.errors import ShapeError
+from gs2d.kernels.cuda.arguments import (
+    BlurArguments,
+    FinishArguments,
+    MeanArguments,
+    NormalArguments,
+    PhotometricArguments,
+    PhotometricVjpArguments,
+    fill,
+)
+
+if TYPE_CHECKING:
+    from gs2d.kernels.cuda.launch import Launcher
+
+__all__ = ["blur", "masked_mean", "normal_consistency", "photometric"]
+
+THREADS = 128
+STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows of a block
+MEAN_PIXELS = 1024  # losses.cu: pixels of a block
+NORMAL_W, NORMAL_H = 32, 8  # losses.cu: tile of the backward pass
+
+
+def ready(**tensors: Tensor) -> list[Tensor]:
+    """The tensors, detached and contiguous, or ShapeError unless all are float32 on the first one's device."""
+    device = next(iter(tensors.values())).device
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or tensor.device != device:
+            raise ShapeError(
+                f"{name} must be float32 on {device} for the cuda kernels, got {tensor.dtype} on {tensor.device}; "
+                "convert it, or use the reference backend"
+            )
+    return [tensor.detach().contiguous() for tensor in tensors.values()]
+
+
+def _mask_of(mask: Tensor | None, device: torch.device) -> Tensor | None:
+    if mask is None:
+        return None
+    if mask.dtype != torch.bool or mask.device != device:
+        raise ShapeError(f"mask must be bool on {device}, got {mask.dtype} on {mask.device}")
+    return mask.contiguous()
+
+
+def _wanted(*tensors: Tensor) -> bool:
+    """Whether a gradient may be asked for (inside an autograd.Function it is too late to know)."""
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+
+
+def _cotangent(given: Tensor | None) -> Tensor | None:
+    return None if given is None else given.detach().to(torch.float32).contiguous()
+
+
+def _strips(height: int, width: int) -> int:
+    """Blocks of photometric.cu."""
+    return -(-3 * width // STRIP) * -(-height // STRIP_ROWS)
+
+
+def _finish(launcher: Launcher, partials: Tensor, *, complement: bool = False) -> Tensor:
+    """[1 / count, mean, ...] from each block's [count, sum, ...], a row each."""
+    means = partials.new_empty(len(partials))
+    arguments = FinishArguments(blocks=partials.shape[1], values=len(partials) - 1, complement=int(complement))
+    fill(arguments, partials=partials, means=means)
+    launcher.launch("finish_means", 1, THREADS, arguments)
+    return means
+
+
+def blur(image: Tensor, *, launcher: Launcher) -> Tensor:
+    """The SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
+
+    Of a target this is the ``target_mean`` that ``photometric`` takes.
+
+    Raises
+    ------
+    ShapeError
+        Another shape or dtype.
+    """
+    sizes = check_shapes({"image": (image, "H W 3")})
+    (source,) = ready(image=image)
+    out = torch.empty_like(source)
+    if source.numel() > 0:
+        arguments = BlurArguments(sizes["H"], sizes["W"])
+        fill(arguments, image=source, out=out)
+        launcher.launch("blur_image", _strips(sizes["H"], sizes["W"]), THREADS, arguments)
+    return out
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rendered: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+        mean: Tensor | None,
+        wanted: bool,
+        launcher: Launcher,
+    ) -> tuple[Tensor, Tensor]:
+        height, width = rendered.shape[:2]
+        blocks = _strips(height, width)
+        partials = rendered.new_empty(3, blocks)
+        maps = rendered.new_empty(3, height, width, 3) if wanted else None
+        if blocks > 0:
+            arguments = PhotometricArguments(height, width)
+            images = {"rendered": rendered, "target": target, "mask": mask, "target_mean": mean}
+            fill(arguments, **images, maps=maps, partials=partials)
+            name = "photometric_forward" if mean is None else "photometric_forward_known"
+            launcher.launch(name, blocks, THREADS, arguments)
+        means = _finish(launcher, partials)
+        ctx.launcher = launcher
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(rendered, target, mask, maps, means)
+        return means[1].clone(), means[2].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_l1: Tensor | None, g_ssim: Tensor | None) -> tuple[Tensor | None, ...]:
+        rendered, target, mask, maps, means = ctx.saved_tensors
+        gradient = torch.empty_like(rendered)
+        height, width = rendered.shape[:2]
+        if gradient.numel() > 0:
+            arguments = PhotometricVjpArguments(height, width)
+            fill(arguments, rendered=rendered, target=target, mask=mask, maps=maps, means=means, gradient=gradient)
+            cotangents = {"g_l1": _cotangent(g_l1), "g_ssim": _cotangent(g_ssim)}
+            fill(arguments, **cotangents)
+            ctx.launcher.launch("photometric_vjp", _strips(height, width), THREADS, arguments)
+        return gradient, None, None, None, None, None
+
+
+def photometric(
+    rendered: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    target_mean: Tensor | None = None,
+    *,
+    expected: tuple[float, float] = (0.8, -0.2),
+    launcher: Launcher,
+) -> tuple[Tensor, Tensor]:
+    """Mean L1 and mean SSIM of an image, both differentiable in ``rendered``.
+
+    Parameters
+    ----------
+    rendered, target : Tensor [H, W, 3] float32
+        In [0, 1].
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+    target_mean : Tensor [H, W, 3], optional
+        ``blur(target)``, if at hand. Changes no bit of the result.
+    expected : (float, float)
+        Not needed here; any cotangents cost the same.
+    launcher : Launcher
+        Of the tensors' device.
+
+    Returns
+    -------
+    l1, ssim : Tensor []
+        Means over valid pixels and channels; 0 when no pixel is valid.
+
+    Raises
+    ------
+    ShapeError
+        Shapes that differ, or another dtype or device.
+    """
+    del expected
+    images = {"rendered": rendered, "target": target}
+    if target_mean is not None:
+        images["target_mean"] = target_mean
+    shapes = {name: (image, "H W 3") for name, image in images.items()}
+    check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
+    _, target, *known = ready(**images)
+    mask = _mask_of(mask, rendered.device)
+    mean = known[0] if known else None
+    l1, ssim = _Photometric.apply(rendered.contiguous(), target, mask, mean, _wanted(rendered), launcher)
+    return l1, ssim
+
+
+def _normal_arguments(
+    images: Sequence[Tensor | None], camera: Camera, per_splat: bool, **more: Tensor | None
+) -> NormalArguments:
+    normal, depth, alpha, mask = images
+    arguments = NormalArguments(height=camera.height, width=camera.width, per_splat=int(per_splat))
+    for name in ("fx", "fy", "cx", "cy"):
+        setattr(arguments, name, float(getattr(camera, name)))
+    rows = torch.as_tensor(camera.rotation, dtype=torch.float64, device="cpu")
+    arguments.rotation[:] = rows.flatten().tolist()
+    fill(arguments, normal=normal, depth=depth, alpha=alpha, mask=mask, **more)
+    return arguments
+
+
+class _NormalConsistency(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        normal: Tensor,
+        depth: Tensor,
+        alpha: Tensor,
+        mask: Tensor | None,
+        camera: Camera,
+        per_splat: bool,
+        launcher: Launcher,
+    ) -> Tensor:
+        blocks = -(-depth.numel() // MEAN_PIXELS)
+        partials = depth.new_empty(2, blocks)
+        if blocks > 0:
+            arguments = _normal_arguments((normal, depth, alpha, mask), camera, per_splat, partials=partials)
+            launcher.launch("normal_consistency", blocks, THREADS, arguments)
+        means = _finish(launcher, partials, complement=not per_splat)
+        ctx.launcher, ctx.camera, ctx.per_splat = launcher, camera, per_splat
+        ctx.save_for_backward(normal, depth, alpha, mask, means)
+        return means[1].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        *images, means = ctx.saved_tensors
+        want = [*ctx.needs_input_grad[:2], ctx.needs_input_grad[2] and ctx.per_splat]
+        gradients = [torch.empty_like(x) if w else None for x, w in zip(images[:3], want, strict=True)]
+        blocks = -(-ctx.camera.width // NORMAL_W) * -(-ctx.camera.height // NORMAL_H)
+        if images[1].numel() > 0:
+            g_normal, g_depth, g_alpha = gradients
+            given = _cotangent(cotangent)
+            outputs = {"g_normal": g_normal, "g_depth": g_depth, "g_alpha": g_alpha}
+            arguments = _normal_arguments(images, ctx.camera, ctx.per_splat, means=means, cotangent=given, **outputs)
+            ctx.launcher.launch("normal_consistency_vjp", blocks, THREADS, arguments)
+        return (*gradients, None, None, None, None)
+
+
+def normal_consistency(
+    normal: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    camera: Camera,
+    mask: Tensor | None = None,
+    *,
+    per_splat: bool = False,
+    expected: float = 0.05,
+    launcher: Launcher,
+) -> Tensor:
+    """Normal consistency [], the form on a GPU of the functions of the same name in ``losses_reference``.
+
+    Parameters
+    ----------
+    normal : Tensor [H, W, 3] float32
+        sum w n, world frame.
+    depth : Tensor [H, W] float32, wu
+        0 where nothing was hit.
+    alpha : Tensor [H, W] float32
+    camera : Camera
+    mask : Tensor [H, W] bool, optional
+        False = ignore this pixel.
+    per_splat : bool
+        The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
+    expected : float
+        Not needed here.
+    launcher : Launcher
+        Of the tensors' device.
+
+    Raises
+    ------
+    ShapeError
+        Shapes that differ, or another dtype or device.
+    """
+    del expected
+    shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
+    sizes = check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
+    if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
+        raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
+    ready(normal=normal, depth=depth, alpha=alpha)
+    images = (normal.contiguous(), depth.contiguous(), alpha.contiguous(), _mask_of(mask, normal.device))
+    value: Tensor = _NormalConsistency.apply(*images, camera, per_splat, launcher)
+    return value
+
+
+class _MaskedMean(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, mask: Tensor | None, launcher: Launcher) -> Tensor:
+        blocks = -(-values.numel() // MEAN_PIXELS)
+        partials = values.new_empty(2, blocks)
+        if blocks > 0:
+            arguments = MeanArguments(*values.shape)
+            fill(arguments, values=values, mask=mask, partials=partials)
+            launcher.launch("masked_mean", blocks, THREADS, arguments)
+        means = _finish(launcher, partials)
+        ctx.shape = values.shape
+        ctx.save_for_backward(mask, means)
+        return means[1].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        mask, means = ctx.saved_tensors
+        each = cotangent * means[0]
+        return (each.expand(ctx.shape) if mask is None else mask * each), None, None
+
+
+def masked_mean(values: Tensor, mask: Tensor | None = None, *, launcher: Launcher) -> Tensor:
+    """Mean [] of a map [H, W] over the pixels where ``mask`` is True, summed in a fixed order; 0 when there are none.
+
+    Raises
+    ------
+    ShapeError
+        Shapes that differ, or another dtype or device.
+    """
+    check_shapes({"values": (values, "H W")} | ({} if mask is None else {"mask": (mask, "H W")}))
+    ready(values=values)
+    mean: Tensor = _MaskedMean.apply(values.contiguous(), _mask_of(mask, values.device), launcher)
+    return mean

@@ -1,0 +1,206 @@
+"""The CUDA losses, executed on the CPU by the emulator, against the torch references in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import emulate
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d import losses_reference as reference
+from gs2d.camera import Camera, look_at
+from gs2d.errors import ShapeError
+from gs2d.kernels.cuda import ops
+
+pytestmark = pytest.mark.timeout(120)
+# Smaller than the window; a row and a strip of 128 reals (43 pixels) and of 32 rows begun and passed.
+SIZES = [(1, 1), (5, 3), (37, 44), (33, 20)]
+
+
+def make_camera(height: int, width: int) -> Camera:
+    T = look_at(
+        np.array([1.0, -2.0, 0.7]), np.zeros(3), np.array([0.1, 0.2, 1.0]), width=width, height=height, fx=1.0
+    ).T_cam_world
+    return Camera(width, height, 0.9 * width + 2, 1.1 * width + 2, 0.4 * width, 0.55 * height, T)
+
+
+def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """A noisy rendering with some equal pixels, its target, and a mask; float32."""
+    g = torch.Generator().manual_seed(seed)
+    target = reference.blur(torch.rand(height, width, 3, generator=g))
+    rendered = (target + 0.2 * torch.randn(height, width, 3, generator=g)).clamp(0, 1)
+    rendered = torch.where(torch.rand(height, width, 1, generator=g) < 0.1, target, rendered)
+    return rendered, target, torch.rand(height, width, generator=g) < 0.8
+
+
+def geometry(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rendered normals, depth with holes, alpha and a mask; float32."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g)
+
+    depth = torch.where(rand(height, width) < 0.05, 0.0, 2 + rand(height, width))
+    return rand(height, width, 3) - 0.5, depth, rand(height, width), rand(height, width) < 0.85
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_l1_and_ssim_and_their_gradient_are_those_of_the_reference(
+    emulator: emulate.Emulator, size: tuple[int, int], masked: bool
+) -> None:
+    x, y, mask = photographs(*size)
+    x.requires_grad_()
+    valid = mask if masked else None
+    exact = x.detach().double().requires_grad_()
+    l1, ssim = ops.photometric(x, y, valid, launcher=emulator)
+    expected_l1 = reference.l1(exact, y.double(), valid)
+    expected_ssim = reference.ssim(exact, y.double(), valid)
+    assert l1.item() == pytest.approx(expected_l1.item(), abs=1e-6)
+    assert ssim.item() == pytest.approx(expected_ssim.item(), abs=2e-6)
+    for weights in [(0.8, -0.2), (0.0, 1.0), (1.0, 0.0)]:
+        (found,) = torch.autograd.grad((l1, ssim), x, tuple(map(torch.tensor, weights)), retain_graph=True)
+        total = weights[0] * expected_l1 + weights[1] * expected_ssim
+        (expected,) = torch.autograd.grad(total, exact, retain_graph=True)
+        assert relative_error(found, expected) < 2e-5
+
+
+def test_one_value_alone_has_its_own_gradient(emulator: emulate.Emulator) -> None:
+    """The cotangent that never comes is a null pointer."""
+    x, y, _ = photographs(9, 7)
+    x.requires_grad_()
+    exact = x.detach().double().requires_grad_()
+    for which, expected in enumerate((reference.l1(exact, y.double()), reference.ssim(exact, y.double()))):
+        (found,) = torch.autograd.grad(ops.photometric(x, y, launcher=emulator)[which], x)
+        assert relative_error(found, torch.autograd.grad(expected, exact)[0]) < 2e-5
+
+
+def test_the_cached_mean_of_the_target_changes_no_bit(emulator: emulate.Emulator) -> None:
+    x, y, mask = photographs(37, 44)
+    mean = ops.blur(y, launcher=emulator)
+    assert relative_error(mean, reference.blur(y.double())) < 1e-6
+    results = []
+    for known in (None, mean):
+        z = x.clone().requires_grad_()
+        values = ops.photometric(z, y, mask, known, launcher=emulator)
+        results.append((*values, *torch.autograd.grad(values[0] - values[1], z)))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_ignored_pixels_have_no_influence_and_no_gradient(emulator: emulate.Emulator) -> None:
+    x, y, mask = photographs(12, 10)
+    results = []
+    for filler in (0.5, float("nan")):
+        z = torch.where(mask[..., None], x, torch.tensor(filler)).requires_grad_()
+        l1, ssim = ops.photometric(z, y, mask, launcher=emulator)
+        results.append((l1, ssim, *torch.autograd.grad(l1 + ssim, z)))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    gradient = results[0][2]
+    assert not gradient[~mask].any()
+    assert bool(gradient[mask].any())
+
+
+def test_nan_at_a_valid_pixel_reaches_the_value(emulator: emulate.Emulator) -> None:
+    x, y, _ = photographs(6, 5)
+    x[3, 2] = float("nan")
+    assert all(bool(v.isnan()) for v in ops.photometric(x, y, launcher=emulator))
+    normal, depth, alpha, _ = geometry(6, 5)
+    depth[3, 2] = float("nan")
+    depth[2:5, 1:4] = torch.where(depth[2:5, 1:4] == 0, 1.0, depth[2:5, 1:4])
+    assert bool(ops.normal_consistency(normal, depth, alpha, make_camera(6, 5), launcher=emulator).isnan())
+    assert bool(ops.masked_mean(x[..., 0], launcher=emulator).isnan())
+
+
+def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emulator) -> None:
+    x, y, _ = photographs(7, 6)
+    nothing = torch.zeros(7, 6, dtype=torch.bool)
+    x.requires_grad_()
+    l1, ssim = ops.photometric(x, y, nothing, launcher=emulator)
+    normal, depth, alpha, _ = geometry(7, 6)
+    mean = ops.masked_mean(x[..., 0], nothing, launcher=emulator)
+    consistency = ops.normal_consistency(normal, depth, alpha, make_camera(7, 6), nothing, launcher=emulator)
+    assert [l1.item(), ssim.item(), mean.item(), consistency.item()] == [0.0] * 4
+    (gradient,) = torch.autograd.grad(l1 + ssim + mean, x)
+    assert not gradient.any()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("per_splat", [False, True])
+@pytest.mark.parametrize("size", [*SIZES, (9, 33)])
+def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
+    emulator: emulate.Emulator, size: tuple[int, int], per_splat: bool, masked: bool
+) -> None:
+    *images, mask = geometry(*size)
+    camera, valid = make_camera(*size), mask if masked else None
+    found_in = [image.requires_grad_() for image in images]
+    exact_in = [image.detach().double().requires_grad_() for image in images]
+    value = ops.normal_consistency(*found_in, camera, valid, per_splat=per_splat, launcher=emulator)
+    function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
+    exact = function(*exact_in, camera, valid)
+    assert value.item() == pytest.approx(exact.item(), abs=1e-6)
+    if min(size) < 3:
+        return
+    weight = torch.tensor(0.05)
+    found = torch.autograd.grad(value, found_in, weight, allow_unused=True)
+    expected = torch.autograd.grad(exact, exact_in, weight.double(), allow_unused=True)
+    assert (found[2] is None) == (expected[2] is None) == (not per_splat)
+    for f, e in zip(found, expected, strict=True):
+        if f is not None and e is not None:
+            assert relative_error(f, e) < 2e-5
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_mean_of_a_map_and_its_gradient_are_those_of_the_reference(
+    emulator: emulate.Emulator, masked: bool
+) -> None:
+    """35 x 31 pixels are more than one block of 1024."""
+    values, mask = torch.randn(35, 31, generator=torch.Generator().manual_seed(0)), photographs(35, 31)[2]
+    values.requires_grad_()
+    exact = values.detach().double().requires_grad_()
+    found = ops.masked_mean(values, mask if masked else None, launcher=emulator)
+    expected = reference.masked_mean(exact, mask if masked else None)
+    assert found.item() == pytest.approx(expected.item(), abs=1e-7)
+    (gradient,) = torch.autograd.grad(found, values, torch.tensor(3.0))
+    assert relative_error(gradient, torch.autograd.grad(expected, exact, torch.tensor(3.0).double())[0]) < 1e-6
+
+
+def test_values_and_gradients_do_not_depend_on_the_order_of_threads(emulator: emulate.Emulator) -> None:
+    """Sums are taken in a fixed order; a missing barrier would show too."""
+    x, y, mask = photographs(37, 44)
+    *images, _ = geometry(37, 44)
+    results = []
+    for launcher in (emulator, replace(emulator, descending=True)):
+        z, depth = x.clone().requires_grad_(), images[1].clone().requires_grad_()
+        l1, ssim = ops.photometric(z, y, mask, launcher=launcher)
+        consistency = ops.normal_consistency(images[0], depth, images[2], make_camera(37, 44), mask, launcher=launcher)
+        mean = ops.masked_mean(x[..., 0], mask, launcher=launcher)
+        results.append((l1, ssim, consistency, mean, *torch.autograd.grad(l1 + ssim + consistency, (z, depth))))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_no_gradient_is_prepared_where_none_is_wanted(emulator: emulate.Emulator) -> None:
+    x, y, _ = photographs(5, 4)
+    assert not ops.photometric(x, y, launcher=emulator)[0].requires_grad
+    with torch.no_grad():
+        assert not ops.photometric(x.requires_grad_(), y, launcher=emulator)[0].requires_grad
+
+
+def test_what_a_kernel_would_misread_is_refused(emulator: emulate.Emulator) -> None:
+    x, y, mask = photographs(5, 4)
+    with pytest.raises(ShapeError, match="target"):
+        ops.photometric(x, y[1:], launcher=emulator)
+    with pytest.raises(ShapeError, match="float32"):
+        ops.photometric(x, y.double(), launcher=emulator)
+    with pytest.raises(ShapeError, match="bool"):
+        ops.photometric(x, y, mask.to(torch.uint8), launcher=emulator)
+    with pytest.raises(ShapeError, match="camera"):
+        ops.normal_consistency(x, x[..., 0], x[..., 0], make_camera(4, 5), launcher=emulator)
+    with pytest.raises(ShapeError, match="float32"):
+        ops.masked_mean(x[..., 0].double(), launcher=emulator)
