@@ -1,0 +1,42 @@
+"""What the tests of the pipeline share: how the tiny ball is trained, and what may not differ between two runs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.io.run import RunFolder
+from gs2d.pipeline.options import TrainOptions
+
+SMALL = ("init_points=150", "surface.densify.max_splats=250")
+SCALE = 0.001  # 30 + 10 + 20 iterations
+
+
+def options(capture: Path, out: Path, **changes: Any) -> TrainOptions:
+    plain = TrainOptions(scene=capture, out=out, schedule_scale=SCALE, overrides=SMALL, threads=1, checkpoint_every=4)
+    return replace(plain, **changes)
+
+
+def comparable(run: RunFolder) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
+    """All of a run that may not depend on how it got there: splats, log, metrics without times."""
+    stages = [
+        {k: v for k, v in stage.items() if k not in ("seconds", "peak_memory_bytes", "reused_from")}
+        for stage in run.metrics()["stages"]
+    ]
+    return run.file("splats.ply").read_bytes(), run.events.read(), stages
+
+
+class Stop(Exception):
+    """Stands for a kill."""
+
+
+def spawn(capture: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
+    words = [sys.executable, "-m", "gs2d", "train", str(capture), "--out", str(out), "--schedule-scale", str(SCALE)]
+    words += ["--threads", "1", "--checkpoint-every", "4", "--quiet", *more]
+    for override in SMALL:
+        words += ["--set", override]
+    return subprocess.Popen(words, env=dict(os.environ), stderr=subprocess.PIPE)

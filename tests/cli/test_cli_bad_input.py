@@ -1,0 +1,191 @@
+"""Bad input: one line, exit code 2, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli_runs import TINY, one_line
+from gs2d.cli import run
+from tiny import ball_cameras, ball_picture, write_ball_mesh, write_capture
+
+
+def missing(folder: Path) -> None:
+    """Nothing there."""
+
+
+def empty(folder: Path) -> None:
+    folder.mkdir()
+
+
+def colmap(folder: Path, model: int = 1) -> None:
+    """A COLMAP capture of the ball: PINHOLE (1) or another camera model."""
+    cameras = ball_cameras(3)
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    c = cameras[0]
+    params = [c.fx, c.fy, c.cx, c.cy] + [0.0] * (8 if model == 10 else 0)
+    head = struct.pack("<QiiQQ", 1, 1, model, c.width, c.height)
+    (folder / "sparse/0/cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
+    from PIL import Image
+    from scipy.spatial.transform import Rotation
+
+    body = struct.pack("<Q", len(cameras))
+    for i, camera in enumerate(cameras):
+        Image.fromarray(ball_picture(camera)[..., :3]).save(folder / "images" / f"{i}.png")
+        x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
+        body += struct.pack("<i7di", i + 1, w, x, y, z, *camera.T_cam_world[:3, 3], 1)
+        body += f"{i}.png".encode() + b"\0" + struct.pack("<Q", 0)
+    (folder / "sparse/0/images.bin").write_bytes(body)
+    points = struct.pack("<Q", 20)
+    for i, xyz in enumerate(np.random.default_rng(0).normal(size=(20, 3)) * 0.4):
+        points += struct.pack("<Q3d3BdQ", i + 1, *xyz, 200, 100, 50, 0.5, 0)
+    (folder / "sparse/0/points3D.bin").write_bytes(points)
+
+
+def truncated_images_bin(folder: Path) -> None:
+    colmap(folder)
+    path = folder / "sparse/0/images.bin"
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def unsupported_camera(folder: Path) -> None:
+    colmap(folder, model=10)  # THIN_PRISM_FISHEYE
+
+
+def wrong_json_key(folder: Path) -> None:
+    write_capture(folder, train=2, test=1)
+    path = folder / "transforms_train.json"
+    path.write_text(path.read_text().replace("transform_matrix", "transfrom_matrix"))
+
+
+def broken_json(folder: Path) -> None:
+    write_capture(folder, train=2, test=1)
+    path = folder / "transforms_train.json"
+    path.write_text(path.read_text()[:-40])
+
+
+def image_that_does_not_decode(folder: Path) -> None:
+    write_capture(folder, train=3, test=1)
+    path = folder / "train" / "r_2.png"
+    path.write_bytes(path.read_bytes()[:100])
+
+
+def text_for_image(folder: Path) -> None:
+    write_capture(folder, train=3, test=1)
+    (folder / "train" / "r_1.png").write_text("not a picture")
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (missing, "capture"),
+        (empty, "capture"),
+        (truncated_images_bin, "images.bin"),
+        (unsupported_camera, "THIN_PRISM_FISHEYE"),
+        (wrong_json_key, "transform_matrix"),
+        (broken_json, "transforms_train.json"),
+        (image_that_does_not_decode, "r_2.png"),
+        (text_for_image, "r_1.png"),
+    ],
+)
+def test_a_capture_that_cannot_be_read_gives_one_line_and_exit_code_2_and_leaves_nothing(
+    make: Callable[[Path], None], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make(tmp_path / "capture")
+    before = sorted(tmp_path.rglob("*"))
+    words = ["train", str(tmp_path / "capture"), "--out", str(tmp_path / "deep" / "run"), "--quiet", *TINY]
+    assert run(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert named in one_line(err)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_colmap_capture_of_these_tests_is_good_when_nothing_is_broken(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    colmap(tmp_path / "capture")
+    assert run(["info", str(tmp_path / "capture"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["points"] == 20
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [
+        (["--recipe", "3dgs"], "no recipe '3dgs'"),
+        (["--set", "appearance.train.sh0=nobody"], "row group 'nobody'"),
+        (["--protocol", "tanks"], "no protocol 'tanks'"),
+        (["--downscale", "0"], "--downscale"),
+        (["--downscale", "1000"], "1000"),
+        (["--schedule-scale", "-1"], "schedule scale"),
+        (["--from", "nowhere"], "expected a run folder"),
+        (["--format", "colmap"], "colmap"),
+    ],
+)
+def test_options_that_make_no_sense_give_one_line_and_leave_nothing(
+    capture: Path, more: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY, *more]) == 2
+    assert named.lower() in one_line(capsys.readouterr().err).lower()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_holds_a_run_or_something_else_is_kept(
+    capture: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (trained / "splats.ply").read_bytes()
+    assert run(["train", str(capture), "--out", str(trained)]) == 2
+    assert "--resume" in one_line(capsys.readouterr().err)
+    assert (trained / "splats.ply").read_bytes() == before
+    (tmp_path / "mine.txt").write_text("mine")
+    assert run(["train", str(capture), "--out", str(tmp_path), "--overwrite"]) == 2
+    assert "mine.txt" in one_line(capsys.readouterr().err)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_failing_overwrite_keeps_the_old_run(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy)
+    image_that_does_not_decode(tmp_path / "capture")
+    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
+    assert run(["train", str(tmp_path / "capture"), "--out", str(copy), "--overwrite", "--quiet"]) == 2
+    one_line(capsys.readouterr().err)
+    assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("command", ["mesh", "render", "evaluate", "report"])
+def test_a_command_on_what_is_no_run_says_what_it_found(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([command, str(tmp_path)]) == 2
+    assert "found a folder without run.json" in one_line(capsys.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_ply_of_another_kind_is_named(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy)
+    write_ball_mesh(tmp_path / "mesh.ply")
+    shutil.copy(tmp_path / "mesh.ply", copy / "splats.ply")
+    assert run(["export", str(copy), "--out", str(tmp_path / "x.ply")]) == 2
+    assert "mesh" in one_line(capsys.readouterr().err)
+    assert not (tmp_path / "x.ply").exists()
+    (tmp_path / "text.ply").write_text("hello")
+    assert run(["evaluate", str(trained), "--ground-truth", str(tmp_path / "text.ply"), "--quiet"]) == 2
+    assert "text.ply" in one_line(capsys.readouterr().err)
+
+
+def test_exporting_into_a_folder_that_does_not_exist_is_one_line(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["export", str(trained), "--out", str(tmp_path / "no" / "x.ply")]) == 2
+    assert "the folder does not exist" in one_line(capsys.readouterr().err)

@@ -1,0 +1,196 @@
+"""Commands: what they print and write, and the exit codes of arguments."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import gs2d
+from cli_runs import TINY, one_line
+from gs2d.cli import run
+from gs2d.recipes import RECIPES
+from tiny import write_ball_mesh
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["train"], "--out RUN"),
+        (["train", "here", "--out", "there", "--downscale", "two"], "--downscale"),
+        (["train", "here", "--out", "there", "--nonsense"], "--nonsense"),
+        (["train", "here", "--out", "there", "--backend", "gpu"], "--backend"),
+        (["paint"], "paint"),
+        (["paint"], "see `gs2d --help`"),
+        (["mesh", "here", "--bbox", "1", "2", "3"], "input length 3 did not match expected argument count 6 of `FLOAT"),
+        (["train", "here", "--out", "there", "--resume", "--overwrite"], "exclude each other"),
+    ],
+)
+def test_arguments_that_do_not_parse_give_one_line_and_exit_code_2(
+    words: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert named in one_line(err)
+
+
+def test_help_is_instant_because_it_does_not_import_torch() -> None:
+    code = "import sys; from gs2d.cli import run; run(['--help']); run(['train', '--help']); run(['recipes']); "
+    code += "assert 'torch' not in sys.modules; assert 'numpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.parametrize("words", [["--help"], [], ["train", "--help"]])
+def test_help_exits_with_0(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(words) == 0
+    assert "usage: gs2d" in capsys.readouterr().out
+
+
+def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out == f"gs2d {gs2d.__version__}\n"
+
+
+def test_recipes_lists_every_recipe_and_shows_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["recipes"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in RECIPES)
+    assert run(["recipes", "show", "2dgs-r", "--schedule-scale", "0.1"]) == 0
+    shown = capsys.readouterr().out
+    assert "2dgs-r: 6,000 iterations" in shown
+    assert "2. appearance: 1,000 iterations" in shown
+
+
+def test_recipes_show_json_is_the_recipe(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["recipes", "show", "2dgs-r", "--set", "refine.iterations=7", "--json"]) == 0
+    recipe = json.loads(capsys.readouterr().out)
+    assert [stage["iterations"] for stage in recipe["stages"]] == [30_000, 10_000, 7]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["recipes", "show", "2dgs-s"], "no recipe '2dgs-s'; there is 2dgs-r"),
+        (["recipes", "show"], "needs the name"),
+        (["recipes", "show", "2dgs", "--set", "surface.iteration=3"], "iteration"),
+        (["recipes", "show", "2dgs", "--set", "nonsense"], "stage.field=value"),
+        (["recipes", "show", "2dgs-r", "--set", "refine.train.means=nobody"], "row group 'nobody'"),
+    ],
+)
+def test_a_recipe_that_cannot_be_trained_is_one_line(
+    words: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words) == 2
+    assert named in one_line(capsys.readouterr().err)
+
+
+def test_doctor_says_what_runs_and_why_the_rest_does_not(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert "yes  reference" in text
+    if "yes  cuda" not in text:
+        assert "no   cuda: " in text
+        assert "to get it: " in text.partition("no   cuda")[2]
+    assert run(["doctor", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [backend["name"] for backend in report["backends"]] == ["cuda", "cpu", "reference"]
+    assert report["auto"] in ("cuda", "cpu", "reference")
+
+
+def test_doctor_without_the_native_library_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.kernels import library
+
+    monkeypatch.setattr(library, "FOLDER", tmp_path)
+    assert run(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert "no   cpu" in text
+    assert "C++" in text
+    assert "compiler" in text
+    assert "pip install --force-reinstall" in text
+    assert "--backend auto takes: " in text
+    assert "--backend auto takes: cpu" not in text
+
+
+def test_asking_for_a_backend_that_is_not_here_is_one_line(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--backend", "cuda"]) == 2
+    assert "cuda" in one_line(capsys.readouterr().err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_info_describes_a_run_a_capture_and_a_ply(
+    trained: Path, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    facts = {}
+    viewer = tmp_path / "viewer.ply"
+    assert run(["export", str(trained), "--out", str(viewer), "--quiet"]) == 0
+    paths = {"run": trained, "capture": capture, "ply": trained / "splats.ply", "viewer": viewer}
+    for name, path in paths.items():
+        assert run(["info", str(path), "--json"]) == 0
+        facts[name] = json.loads(capsys.readouterr().out)
+    assert facts["capture"]["format"] == "blender"
+    assert facts["capture"]["training views"] == 3
+    assert facts["run"]["stages"][-1]["splats"] == facts["ply"]["splats"]
+    assert (facts["ply"]["layout"], facts["viewer"]["layout"][:4]) == ("2dgs", "3dgs")
+    assert facts["viewer"]["splats"] == facts["ply"]["splats"]
+    assert facts["run"]["definition"]["recipe"]["name"] == "2dgs-r"
+
+
+def test_quiet_prints_nothing_and_json_prints_only_json(
+    capture: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(trained, out)
+    words = ["train", str(capture), "--out", str(out), "--threads", "1", "--resume", *TINY]
+    assert run([*words, "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert run([*words, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [stage["name"] for stage in result["stages"]] == ["surface", "appearance", "refine"]
+
+
+def test_train_shows_a_table_and_where_the_report_is(
+    capture: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(trained, out)
+    assert run(["train", str(capture), "--out", str(out), "--threads", "1", "--resume", *TINY]) == 0
+    text = capsys.readouterr().out
+    assert "appearance" in text
+    assert str(out / "report.html") in text
+
+
+def test_mesh_render_export_and_report_work_on_a_run(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = str(trained)
+    assert run(["mesh", name, "--out", str(tmp_path / "m.ply"), "--voxel", "0.1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["voxel"] == pytest.approx(0.1)
+    assert run(["render", name, "--split", "train", "--out", str(tmp_path / "views"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["images"] == 3
+    assert run(["export", name, "--layout", "3dgs", "--out", str(tmp_path / "s.ply"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["bytes"] == (tmp_path / "s.ply").stat().st_size
+    assert run(["report", name]) == 0
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_evaluate_shows_what_is_missing_and_scores_the_surface(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy)
+    write_ball_mesh(copy / "mesh.ply")
+    write_ball_mesh(tmp_path / "truth.ply")
+    assert run(["evaluate", str(copy), "--ground-truth", str(tmp_path / "truth.ply"), "--thresholds", "0.05"]) == 0
+    text = capsys.readouterr().out
+    assert "no LPIPS weights" in text
+    assert "F-score" in text
+    assert "Chamfer distance" in text

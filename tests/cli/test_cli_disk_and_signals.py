@@ -1,0 +1,122 @@
+"""Full disks, Ctrl-C, lack of memory and faults of ours: one line and the right exit code."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from cli_runs import TINY, one_line, spawn
+from gs2d.cli import app as app_module
+from gs2d.cli import run
+
+
+def test_a_file_size_limit_stops_training_with_one_line_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--threads", "1", *TINY]
+    done = spawn(words, preexec_fn=limit)
+    assert done.returncode == 2
+    assert "file-size limit" in one_line(done.stderr)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = shutil.which("mount")
+    if mount is None or os.geteuid() != 0:
+        pytest.skip("only root may mount a small disk")
+    made = subprocess.run([mount, "-t", "tmpfs", "-o", "size=48k", "none", str(disk)], capture_output=True, text=True)
+    if made.returncode:
+        pytest.skip(f"a small disk cannot be mounted here: {made.stderr.strip()}")
+    try:
+        done = spawn(["train", str(capture), "--out", str(disk / "run"), "--quiet", "--threads", "1", *TINY])
+        assert done.returncode == 2
+        assert "No space left on device" in one_line(done.stderr)
+        assert list(disk.iterdir()) == []
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.pipeline import jobs
+
+    def broken(_path: Path) -> Path:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(jobs, "report_run", broken)
+    assert run(["report", str(trained)]) == 1
+    err = capsys.readouterr().err
+    assert err.splitlines() == [
+        "fault in gs2d: ZeroDivisionError: a bug; run again with --debug and report it with the traceback"
+    ]
+    assert run(["report", str(trained), "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.pipeline import recorder
+
+    put = recorder.Recorder._score_stage
+
+    def interrupted(self: recorder.Recorder, index: int) -> None:
+        put(self, index)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recorder.Recorder, "_score_stage", interrupted)
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--threads", "1", *TINY]
+    assert run(words) == 130
+    line = capsys.readouterr().err.strip()
+    assert line.startswith(f"interrupted; resume with: gs2d train {capture} --out {tmp_path / 'run'}")
+    assert line.endswith("--resume")
+
+
+def test_ctrl_c_before_the_first_checkpoint_leaves_nothing(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.train.loop import Trainer
+
+    def interrupted(_self: Trainer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+    assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_out_of_memory_names_the_remedy(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.pipeline import jobs
+
+    def hungry(_path: Path) -> Path:
+        raise MemoryError
+
+    monkeypatch.setattr(jobs, "report_run", hungry)
+    assert run(["report", str(trained)]) == 2
+    assert "--downscale" in one_line(capsys.readouterr().err)
+
+
+def test_an_os_error_that_the_user_can_mend_is_one_line(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.pipeline import jobs
+
+    def denied(path: Path) -> Path:
+        raise PermissionError(13, "Permission denied", str(path / "report.html"))
+
+    monkeypatch.setattr(jobs, "report_run", denied)
+    assert run(["report", str(trained)]) == 2
+    assert "Permission denied" in one_line(capsys.readouterr().err)
+    assert app_module.OURS == 1

@@ -1,0 +1,26 @@
+"""What the tests of the command line share: tiny runs, and the one line of an error."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+TINY = ["--schedule-scale", "0.0005", "--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
+
+
+def one_line(text: str) -> str:
+    """The only line of a stderr, which must be an error."""
+    lines = text.splitlines()
+    assert len(lines) == 1, text
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+def spawn(words: list[str], **kwargs: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "gs2d", *words],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        **kwargs,  # type: ignore[call-overload]
+    )

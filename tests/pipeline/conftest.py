@@ -1,0 +1,22 @@
+"""A tiny capture and an undisturbed run of it, for all tests of the pipeline; they are never changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ball_runs import options
+from gs2d.io.run import RunFolder
+from gs2d.pipeline.train import train
+from tiny import write_capture
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_capture(tmp_path_factory.mktemp("data") / "ball")
+
+
+@pytest.fixture(scope="session")
+def undisturbed(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return train(options(capture, tmp_path_factory.mktemp("runs") / "undisturbed"))

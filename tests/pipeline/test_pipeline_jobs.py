@@ -1,0 +1,175 @@
+"""What is done with a trained run: mesh, render, score, export, report again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ball_runs import Stop, options
+from gs2d.errors import DataError, ProtocolError, RunError
+from gs2d.io.ply import read_mesh, read_splats, write_mesh
+from gs2d.io.run import RunFolder, open_run
+from gs2d.pipeline.events import Event, StageDone, Step
+from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
+from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.train import train
+from gs2d.triangles import Mesh
+from tiny import write_ball_mesh
+
+
+def test_meshing_again_keeps_to_the_box_and_the_voxel(undisturbed: RunFolder, tmp_path: Path) -> None:
+    out = tmp_path / "half.ply"
+    result = mesh_run(undisturbed.path, MeshOptions(bbox=(-1, -1, 0, 1, 1, 1), voxel=0.1, depth="median"), out=out)
+    assert result["voxel"] == pytest.approx(0.1)
+    assert result["truncation"] > result["voxel"]
+    mesh = read_mesh(out)
+    assert result["vertices"] == len(mesh.vertices)
+    if len(mesh.vertices):
+        assert mesh.vertices.min(axis=0)[2] > -0.2
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"voxel": -1.0},
+        {"voxel": 0.0},
+        {"truncation": 0.0},
+        {"depth_limit": float("nan")},
+        {"keep_components": -1},
+        {"bbox": (1, 1, 1, 0, 0, 0)},
+    ],
+)
+def test_meshing_with_senseless_limits_is_refused_before_anything_is_rendered(
+    undisturbed: RunFolder, tmp_path: Path, bad: dict[str, Any]
+) -> None:
+    heard: list[Event] = []
+    with pytest.raises(ProtocolError, match=f"--{next(iter(bad)).replace('_', '-')} must be"):
+        mesh_run(undisturbed.path, MeshOptions(**bad), heard.append, out=tmp_path / "x.ply")
+    assert list(tmp_path.iterdir()) == []
+    assert not any(isinstance(event, Step) for event in heard)
+
+
+def test_splats_that_give_no_mesh_still_give_a_report(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gs2d.pipeline import train as train_module
+
+    def nothing(*_args: Any, **_kwargs: Any) -> None:
+        raise ProtocolError("depth was expected, got none")
+
+    monkeypatch.setattr(train_module, "extract_mesh", nothing)
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    for name in ("mesh.ply", "report.html"):
+        (copy / name).unlink()
+    with pytest.raises(ProtocolError, match="no mesh of .*: depth was expected, got none; splats and report"):
+        train(options(capture, copy, resume=True))
+    assert "There is no mesh.ply" in (copy / "report.html").read_text()
+
+
+def test_an_empty_mesh_is_said_to_be_empty_in_the_report(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    write_mesh(copy / "mesh.ply", Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))
+    report_run(copy)
+    assert "mesh.ply has no faces" in (copy / "report.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["protocol", "raster", "backend", "downscale"])
+def test_a_damaged_definition_is_named_when_the_run_is_used(undisturbed: RunFolder, tmp_path: Path, name: str) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    data = json.loads((copy / "run.json").read_text())
+    (copy / "run.json").write_text(json.dumps({key: value for key, value in data.items() if key != name}))
+    with pytest.raises(RunError, match=name):
+        render_run(copy)
+
+
+@pytest.mark.parametrize(("text", "kind"), [("splats.ply", "splats"), ("bad", "vertex indices below 1")])
+def test_a_ground_truth_of_another_kind_is_refused_before_the_run_is_read(
+    undisturbed: RunFolder, tmp_path: Path, text: str, kind: str
+) -> None:
+    file = undisturbed.file("splats.ply")
+    if text == "bad":  # a mesh whose face names no vertex is a broken mesh, never a point cloud
+        file = tmp_path / "bad.ply"
+        header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        file.write_text(header + "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 7\n")
+    with pytest.raises(DataError, match=kind):
+        evaluate_run(tmp_path / "no run", EvaluateOptions(ground_truth=file))
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_threshold_that_is_no_distance_is_refused_first(tmp_path: Path, threshold: float) -> None:
+    with pytest.raises(DataError, match="--thresholds must be positive distances"):
+        evaluate_run(tmp_path / "no run", EvaluateOptions(thresholds=(0.1, threshold)))
+
+
+def test_a_shorter_orbit_leaves_no_frame_of_a_longer_one(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    for frames in (3, 2):
+        render_run(copy, orbit=frames)
+    assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 2
+
+
+def test_rendering_writes_one_png_for_each_view(undisturbed: RunFolder, tmp_path: Path) -> None:
+    assert render_run(undisturbed.path, split="train", out=tmp_path / "train")["images"] == 6
+    assert len(list((tmp_path / "train").glob("*.png"))) == 6
+    assert render_run(undisturbed.path, orbit=3, out=tmp_path / "orbit")["images"] == 3
+    assert sorted(p.name for p in (tmp_path / "orbit").iterdir()) == ["0000.png", "0001.png", "0002.png"]
+
+
+def test_an_orbit_looks_at_the_focus_from_a_constant_height() -> None:
+    from tiny import ball_cameras
+
+    circle = orbit_cameras(ball_cameras(12), 8)
+    centers = np.array([camera.center for camera in circle])
+    for camera in circle:
+        to_focus = -camera.center / np.linalg.norm(camera.center)  # the ball's cameras look at the origin
+        assert camera.forward @ to_focus == pytest.approx(1.0, abs=1e-6)
+    radii = np.linalg.norm(centers, axis=1)
+    assert np.ptp(radii) < 1e-9
+
+
+def test_exporting_writes_the_layout_that_viewers_open(undisturbed: RunFolder, tmp_path: Path) -> None:
+    result = export_run(undisturbed.path, tmp_path / "out.ply", "3dgs")
+    head = (tmp_path / "out.ply").read_bytes()[:2000].decode("latin1")
+    assert "property float scale_2" in head
+    assert result["splats"] == len(read_splats(undisturbed.file("splats.ply")))
+
+
+def test_an_unfinished_run_cannot_be_exported(capture: Path, tmp_path: Path) -> None:
+    def listen(event: Event) -> None:
+        if isinstance(event, StageDone):
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(options(capture, tmp_path / "run"), listen)
+    with pytest.raises(RunError, match="is not finished"):
+        export_run(tmp_path / "run", tmp_path / "x.ply", "2dgs")
+    assert report_run(tmp_path / "run").exists()
+
+
+def test_evaluating_scores_the_surface_against_a_mesh(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(undisturbed.path, copy)
+    write_ball_mesh(copy / "mesh.ply")
+    write_ball_mesh(tmp_path / "truth.ply")
+    truth = EvaluateOptions(ground_truth=tmp_path / "truth.ply", thresholds=(0.02, 0.05))
+    result = evaluate_run(copy, truth)
+    rows = result["surface"]["thresholds"]
+    assert [row["threshold"] for row in rows] == [0.02, 0.05]
+    assert rows[-1]["f_score"] > 0.99  # the same surface
+    assert open_run(copy).metrics()["surface"]["thresholds"] == rows
+    assert result["test"]["psnr"] == pytest.approx(undisturbed.metrics()["stages"][-1]["test"]["psnr"], abs=0.02)
+
+
+def test_a_capture_that_moved_is_named(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(undisturbed.path, copy)
+    definition = json.loads((copy / "run.json").read_text())
+    definition["scene"]["path"] = str(tmp_path / "gone")
+    (copy / "run.json").write_text(json.dumps(definition))
+    with pytest.raises(RunError, match="was at .*gone, which is not there"):
+        render_run(copy)

@@ -1,0 +1,194 @@
+"""Exact resume, stages shared by runs, and the same bytes from the same seed."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ball_runs import SMALL, Stop, comparable, options, spawn
+from gs2d.errors import RunError
+from gs2d.io.run import RunFolder, open_run
+from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
+from gs2d.pipeline.prepare import prepare
+from gs2d.pipeline.train import train
+
+
+@pytest.mark.parametrize("stop_after", [3, 13, 30, 37, 41, 59])
+def test_a_run_stopped_at_any_iteration_resumes_to_the_same_bytes(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path, stop_after: int
+) -> None:
+    def listen(event: Event) -> None:
+        if isinstance(event, Step) and event.done >= stop_after and "loss" in event.detail:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(options(capture, tmp_path / "run"), listen)
+    resumed = train(options(capture, tmp_path / "run", resume=True))
+    assert comparable(resumed) == comparable(undisturbed)
+
+
+def test_a_run_stopped_between_the_end_of_a_stage_and_its_scores_is_scored_on_resume(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    def listen(event: Event) -> None:
+        if isinstance(event, StageDone):
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(options(capture, tmp_path / "run"), listen)
+    run = RunFolder(tmp_path / "run")
+    run.write_metrics({"stages": [], "surface": None})  # as if killed before they were written
+    assert comparable(train(options(capture, tmp_path / "run", resume=True))) == comparable(undisturbed)
+
+
+@pytest.mark.parametrize("when", [(0, 12.0), (1, float("inf"))])  # in the first stage; at the end of the second
+def test_a_killed_process_resumes_to_the_same_splats_byte_for_byte(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path, when: tuple[int, float]
+) -> None:
+    process = spawn(capture, tmp_path / "run")
+    deadline = time.monotonic() + 250
+    while not any(saved.progress >= when for saved in RunFolder(tmp_path / "run").checkpoints()):
+        assert process.poll() is None, process.communicate()[1].decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (tmp_path / "run" / "splats.ply").exists()
+    again = spawn(capture, tmp_path / "run", "--resume")
+    assert again.communicate(timeout=250)[1] == b""
+    assert again.returncode == 0
+    assert comparable(open_run(tmp_path / "run")) == comparable(undisturbed)
+
+
+def test_resuming_a_finished_run_changes_nothing(capture: Path, undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(undisturbed.path, copy)
+    before = comparable(RunFolder(copy))
+    mesh = (copy / "mesh.ply").read_bytes()
+    assert comparable(train(options(capture, copy, resume=True))) == before
+    assert (copy / "mesh.ply").read_bytes() == mesh
+
+
+def test_resume_goes_back_one_checkpoint_when_the_last_is_damaged_and_says_so(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(undisturbed.path, copy)
+    (copy / "checkpoints" / "2-refine-end.pt").write_bytes(b"damaged")
+    (copy / "splats.ply").unlink()
+    heard: list[Event] = []
+    resumed = train(options(capture, copy, resume=True), heard.append)
+    notices = [event.text for event in heard if isinstance(event, Notice)]
+    assert any("2-refine-end.pt is not a readable checkpoint" in text for text in notices)
+    assert comparable(resumed) == comparable(undisturbed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"seed": 1}, r"another recipe \(seed: 0, now 1\)"),
+        ({"overrides": (*SMALL, "refine.iterations=25")}, r"recipe \(stages.refine.iterations: 20, now 25\)"),
+        ({"protocol": "generic"}, r"another protocol \(name: nerf-synthetic, now generic\)"),
+        ({"downscale": 2}, r"another downscale \(1, now 2\)"),
+        ({"stage2_cache_mb": 0}, r"another stage2_cache_bytes \(1073741824, now 0\)"),
+    ],
+)
+def test_resuming_with_other_options_is_refused_and_names_the_difference(
+    capture: Path, undisturbed: RunFolder, changes: dict[str, Any], named: str
+) -> None:
+    before = comparable(undisturbed)
+    with pytest.raises(RunError, match=named):
+        train(options(capture, undisturbed.path, resume=True, **changes))
+    assert comparable(undisturbed) == before
+
+
+def test_a_cache_gives_the_same_bytes_without_training_the_shared_stages(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache"
+    train(options(capture, tmp_path / "plain", recipe="2dgs", cache=cache))
+    heard: list[Event] = []
+    shared = train(options(capture, tmp_path / "r", cache=cache), heard.append)
+    assert comparable(shared) == comparable(undisturbed)
+    stages = shared.metrics()["stages"]
+    assert [("reused_from" in stage) for stage in stages] == [True, False, False]
+    assert shared.file("renders/surface").is_dir()
+    assert not any(isinstance(event, Step) and event.detail.startswith("surface") for event in heard)
+    assert len(list(cache.glob("*.pt"))) == 3
+
+
+def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    first = options(capture, tmp_path / "a", recipe="2dgs", cache=cache)
+    train(first)
+    train(replace(first, out=tmp_path / "b", seed=1))
+    train(replace(first, out=tmp_path / "c", overrides=(*SMALL, "surface.rates.sh0=0.003")))
+    train(replace(first, out=tmp_path / "d", downscale=2))
+    assert len(list(cache.glob("*.pt"))) == 4
+    assert all("reused_from" not in open_run(tmp_path / x).metrics()["stages"][0] for x in "abcd")
+
+
+def test_runs_share_stages_with_and_without_cached_views_up_to_the_one_that_uses_them(
+    capture: Path, tmp_path: Path
+) -> None:
+    jobs = [
+        prepare(options(capture, tmp_path, overrides=(*SMALL, f"appearance.iterations={iterations}"), **more), ignore)
+        for iterations in (11, 12)  # six views: cached from twelve iterations
+        for more in ({}, {"stage2_cache_mb": 0})
+    ]
+    with_cache = jobs[0].backend.name == "cpu"
+    same_key = [[a.stage_key(i) == b.stage_key(i) for i in range(3)] for a, b in (jobs[:2], jobs[2:])]
+    assert same_key == [[True] * 3, [True, not with_cache, not with_cache]]
+    assert [job.definition()["stage2_cache_bytes"] for job in jobs] == [1 << 30, 0, 1 << 30, 0]
+
+
+def test_a_run_starts_from_the_stages_it_shares_with_another(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    overrides = (*SMALL, "refine.iterations=6")
+    run = train(options(capture, tmp_path / "run", start_from=undisturbed.path, overrides=overrides))
+    assert [("reused_from" in stage) for stage in run.metrics()["stages"]] == [True, True, False]
+    assert run.metrics()["stages"][2]["iterations"] == 6
+
+
+def test_starting_from_a_run_that_shares_no_stage_is_an_error_that_leaves_nothing(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    with pytest.raises(RunError, match=r"no finished stage in common .* \(its stages: surface, appearance, refine\)"):
+        train(options(capture, tmp_path / "run", start_from=undisturbed.path, seed=5))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_seed_gives_the_same_bytes(capture: Path, undisturbed: RunFolder, tmp_path: Path) -> None:
+    again = train(options(capture, tmp_path / "again", checkpoint_every=1000))
+    assert again.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
+    other = train(options(capture, tmp_path / "other", seed=1))
+    assert other.file("splats.ply").read_bytes() != undisturbed.file("splats.ply").read_bytes()
+
+
+def test_a_finished_run_whose_checkpoints_were_deleted_is_never_touched_by_resume(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(undisturbed.path, copy)
+    shutil.rmtree(copy / "checkpoints")  # to save space
+    for changes, words in (({}, "finished and its checkpoints are gone"), ({"seed": 1}, "another recipe")):
+        with pytest.raises(RunError, match=words):
+            train(options(capture, copy, resume=True, **changes))
+        for name in ("splats.ply", "mesh.ply", "metrics.json", "report.html"):
+            assert (copy / name).read_bytes() == undisturbed.file(name).read_bytes()
+
+
+def test_resuming_a_finished_run_keeps_the_scores_of_its_mesh(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    surface = {"chamfer": 0.5, "thresholds": []}
+    run.write_metrics({**run.metrics(), "surface": surface})
+    assert train(options(capture, run.path, resume=True)).metrics()["surface"] == surface

@@ -1,0 +1,192 @@
+"""The whole path on a tiny ball: what a run leaves, what stops it, the demo."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from ball_runs import Stop, comparable, options
+from gs2d.errors import DiskError, DivergedError, RecipeError, RunError
+from gs2d.io.ply import read_splats
+from gs2d.io.run import RunFolder
+from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.events import Event, Notice, Step
+from gs2d.pipeline.train import train
+
+
+def test_a_run_holds_everything_that_was_promised(undisturbed: RunFolder) -> None:
+    files = {
+        "run.json",
+        "events.jsonl",
+        "checkpoints",
+        "splats.ply",
+        "mesh.ply",
+        "metrics.json",
+        "renders",
+        "report.html",
+    }
+    assert files <= {entry.name for entry in undisturbed.path.iterdir()}
+    assert not list(undisturbed.path.rglob("*.tmp"))
+    definition = undisturbed.definition()
+    assert [stage["name"] for stage in definition["recipe"]["stages"]] == ["surface", "appearance", "refine"]
+    assert definition["scene"]["format"] == "blender"
+    assert definition["protocol"]["name"] == "nerf-synthetic"
+    assert definition["raster"]["near"] == 0.2
+    splats = read_splats(undisturbed.file("splats.ply"))
+    last = undisturbed.metrics()["stages"][-1]
+    assert last["splats"] == len(splats)
+    assert last["bytes"] == splats.nbytes
+
+
+def test_metrics_have_an_entry_for_each_stage_with_a_reason_for_each_null(undisturbed: RunFolder) -> None:
+    stages = undisturbed.metrics()["stages"]
+    assert [(s["name"], s["iterations"]) for s in stages] == [("surface", 30), ("appearance", 10), ("refine", 20)]
+    for stage in stages:
+        assert stage["seconds"] > 0
+        assert stage["peak_memory_bytes"] > 10_000_000
+        for split in ("train", "test"):
+            assert 0 < stage[split]["psnr"] < 60
+            assert -1 < stage[split]["ssim"] < 1
+            assert stage[split]["lpips"] is None
+            assert "weights" in stage[split]["lpips_reason"]
+    assert "after_clone" not in stages[0]
+    assert stages[2]["after_clone"]["train"]["psnr"] != stages[1]["train"]["psnr"]
+
+
+def test_the_log_has_the_figures_of_every_curve(undisturbed: RunFolder) -> None:
+    steps = [event for event in undisturbed.events.read() if event["kind"] == "step"]
+    assert steps[-1]["total_iteration"] == 60
+    assert {event["stage"] for event in steps} == {"surface", "appearance", "refine"}
+    for event in steps:
+        assert {"loss", "losses", "splats", "mean_opacity", "mean_area", "iteration"} <= set(event)
+    assert any("psnr" in event for event in steps)
+    kinds = {event["kind"] for event in undisturbed.events.read()}
+    assert {"initialised", "stage_start", "stage_end", "ranked", "cloned", "after_clone"} <= kinds
+
+
+def test_pictures_of_every_stage_lie_beside_the_photographs(undisturbed: RunFolder) -> None:
+    index = json.loads(undisturbed.file("renders/index.json").read_text())
+    assert index["stages"] == ["surface", "appearance", "refine"]
+    assert [view["split"] for view in index["views"]] == ["test", "test"]
+    for view in index["views"]:
+        assert undisturbed.file(f"renders/photos/{view['file']}.png").exists()
+        for stage in index["stages"]:
+            for what in ("color", "normal", "depth", "error"):
+                assert undisturbed.file(f"renders/{stage}/{view['file']}.{what}.png").exists()
+        assert not undisturbed.file(f"renders/surface/{view['file']}.high_error.png").exists()
+        assert undisturbed.file(f"renders/refine/{view['file']}.high_error.png").exists()
+
+
+def test_nan_stops_the_run_and_names_iteration_attribute_and_checkpoint(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gs2d.train import loop
+
+    step = loop.adam_step
+
+    def poisoned(state: Any, *args: Any, **kwargs: Any) -> None:
+        step(state, *args, **kwargs)
+        if state.step == 19:  # the twentieth iteration is under way
+            state.splats.log_scales[0, 0] = float("nan")
+
+    monkeypatch.setattr(loop, "adam_step", poisoned)
+    with pytest.raises(DivergedError) as error:
+        train(options(capture, tmp_path / "run"))
+    message = str(error.value)
+    assert "iteration 20 of stage 'surface'" in message
+    assert "log_scales" in message
+    assert f"the last good checkpoint is {tmp_path / 'run' / 'checkpoints' / '0-surface-0000016.pt'}" in message
+
+
+def test_a_full_disk_before_the_first_checkpoint_leaves_nothing(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gs2d.io import run as run_module
+
+    def full(path: Path, _payload: Any) -> None:
+        raise DiskError(f"cannot write {path}: No space left on device; free some space or choose another folder")
+
+    monkeypatch.setattr(run_module, "save_tensors", full)
+    with pytest.raises(DiskError, match="No space left"):
+        train(options(capture, tmp_path / "deep" / "run"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recipe_that_names_an_unknown_group_fails_before_the_capture_is_read(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="no earlier action writes the row group"):
+        train(options(tmp_path / "missing", tmp_path / "run", overrides=("refine.train.means=nobody",)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "got"),
+    [
+        ({"downscale": 0}, "got 0"),
+        ({"checkpoint_every": 0}, "got 0"),
+        ({"stage2_cache_mb": -1}, "got -1"),
+        ({"checkpoint_seconds": float("nan")}, "got nan"),
+        ({"threads": 0}, "got 0"),
+        ({"threads": 1_000_000}, "from 1 to 1024, got 1000000"),
+        ({"schedule_scale": 0.0}, "got 0"),
+        ({"seed": 2**63}, "at most 2.63 - 1"),
+        ({"overrides": ("name=",)}, "must have a name"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(capture: Path, tmp_path: Path, changes: dict[str, Any], got: str) -> None:
+    with pytest.raises(RecipeError, match=got):
+        train(options(capture, tmp_path / "run", **changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_leaves_the_threads_of_torch_as_asked(capture: Path, undisturbed: RunFolder) -> None:
+    assert torch.get_num_threads() == 1
+
+
+def test_the_demo_makes_its_capture_trains_scores_the_surface_and_reports(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    small = DemoOptions(out=out, threads=1, schedule_scale=0.0005, train_views=3, test_views=1, size=24)
+    run = demo(small)
+    metrics = run.metrics()
+    assert [stage["name"] for stage in metrics["stages"]] == ["surface", "appearance", "refine"]
+    assert len(metrics["surface"]["thresholds"]) >= 3
+    assert metrics["surface"]["ground_truth"].endswith("mesh_gt.ply")
+    assert (out / "capture" / "transforms_train.json").exists()
+    assert (out / "report.html").exists()
+    before = run.file("splats.ply").read_bytes()
+    again = demo(replace(small, resume=True))  # the capture is taken as it is
+    assert again.file("splats.ply").read_bytes() == before
+    assert again.metrics()["surface"] is not None
+
+
+def test_the_demo_does_not_replace_a_run_of_another_kind(undisturbed: RunFolder) -> None:
+    before = comparable(undisturbed)
+    with pytest.raises(RunError, match="holds a run that is not a demo"):
+        demo(DemoOptions(out=undisturbed.path))
+    assert comparable(undisturbed) == before
+
+
+def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "ball"
+    shutil.copytree(capture, folder)
+    for i in range(4):
+        (folder / "train" / f"r_{i}.png").unlink()
+    heard: list[Event] = []
+
+    def listen(event: Event) -> None:
+        heard.append(event)
+        if isinstance(event, Step) and "loss" in event.detail:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(options(folder, tmp_path / "run", protocol="generic"), listen)
+    texts = [event.text for event in heard if isinstance(event, Notice)]
+    assert "starting from 150 random points in the box the cameras look at" in texts
+    assert any("r_0" in text for text in texts)
+    assert "... and 1 more views skipped; `gs2d info` lists them" in texts
+    assert any(text.startswith("near plane at") for text in texts)
+    assert not (tmp_path / "run").exists()  # nothing was saved yet
