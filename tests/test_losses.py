@@ -16,7 +16,7 @@ from gs2d import losses_reference as reference
 from gs2d.camera import Camera, look_at
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.kernels.library import load
-from gs2d.losses import LOSSES, NATIVE_LOSSES, compute_losses, normals_from_depth, target_maps
+from gs2d.losses import FUSED_LOSSES, LOSSES, compute_losses, normals_from_depth, target_maps
 from gs2d.recipe import LossTerm
 from gs2d.render.types import RenderOutput
 
@@ -393,4 +393,4 @@ def test_a_cache_of_another_target_is_refused(native: None) -> None:
 
 
 def test_both_implementations_know_the_same_kinds() -> None:
-    assert list(LOSSES) == list(NATIVE_LOSSES)
+    assert list(LOSSES) == list(FUSED_LOSSES)

@@ -4,16 +4,18 @@ The total of official 2DGS is 0.8 L1 + 0.2 (1 - SSIM) + lambda_n mean(1 - alpha 
 weights are the :class:`~gs2d.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math.md``.
 
 There are two implementations of each kind: plain torch (``losses_reference``), used by the reference backend, and
-native fused operations (``kernels.ops``), used by the cpu backend. The backend's name chooses; nothing falls back.
+fused operations, native (``kernels.ops``) for the cpu backend and on the GPU (``kernels.cuda.ops``) for the cuda
+backend. The backend's name chooses; nothing falls back.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
 
+import torch
 from torch import Tensor
 
 from gs2d import losses_reference as reference
@@ -21,6 +23,8 @@ from gs2d.camera import Camera
 from gs2d.check import check_shapes
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.kernels import ops
+from gs2d.kernels.cuda import launch
+from gs2d.kernels.cuda import ops as cuda_ops
 from gs2d.losses_reference import normals_from_depth
 from gs2d.recipe import LossTerm
 from gs2d.render.types import RenderOutput
@@ -64,6 +68,26 @@ def target_maps(target: Tensor) -> TargetMaps:
     return TargetMaps(target, ops.blur(target), target._version)
 
 
+@dataclass(frozen=True)
+class FusedOperations:
+    """The fused operations of a backend, with the signatures of ``kernels.ops``."""
+
+    photometric: Callable[..., tuple[Tensor, Tensor]]
+    normal_consistency: Callable[..., Tensor]
+    masked_mean: Callable[..., Tensor]
+
+
+def _fused_operations(backend_name: str, device: torch.device) -> FusedOperations | None:
+    """Those of a backend on a device; None for the reference."""
+    if backend_name == "cpu":
+        return FusedOperations(ops.photometric, ops.normal_consistency, ops.masked_mean)
+    if backend_name == "cuda":
+        functions = (cuda_ops.photometric, cuda_ops.normal_consistency, cuda_ops.masked_mean)
+        launcher = launch.launcher_for(device)
+        return FusedOperations(*(partial(function, launcher=launcher) for function in functions))
+    return None
+
+
 @dataclass(frozen=True, eq=False)
 class LossInputs:
     """One rendered view and what it should look like.
@@ -77,9 +101,11 @@ class LossInputs:
         False = ignore this pixel.
     camera : Camera
     target_mean : Tensor [H, W, 3] or None
-        Local mean of the target when known (native SSIM only).
+        Local mean of the target when known (fused SSIM only).
     weights : mapping of kind to float
         Of the active terms. Not applied here: the native operations prepare their gradients for them.
+    fused : FusedOperations or None
+        What FUSED_LOSSES are made of; None for the reference.
     """
 
     output: RenderOutput
@@ -88,12 +114,13 @@ class LossInputs:
     camera: Camera
     target_mean: Tensor | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
+    fused: FusedOperations | None = None
 
     @cached_property
-    def native_photometric(self) -> tuple[Tensor, Tensor]:
-        """(L1, SSIM) by one fused native pass, shared by both terms."""
+    def fused_photometric(self) -> tuple[Tensor, Tensor]:
+        """(L1, SSIM) by one fused pass, shared by both terms."""
         expected = (self.weights.get("l1", 0.0), -self.weights.get("ssim", 0.0))
-        return ops.photometric(self.output.color, self.target, self.mask, self.target_mean, expected=expected)
+        return _fused(self).photometric(self.output.color, self.target, self.mask, self.target_mean, expected=expected)
 
 
 LossFunction = Callable[[LossInputs, str], Tensor]
@@ -105,10 +132,15 @@ def _normals(inputs: LossInputs, depth_kind: str) -> tuple[Tensor, Tensor, Tenso
     return output.normal, output.depth(depth_kind), output.alpha, inputs.camera, inputs.mask
 
 
-def _native_normals(inputs: LossInputs, depth_kind: str, kind: str) -> Tensor:
+def _fused(inputs: LossInputs) -> FusedOperations:
+    assert inputs.fused is not None
+    return inputs.fused
+
+
+def _fused_normals(inputs: LossInputs, depth_kind: str, kind: str) -> Tensor:
     per_splat = kind == "normal_consistency_per_splat"
     weight = inputs.weights.get(kind, 1.0)
-    return ops.normal_consistency(*_normals(inputs, depth_kind), per_splat=per_splat, expected=weight)
+    return _fused(inputs).normal_consistency(*_normals(inputs, depth_kind), per_splat=per_splat, expected=weight)
 
 
 LOSSES: Mapping[str, LossFunction] = MappingProxyType(
@@ -122,18 +154,20 @@ LOSSES: Mapping[str, LossFunction] = MappingProxyType(
 )
 """Every kind of loss in plain torch, unweighted."""
 
-NATIVE_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
+FUSED_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
     {
-        "l1": lambda x, _: x.native_photometric[0],
-        "ssim": lambda x, _: 1 - x.native_photometric[1],
-        "normal_consistency": lambda x, depth: _native_normals(x, depth, "normal_consistency"),
-        "normal_consistency_per_splat": lambda x, depth: _native_normals(x, depth, "normal_consistency_per_splat"),
-        "distortion": lambda x, _: ops.masked_mean(x.output.distortion, x.mask),
+        "l1": lambda x, _: x.fused_photometric[0],
+        "ssim": lambda x, _: 1 - x.fused_photometric[1],
+        "normal_consistency": lambda x, depth: _fused_normals(x, depth, "normal_consistency"),
+        "normal_consistency_per_splat": lambda x, depth: _fused_normals(x, depth, "normal_consistency_per_splat"),
+        "distortion": lambda x, _: _fused(x).masked_mean(x.output.distortion, x.mask),
     }
 )
-"""The same kinds as fused native operations."""
+"""The same kinds as fused operations."""
 
-_BY_BACKEND: Mapping[str, Mapping[str, LossFunction]] = MappingProxyType({"reference": LOSSES, "cpu": NATIVE_LOSSES})
+_BY_BACKEND: Mapping[str, Mapping[str, LossFunction]] = MappingProxyType(
+    {"reference": LOSSES, "cpu": FUSED_LOSSES, "cuda": FUSED_LOSSES}
+)
 
 
 def compute_losses(
@@ -164,7 +198,7 @@ def compute_losses(
         Counted from 1 within the stage.
     depth_kind : "mean" or "median"
         The protocol's depth, for terms that name none.
-    backend_name : "cpu" or "reference"
+    backend_name : "cpu", "cuda" or "reference"
         Resolved name of the backend that rendered ``output`` (not "auto").
     target_cache : TargetMaps, optional
         Of this target: spares the native SSIM one blur of four. It never changes the value.
@@ -204,7 +238,8 @@ def compute_losses(
             active.append((term, term.weight))
             weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
     mean = target_cache.mean if target_cache is not None else None
-    inputs = LossInputs(output, target, mask, camera, mean, weights)
+    fused = _fused_operations(backend_name, output.color.device)
+    inputs = LossInputs(output, target, mask, camera, mean, weights, fused)
     values: dict[str, Tensor] = {}
     for term, weight in active:
         value = weight * functions[term.kind](inputs, term.depth or depth_kind)
@@ -222,7 +257,7 @@ def ssim(
     image, target : Tensor [H, W, 3]
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
-    backend_name : "cpu" or "reference"
+    backend_name : "cpu", "cuda" or "reference"
     target_mean : Tensor [H, W, 3], optional
         ``target_maps(target).mean``.
 
@@ -233,6 +268,7 @@ def ssim(
     """
     if backend_name not in _BY_BACKEND:
         raise BackendError(f"losses run on backend {' or '.join(map(repr, _BY_BACKEND))}, got {backend_name!r}")
-    if backend_name == "cpu":
-        return ops.photometric(image, target, mask, target_mean)[1]
+    fused = _fused_operations(backend_name, image.device)
+    if fused is not None:
+        return fused.photometric(image, target, mask, target_mean)[1]
     return reference.ssim(image, target, mask)
