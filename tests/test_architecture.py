@@ -23,7 +23,6 @@ FLOORS = {
     "errors": 0,
     "check": 0,
     "disk": 0,
-    "memory": 0,
     "recipe": 1,
     "recipes": 1,
     "protocols": 1,

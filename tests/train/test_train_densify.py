@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
-from train_toys import random_splats
+from slow_densify import densify_step_by_step
+from torch.utils._python_dispatch import TorchDispatchMode
+from train_toys import full_state, random_splats
 
 from gs2d.errors import DivergedError
 from gs2d.geometry import quats_to_matrices
@@ -195,3 +199,78 @@ def test_screen_size_never_prunes() -> None:
     state = state_of([(0.09, 0.09)], [0.5], [0.0], [1.0])
     assert run(state, iteration=14_900) == DensifyCounts(0, 0, 0, 0)
     assert isinstance(state.splats, Splats)
+
+
+def crowd(n: int, seed: int) -> TrainState:
+    """Splats of every fate: small and large, faint and bright, with and without a reason to grow."""
+    state = full_state(n, seed)
+    g = torch.Generator().manual_seed(seed + 1)
+    state.splats.log_scales = torch.empty(n, 2).uniform_(math.log(0.002), math.log(0.2), generator=g)
+    state.splats.opacity_logits = torch.randn(n, generator=g) - 2.0
+    signed, absolute = (5e-4 * torch.rand(n, generator=g) for _ in range(2))
+    state.statistics = Statistics(signed, absolute, torch.randint(0, 3, (n,), generator=g).float())
+    return state
+
+
+def bytes_of(state: TrainState) -> dict[str, bytes]:
+    """Everything with rows, and the generator."""
+    tensors = dict(state.splats.items()) | state.groups | {"generator": state.generator.get_state()}
+    for name, moments in state.moments.items():
+        tensors |= {f"mean of {name}": moments.mean, f"square of {name}": moments.square}
+    assert state.statistics is not None
+    return {name: tensor.numpy().tobytes() for name, tensor in (tensors | vars(state.statistics)).items()}
+
+
+@pytest.mark.parametrize("n", [7, 1000, 40_000])
+@pytest.mark.parametrize(
+    "densify",
+    [
+        GradDensify(),
+        GradDensify(absolute=True, abs_threshold=3e-4, split_count=3),
+        GradDensify(max_splats=1100),
+        GradDensify(grad_threshold=1.0, opacity_cull=0.0),  # nothing happens before the first reset
+    ],
+    ids=["plain", "absolute", "limited", "idle"],
+)
+@pytest.mark.parametrize("iteration", [600, 3050])
+def test_one_pass_leaves_the_bytes_that_one_step_after_another_does(
+    n: int, densify: GradDensify, iteration: int
+) -> None:
+    fast = crowd(n, seed=n)
+    slow = TrainState.from_state_dict(fast.state_dict())
+    assert run(fast, densify, iteration) == densify_step_by_step(
+        slow, densify, iteration=iteration, extent=1.0, white=False
+    )
+    assert bytes_of(fast) == bytes_of(slow)
+
+
+class Written(TorchDispatchMode):
+    """Bytes that operators write, counted: what a machine does, without its clock."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bytes = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if isinstance(result, torch.Tensor) and not func.is_view and "empty" not in func.name():
+            self.bytes += result.numel() * result.element_size()
+        return result
+
+
+def test_densification_writes_every_row_about_once_however_many_there_are() -> None:
+    # 4 % grow: signed is U(0, 5e-4), above 4.7e-4 for 6 % of the two thirds that are divided by 1. A row is 708 bytes:
+    # three times 58 floats, statistics; a quarter are pruned. What splats are chosen by (scales, sizes, gradients,
+    # masks, 8 bytes of index) comes on top, a few bytes each. One step after another copies everything three times.
+    densify = GradDensify(grad_threshold=4.7e-4)
+
+    def written_per_byte_held(n: int, step: Callable[..., DensifyCounts]) -> float:
+        state = crowd(n, seed=2)
+        with Written() as written:
+            step(state, densify, iteration=600, extent=1.0, white=False)
+        return written.bytes / sum(len(data) for data in bytes_of(state).values())
+
+    few, many = (written_per_byte_held(n, densify_and_prune) for n in (4_000, 100_000))
+    assert many == pytest.approx(few, rel=0.02)
+    assert many < 1.3
+    assert written_per_byte_held(4_000, densify_step_by_step) > 3

@@ -14,8 +14,7 @@ from torch import Tensor
 from gs2d.errors import DivergedError
 from gs2d.geometry import quats_to_matrices
 from gs2d.recipe import GradDensify
-from gs2d.splats import Splats
-from gs2d.train.rows import append_rows, keep_rows
+from gs2d.train.rows import append_rows
 from gs2d.train.state import Moments, Statistics, TrainState
 
 
@@ -73,23 +72,33 @@ def densify_and_prune(
     DivergedError
         If no splat would be left.
     """
-    to_clone, to_split = _select(state, densify, extent)
-    _append_clones(state, to_clone)
-    _append_children(state, to_split, densify)
-    parents = torch.zeros(len(state.splats), dtype=torch.bool, device=state.splats.device)
-    parents[: len(to_split)] = to_split
-    faint, large = _prunable(state.splats, densify, iteration=iteration, extent=extent, white=white)
-    faint &= ~parents
-    large &= ~parents & ~faint
-    keep = ~(parents | faint | large)
-    if not bool(keep.any()):
+    splats, sizes = state.splats, _largest(state.splats.scales)
+    clone, split = _select(state, densify, sizes, extent)
+    faint, large = _prunable(splats.opacities, sizes, densify, iteration=iteration, extent=extent, white=white)
+    parents = split.nonzero().squeeze(1)  # [P]
+    children = parents.repeat(densify.split_count)  # [C] all first children, then all second ones
+    shrunk = splats.log_scales[children] - math.log(densify.split_shrink)  # [C, 2]
+    ends = _prunable(
+        splats.opacities[children], _largest(shrunk.exp()), densify, iteration=iteration, extent=extent, white=white
+    )
+    means = _scattered(state, children)  # draws for all children, whether they live or not
+    keep, living = ~(split | faint | large), ~(ends[0] | ends[1])
+    cloned = (clone & keep).nonzero().squeeze(1)
+    counts = _counts(clone, split, (faint, large), ends)
+    if not bool(keep.any()) and not len(cloned) and not bool(living.any()):
         raise DivergedError(
-            f"all {int((faint | large).sum())} splats were pruned at iteration {iteration}: none has opacity >= "
-            f"{densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or opacity_cull"
+            f"all {counts.pruned_faint + counts.pruned_large} splats were pruned at iteration {iteration}: none has "
+            f"opacity >= {densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or "
+            "opacity_cull"
         )
-    keep_rows(state, keep)
+    rows = torch.cat([cloned, children[living]])
+    new = splats.rows(rows)
+    new.means[len(cloned) :] = means[living]
+    new.log_scales[len(cloned) :] = shrunk[living]
+    state.statistics = None  # of rows that are no more
+    append_rows(state, new, {name: group[rows] for name, group in state.groups.items()}, keep=keep)
     state.statistics = Statistics.zeros(state.splats)
-    return DensifyCounts(int(to_clone.sum()), int(to_split.sum()), int(faint.sum()), int(large.sum()))
+    return counts
 
 
 @torch.no_grad()
@@ -103,13 +112,13 @@ def limit_opacity(state: TrainState, ceiling: float) -> None:
         )
 
 
-def _select(state: TrainState, densify: GradDensify, extent: float) -> tuple[Tensor, Tensor]:
+def _select(state: TrainState, densify: GradDensify, sizes: Tensor, extent: float) -> tuple[Tensor, Tensor]:
     """Rows to clone and rows to split, bool [N] each."""
     statistics = state.statistics
     assert statistics is not None
     count = statistics.count.clamp(min=1.0)  # never seen: sum 0, mean 0
     signed, absolute = statistics.signed / count, statistics.absolute / count
-    small = state.splats.scales.amax(dim=1) <= densify.percent_dense * extent
+    small = sizes <= densify.percent_dense * extent
     for_split, split_threshold = (
         (absolute, densify.abs_threshold) if densify.absolute else (signed, densify.grad_threshold)
     )
@@ -126,34 +135,46 @@ def _select(state: TrainState, densify: GradDensify, extent: float) -> tuple[Ten
     return to_clone, to_split
 
 
-def _append_clones(state: TrainState, mask: Tensor) -> None:
-    """Exact copies with the memberships of the originals."""
-    append_rows(state, state.splats.rows(mask), {name: group[mask] for name, group in state.groups.items()})
+def _scattered(state: TrainState, rows: Tensor) -> Tensor:
+    """A point [M, 3] wu drawn from the Gaussian of each of these splats, in its plane."""
+    splats = state.splats
+    if len(rows) == 0:
+        return splats.means[rows]
+    draws = torch.randn(len(rows), 2, generator=state.generator, dtype=splats.dtype).to(splats.device)
+    in_plane = draws * splats.log_scales[rows].exp()  # [M, 2] wu
+    frames = quats_to_matrices(splats.quats[rows])[:, :, :2]  # [M, 3, 2] columns t_u, t_v
+    return splats.means[rows] + (frames * in_plane[:, None, :]).sum(dim=2)
 
 
-def _append_children(state: TrainState, mask: Tensor, densify: GradDensify) -> None:
-    """Children of each marked splat (bool [<= N]), drawn from its Gaussian in its plane; the parents stay for now."""
-    parents = mask.nonzero().squeeze(1)
-    if len(parents) == 0:
-        return
-    rows = parents.repeat(densify.split_count)
-    children = state.splats.rows(rows)
-    draws = torch.randn(len(rows), 2, generator=state.generator, dtype=children.dtype).to(children.device)
-    in_plane = draws * children.scales  # [M, 2] wu
-    frames = quats_to_matrices(children.quats)[:, :, :2]  # [M, 3, 2] columns t_u, t_v
-    children.means += (frames * in_plane[:, None, :]).sum(dim=2)
-    children.log_scales -= math.log(densify.split_shrink)
-    append_rows(state, children, {name: group[rows] for name, group in state.groups.items()})
+def _largest(scales: Tensor) -> Tensor:
+    """The larger of s_u and s_v, [M] wu."""
+    return torch.maximum(scales[:, 0], scales[:, 1])
 
 
 def _prunable(
-    splats: Splats, densify: GradDensify, *, iteration: int, extent: float, white: bool
+    opacities: Tensor, sizes: Tensor, densify: GradDensify, *, iteration: int, extent: float, white: bool
 ) -> tuple[Tensor, Tensor]:
-    """Splats that are too faint, and splats that are too large, bool [N] each."""
-    faint = splats.opacities < densify.opacity_cull
+    """Splats that are too faint, and splats that are too large, bool [M] each."""
+    faint = opacities < densify.opacity_cull
     if densify.spares_faint(iteration, white=white):
         faint = torch.zeros_like(faint)
-    large = splats.scales.amax(dim=1) > densify.scale_cull * extent
+    large = sizes > densify.scale_cull * extent
     if iteration <= densify.reset_every:
         large = torch.zeros_like(large)
     return faint, large
+
+
+def _counts(
+    clone: Tensor, split: Tensor, ends: tuple[Tensor, Tensor], ends_of_children: tuple[Tensor, Tensor]
+) -> DensifyCounts:
+    """What happened, of old splats, clones and children together; a faint one that is large too counts as faint."""
+    faint, large = ends
+    copies = (~split).long() + clone.long()  # [N] a splat that is not split and its clone have one fate
+    child_faint, child_large = ends_of_children
+    figures = (
+        clone.sum(),
+        split.sum(),
+        (copies * faint).sum() + child_faint.sum(),
+        (copies * (large & ~faint)).sum() + (child_large & ~child_faint).sum(),
+    )
+    return DensifyCounts(*torch.stack(figures).tolist())

@@ -1,4 +1,7 @@
-"""The only two functions that change N: parameters, moments, statistics and row groups move together or not at all."""
+"""The only two functions that change N: parameters, moments, statistics and row groups move together or not at all.
+
+Either is one pass: what stays of each tensor is gathered once, straight into storage that has room for what comes.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +18,13 @@ from gs2d.train.state import TrainState
 
 def keep_rows(state: TrainState, mask: Tensor) -> None:
     """Drop every row where ``mask`` (bool [N]) is False; the others keep their order."""
-    check_shapes({"means": (state.splats.means, "N 3"), "mask": (mask, "N")})
-    if mask.dtype != torch.bool:
-        raise ShapeError(f"mask must be bool [N], got {mask.dtype}")
-    state.splats = state.splats.rows(mask)
-    for moments in state.moments.values():
-        moments.mean, moments.square = moments.mean[mask], moments.square[mask]
-    state.groups = {name: group[mask] for name, group in state.groups.items()}
-    if state.statistics is not None:
-        for name, tensor in vars(state.statistics).items():
-            setattr(state.statistics, name, tensor[mask])
+    append_rows(state, _no_rows(state.splats), keep=mask)
 
 
-def append_rows(state: TrainState, splats: Splats, groups: Mapping[str, Tensor] | None = None) -> None:
+@torch.no_grad()
+def append_rows(
+    state: TrainState, splats: Splats, groups: Mapping[str, Tensor] | None = None, *, keep: Tensor | None = None
+) -> None:
     """Append M splats: zero moments and statistics.
 
     Parameters
@@ -38,23 +35,52 @@ def append_rows(state: TrainState, splats: Splats, groups: Mapping[str, Tensor] 
     groups : mapping of name to bool Tensor [M], optional
         Membership of the new rows. Groups of the state that are not named get False; a new name becomes a group in
         which no old row is.
+    keep : Tensor [N] bool, optional
+        Drop the old rows where it is False, in the same pass.
     """
     groups = {} if groups is None else groups
     check_shapes({"means": (splats.means, "M 3")} | {f"group {k}": (mask, "M") for k, mask in groups.items()})
-    old, new = len(state.splats), len(splats)
+    rows = _Rows(state, len(splats), keep)
     added = dict(splats.items())
-    state.splats = Splats(**{name: torch.cat([t, added[name].detach()]) for name, t in state.splats.items()})
+    state.splats = Splats(**{name: rows.of(t.detach(), added[name].detach()) for name, t in state.splats.items()})
     for moments in state.moments.values():
-        moments.mean, moments.square = _pad(moments.mean, new), _pad(moments.square, new)
+        moments.mean = rows.of(moments.mean)
+        moments.square = rows.of(moments.square)
     if state.statistics is not None:
         for name, tensor in vars(state.statistics).items():
-            setattr(state.statistics, name, _pad(tensor, new))
-    device = state.splats.device
-    for name in [*state.groups, *(name for name in groups if name not in state.groups)]:
-        before = state.groups.get(name, torch.zeros(old, dtype=torch.bool, device=device))
-        after = groups.get(name, torch.zeros(new, dtype=torch.bool, device=device))
-        state.groups[name] = torch.cat([before, after])
+            setattr(state.statistics, name, rows.of(tensor))
+    new_names = [name for name in groups if name not in state.groups]
+    nowhere = torch.zeros(rows.before if new_names else 0, dtype=torch.bool, device=state.splats.device)
+    old_groups = state.groups | dict.fromkeys(new_names, nowhere)
+    state.groups = {name: rows.of(group, groups.get(name)) for name, group in old_groups.items()}
 
 
-def _pad(tensor: Tensor, rows: int) -> Tensor:
-    return torch.cat([tensor, tensor.new_zeros(rows, *tensor.shape[1:])])
+class _Rows:
+    """Which old rows stay, and how many new ones follow them."""
+
+    def __init__(self, state: TrainState, added: int, keep: Tensor | None) -> None:
+        self.before, self.added = len(state.splats), added
+        self.kept: Tensor | None = None  # [K] int64; None = all
+        if keep is not None:
+            check_shapes({"means": (state.splats.means, "N 3"), "mask": (keep, "N")})
+            if keep.dtype != torch.bool:
+                raise ShapeError(f"mask must be bool [N], got {keep.dtype}")
+            kept = keep.nonzero().squeeze(1)
+            self.kept = None if len(kept) == self.before else kept
+
+    def of(self, old: Tensor, new: Tensor | None = None) -> Tensor:
+        """The rows of ``old`` that stay, then those of ``new``, or zeros."""
+        if self.kept is None and self.added == 0:
+            return old
+        stay = self.before if self.kept is None else len(self.kept)
+        result = old.new_empty(stay + self.added, *old.shape[1:])
+        if self.kept is None:
+            result[:stay] = old
+        else:
+            torch.index_select(old, 0, self.kept, out=result[:stay])
+        result[stay:] = 0 if new is None else new
+        return result
+
+
+def _no_rows(splats: Splats) -> Splats:
+    return Splats(**{name: tensor[:0] for name, tensor in splats.items()})
