@@ -27,7 +27,7 @@ template <class V> struct Hit {
 // dx, dy: pixel centre - projected splat centre, px.
 template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h;
-    const V Q = fma(s.az, dx, fma(s.bz, dy, V(1))), rq = V(1) / Q;
+    const V Q = fma(s.az, dx, fma(s.bz, dy, V(1))), rq = reciprocal(Q);
     const V u = fma(s.au, dx, s.bu * dy) * rq, v = fma(s.av, dx, s.bv * dy) * rq;
     const V rho3d = fma(u, u, v * v), rho2d = fma(dx, dx, dy * dy) * k.inv_lowpass2;
     h.ray = (Q > V(0)) & (rho3d <= rho2d);
@@ -95,7 +95,8 @@ template <class V> struct PairSums {
 
 // One splat at one pixel, front to back. T is 0 where the pixel has stopped (or does not exist).
 // Geo: normal or depth images have gradients. Dist: the distortion has. Abs: the AbsGS signal is wanted.
-template <bool Geo, bool Dist, bool Abs, class V>
+// Column: dx is the same in all calls of these sums; finish_column multiplies by it once instead.
+template <bool Geo, bool Dist, bool Abs, bool Column = false, class V>
 GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
                            const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
     const V alpha = min(h.alpha, k.alpha_max), depth = s.zc * h.rq;
@@ -117,7 +118,7 @@ GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const H
     }
     S = fnma(w, along, S);
     // d alpha / d ln(alpha) = the unclamped alpha: the ceiling passes gradients
-    const V gl = keep(goes_on, fma(T, along, -(S / (V(1) - alpha))) * h.alpha);
+    const V gl = keep(goes_on, fma(T, along, -quotient(S, V(1) - alpha)) * h.alpha);
     T = keep(goes_on, after);
 
     sums.ln_alpha = sums.ln_alpha + gl;
@@ -132,15 +133,19 @@ GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const H
         gQ = fnma(gzc, depth, gQ);
     }
     gQ = keep(h.ray, gQ);
-    sums.X = sums.X + tu, sums.Xx = fma(tu, dx, sums.Xx), sums.Xy = fma(tu, dy, sums.Xy);
-    sums.Y = sums.Y + tv, sums.Yx = fma(tv, dx, sums.Yx), sums.Yy = fma(tv, dy, sums.Yy);
-    sums.Q = sums.Q + gQ, sums.Qx = fma(gQ, dx, sums.Qx), sums.Qy = fma(gQ, dy, sums.Qy);
+    const auto along_x = [&](V g, V& sum) {
+        if constexpr (!Column) sum = fma(g, dx, sum);
+    };
+    sums.X = sums.X + tu, along_x(tu, sums.Xx), sums.Xy = fma(tu, dy, sums.Xy);
+    sums.Y = sums.Y + tv, along_x(tv, sums.Yx), sums.Yy = fma(tv, dy, sums.Yy);
+    sums.Q = sums.Q + gQ, along_x(gQ, sums.Qx), sums.Qy = fma(gQ, dy, sums.Qy);
     if constexpr (Abs) {
         const V px = fma(s.au, tu, fma(s.av, tv, -(s.az * gQ))), py = fma(s.bu, tu, fma(s.bv, tv, -(s.bz * gQ)));
         sums.abs_x = sums.abs_x + abs(h.Q * px), sums.abs_y = sums.abs_y + abs(h.Q * py);
     }
     const V filtered = select(h.ray, V(0), gl);
-    sums.lowpass_x = fma(filtered, dx, sums.lowpass_x), sums.lowpass_y = fma(filtered, dy, sums.lowpass_y);
+    sums.lowpass_x = Column ? sums.lowpass_x + filtered : fma(filtered, dx, sums.lowpass_x);
+    sums.lowpass_y = fma(filtered, dy, sums.lowpass_y);
 }
 
 // The part of it that reaches the splat's colour: all that is needed while everything else is frozen.
@@ -150,6 +155,11 @@ GS2D_HD void composite_color_vjp(const Hit<V>& h, const BlendLimits<V>& k, Vec3<
     const auto goes_on = after >= k.transmittance_min;
     sum = axpy(keep(goes_on, alpha * T), g_color, sum);
     T = keep(goes_on, after);
+}
+
+// For sums of `Column` calls: what they have left out.
+template <class V> GS2D_HD void finish_column(V dx, PairSums<V>& a) {
+    a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Qx = dx * a.Q, a.lowpass_x = dx * a.lowpass_x;
 }
 
 // dL/d(record) from the sums, per lane (the sum over lanes is left to the caller).

@@ -104,7 +104,7 @@ class BlendVjpArguments(ctypes.Structure):
         ("view", View),
         *_pointers("records", "entries", "ranges", "tiles", "seen"),
         *_pointers("color", "alpha", "normal", "depth_mean", "distortion", "final_T", "moments"),
-        *_pointers(*(f"g_{name}" for name in IMAGES), "gradients", "extras"),
+        *_pointers(*(f"g_{name}" for name in IMAGES), "slots", "gradients", "extras"),
     )
 
 

@@ -62,14 +62,15 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
         uint seen[HALVES] = {0u, 0u};
         for (uint todo = wanted; todo; todo &= todo - 1) {
             const int j = __ffs(int(todo)) - 1;
+            const uint bit = todo & (0u - todo);
             const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
-            const float inverse_zc = DIST ? 1.f / s.zc : 0.f;
+            const float inverse_zc = DIST ? reciprocal(s.zc) : 0.f;
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
-                if (!(hits[h] >> j & 1u)) continue;  // the same for all lanes
+                if (!(hits[h] & bit)) continue;  // the same for all lanes
                 const Hit<float> hit = intersect(s, x - s.cx, y + float(4 * h) - s.cy, limits);
                 const bool saw = composite(s, hit.alpha, s.zc * hit.rq, inverse_zc * hit.Q, limits, p[h]);
-                seen[h] |= uint(saw) << j;
+                seen[h] |= saw ? bit : 0u;
             }
         }
         __syncwarp();  // before the records are overwritten
@@ -87,13 +88,20 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
         if (at.inside[h]) write_pixel<DIST>(a, at.x, at.y + 4 * h, p[h]);
 }
 
+// Blocks per multiprocessor to compile for: 8 leave 64 registers a thread, with which sm_75 would spill.
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
+constexpr int BLOCKS = 6;
+#else
+constexpr int BLOCKS = 8;
+#endif
+
 // The distortion's three moments cost registers and time; without it `distortion` and `moments` are not touched.
-extern "C" __global__ void __launch_bounds__(128) blend_forward(BlendArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_forward(BlendArguments a) {
     __shared__ float4 records[4][4][32];  // warp, quarter of a record, entry
     blend<false>(a, records[threadIdx.x >> 5]);
 }
 
-extern "C" __global__ void __launch_bounds__(128) blend_forward_distortion(BlendArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_forward_distortion(BlendArguments a) {
     __shared__ float4 records[4][4][32];
     blend<true>(a, records[threadIdx.x >> 5]);
 }

@@ -16,8 +16,9 @@ struct BlendVjpArguments {
     const uint* seen;
     const float *color, *alpha, *normal, *depth_mean, *distortion, *final_T, *moments;  // of the forward pass
     const float *g_color, *g_alpha, *g_normal, *g_depth_mean, *g_depth_median, *g_distortion;  // null: no gradient
-    float* gradients;  // [N, 16], zeros on entry
-    float* extras;     // [N, 4]: low-pass centre, absolute densification signal; zeros on entry
+    const int64* slots;  // [entries]: the candidate that each was, or null
+    float* gradients;    // [N, 16], zeros on entry; with slots [4 * candidates, 16]
+    float* extras;       // the same rows of 4: low-pass centre, absolute densification signal
 };
 
 // One value of a plane that may be absent.
@@ -53,116 +54,148 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
     return g;
 }
 
-// One exchange of the transposing reduction: the lanes with `STEP` set keep the upper half of the values.
-template <int WIDTH, int STEP> __device__ __forceinline__ void fold(float (&v)[16], int lane) {
-    const bool upper = lane & STEP;
+// Sums of N = 16, 4 or 2 values over the warp, by exchange: with each step a lane keeps half of the values. Lane l ends with
+// the sum of value l / (32 / N).
+template <int N, int STEP = 16> __device__ __forceinline__ float transpose_reduce(float* v, int lane) {
+    if constexpr (N == 1) {
 #pragma unroll
-    for (int k = 0; k < WIDTH; ++k) {
-        const float kept = upper ? v[k + WIDTH] : v[k], given = upper ? v[k] : v[k + WIDTH];
-        v[k] = kept + __shfl_xor_sync(FULL_MASK, given, STEP);
+        for (int step = STEP; step > 0; step >>= 1) v[0] = v[0] + __shfl_xor_sync(FULL_MASK, v[0], step);
+        return v[0];
+    } else {
+        const bool upper = lane & STEP;
+#pragma unroll
+        for (int k = 0; k < N / 2; ++k) {
+            const float kept = upper ? v[k + N / 2] : v[k], given = upper ? v[k] : v[k + N / 2];
+            v[k] = kept + __shfl_xor_sync(FULL_MASK, given, STEP);
+        }
+        return transpose_reduce<N / 2, STEP / 2>(v, lane);
     }
 }
 
-// Sum over the warp of value lane / 2.
-__device__ __forceinline__ float transpose_reduce(float (&v)[16], int lane) {
-    fold<8, 16>(v, lane), fold<4, 8>(v, lane), fold<2, 4>(v, lane), fold<1, 2>(v, lane);
-    return v[0] + __shfl_xor_sync(FULL_MASK, v[0], 1);
-}
-
-__device__ __forceinline__ float sum_over_warp(float v) {
-#pragma unroll
-    for (int step = 16; step > 0; step >>= 1) v = v + __shfl_xor_sync(FULL_MASK, v, step);
-    return v;
-}
-
+// `row` is the splat's, or with slots the one of this entry and warp.
 template <bool ABS>
-__device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 splat, const RecordGradient<float>& g, int lane) {
+__device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 row, const RecordGradient<float>& g, int lane) {
     float v[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz, g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
-    const float sum = transpose_reduce(v, lane);
-    if (!(lane & 1)) atomicAdd(a.gradients + 16 * splat + (lane >> 1), sum);
-    if (ABS || __any_sync(FULL_MASK, g.lowpass_cx != 0.f || g.lowpass_cy != 0.f)) {  // the same for all lanes
-        const float x = sum_over_warp(g.lowpass_cx), y = sum_over_warp(g.lowpass_cy);
-        float abs_x = 0.f, abs_y = 0.f;
-        if constexpr (ABS) abs_x = sum_over_warp(g.abs_x), abs_y = sum_over_warp(g.abs_y);
-        const float mine = lane == 0 ? x : lane == 1 ? y : lane == 2 ? abs_x : abs_y;
-        if (lane < (ABS ? 4 : 2)) atomicAdd(a.extras + 4 * splat + lane, mine);
+    const float sum = transpose_reduce<16>(v, lane);
+    if (!(lane & 1)) atomicAdd(a.gradients + 16 * row + (lane >> 1), sum);
+    if constexpr (ABS) {
+        float extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
+        const float mine = transpose_reduce<4>(extra, lane);
+        if (!(lane & 7)) atomicAdd(a.extras + 4 * row + (lane >> 3), mine);
+    } else if (__any_sync(FULL_MASK, g.lowpass_cx != 0.f || g.lowpass_cy != 0.f)) {  // the same for all lanes
+        float extra[2] = {g.lowpass_cx, g.lowpass_cy};
+        const float mine = transpose_reduce<2>(extra, lane);
+        if (!(lane & 15)) atomicAdd(a.extras + 4 * row + (lane >> 4), mine);
     }
 }
+
+// What the inner loop needs of a pixel's upstream gradient, in shared memory: each thread reads what it wrote itself.
+struct Upstream {
+    float4 color[HALVES][128];   // red, green, blue, alpha
+    float4 normal[HALVES][128];  // and depth
+    __device__ __forceinline__ void put(int h, const PixelGradient<float>& g) {
+        color[h][threadIdx.x] = {g.red, g.green, g.blue, g.alpha}, normal[h][threadIdx.x] = {g.nx, g.ny, g.nz, g.depth};
+    }
+    template <bool GEO> __device__ __forceinline__ void get(int h, PixelGradient<float>& g) const {
+        const float4 c = color[h][threadIdx.x];
+        g.red = c.x, g.green = c.y, g.blue = c.z, g.alpha = c.w;
+        if constexpr (!GEO) return;
+        const float4 n = normal[h][threadIdx.x];
+        g.nx = n.x, g.ny = n.y, g.nz = n.z, g.depth = n.w;
+    }
+};
+
+struct Staged {  // of a warp: 32 splats
+    float4 records[4][32];
+    uint rows[32];
+};
 
 template <bool GEO, bool DIST, bool ABS>
-__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, float4 (*records)[32]) {
+__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream& upstream) {
     const Place at = place_of(a.view, a.tiles);
     const BlendLimits<float> limits = limits_of(a.view);
-    PixelGradient<float> g[HALVES];
+    PixelGradient<float> g[HALVES];  // in registers only what is not in `upstream`
     float T[HALVES], S[HALVES];
 #pragma unroll
     for (int h = 0; h < HALVES; ++h) {
         g[h] = {}, T[h] = 0.f, S[h] = 0.f;
-        if (!at.inside[h]) continue;
-        T[h] = 1.f;
-        g[h] = upstream_of<GEO, DIST>(a, int64(at.y + 4 * h) * a.view.width + at.x, S[h]);
+        if (at.inside[h]) {
+            T[h] = 1.f;
+            g[h] = upstream_of<GEO, DIST>(a, int64(at.y + 4 * h) * a.view.width + at.x, S[h]);
+        }
+        upstream.put(h, g[h]);
     }
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
     const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];
 
     for (int64 i = begin; i < end; i += 32) {
         const uint* words = a.seen + word_of(begin, at.tile, (i - begin) >> 5);
-        const uint hits[HALVES] = {words[at.sub_block[0]], words[at.sub_block[1]]};
+        const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane), uniform(words[at.sub_block[1]], at.lane)};
         const uint wanted = hits[0] | hits[1];
         if (wanted == 0u) continue;  // the same for all lanes
-        const uint entry = i + at.lane < end ? a.entries[i + at.lane] : 0u;
         if (wanted >> at.lane & 1u) {
-            fetch_record(a.records, entry >> 8, records, at.lane);
-            records[4][at.lane].x = __int_as_float(int(entry >> 8));
+            const uint splat = a.entries[i + at.lane] >> 8;
+            fetch_record(a.records, splat, staged.records, at.lane);
+            staged.rows[at.lane] = a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
         }
         __syncwarp();
         for (uint todo = wanted; todo; todo &= todo - 1) {
             const int j = __ffs(int(todo)) - 1;
-            const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
-            const float inverse_zc = DIST ? 1.f / s.zc : 0.f;
+            const uint bit = todo & (0u - todo);
+            const auto& r = staged.records;
+            const Record<float> s = record_of(r[0][j], r[1][j], r[2][j], r[3][j]);
+            const float inverse_zc = DIST ? reciprocal(s.zc) : 0.f, dx = x - s.cx;
             PairSums<float> sums = {};
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
-                if (!(hits[h] >> j & 1u)) continue;
-                const float dx = x - s.cx, dy = y + float(4 * h) - s.cy;
+                if (!(hits[h] & bit)) continue;
+                const float dy = y + float(4 * h) - s.cy;
                 const Hit<float> hit = intersect(s, dx, dy, limits);
-                composite_vjp<GEO, DIST, ABS>(s, inverse_zc, dx, dy, hit, limits, g[h], T[h], S[h], sums);
+                upstream.get<GEO>(h, g[h]);
+                composite_vjp<GEO, DIST, ABS, true>(s, inverse_zc, dx, dy, hit, limits, g[h], T[h], S[h], sums);
             }
-            add_gradient<ABS>(a, __float_as_int(records[4][j].x), finish(s, sums, limits), at.lane);
+            finish_column(dx, sums);
+            add_gradient<ABS>(a, staged.rows[j], finish(s, sums, limits), at.lane);
         }
-        __syncwarp();
+        __syncwarp();  // before the records are overwritten
     }
 }
 
 // GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is wanted.
-extern "C" __global__ void __launch_bounds__(128) blend_vjp_color(BlendVjpArguments a) {
-    __shared__ float4 records[4][5][32];  // warp, quarter of a record (and the row), entry
-    blend_vjp<false, false, false>(a, records[threadIdx.x >> 5]);
+extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream upstream;
+    blend_vjp<false, false, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128) blend_vjp_color_abs(BlendVjpArguments a) {
-    __shared__ float4 records[4][5][32];  // warp, quarter of a record (and the row), entry
-    blend_vjp<false, false, true>(a, records[threadIdx.x >> 5]);
+extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color_abs(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream upstream;
+    blend_vjp<false, false, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128) blend_vjp_geometry(BlendVjpArguments a) {
-    __shared__ float4 records[4][5][32];  // warp, quarter of a record (and the row), entry
-    blend_vjp<true, false, false>(a, records[threadIdx.x >> 5]);
+extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_geometry(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream upstream;
+    blend_vjp<true, false, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128) blend_vjp_geometry_abs(BlendVjpArguments a) {
-    __shared__ float4 records[4][5][32];  // warp, quarter of a record (and the row), entry
-    blend_vjp<true, false, true>(a, records[threadIdx.x >> 5]);
+extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_geometry_abs(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream upstream;
+    blend_vjp<true, false, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128) blend_vjp_distortion(BlendVjpArguments a) {
-    __shared__ float4 records[4][5][32];  // warp, quarter of a record (and the row), entry
-    blend_vjp<true, true, false>(a, records[threadIdx.x >> 5]);
+extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream upstream;
+    blend_vjp<true, true, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
-extern "C" __global__ void __launch_bounds__(128) blend_vjp_distortion_abs(BlendVjpArguments a) {
-    __shared__ float4 records[4][5][32];  // warp, quarter of a record (and the row), entry
-    blend_vjp<true, true, true>(a, records[threadIdx.x >> 5]);
+extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion_abs(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream upstream;
+    blend_vjp<true, true, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 }  // namespace gs2d

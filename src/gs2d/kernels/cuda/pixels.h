@@ -16,6 +16,9 @@ __device__ __forceinline__ uint or_over_warp(uint bits) {
     return bits;
 }
 
+// A word that is the same for all lanes, in a form that lets the compiler know it: branches on it are uniform.
+__device__ __forceinline__ uint uniform(uint word, int lane) { return __ballot_sync(FULL_MASK, word >> lane & 1u); }
+
 struct Place {  // of a thread
     int lane, warp, tile;
     int x, y;              // first pixel
