@@ -82,9 +82,12 @@ def _fused_operations(backend_name: str, device: torch.device) -> FusedOperation
     if backend_name == "cpu":
         return FusedOperations(ops.photometric, ops.normal_consistency, ops.masked_mean)
     if backend_name == "cuda":
-        functions = (cuda_ops.photometric, cuda_ops.normal_consistency, cuda_ops.masked_mean)
         launcher = launch.launcher_for(device)
-        return FusedOperations(*(partial(function, launcher=launcher) for function in functions))
+        return FusedOperations(
+            partial(cuda_ops.photometric, launcher=launcher),
+            partial(cuda_ops.normal_consistency, launcher=launcher),
+            partial(cuda_ops.masked_mean, launcher=launcher),
+        )
     return None
 
 

@@ -25,9 +25,10 @@ from gs2d.train.cached_views import choose_evaluator
 from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
 from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
+from gs2d.train.optimizer_fused import fused_adam_step
 from gs2d.train.state import Statistics, TrainState
-from gs2d.train.targets import Targets
-from gs2d.train.views import Evaluated, Evaluator, WholeViews, diverged, finite, raster_settings
+from gs2d.train.targets import DeviceTargets, Targets, TargetSource
+from gs2d.train.views import Evaluated, Evaluator, WholeViews, check_losses, diverged, finite, raster_settings, waits
 
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
 
@@ -43,15 +44,15 @@ class Trainer:
     recipe : Recipe
     protocol : Protocol
     backend : str or Backend
-        Rasterizer: "auto", "cpu" or "reference".
+        Rasterizer: "auto", "cuda", "cpu" or "reference". Its device is where everything is kept.
     on_event : callable
         Gets every event; the state is whole then, so ``state.state_dict()`` may be saved. What it raises stops the run.
     state : TrainState, optional
         To go on from; without it training starts anew from ``recipe.seed``.
     progress_every : int
         Iterations between Progress events (the last of a stage always sends one).
-    target_bytes : int
-        Memory for photographs as float tensors.
+    target_bytes : int, optional
+        Memory for photographs: float tensors on the CPU (default 512 MiB), bytes on a GPU (default 2 GiB).
     stage2_cache_bytes : int
         Memory for cached views (cpu backend, stages that train only the colours of a row group); 0 = none. The first
         views that fit are cached. The result depends on it, by rounding.
@@ -74,7 +75,7 @@ class Trainer:
         on_event: OnEvent = lambda event: None,
         state: TrainState | None = None,
         progress_every: int = 10,
-        target_bytes: int = 1 << 29,
+        target_bytes: int | None = None,
         stage2_cache_bytes: int = 1 << 30,
         dtype: torch.dtype = torch.float32,
     ) -> None:
@@ -85,15 +86,9 @@ class Trainer:
         self._on_event, self._progress_every = on_event, progress_every
         self._pending: list[events.Event] = []
         self.state = self._new_state(dtype) if state is None else self._checked(state)
-        self._targets = Targets(
-            scene.train,
-            protocol.background,
-            use_masks=protocol.use_mask_in_training,
-            with_maps=self.backend.name == "cpu",
-            dtype=self.state.splats.dtype,
-            device=self.state.splats.device,
-            limit_bytes=target_bytes,
-        )
+        self.state.move_to(self.backend.device)
+        self._targets = self._make_targets(target_bytes)
+        self._adam_step = fused_adam_step if self.backend.name == "cuda" else adam_step
         self._whole = WholeViews(scene, self.recipe, protocol, self.backend, self._targets)
         self._stage2_cache_bytes = stage2_cache_bytes
         self._evaluator: Evaluator | None = None  # of the stage under way, from its first iteration here
@@ -147,7 +142,8 @@ class Trainer:
         Raises
         ------
         DivergedError
-            NaN or infinity in the loss, a gradient or a parameter; names the iteration, the stage and the attribute.
+            NaN or infinity in the loss, a gradient or a parameter; names the iteration, the stage and the attribute. On
+            a GPU, whose host does not wait for it, at the next Progress event, before anything could be saved.
         """
         state = self.state
         stage, iteration = self.recipe.stages[state.stage], state.step + 1
@@ -161,13 +157,31 @@ class Trainer:
         if not rebuilt:
             limited = any(isinstance(event, events.OpacityLimited) for event in happened)
             skip = ("opacity_logits",) if limited else ()
-            adam_step(state, stage, result.gradients, rates, skip=skip, rows=result.rows)
+            self._adam_step(state, stage, result.gradients, rates, skip=skip, rows=result.rows)
         state.step = iteration
         for event in happened:
             self._on_event(event)
         if iteration % self._progress_every == 0 or iteration == stage.iterations:
-            self._check_parameters(stage, tuple(stage.train))  # gradients are checked each time
-            self._on_event(self._progress(stage, iteration, result.losses, rates))
+            losses = check_losses(stage, iteration, result.losses)
+            self._check_parameters(stage, tuple(stage.train))  # on a CPU gradients are checked each time
+            self._on_event(self._progress(stage, iteration, losses, rates))
+
+    def _make_targets(self, limit_bytes: int | None) -> TargetSource:
+        """The photographs, where the splats are."""
+        views, background, splats = self.scene.train, self.protocol.background, self.state.splats
+        use_masks, dtype, device = self.protocol.use_mask_in_training, splats.dtype, splats.device
+        if waits(device):
+            limit = 1 << 31 if limit_bytes is None else limit_bytes
+            return DeviceTargets(views, background, use_masks=use_masks, device=device, dtype=dtype, limit_bytes=limit)
+        return Targets(
+            views,
+            background,
+            use_masks=use_masks,
+            with_maps=self.backend.name == "cpu",
+            dtype=dtype,
+            device=device,
+            limit_bytes=1 << 29 if limit_bytes is None else limit_bytes,
+        )
 
     def _new_state(self, dtype: torch.dtype) -> TrainState:
         generator = torch.Generator().manual_seed(self.recipe.seed)

@@ -101,18 +101,18 @@ class TrainState:
         return self.queue.pop()
 
     def state_dict(self) -> dict[str, Any]:
-        """A deep copy in tensors and plain Python (``torch.load(..., weights_only=True)`` reads it)."""
+        """A deep copy in the host's memory, in tensors and plain Python (``torch.load(..., weights_only=True)``)."""
         return {
             "format": FORMAT,
-            "splats": {name: tensor.detach().clone() for name, tensor in self.splats.items()},
+            "splats": {name: _copy(tensor) for name, tensor in self.splats.items()},
             "moments": {
-                name: {"mean": m.mean.clone(), "square": m.square.clone(), "steps": m.steps}
+                name: {"mean": _copy(m.mean), "square": _copy(m.square), "steps": m.steps}
                 for name, m in self.moments.items()
             },
-            "groups": {name: mask.clone() for name, mask in self.groups.items()},
+            "groups": {name: _copy(mask) for name, mask in self.groups.items()},
             "statistics": None
             if self.statistics is None
-            else {name: tensor.clone() for name, tensor in vars(self.statistics).items()},
+            else {name: _copy(tensor) for name, tensor in vars(self.statistics).items()},
             "stage": self.stage,
             "step": self.step,
             "entered": self.entered,
@@ -155,6 +155,15 @@ class TrainState:
         state.check()
         return state
 
+    def move_to(self, device: torch.device | str) -> None:
+        """Move all tensors to a device; the generator stays on the CPU, so that its draws do not depend on it."""
+        self.splats = self.splats.to(device)
+        for moments in self.moments.values():
+            moments.mean, moments.square = moments.mean.to(device), moments.square.to(device)
+        self.groups = {name: mask.to(device) for name, mask in self.groups.items()}
+        if self.statistics is not None:
+            self.statistics = Statistics(**{k: v.to(device) for k, v in vars(self.statistics).items()})
+
     def check(self) -> None:
         """Raise ShapeError unless everything has the same N."""
         parameters = dict(self.splats.items())
@@ -167,3 +176,8 @@ class TrainState:
         if self.statistics is not None:
             arrays |= {f"statistics {name}": (tensor, "N") for name, tensor in vars(self.statistics).items()}
         check_shapes(arrays)
+
+
+def _copy(tensor: Tensor) -> Tensor:
+    """A copy in the host's memory."""
+    return tensor.detach().to("cpu", copy=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -35,6 +36,12 @@ class Target:
         """Bytes of all tensors."""
         tensors = [self.image, self.mask, None if self.maps is None else self.maps.mean]
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors if tensor is not None)
+
+
+class TargetSource(Protocol):
+    """Targets by the index of their training view."""
+
+    def __getitem__(self, index: int) -> Target: ...
 
 
 class Targets:
@@ -77,3 +84,78 @@ class Targets:
         self._room -= target.nbytes
         self._kept[index] = target
         return target
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """A photograph as it was decoded."""
+
+    image: Tensor  # [H, W, 3 or 4] uint8
+    mask: Tensor | None  # [H, W] bool
+
+    @property
+    def nbytes(self) -> int:
+        return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> _Picture:
+        return _Picture(change(self.image), None if self.mask is None else change(self.mask))
+
+
+class DeviceTargets:
+    """Targets on a GPU: photographs wait there as bytes, 3 or 4 a pixel, and become floats when they are wanted.
+
+    The first ones that fit in ``limit_bytes`` stay on the device. The next ones, up to ``pinned_bytes``, stay in pinned
+    memory of the host, from which they are copied without waiting; any others are decoded anew each time.
+
+    Parameters
+    ----------
+    views : sequence of View
+    background : 3 floats in [0, 1]
+    use_masks : bool
+    device : torch.device
+    dtype : torch.dtype
+    limit_bytes, pinned_bytes : int
+    pin : callable
+        Makes a copy in pinned memory.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        background: tuple[float, float, float],
+        *,
+        use_masks: bool,
+        device: torch.device,
+        dtype: torch.dtype = torch.float32,
+        limit_bytes: int = 1 << 31,
+        pinned_bytes: int = 1 << 33,
+        pin: Callable[[Tensor], Tensor] = torch.Tensor.pin_memory,
+    ) -> None:
+        self._views, self._use_masks = views, use_masks
+        self._background = torch.tensor(background, dtype=dtype, device=device)
+        self._dtype, self._device, self._pin = dtype, device, pin
+        self._room = {"device": limit_bytes, "pinned": pinned_bytes}
+        self._kept: dict[int, _Picture] = {}
+
+    def __getitem__(self, index: int) -> Target:
+        picture = self._kept.get(index)
+        if picture is None:
+            picture = self._take_in(index)
+        there = picture.map(lambda tensor: tensor.to(self._device, non_blocking=True))
+        color = there.image[..., :3].to(self._dtype) / 255
+        if there.image.shape[2] == 4:  # as images.composite
+            color = (color - self._background) * (there.image[..., 3:].to(self._dtype) / 255) + self._background
+        return Target(color, there.mask, None)
+
+    def _take_in(self, index: int) -> _Picture:
+        """Decode a photograph, and keep it where there is room."""
+        view = self._views[index]
+        mask = view.mask() if self._use_masks else None
+        picture = _Picture(torch.tensor(view.image()), None if mask is None else torch.tensor(mask))
+        for place in ("device", "pinned"):
+            if picture.nbytes <= self._room[place]:
+                self._room[place] -= picture.nbytes
+                change = self._pin if place == "pinned" else lambda tensor: tensor.to(self._device)
+                self._kept[index] = picture.map(change)
+                return self._kept[index]
+        return picture

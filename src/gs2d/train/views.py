@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol as Interface
@@ -20,7 +21,7 @@ from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
 from gs2d.train.state import TrainState
-from gs2d.train.targets import Targets
+from gs2d.train.targets import TargetSource
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
@@ -34,8 +35,8 @@ class Evaluated:
 
     Attributes
     ----------
-    losses : mapping of kind to float
-        Weighted.
+    losses : mapping of kind to float or Tensor []
+        Weighted. Tensors on a GPU: to read them is to wait for it.
     gradients : mapping of attribute to Tensor
         Like the attributes; only of ``rows``, in their order, where those are given.
     signal : Tensor [N, 2] or [N, 4], or None
@@ -44,7 +45,7 @@ class Evaluated:
     rows : Tensor [M] int64 or None
     """
 
-    losses: Mapping[str, float]
+    losses: Mapping[str, float | Tensor]
     gradients: Mapping[str, Tensor]
     signal: Tensor | None
     radii: Tensor | None
@@ -61,7 +62,9 @@ class Evaluator(Interface):
 class WholeViews:
     """Every splat is rendered each time."""
 
-    def __init__(self, scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, targets: Targets) -> None:
+    def __init__(
+        self, scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, targets: TargetSource
+    ) -> None:
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
         self._targets = targets
 
@@ -71,7 +74,7 @@ class WholeViews:
         return raster_settings(self.protocol, self.scene.extent, degree)
 
     def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
-        """Render one view; loss and gradients, checked to be finite (DivergedError)."""
+        """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
         splats, densify = state.splats, stage.densify
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
         gather = densify is not None and iteration < densify.stop
@@ -86,13 +89,14 @@ class WholeViews:
 
     def differentiate(
         self, stage: Stage, iteration: int, index: int, output: RenderOutput, leaves: Mapping[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+    ) -> tuple[dict[str, float | Tensor], dict[str, Tensor]]:
         """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
 
         Raises
         ------
         DivergedError
-            If one of them is not finite.
+            If one of them is not finite. On a GPU nothing is looked at here, because a look waits for the device; the
+            trainer looks at losses and parameters together, before anything is reported or saved.
         """
         target = self._targets[index]
         terms = compute_losses(
@@ -107,16 +111,40 @@ class WholeViews:
             target_cache=target.maps,
         )
         loss = torch.stack(list(terms.values())).sum()
-        values = {kind: float(value.detach()) for kind, value in terms.items()}
-        if not bool(torch.isfinite(loss)):
-            raise diverged(stage, iteration, f"the loss ({', '.join(f'{k} {v:g}' for k, v in values.items())})")
+        watched = not waits(loss.device)
+        values: dict[str, float | Tensor] = {
+            kind: float(value.detach()) if watched else value.detach() for kind, value in terms.items()
+        }
+        if watched:
+            check_losses(stage, iteration, values)
         if loss.requires_grad:  # not where no splat is in the picture
             loss.backward()
         gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
+        if not watched:
+            return values, gradients
         for name, gradient in gradients.items():
             if not finite(gradient):
                 raise diverged(stage, iteration, f"the gradient of {name}")
         return values, gradients
+
+
+def waits(device: torch.device) -> bool:
+    """Whether the host would wait to look at a tensor there."""
+    return device.type != "cpu"
+
+
+def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tensor]) -> dict[str, float]:
+    """The losses as numbers.
+
+    Raises
+    ------
+    DivergedError
+        If their sum is not finite.
+    """
+    values = {kind: float(value) for kind, value in losses.items()}
+    if not math.isfinite(sum(values.values())):
+        raise diverged(stage, iteration, f"the loss ({', '.join(f'{k} {v:g}' for k, v in values.items())})")
+    return values
 
 
 def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
