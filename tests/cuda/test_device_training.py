@@ -1,0 +1,229 @@
+"""Training with the cuda backend in the emulator: the CPU's result within rounding, and a host that never waits.
+
+Tensors lie in host memory here, so what would be a copy to or a wait for the GPU is counted by operation: reading a
+value, looking up which rows are True, or making a tensor from Python numbers.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from emulate import Emulator
+from render_scenes import front_camera
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "train"))  # train_toys
+
+import train_toys
+
+from gs2d.data.scene import Scene, View
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda import launch
+from gs2d.protocols import GENERIC
+from gs2d.recipe import Recipe
+from gs2d.render import cuda
+from gs2d.render.backend import Backend, get_backend
+from gs2d.train import events, loop, views
+from gs2d.train.loop import Trainer
+from gs2d.train.targets import DeviceTargets, Targets
+
+pytestmark = pytest.mark.timeout(170)
+
+
+@pytest.fixture
+def emulated(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Backend:
+    """The cuda backend with the emulator in the place of the GPU."""
+    monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
+    return Backend("cuda", cuda.rasterize, cuda.splat_errors, "cpu")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return train_toys.make_scene()
+
+
+def cpu_backend() -> Backend:
+    try:
+        return get_backend("cpu")
+    except BackendError as error:
+        pytest.skip(str(error))
+
+
+def test_three_stages_give_the_cpu_backends_scene_within_rounding(emulated: Backend, scene: Scene) -> None:
+    """19 iterations with densifications, a reset, ranking, a clone and frozen rows; decisions and counts are equal."""
+    recipe = train_toys.short()
+    results = [
+        train_toys.train(scene, recipe, backend=backend, stage2_cache_bytes=0) for backend in (cpu_backend(), emulated)
+    ]
+    (cpu, on_cpu), (gpu, on_gpu) = results
+    counts = [[(type(e).__name__, getattr(e, "splats", None)) for e in r.events] for r in (on_cpu, on_gpu)]
+    assert counts[0] == counts[1]
+    losses = [[e.loss for e in r.events if isinstance(e, events.Progress)] for r in (on_cpu, on_gpu)]
+    assert losses[0] == pytest.approx(losses[1], rel=2e-3)
+    for (name, a), (_, b) in zip(cpu.splats.items(), gpu.splats.items(), strict=True):
+        assert float((a - b).norm()) <= 5e-3 * float(a.norm()), name
+    moved = gpu.splats.means - on_gpu.splats[0].means[:1]
+    assert float(moved.abs().max()) > 0
+
+
+def test_frozen_attributes_and_rows_stay_bit_identical(emulated: Backend, scene: Scene) -> None:
+    trainer, recorder = train_toys.train(scene, train_toys.short(), backend=emulated)
+    before, after = (recorder.at(kind, "appearance") for kind in (events.StageStarted, events.StageFinished))
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        assert torch.equal(getattr(before, name), getattr(after, name)), name
+    changed = (before.sh0 != after.sh0).flatten(1).any(dim=1)
+    high = trainer.state.groups["high_error"][: len(changed)]
+    assert bool(changed.any())
+    assert not bool((changed & ~high).any())
+    start, end = recorder.at(events.StageStarted, "refine"), trainer.splats
+    assert torch.equal(start.opacity_logits, end.opacity_logits)
+    assert not torch.equal(start.means, end.means)
+
+
+WAITS = {
+    "_local_scalar_dense": "a value is read",
+    "nonzero": "the number of True rows is read",
+    "masked_select": "the number of True rows is read",
+    "equal": "a value is read",
+    "_unique2": "the number of values is read",
+}
+
+
+class Watch(TorchDispatchMode):
+    """Counts operations that make the host wait for a GPU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        if name in WAITS:
+            self.seen[name] += 1
+        indexing = name in ("index", "index_put", "index_put_")
+        if indexing and any(i is not None and i.dtype == torch.bool for i in args[1]):
+            self.seen["index by a mask"] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counter[str]]:
+    """Operations that wait, and tensors made of Python numbers (a copy that the host waits for)."""
+    with monkeypatch.context() as patch, Watch() as watch:
+        for where, name in ((torch, "tensor"), (torch, "as_tensor"), (torch.Tensor, "new_tensor")):
+            original = getattr(where, name)
+
+            def recording(*args: Any, _original: Any = original, _name: str = name, **kwargs: Any) -> Any:
+                if str(kwargs.get("device", "")) != "cpu":  # said to be for the host
+                    watch.seen[_name] += 1
+                return _original(*args, **kwargs)
+
+            patch.setattr(where, name, recording)
+        yield watch.seen
+
+
+def in_stage(trainer: Trainer, stage: int) -> None:
+    while trainer.state.stage < stage or not trainer.state.entered:
+        if not trainer.state.entered:
+            trainer.enter(trainer.state.stage)
+            continue
+        finished = trainer.recipe.stages[trainer.state.stage]
+        while trainer.state.step < finished.iterations:
+            trainer.step()
+        trainer._finish(finished)
+
+
+def quiet(recipe: Recipe) -> Recipe:
+    """Nothing is densified or reset in the iterations that are watched."""
+    first = recipe.stages[0]
+    assert first.densify is not None
+    densify = replace(first.densify, start=1000, stop=2000, reset_at=())
+    longer = [replace(stage, iterations=100) for stage in (replace(first, densify=densify), *recipe.stages[1:])]
+    return replace(recipe, stages=(longer[0], *recipe.stages[1:]))
+
+
+@pytest.mark.parametrize("stage", [0, 1, 2])
+def test_an_iteration_waits_for_the_device_only_to_count_pairs(
+    emulated: Backend, scene: Scene, stage: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = quiet(train_toys.short()) if stage == 0 else train_toys.short()
+    monkeypatch.setattr(loop, "waits", lambda device: True)
+    monkeypatch.setattr(views, "waits", lambda device: True)
+    trainer = Trainer(scene, recipe, GENERIC, backend=emulated, progress_every=1000, target_bytes=1 << 20)
+    in_stage(trainer, stage)
+    trainer.step()
+    for index in range(len(scene.train)):
+        trainer._targets[index]  # each photograph is taken in once
+    with watched(monkeypatch) as seen:
+        trainer.step()
+        trainer.step()
+    looks_at_probe = 2 if stage == 0 else 0  # rasterize() checks for zeros where tensors are in host memory, as here
+    assert dict(seen) == {"_local_scalar_dense": 2 + looks_at_probe}, "two iterations, one count of pairs in each"
+
+
+def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
+    emulated: Backend, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gs2d.errors import DivergedError
+
+    monkeypatch.setattr(loop, "waits", lambda device: True)
+    monkeypatch.setattr(views, "waits", lambda device: True)
+    trainer = Trainer(scene, train_toys.short(), GENERIC, backend=emulated, progress_every=2)
+    trainer.enter(0)
+    trainer.step()
+    trainer.state.splats.sh0[3] = float("nan")
+    with pytest.raises(DivergedError, match="iteration 2 of stage 'surface': sh0 is NaN"):
+        trainer.step()
+
+
+def picture_scene() -> tuple[View, ...]:
+    """Four views of 6 x 4 px: opaque, with alpha, with a mask, opaque."""
+    rng = np.random.default_rng(0)
+    camera = front_camera(6, 4)
+    images = [rng.integers(0, 256, (4, 6, channels), dtype=np.uint8) for channels in (3, 4, 3, 3)]
+    mask = rng.uniform(size=(4, 6)) < 0.5
+    masks = (None, None, mask, None)
+    return tuple(
+        View.from_arrays(str(i), camera, image, m) for i, (image, m) in enumerate(zip(images, masks, strict=True))
+    )
+
+
+def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
+    """72 bytes opaque, 96 with alpha, 96 with a mask: of 170 bytes on the device the first two use 168."""
+    scene_views, pinned = picture_scene(), []
+
+    def pin(tensor: Tensor) -> Tensor:
+        pinned.append(tensor.nbytes)
+        return tensor.clone()
+
+    background = (0.25, 0.5, 1.0)
+    options: dict[str, Any] = {"use_masks": True, "device": torch.device("cpu")}
+    targets = DeviceTargets(scene_views, background, **options, limit_bytes=170, pinned_bytes=100, pin=pin)
+    plain = Targets(scene_views, background, use_masks=True, with_maps=False)
+    for _ in range(2):
+        for index in range(4):
+            target, expected = targets[index], plain[index]
+            assert torch.allclose(target.image, expected.image, rtol=0, atol=2e-7)
+            assert (target.mask is None) == (expected.mask is None)
+            assert target.mask is None or torch.equal(target.mask, expected.mask)  # type: ignore[arg-type]
+    assert pinned == [72, 24]  # the third, image and mask; the fourth does not fit any more and is read each time
+    assert sorted(targets._kept) == [0, 1, 2]
+
+
+def test_a_state_on_a_device_is_saved_in_host_memory_and_moves_whole() -> None:
+    state = train_toys.full_state()
+    state.move_to("meta")
+    tensors = [t for _, t in state.splats.items()] + [m.mean for m in state.moments.values()]
+    tensors += [m.square for m in state.moments.values()] + [*state.groups.values(), *vars(state.statistics).values()]
+    assert {tensor.device.type for tensor in tensors} == {"meta"}
+    assert state.generator.device.type == "cpu"
