@@ -1,0 +1,341 @@
+"""Precision, recall and F-score of Tanks and Temples (Knapitsch et al. 2017), in the official steps.
+
+1. Point set of the reconstruction: mesh vertices and face centroids, as the official script takes them (so the score
+   depends on the triangulation, not on area alone).
+2. Start: the similarity that takes the capture's camera centres to those of the official log, moved into the scan's
+   frame by ``_trans.txt``. Our own cameras are used, never a second trajectory file that may be in another frame.
+3. Three stages of iterative closest points with scale, both clouds cut to the crop volume.
+4. Both clouds cut and thinned to tau / 2; precision and recall are the parts nearer than tau.
+
+The self-check says whether the alignment can be believed; a wrong log or transform gives a low score, not an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gs2d.errors import DataError
+from gs2d.evaluate.align import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
+from gs2d.evaluate.icp import IcpResult, icp, nearest, uniform_downsample, voxel_downsample
+from gs2d.evaluate.surface_clouds import ScoredClouds
+from gs2d.evaluate.tnt_files import TntTruth, match_cameras
+from gs2d.protocols_surface import TNT_SURFACE, IcpStage, TntSurface
+from gs2d.triangles import Mesh
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """One stage of the alignment: distances in m; None where nothing was paired."""
+
+    voxel: float | None
+    threshold: float
+    points: int
+    share_before: float
+    share: float
+    rms_before: float | None
+    rms: float | None
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """The self-check.
+
+    Attributes
+    ----------
+    ok : bool
+        Whether the score can be believed.
+    messages : tuple of str
+        What is odd, one line each.
+    cameras : int
+        Cameras that were matched with the log.
+    camera_share : float
+        Part of them that agree within the protocol's threshold.
+    camera_rms, camera_worst : float
+        m, of those.
+    scale : float
+        From the capture to the scan, in the end.
+    shift : float or None
+        How far the stages moved the mesh, rms, in tau.
+    shift_scale, shift_degrees : float
+        By how much they changed its size, and turned it.
+    transform_alone : float or None
+        tau. How far off the mesh would be (rms) had ``_trans.txt`` alone been used.
+    stages : tuple of StageReport
+    T_truth_mesh : ndarray [4, 4]
+    """
+
+    ok: bool
+    messages: tuple[str, ...]
+    cameras: int
+    camera_share: float
+    camera_rms: float
+    camera_worst: float
+    scale: float
+    shift: float | None
+    shift_scale: float
+    shift_degrees: float
+    transform_alone: float | None
+    stages: tuple[StageReport, ...]
+    T_truth_mesh: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class TntScore:
+    """The score of one scene; distances in m. None, with ``reason``, where there was nothing to measure.
+
+    Attributes
+    ----------
+    tau : float
+    precision, recall, f_score : float or None
+    accuracy, completeness, chamfer : float or None
+        Mean distance from the reconstruction to the scan, back, and the mean of the two (not part of the protocol).
+    mesh_points, truth_points : int
+        Points that were scored.
+    alignment : Alignment
+    clouds : ScoredClouds
+        The scored points with their distances.
+    reason : str or None
+    """
+
+    tau: float
+    precision: float | None
+    recall: float | None
+    f_score: float
+    accuracy: float | None
+    completeness: float | None
+    chamfer: float | None
+    mesh_points: int
+    truth_points: int
+    alignment: Alignment
+    clouds: ScoredClouds
+    reason: str | None = None
+
+
+def evaluate_tnt(
+    mesh: Mesh,
+    names: Sequence[str],
+    centers: np.ndarray,
+    truth: TntTruth,
+    tau: float,
+    *,
+    published: np.ndarray | None = None,
+    protocol: TntSurface = TNT_SURFACE,
+    seed: int = 0,
+    workers: int | None = None,
+) -> TntScore:
+    """Score a mesh.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        In the capture's frame.
+    names : sequence of str
+        Of all photographs of the capture.
+    centers : ndarray [n, 3]
+        Their camera centres, in the capture's frame.
+    truth : TntTruth
+    tau : float
+        m.
+    published : ndarray [m, 4, 4], optional
+        The log that came with the photographs: checked against the cameras, never used.
+
+    Raises
+    ------
+    DataError
+        The cameras cannot be matched with the log.
+    """
+    source = point_set(mesh)
+    fit, frame_notes = _camera_fit(names, centers, truth, published, protocol, seed)
+    target = truth.crop.apply(truth.points).astype(np.float64)
+    start = T = fit.T_target_source
+    reports: list[StageReport] = []
+    for stage in protocol.stages:
+        step, report = _stage(source, target, T, truth, stage, tau, protocol, workers)
+        T = step.T_target_source @ T
+        reports.append(report)
+    moved = truth.crop.apply(apply(T, source))
+    alignment = _check(fit, start, T, moved, truth, tau, tuple(reports), frame_notes, protocol)
+    return _score(moved, target, tau, alignment, protocol, workers)
+
+
+def point_set(mesh: Mesh) -> np.ndarray:
+    """Vertices and face centroids [P + F, 3]: what the official script compares."""
+    vertices = mesh.vertices.astype(np.float64)
+    return np.concatenate([vertices, vertices[mesh.faces].mean(axis=1)]) if len(mesh.faces) else vertices
+
+
+def _camera_fit(
+    names: Sequence[str],
+    centers: np.ndarray,
+    truth: TntTruth,
+    published: np.ndarray | None,
+    protocol: TntSurface,
+    seed: int,
+) -> tuple[RobustFit, list[str]]:
+    """From the capture to the scan by camera centres; what is odd about the frames."""
+    ours, entries = match_cameras(names, len(truth.trajectory), f"{truth.scene}_COLMAP_SfM.log")
+    targets = apply(truth.T_truth_log, truth.trajectory[entries, :3, 3])
+    fit = ransac_similarity(
+        centers[ours], targets, threshold=protocol.camera_threshold, sample=protocol.camera_sample, seed=seed
+    )
+    notes = []
+    if published is not None and len(published) == len(names):
+        order = np.array(sorted(range(len(names)), key=lambda i: names[i]))
+        gap = np.linalg.norm(published[:, :3, 3] - centers[order], axis=1)
+        spread = float(np.linalg.norm(np.ptp(centers, axis=0)))
+        if np.median(gap) > 0.01 * spread:
+            notes.append(
+                f"{truth.scene}_COLMAP_SfM.log beside the photographs is in another frame than their cameras (median "
+                f"distance {np.median(gap) / spread:.0%} of their spread): the cameras were used instead"
+            )
+    return fit, notes
+
+
+def _stage(
+    source: np.ndarray,
+    target: np.ndarray,
+    T: np.ndarray,
+    truth: TntTruth,
+    stage: IcpStage,
+    tau: float,
+    protocol: TntSurface,
+    workers: int | None,
+) -> tuple[IcpResult, StageReport]:
+    """One stage on the cropped and thinned clouds."""
+    moved = truth.crop.apply(apply(T, source))
+    if stage.voxel is None:
+        thin_source = uniform_downsample(moved, protocol.max_points)
+        thin_target = uniform_downsample(target, protocol.max_points)
+    else:
+        thin_source = voxel_downsample(moved, stage.voxel * tau)
+        thin_target = voxel_downsample(target, stage.voxel * tau)
+    step = icp(
+        thin_source,
+        thin_target,
+        threshold=stage.threshold * tau,
+        iterations=stage.iterations,
+        share_change=protocol.share_change,
+        rms_change=protocol.rms_change,
+        workers=workers,
+    )
+    report = StageReport(
+        None if stage.voxel is None else stage.voxel * tau,
+        stage.threshold * tau,
+        len(thin_source),
+        step.share_before,
+        step.share,
+        step.rms_before,
+        step.rms,
+        step.iterations,
+    )
+    return step, report
+
+
+def _check(
+    fit: RobustFit,
+    start: np.ndarray,
+    T: np.ndarray,
+    moved: np.ndarray,
+    truth: TntTruth,
+    tau: float,
+    stages: tuple[StageReport, ...],
+    messages: list[str],
+    protocol: TntSurface,
+) -> Alignment:
+    """Whether the alignment can be believed, and why not."""
+    change = T @ np.linalg.inv(start)
+    shift = _rms_between(moved, np.linalg.inv(change), tau)  # where they are now against where they were
+    alone = _rms_between(moved, truth.T_truth_log @ np.linalg.inv(T), tau)
+    scale = similarity_scale(change)
+    log, transform = f"{truth.scene}_COLMAP_SfM.log", f"{truth.scene}_trans.txt"
+    wrong = []
+    if fit.share < protocol.min_camera_share:
+        wrong.append(
+            f"only {fit.share:.0%} of the cameras agree with {log} within {protocol.camera_threshold:g} m: "
+            "is it the log of these photographs?"
+        )
+    apart = not stages or stages[0].share < protocol.min_share
+    if apart or shift is None or shift > protocol.max_shift or abs(scale - 1) > protocol.max_scale_change:
+        what = (
+            f"{stages[0].share if stages else 0:.0%} of the mesh lies within {protocol.stages[0].threshold:g} tau "
+            f"of the scan, after a shift of {'no' if shift is None else f'{shift:.1f}'} tau and a scale of {scale:.4f}"
+        )
+        trap = (
+            f"the cameras fit {log}, the surface does not fit the scan: take {log} and {transform} from the official "
+            "ground truth (TNT_GOF has a log of the same name, which for Truck is in another frame)"
+        )
+        wrong.append(f"{what}; {trap if fit.share >= protocol.min_camera_share else 'the alignment failed'}")
+    elif alone is not None and alone > protocol.max_shift:
+        messages = [
+            *messages,
+            f"the capture is not in the frame of {log} (as Truck of TNT_GOF): {transform} alone would misplace the "
+            f"mesh by {alone:.0f} tau; it was aligned by its cameras",
+        ]
+    return Alignment(
+        ok=not wrong,
+        messages=(*wrong, *messages),
+        cameras=len(fit.inliers),
+        camera_share=fit.share,
+        camera_rms=fit.rms,
+        camera_worst=fit.worst,
+        scale=similarity_scale(T),
+        shift=shift,
+        shift_scale=scale,
+        shift_degrees=rotation_degrees(change),
+        transform_alone=alone,
+        stages=stages,
+        T_truth_mesh=T,
+    )
+
+
+def _rms_between(points: np.ndarray, T: np.ndarray, unit: float) -> float | None:
+    """How far a transform moves points, rms, in units; None without points."""
+    if not len(points):
+        return None
+    few = uniform_downsample(points, 100_000)
+    return float(np.sqrt(np.square(apply(T, few) - few).sum(axis=1).mean()) / unit)
+
+
+def _score(
+    moved: np.ndarray,
+    target: np.ndarray,
+    tau: float,
+    alignment: Alignment,
+    protocol: TntSurface,
+    workers: int | None,
+) -> TntScore:
+    """Precision, recall and F of the cropped clouds."""
+    ours = voxel_downsample(moved, protocol.score_voxel * tau)
+    theirs = voxel_downsample(target, protocol.score_voxel * tau)
+    if not len(theirs):
+        raise DataError("a scan with points inside the crop volume was expected, got none; copy both again")
+    if not len(ours):
+        clouds = ScoredClouds(ours, np.zeros(0), theirs, np.full(len(theirs), np.inf), tau)
+        why = "no part of the mesh lies inside the crop volume"
+        return TntScore(tau, None, 0.0, 0.0, None, None, None, 0, len(theirs), alignment, clouds, why)
+    accuracy, _ = nearest(cKDTree(theirs), ours, workers=workers)
+    completeness, _ = nearest(cKDTree(ours), theirs, workers=workers)
+    precision, recall = float((accuracy < tau).mean()), float((completeness < tau).mean())
+    return TntScore(
+        tau=tau,
+        precision=precision,
+        recall=recall,
+        f_score=f_score(precision, recall),
+        accuracy=float(accuracy.mean()),
+        completeness=float(completeness.mean()),
+        chamfer=float(accuracy.mean() + completeness.mean()) / 2,
+        mesh_points=len(ours),
+        truth_points=len(theirs),
+        alignment=alignment,
+        clouds=ScoredClouds(ours, accuracy, theirs, completeness, tau),
+    )
+
+
+def f_score(precision: float, recall: float) -> float:
+    """Harmonic mean, 0 where both are."""
+    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
