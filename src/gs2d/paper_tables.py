@@ -290,6 +290,7 @@ PAPER_TABLES: Mapping[str, PaperTable] = MappingProxyType(
 )
 
 
-def best_of(metric: str, a: float, b: float) -> bool:
-    """Whether ``a`` is better than ``b``."""
-    return a < b if metric in LOWER_IS_BETTER else a > b
+def printed(metric: str, data_set: str, figure: float) -> str:
+    """A figure of the paper with the digits that it prints."""
+    digits = {"psnr": 2, "chamfer": 2, "fscore": 2 if data_set == TNT else 3}.get(metric, 3)
+    return f"{figure:.{digits}f}"

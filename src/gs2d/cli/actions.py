@@ -22,6 +22,7 @@ def execute(command: c.Common, console: Console) -> None:
         c.Export: export,
         c.Report: report,
         c.Recipes: recipes,
+        c.Paper: paper,
         c.Doctor: doctor,
         c.Info: info,
     }
@@ -183,6 +184,13 @@ def recipes(command: c.Recipes, console: Console) -> None:
     for line in describe_recipe(recipe):
         console.say(line)
     console.result(to_json(recipe))
+
+
+def paper(command: c.Paper, console: Console) -> None:
+    """``gs2d paper``."""
+    from gs2d.cli.paper import show_paper
+
+    show_paper(command, console)
 
 
 def doctor(_command: c.Doctor, console: Console) -> None:

@@ -175,6 +175,48 @@ class Recipes(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Paper(Common):
+    """Train what one of the paper's tables needs, score it, and write the table beside the paper's figures."""
+
+    table: Annotated[
+        Positional[Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"]], arg(metavar="TABLE")
+    ]
+    """Which table: regularisation, benchmark, k, freeze, modules or absgs."""
+    data: Annotated[Path, arg(metavar="DIR")]
+    """A capture, or a folder of captures."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for runs, table and page. The command can be stopped and started again; several may share it."""
+    scenes: tuple[str, ...] = ()
+    """Only these captures, by the names of their folders."""
+    protocol: str = "auto"
+    """Protocol of all captures (default: by the format of each)."""
+    downscale: int | None = None
+    """Shrink the photographs by this integer (default: what the protocol says)."""
+    schedule_scale: float = 1.0
+    """Fraction of the full schedule."""
+    seeds: tuple[str, ...] = ("0",)
+    """Seeds, as 0,1,2; or a count: 3 is 0,1,2."""
+    backend: Backend = "auto"
+    """Rasterizer."""
+    slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
+    """Runs at the same time (default: one a GPU, else one)."""
+    threads: int | None = None
+    """CPU threads of each slot (default: the cores divided among the slots)."""
+    cache: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Stage cache (default: in --out). Tables that share it train their common stages once."""
+    truth: Annotated[Path | None, arg(metavar="DIR")] = None
+    """True surfaces, NAME.ply, for captures that have no mesh_gt.ply beside them."""
+    lpips_weights: Path | None = None
+    """VGG-16 and LPIPS weights for the LPIPS metric."""
+    overrides: Overrides = ()
+    """Change the recipes, as in `gs2d train`; reaches those that have the stage."""
+    slurm: Annotated[str | None, arg(metavar="KEY=VALUE,...")] = None
+    """Run the slots as Slurm jobs with these parameters, e.g. slurm_partition=gpu,timeout_min=600."""
+    no_train: bool = False
+    """Only write the table of what is there."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
     """Say what this machine can run, and why not the rest."""
 
@@ -188,7 +230,7 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Doctor, Info
+    Demo, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Paper, Doctor, Info
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
@@ -199,6 +241,7 @@ Command = (
     | Annotated[Export, subcommand("export")]
     | Annotated[Report, subcommand("report")]
     | Annotated[Recipes, subcommand("recipes")]
+    | Annotated[Paper, subcommand("paper")]
     | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Info, subcommand("info")]
 )

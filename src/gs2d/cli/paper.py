@@ -1,0 +1,117 @@
+"""``gs2d paper``: from arguments to options, and the table on the screen."""
+
+from __future__ import annotations
+
+import json
+
+from gs2d.cli.commands import Paper
+from gs2d.cli.console import Console
+from gs2d.errors import RecipeError, RunError
+from gs2d.pipeline.paper import PaperOptions, PaperResult
+from gs2d.pipeline.paper import paper as run_paper
+from gs2d.pipeline.paper_text import TITLES, columns_of, measured, verdict_text
+
+
+def show_paper(command: Paper, console: Console) -> None:
+    """Run the command; what failed is an error at the end, when everything else is done and written.
+
+    Raises
+    ------
+    RunError
+        Some runs failed.
+    """
+    result = run_paper(paper_options(command), console.on_event)
+    console.close()
+    _tables(result, console)
+    if command.json:
+        files = {path.name: str(path) for path in result.files}
+        orders = [verdict.to_json() for verdict in result.verdicts]
+        rows = json.loads(result.files[0].read_text(encoding="utf-8"))
+        console.result({"rows": rows, "orders": orders, "failures": result.failures, "files": files})
+    if result.failures:
+        name, reason = next(iter(result.failures.items()))
+        more = (
+            f" (and {len(result.failures) - 1} more, in {command.out / 'about.json'})"
+            if len(result.failures) > 1
+            else ""
+        )
+        raise RunError(
+            f"{len(result.failures)} of the runs failed, the table is written without them: {name}: {reason}{more}; "
+            "mend that and run the command again"
+        )
+
+
+def paper_options(command: Paper) -> PaperOptions:
+    """The options of the pipeline.
+
+    Raises
+    ------
+    RecipeError
+    """
+    return PaperOptions(
+        table=command.table,
+        data=command.data,
+        out=command.out,
+        scenes=tuple(name for words in command.scenes for name in words.split(",") if name),
+        protocol=command.protocol,
+        backend=command.backend,
+        schedule_scale=command.schedule_scale,
+        downscale=command.downscale,
+        seeds=parse_seeds(command.seeds),
+        overrides=command.overrides,
+        slots=command.slots,
+        cache=command.cache,
+        truth=command.truth,
+        lpips_weights=command.lpips_weights,
+        threads=command.threads,
+        train=not command.no_train,
+        slurm=None if command.slurm is None else parse_parameters(command.slurm),
+    )
+
+
+def parse_seeds(words: tuple[str, ...]) -> tuple[int, ...]:
+    """``0,1,2`` or ``0 1 2`` are seeds; one number n > 0 is a count, the seeds 0 to n - 1.
+
+    Raises
+    ------
+    RecipeError
+    """
+    parts = [part for word in words for part in word.split(",") if part]
+    if not parts or not all(part.isdecimal() for part in parts):
+        raise RecipeError(
+            f"--seeds must be whole numbers like 0,1,2, or a count like 3, got {' '.join(words) or 'nothing'}"
+        )
+    numbers = tuple(int(part) for part in parts)
+    listed = len(numbers) > 1 or "," in words[0] or numbers == (0,)
+    return numbers if listed else tuple(range(numbers[0]))
+
+
+def parse_parameters(text: str) -> dict[str, str | int]:
+    """``slurm_partition=gpu,timeout_min=600`` as a mapping.
+
+    Raises
+    ------
+    RecipeError
+    """
+    found: dict[str, str | int] = {}
+    for part in filter(None, text.split(",")):
+        name, equals, value = part.partition("=")
+        if not equals:
+            raise RecipeError(f"--slurm must be name=value,name=value, got {part!r}")
+        found[name.strip()] = int(value) if value.strip().isdecimal() else value.strip()
+    return found
+
+
+def _tables(result: PaperResult, console: Console) -> None:
+    results = result.results
+    for data_set in results.data_sets:
+        columns = columns_of(result.table, results, data_set)
+        trained = [row for row in results.rows if row.recipe is not None]
+        rows = [[row.name, *(measured(metric, results, row, data_set) for metric in columns)] for row in trained]
+        console.table(f"{result.table.title}: {data_set}", ["", *(TITLES[metric] for metric in columns)], rows)
+    for verdict in result.verdicts:
+        console.say(f"{verdict.holds:>7}  {verdict.text} ({verdict.data_set}): {verdict_text(verdict)}")
+    if result.unfinished:
+        console.say(f"{result.unfinished} runs are not trained yet")
+    for path in result.files:
+        console.say(str(path))

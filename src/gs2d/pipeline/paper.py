@@ -1,0 +1,393 @@
+"""One of the paper's tables: find the scenes, train what the rows need, score it, write the table and its page."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.disk import atomic_write
+from gs2d.errors import RecipeError, RunError
+from gs2d.io.files import read_json, write_json
+from gs2d.io.run import machine, make_folder, versions
+from gs2d.paper_tables import PAPER_TABLES, PaperTable
+from gs2d.pipeline.events import OnEvent, ignore
+from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.paper_deviations import deviations_of
+from gs2d.pipeline.paper_page import write_page
+from gs2d.pipeline.paper_rows import Results, Row, Verdict, judge, read_cell
+from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
+from gs2d.pipeline.paper_text import to_csv, to_latex, to_markdown
+from gs2d.pipeline.sweep import Sweep, SweepJob, stage_keys
+from gs2d.pipeline.sweep_slots import run_sweep
+from gs2d.recipe import Recipe, validate
+from gs2d.recipe_json import apply_overrides, to_json
+from gs2d.recipes import RECIPES, get_recipe
+from gs2d.schedule import scale_schedule
+
+ABOUT = "about.json"
+FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrides")  # of all runs in a folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperOptions:
+    """Which table, of which scenes, how.
+
+    Attributes
+    ----------
+    table : str
+        A key of ``PAPER_TABLES``.
+    data, out : Path
+        Captures; where runs, table and page go.
+    scenes : tuple of str
+        Names; empty = all that are found.
+    protocol, backend : str
+    schedule_scale : float
+    downscale : int or None
+        None = what the protocol of each scene says (DTU and TnT: 2).
+    seeds : tuple of int
+    overrides : tuple of str
+        ``stage.field=value``; those of a stage reach the recipes that have it.
+    slots : int or None
+        Processes that train at the same time; None = one a GPU, or one.
+    cache : Path or None
+        Stage cache; None = ``out/cache``. Shared by several tables it trains their common stages once.
+    truth : Path or None
+        Folder of ground truths that do not lie beside their captures.
+    lpips_weights : Path or None
+    threads : int or None
+        CPU threads of each slot; None = what is there, divided among the slots.
+    train : bool
+        False: only tabulate what is there.
+    slurm : dict or None
+        Parameters of a Slurm job (partition, timeout_min ...): slots become Slurm jobs.
+    """
+
+    table: str
+    data: Path
+    out: Path
+    scenes: tuple[str, ...] = ()
+    protocol: str = "auto"
+    backend: str = "auto"
+    schedule_scale: float = 1.0
+    downscale: int | None = None
+    seeds: tuple[int, ...] = (0,)
+    overrides: tuple[str, ...] = ()
+    slots: int | None = None
+    cache: Path | None = None
+    truth: Path | None = None
+    lpips_weights: Path | None = None
+    threads: int | None = None
+    train: bool = True
+    slurm: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class PaperResult:
+    """What came out.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        table.json first.
+    results : Results
+    verdicts : tuple of Verdict
+    failures : dict
+        Job -> reason, of runs that failed.
+    unfinished : int
+        Runs that are not there yet (tabulated without training).
+    """
+
+    table: PaperTable
+    files: tuple[Path, ...]
+    results: Results
+    verdicts: tuple[Verdict, ...]
+    failures: dict[str, str]
+    unfinished: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A table's work: its scenes, and the job of every (recipe, scene, seed)."""
+
+    options: PaperOptions
+    table: PaperTable
+    scenes: tuple[FoundScene, ...]
+    sweep: Sweep
+    jobs: Mapping[tuple[str, str, int], SweepJob]  # (recipe of the row, scene, seed)
+
+
+def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
+    """Train what a table needs and is not there, and write the table.
+
+    A run that fails leaves its cells empty, with the reason; the others go on.
+
+    Raises
+    ------
+    Gs2dError
+        The options or the data folder are wrong; nothing is trained then.
+    """
+    plan = make_plan(options)
+    check_folder(plan)
+    if options.train:
+        make_folder(options.out)
+        write_json(options.out / ABOUT, about(plan, None, ()))
+        run_sweep(
+            plan.sweep,
+            on_event,
+            slots=options.slots,
+            threads=options.threads,
+            backend=options.backend,
+            slurm=options.slurm,
+            after_job=lambda _job: _tabulate_so_far(plan),
+        )
+    return tabulate(plan)
+
+
+def _tabulate_so_far(plan: Plan) -> None:
+    tabulate(plan, pictures=False)
+
+
+# -- planning --------------------------------------------------------------------------------------------------------
+def make_plan(options: PaperOptions) -> Plan:
+    """Everything that can be decided, and can be wrong, before a photograph is read.
+
+    Raises
+    ------
+    RecipeError, DataError, ProtocolError
+    """
+    if options.table not in PAPER_TABLES:
+        raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
+    if not options.seeds or len(set(options.seeds)) != len(options.seeds):
+        raise RecipeError(
+            f"--seeds must be different whole numbers, got {', '.join(map(str, options.seeds)) or 'none'}"
+        )
+    table = PAPER_TABLES[options.table]
+    scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
+    names = {row.recipe: canonical_recipe(row.recipe) for row in table.trained if row.recipe is not None}
+    recipes = {name: _recipe(name, options) for name in dict.fromkeys(names.values())}
+    _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
+    cache = options.cache or options.out / "cache"
+    made: dict[str, SweepJob] = {}
+    jobs: dict[tuple[str, str, int], SweepJob] = {}
+    for scene in scenes:
+        for seed in options.seeds:
+            for row_recipe, name in names.items():
+                job = _job(options, scene, name, recipes[name], seed, cache)
+                jobs[row_recipe, scene.name, seed] = made.setdefault(job.name, job)
+    sweep = Sweep(folder=options.out, jobs=tuple(made.values()), cache=cache)
+    return Plan(options, table, scenes, sweep, jobs)
+
+
+def canonical_recipe(name: str) -> str:
+    """The first named recipe that trains the same: "2dgs-r" for "2dgs-r-k1"."""
+    stages = get_recipe(name).stages
+    return next(other for other in RECIPES if get_recipe(other).stages == stages)
+
+
+def _recipe(name: str, options: PaperOptions) -> Recipe:
+    recipe = scale_schedule(get_recipe(name), options.schedule_scale)
+    return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
+
+
+def fitting_overrides(recipe: Recipe, overrides: Sequence[str]) -> tuple[str, ...]:
+    """The overrides that speak of the recipe itself or of a stage that it has."""
+    stages = {stage.name for stage in recipe.stages}
+    heads = {text: text.partition("=")[0].split(".") for text in overrides}
+    return tuple(text for text in overrides if len(heads[text]) == 1 or heads[text][0] in stages)
+
+
+def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> None:
+    for text in overrides:
+        if not any(fitting_overrides(recipe, (text,)) for recipe in recipes):
+            stages = dict.fromkeys(stage.name for recipe in recipes for stage in recipe.stages)
+            raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
+
+
+def _job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int, cache: Path) -> SweepJob:
+    downscale = options.downscale or scene.protocol.downscale
+    train = TrainOptions(
+        scene=scene.path,
+        out=options.out / "runs" / f"{scene.name}-{name}-s{seed}",
+        recipe=name,
+        protocol=scene.protocol.name if options.protocol == "auto" else options.protocol,
+        backend=options.backend,
+        format=scene.format,
+        downscale=downscale,
+        schedule_scale=options.schedule_scale,
+        overrides=fitting_overrides(recipe, options.overrides),
+        seed=seed,
+        resume=True,
+        cache=cache,
+        threads=options.threads,
+    )
+    evaluate = None
+    if scene.truth is not None or options.lpips_weights is not None:
+        evaluate = EvaluateOptions(ground_truth=scene.truth, lpips_weights=options.lpips_weights)
+    facts = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
+    return SweepJob(
+        name=train.out.name,
+        train=train,
+        evaluate=evaluate,
+        stage_keys=stage_keys((*map(repr, facts), recipe.init_points, recipe.sh_degree), to_json(recipe)["stages"]),
+    )
+
+
+def check_folder(plan: Plan) -> None:
+    """Refuse a folder whose runs were made for something else.
+
+    Raises
+    ------
+    RunError
+    """
+    path = plan.options.out / ABOUT
+    if plan.options.out.is_file():
+        raise RunError(f"--out must be a folder, {plan.options.out} is a file")
+    if not path.exists():
+        return
+    before, after = read_json(path)["options"], json.loads(json.dumps(_defining(plan.options)))
+    for name, value in after.items():
+        if before.get(name) != value:
+            raise RunError(
+                f"{plan.options.out} holds a table made with {name} = {before.get(name)}, now {value}; "
+                "choose another --out (--cache may stay: stages that are the same are taken from there)"
+            )
+
+
+def _defining(options: PaperOptions) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in FIXED}
+
+
+# -- tabulating ------------------------------------------------------------------------------------------------------
+def tabulate(plan: Plan, *, pictures: bool = True) -> PaperResult:
+    """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
+    results = Results(tuple(_row(plan, row) for row in plan.table.rows))
+    verdicts = judge(plan.table, results)
+    deviations = deviations_of(plan.options, plan.scenes, plan.table, results)
+    out = plan.options.out
+    make_folder(out)
+    commands = [line for job in plan.sweep.jobs for line in commands_of(job)]
+    write_json(out / "table.json", [row_json(row, results, deviations) for row in results.rows])
+    write_json(out / ABOUT, {**about(plan, results, verdicts), "deviations": deviations})
+    texts = {
+        "table.md": to_markdown(plan.table, results, verdicts, deviations, [paper_command(plan.options), *commands]),
+        "table.csv": to_csv(results),
+        "table.tex": to_latex(plan.table, results),
+    }
+    for name, text in texts.items():
+        with atomic_write(out / name, "w") as file:
+            file.write(text)
+    files = [out / name for name in ("table.json", *texts, ABOUT)]
+    if pictures:
+        files.append(write_page(plan.table, results, verdicts, deviations, commands, about(plan, results, ()), out))
+    unfinished = sum(plan.sweep.record(job)["state"] not in ("done", "failed") for job in plan.sweep.jobs)
+    return PaperResult(plan.table, tuple(files), results, verdicts, plan.sweep.failures(), unfinished)
+
+
+def _row(plan: Plan, row: Any) -> Row:
+    cells, commands = [], []
+    for scene in plan.scenes if row.recipe is not None else ():
+        for seed in plan.options.seeds:
+            job = plan.jobs[row.recipe, scene.name, seed]
+            cells.append(
+                read_cell(
+                    job.train.out,
+                    scene=scene.name,
+                    data_set=scene.data_set,
+                    seed=seed,
+                    test_on=scene.protocol.test_on,
+                    record=plan.sweep.record(job),
+                )
+            )
+            commands += commands_of(job)
+    paper_figures = {data_set: dict(figures) for data_set, figures in row.paper.items()}
+    return Row(row.name, row.recipe, paper_figures, row.note, tuple(cells), tuple(commands))
+
+
+def row_json(row: Row, results: Results, deviations: Sequence[str]) -> dict[str, Any]:
+    """A row of table.json."""
+    return {
+        "name": row.name,
+        "recipe": row.recipe,
+        "mean": results.mean(row),
+        "spread": results.spread(row),
+        "reasons": results.reasons(row),
+        "data_sets": {d: {"mean": results.mean(row, d), "spread": results.spread(row, d)} for d in results.data_sets},
+        "scenes": [cell.to_json() for cell in row.cells],
+        "paper": row.paper,
+        "note": row.note,
+        "deviations": list(deviations) if row.recipe is not None else [],
+        "commands": list(row.commands),
+    }
+
+
+def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """What the whole table was made with."""
+    options = plan.options
+    return {
+        "table": plan.table.name,
+        "title": plan.table.title,
+        "options": _defining(options),
+        "data": str(options.data),
+        "scenes": {scene.name: {"data_set": scene.data_set, **_scene_facts(scene)} for scene in plan.scenes},
+        "seeds": list(options.seeds),
+        "spread": "standard deviation over seeds of the mean over scenes",
+        "orders": [verdict.to_json() for verdict in verdicts],
+        "failures": plan.sweep.failures() if results is not None else {},
+        "command": paper_command(options),
+        "versions": versions(),
+        "machine": machine(),
+        "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+
+
+def _scene_facts(scene: FoundScene) -> dict[str, Any]:
+    truth = None if scene.truth is None else str(scene.truth)
+    return {"path": str(scene.path), "format": scene.format, "ground_truth": truth, "protocol": asdict(scene.protocol)}
+
+
+def paper_command(options: PaperOptions) -> str:
+    """The command that makes this table."""
+    words = ["gs2d", "paper", options.table, "--data", str(options.data), "--out", str(options.out)]
+    words += ["--scenes", *options.scenes] if options.scenes else []
+    if options.schedule_scale != 1.0:
+        words += ["--schedule-scale", str(options.schedule_scale)]
+    if options.downscale is not None:
+        words += ["--downscale", str(options.downscale)]
+    words += ["--seeds", ",".join(map(str, options.seeds))] if options.seeds != (0,) else []
+    for name in ("protocol", "backend"):
+        if getattr(options, name) != "auto":
+            words += [f"--{name}", getattr(options, name)]
+    for name in ("cache", "truth", "lpips_weights"):
+        if getattr(options, name) is not None:
+            words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
+    for text in options.overrides:
+        words += ["--set", text]
+    return shlex.join(words)
+
+
+def commands_of(job: SweepJob) -> list[str]:
+    """The `gs2d train` and `gs2d evaluate` lines that do what a job does."""
+    plain, train = TrainOptions(scene=job.train.scene, out=job.train.out), job.train
+    words = ["gs2d", "train", str(train.scene), "--out", str(train.out), "--recipe", str(train.recipe)]
+    for name in ("protocol", "format", "backend", "schedule_scale", "downscale", "seed", "threads", "cache"):
+        if getattr(train, name) != getattr(plain, name):
+            words += [f"--{name.replace('_', '-')}", str(getattr(train, name))]
+    for text in train.overrides:
+        words += ["--set", text]
+    lines = [shlex.join(words)]
+    if job.evaluate is not None:
+        score = ["gs2d", "evaluate", str(train.out)]
+        if job.evaluate.ground_truth is not None:
+            score += ["--ground-truth", str(job.evaluate.ground_truth)]
+        if job.evaluate.lpips_weights is not None:
+            score += ["--lpips-weights", str(job.evaluate.lpips_weights)]
+        lines.append(shlex.join(score))
+    return lines
+
+
+__all__ = ["PaperOptions", "PaperResult", "make_plan", "paper", "replace", "tabulate"]

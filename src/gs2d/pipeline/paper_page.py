@@ -1,0 +1,261 @@
+"""A table as one HTML page that needs nothing else: figures, the paper's orders, pictures side by side, deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gs2d.disk import atomic_write
+from gs2d.images import read_image
+from gs2d.io.files import read_json
+from gs2d.io.run import RENDERS
+from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
+from gs2d.pipeline.paper_rows import Cell, Results, Row, Verdict
+from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, shown, verdict_text
+from gs2d.report_html import escape, facts, missing, page, picture, table
+
+PICTURE_WIDTH = 300
+SHOWN = {"color": "Colour", "normal": "Normals", "error": "Error"}
+STYLE = """<style>
+td .paper, td .pm { display: block; color: var(--soft); font-size: .74rem; font-weight: 400; }
+tr.quoted td { color: var(--soft); } tr.quoted td:first-child { font-style: italic; }
+td.claim { text-align: left; white-space: normal; min-width: 16rem; }
+td.steps { text-align: left; white-space: normal; color: var(--soft); font-size: .85rem; }
+.yes, .no, .open, .unknown { font-weight: 650; } .yes { color: var(--good); } .no { color: var(--accent); }
+.open, .unknown { color: var(--soft); }
+.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(24rem, 1fr)); gap: 1rem; }
+</style>"""
+
+
+def write_page(
+    paper_table: PaperTable,
+    results: Results,
+    verdicts: Sequence[Verdict],
+    deviations: Sequence[str],
+    commands: Sequence[str],
+    about: dict[str, Any],
+    out: Path,
+) -> Path:
+    """Write ``index.html`` into a folder.
+
+    Raises
+    ------
+    DiskError
+    """
+    body = [STYLE, f'<div class="eyebrow">gs2d paper {escape(paper_table.name)}</div>']
+    body += [f"<h1>{escape(paper_table.title)}</h1>", lead(verdicts, about)]
+    for data_set in results.data_sets:
+        body += [f"<h2>{escape(data_set)}</h2>", figures_table(paper_table, results, data_set)]
+    body += ["<h2>Do the paper&#8217;s orders hold?</h2>", orders_table(verdicts)]
+    body += ["<h2>How this differs from the paper</h2>", _list(deviations)]
+    body += ["<h2>Side by side</h2>", *side_by_side(results)]
+    body += own_figures(results, out)
+    body += ["<h2>Every run</h2>", runs_table(results)]
+    body += ["<h2>How it was made</h2>", made_with(about, commands)]
+    path = out / "index.html"
+    with atomic_write(path, "w") as file:
+        file.write(page(f"{paper_table.title} - gs2d paper {paper_table.name}", body))
+    return path
+
+
+def lead(verdicts: Sequence[Verdict], about: dict[str, Any]) -> str:
+    """The result in two sentences."""
+    known = [verdict for verdict in verdicts if verdict.holds != "unknown"]
+    hold = sum(verdict.holds == "yes" for verdict in known)
+    if not known:
+        text = "None of the paper&#8217;s orders can be checked yet."
+    else:
+        text = f"<b>{hold} of {len(known)}</b> of the paper&#8217;s orders that could be checked hold."
+    if len(known) < len(verdicts):
+        text += f" {len(verdicts) - len(known)} could not be checked."
+    scale = about["options"]["schedule_scale"]
+    if scale != 1.0:
+        text += f" Trained at {scale:g} of the schedule: compare differences, not absolute figures."
+    if len(about["seeds"]) < 2:
+        text += " One seed: how much a figure moves by chance is not known."
+    return f'<p class="lead">{text}</p>'
+
+
+def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> str:
+    """One data set's figures; below each the paper's."""
+    columns = columns_of(paper_table, results, data_set)
+    best = {metric: best_rows(metric, results, data_set) for metric in columns}
+    heads = [TITLES[m] + ("" if m in ("bytes", "seconds") else " ↓" if m in LOWER_IS_BETTER else " ↑") for m in columns]
+    rows = []
+    for row in results.rows:
+        mean, spread = results.mean(row, data_set), results.spread(row, data_set)
+        note = f'<span class="paper">{escape(row.note)}</span>' if row.note else ""
+        cells = [f"<td>{escape(row.name)}{note}</td>"]
+        for metric in columns:
+            cells.append(_cell(row, metric, data_set, mean[metric], spread[metric], row.name in best[metric]))
+        rows.append(cells)
+    built = table(["", *heads], rows)
+    for row in results.rows:
+        if row.recipe is None:  # quoted rows are grey
+            built = built.replace(f"<tr><td>{escape(row.name)}", f'<tr class="quoted"><td>{escape(row.name)}')
+    counted = sorted({scene for scene, _ in results.counted("psnr", data_set)})
+    scenes = (
+        f"Means over {len(counted)} scene{'s' if len(counted) != 1 else ''}: {', '.join(counted)}. " if counted else ""
+    )
+    note = "In small print the paper's figure. MB: float32 parameters. s: training alone, shared stages included."
+    return built + f'<p class="soft">{escape(scenes + note)}</p>'
+
+
+def _cell(row: Row, metric: str, data_set: str, mean: float | None, spread: float | None, best: bool) -> str:
+    text = shown(metric, mean)
+    if spread is not None and metric not in ("bytes", "seconds"):
+        text += f' <span class="pm">± {shown(metric, spread)}</span>'
+    figure = row.paper.get(data_set, {}).get(metric)
+    if figure is not None:
+        text += f'<span class="paper">paper {printed(metric, data_set, figure)}</span>'
+    return f'<td class="best">{text}</td>' if best else f"<td>{text}</td>"
+
+
+def orders_table(verdicts: Sequence[Verdict]) -> str:
+    """The claims, and what the rows say."""
+    if not verdicts:
+        return missing("Nothing is trained yet.")
+    rows = [
+        [
+            f'<td class="claim">{escape(v.text)}</td>',
+            f"<td>{escape(v.data_set)}</td>",
+            f"<td>{escape(METRICS[v.metric])}</td>",
+            f'<td class="{v.holds}">{escape(v.holds)}</td>',
+            f'<td class="steps">{escape(verdict_text(v))}</td>',
+        ]
+        for v in verdicts
+    ]
+    note = (
+        "Differences are taken run by run (same scene, same seed) in the direction of the paper's order, so a "
+        "positive one agrees with it; ± is their standard deviation over seeds. Open: the seeds disagree."
+    )
+    return (
+        table(["The paper says", "data set", "figure", "holds", "difference"], rows)
+        + f'<p class="soft">{escape(note)}</p>'
+    )
+
+
+def side_by_side(results: Results) -> list[str]:
+    """One view of each scene, by every trained row."""
+    rows = [row for row in results.rows if row.recipe is not None]
+    seen = {(cell.scene, cell.data_set): None for row in rows for cell in row.cells}
+    sections = []
+    for scene, _ in seen:
+        shown_runs = {row.name: run for row in rows if (run := _first_run(row, scene)) is not None}
+        sections += _scene_section(scene, shown_runs)
+    return sections or [missing("No run has pictures yet.")]
+
+
+def _first_run(row: Row, scene: str) -> Path | None:
+    """The run of the first seed that has pictures."""
+    cells = sorted((cell for cell in row.cells if cell.scene == scene), key=lambda cell: cell.seed)
+    return next((cell.run for cell in cells if (cell.run / RENDERS / "index.json").exists()), None)
+
+
+def _scene_section(scene: str, runs: dict[str, Path]) -> list[str]:
+    if not runs:
+        return [f"<h3>{escape(scene)}</h3>", missing("No run of this scene has pictures.")]
+    index = read_json(next(iter(runs.values())) / RENDERS / "index.json")
+    if not index["views"]:
+        return []
+    view = index["views"][0]
+    grid = [
+        f'<div class="scroll"><div class="views" style="grid-template-columns: 4.5rem repeat({len(runs) + 1}, 1fr)">'
+    ]
+    grid.append('<div></div><div class="head">Photograph</div>')
+    grid += [f'<div class="head">{escape(name)}</div>' for name in runs]
+    for what, title in SHOWN.items():
+        grid.append(f'<div class="row">{title}</div>')
+        photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view['file']}.png"
+        grid.append(_picture(photo, f"{scene}: photograph") if what == "color" else "<div></div>")
+        for name, run in runs.items():
+            grid.append(_picture(_last_picture(run, view["file"], what), f"{scene}, {name}: {title.lower()}"))
+    grid.append("</div></div>")
+    return [
+        f"<h3>{escape(scene)} <small>view {escape(view['name'])} ({escape(view['split'])})</small></h3>",
+        "".join(grid),
+    ]
+
+
+def _last_picture(run: Path, file: str, what: str) -> Path:
+    """A picture after the last stage that was drawn."""
+    stages = read_json(run / RENDERS / "index.json")["stages"]
+    return run / RENDERS / (stages[-1] if stages else "none") / f"{file}.{what}.png"
+
+
+def _picture(path: Path, alt: str) -> str:
+    return picture(read_image(path), alt=alt, width=PICTURE_WIDTH) if path.exists() else '<div class="soft">none</div>'
+
+
+def own_figures(results: Results, out: Path) -> list[str]:
+    """The paper's figures (K_a and opacity, traces of the attributes, maps of E_i), from the runs of this table."""
+    runs: dict[str, Path] = {}
+    for row in (row for row in results.rows if row.recipe is not None):
+        for scene in dict.fromkeys(cell.scene for cell in row.cells):
+            run = _first_run(row, scene)
+            if run is not None:
+                runs[f"{scene}: {row.name}"] = run
+    write_figures = _figure_writer()
+    if write_figures is None or not runs:
+        return []
+    sections = ["<h2>Figures</h2>", '<div class="figures">']
+    for path in write_figures(runs, out / "figures"):
+        if path.suffix == ".svg":
+            sections.append(f"<figure>{path.read_text(encoding='utf-8')}</figure>")
+        elif path.suffix in (".png", ".jpg"):
+            sections.append(picture(read_image(path), path.stem.replace("_", " "), alt=path.stem, width=900))
+    return [*sections, "</div>"]
+
+
+def _figure_writer() -> Any:
+    """``pipeline.figures.write_figures``."""
+    try:
+        from gs2d.pipeline.figures import write_figures
+    except ModuleNotFoundError:
+        return None
+    return write_figures
+
+
+def runs_table(results: Results) -> str:
+    """Every run's figures, with reasons where there are none."""
+    rows = []
+    for row in (row for row in results.rows if row.recipe is not None):
+        for cell in row.cells:
+            rows.append(
+                [
+                    escape(row.name),
+                    escape(cell.scene),
+                    str(cell.seed),
+                    *(_run_figure(cell, name) for name in ("psnr", "ssim", "lpips", "fscore", "chamfer")),
+                    f"{cell.details['splats']:,}" if "splats" in cell.details else "-",
+                    shown("bytes", cell.figures["bytes"]),
+                    shown("seconds", cell.figures["seconds"]),
+                ]
+            )
+    heads = ["row", "scene", "seed", *(METRICS[m] for m in ("psnr", "ssim", "lpips", "fscore", "chamfer"))]
+    return table([*heads, "splats", "MB", "s"], rows)
+
+
+def _run_figure(cell: Cell, metric: str) -> str:
+    value = cell.figures[metric]
+    if value is not None or cell.figures["psnr"] is not None:
+        return shown(metric, value)
+    return f'-<span class="why">{escape(cell.reasons.get(metric, ""))}</span>' if metric == "psnr" else "-"
+
+
+def made_with(about: dict[str, Any], commands: Sequence[str]) -> str:
+    """Versions, machine and commands."""
+    host = about["machine"]
+    pairs = [
+        ("machine", f"{host['processor']}, {host['cores']} cores, {host['system']}"),
+        ("versions", ", ".join(f"{name} {version}" for name, version in about["versions"].items())),
+        ("seeds", ", ".join(map(str, about["seeds"]))),
+        ("written", about["written"]),
+    ]
+    lines = "\n".join([about["command"], "", "# which does, run by run:", *commands])
+    return facts(pairs) + f"<details><summary>Commands</summary><pre>{escape(lines)}</pre></details>"
+
+
+def _list(lines: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"

@@ -1,0 +1,291 @@
+"""From runs to rows: the figures of each run, means over scenes and seeds, and whether the paper's orders hold."""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gs2d.errors import Gs2dError
+from gs2d.io.run import is_run, open_run
+from gs2d.paper_tables import DTU, LOWER_IS_BETTER, METRICS, Order, PaperTable
+
+FIGURES = (*METRICS, "bytes", "seconds")
+IMAGE_METRICS = ("psnr", "ssim", "lpips")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one run came to.
+
+    Attributes
+    ----------
+    scene, data_set : str
+    seed : int
+    figures : dict
+        One entry for each of FIGURES; None where there is none.
+    reasons : dict
+        Why, for those that are None.
+    run : Path
+    details : dict
+        Other facts: splats, surface thresholds, image metrics of each stage, which views were measured.
+    """
+
+    scene: str
+    data_set: str
+    seed: int
+    figures: dict[str, float | None]
+    reasons: dict[str, str]
+    run: Path
+    details: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Flat: the figures beside scene and seed."""
+        facts = {"scene": self.scene, "data_set": self.data_set, "seed": self.seed, **self.figures}
+        return {**facts, "reasons": self.reasons, "run": str(self.run), **self.details}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table with what was measured for it."""
+
+    name: str
+    recipe: str | None
+    paper: dict[str, dict[str, float]]
+    note: str
+    cells: tuple[Cell, ...]
+    commands: tuple[str, ...] = ()
+
+    def of(self, data_set: str | None) -> list[Cell]:
+        """The cells of one data set, or all."""
+        return [cell for cell in self.cells if data_set in (None, cell.data_set)]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The rows of a table.
+
+    Means are over the runs (scene, seed) that *every* trained row has: a mean over other scenes than those of the row
+    above would be compared with it all the same. Rows of which nothing is there yet do not count for this.
+    """
+
+    rows: tuple[Row, ...]
+
+    @property
+    def data_sets(self) -> tuple[str, ...]:
+        """Those that were trained."""
+        return tuple(dict.fromkeys(cell.data_set for row in self.rows for cell in row.cells))
+
+    def counted(self, metric: str, data_set: str | None = None) -> set[tuple[str, int]]:
+        """The (scene, seed) that means of a metric are taken over."""
+        have = [{(c.scene, c.seed) for c in r.of(data_set) if c.figures[metric] is not None} for r in self.rows]
+        return set.intersection(*filter(None, have)) if any(have) else set()
+
+    def mean(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
+        """Mean of each figure over scenes and seeds; None where there is none."""
+        found: dict[str, float | None] = {}
+        for name in FIGURES:
+            values = self._values(row, name, data_set)
+            found[name] = statistics.fmean([v for group in values.values() for v in group]) if values else None
+        return found
+
+    def spread(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
+        """Standard deviation over seeds of the mean over scenes; None with fewer than two seeds."""
+        found: dict[str, float | None] = {}
+        for name in FIGURES:
+            means = [statistics.fmean(group) for group in self._values(row, name, data_set).values()]
+            found[name] = statistics.stdev(means) if len(means) > 1 else None
+        return found
+
+    def _values(self, row: Row, name: str, data_set: str | None) -> dict[int, list[float]]:
+        """Seed -> values of the counted scenes."""
+        counted = self.counted(name, data_set)
+        found: dict[int, list[float]] = {}
+        for cell in row.of(data_set):
+            value = cell.figures[name]
+            if value is not None and (cell.scene, cell.seed) in counted:
+                found.setdefault(cell.seed, []).append(value)
+        return found
+
+    def reasons(self, row: Row) -> dict[str, str]:
+        """Why a figure has no mean."""
+        if not row.cells:
+            why = "not trained here" if row.recipe is None else "not trained yet"
+            return dict.fromkeys(FIGURES, why)
+        means, found = self.mean(row), {}
+        for name in (n for n in FIGURES if means[n] is None):
+            cell = next(c for c in row.cells if c.figures[name] is None)
+            found[name] = f"{cell.scene}, seed {cell.seed}: {cell.reasons.get(name, 'not measured')}"
+        return found
+
+
+def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, record: dict[str, Any]) -> Cell:
+    """The figures of a run, from its ``metrics.json``; None with a reason where there are none.
+
+    Parameters
+    ----------
+    test_on : str
+        "test" or "train": the views whose image metrics count.
+    record : dict
+        What the sweep wrote about the job.
+    """
+    figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+    place: dict[str, Any] = {"scene": scene, "data_set": data_set, "seed": seed, "run": run}
+    if record["state"] != "done":
+        why = record.get("reason") or ("interrupted" if record["state"] == "running" else "not trained yet")
+        return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, str(why)), **place)
+    try:
+        metrics = open_run(run).metrics() if is_run(run) else {"stages": []}
+    except Gs2dError as error:
+        return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, str(error)), **place)
+    if not metrics["stages"]:
+        return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, f"{run} has no metrics.json"), **place)
+    last, reasons = metrics["stages"][-1], {}
+    views = last.get(test_on)
+    for name in IMAGE_METRICS:
+        figures[name] = (views or {}).get(name)
+        if figures[name] is None:
+            why = last.get(f"{test_on}_reason") if views is None else views.get(f"{name}_reason")
+            reasons[name] = str(why or "not measured")
+    figures["bytes"] = last["bytes"]
+    figures["seconds"] = round(sum(stage["seconds"] for stage in metrics["stages"]), 3)  # shared stages count too
+    surface = surface_figures(metrics.get("surface"), data_set)
+    figures.update(surface)
+    notes = record.get("notes") or {}
+    for name in (n for n in ("fscore", "chamfer") if figures[n] is None):
+        reasons[name] = notes.get("surface") or (metrics.get("surface") or {}).get("reason") or "no ground truth"
+    details = {
+        "splats": last["splats"],
+        "views": test_on,
+        "surface": metrics.get("surface"),
+        "stages": [{"name": s["name"], "seconds": s["seconds"], **_scores(s, test_on)} for s in metrics["stages"]],
+    }
+    return Cell(figures=figures, reasons=reasons, details=details, **place)
+
+
+def _scores(stage: dict[str, Any], test_on: str) -> dict[str, Any]:
+    scores = {"splats": stage["splats"], "psnr": (stage.get(test_on) or {}).get("psnr")}
+    clone = (stage.get("after_clone") or {}).get(test_on)
+    return {**scores, "psnr_after_clone": clone["psnr"]} if clone else scores
+
+
+def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, float | None]:
+    """F-score at the middle threshold, and Chamfer distance, from the ``surface`` entry of ``metrics.json``."""
+    if not surface:
+        return {"fscore": None, "chamfer": None}
+    scores = surface.get("thresholds") or []
+    middle = scores[len(scores) // 2]["f_score"] if scores else None
+    return {"fscore": surface.get("f_score", middle), "chamfer": surface.get("chamfer")}
+
+
+# -- orders ----------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Step:
+    """The difference of two neighbouring rows of an order, in the direction in which the paper has it.
+
+    Attributes
+    ----------
+    lower, upper : str
+        Rows; the paper says that ``upper`` is better (or not worse, or alike).
+    metric : str
+    difference : float
+        Mean over scenes and seeds of better-ness: upper minus lower, the other way round where lower is better.
+    spread : float or None
+        Standard deviation over seeds of the mean over scenes of the difference, taken seed by seed.
+    seeds : int
+    seeds_with_sign : int
+        At so many of them the order is the paper's.
+    """
+
+    lower: str
+    upper: str
+    metric: str
+    difference: float
+    spread: float | None
+    seeds: int
+    seeds_with_sign: int
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether one of the paper's orders holds on one data set.
+
+    ``holds`` is "yes", "no", "open" (the seeds disagree) or "unknown" (something was not measured: ``reason``).
+    """
+
+    text: str
+    metric: str
+    kind: str
+    data_set: str
+    holds: str
+    steps: tuple[Step, ...]
+    reason: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def judge(table: PaperTable, results: Results) -> tuple[Verdict, ...]:
+    """Every order of a table, on every data set that was trained."""
+    return tuple(judge_order(order, results.rows, d) for d in results.data_sets for order in table.orders)
+
+
+def judge_order(order: Order, rows: Sequence[Row], data_set: str) -> Verdict:
+    """One order on one data set."""
+    metric = order.metric
+    if metric == "surface":
+        metric = "chamfer" if data_set == DTU else "fscore"
+    by_name = {row.name: row for row in rows}
+    facts = (order.text, metric, order.kind, data_set)
+    for name in order.rows:
+        cells = by_name[name].of(data_set)
+        if all(cell.figures[metric] is None for cell in cells):
+            why = cells[0].reasons.get(metric, "not measured") if cells else "not trained"
+            return Verdict(*facts, "unknown", (), f"no {METRICS[metric]} of {name}: {why}")
+    steps = tuple(_step(by_name[a], by_name[b], metric, data_set, order) for a, b in _pairs(order))
+    if not all(step.seeds for step in steps):
+        return Verdict(*facts, "unknown", (), "no scene and seed that both rows have")
+    if all(step.seeds_with_sign == step.seeds for step in steps):
+        holds = "yes"
+    elif any(step.seeds_with_sign == 0 for step in steps):
+        holds = "no"
+    else:
+        holds = "open"
+    return Verdict(*facts, holds, steps)
+
+
+def _pairs(order: Order) -> list[tuple[str, str]]:
+    rows = order.rows
+    if order.kind == "best":
+        return [(row, rows[-1]) for row in rows[:-1]]
+    if order.kind == "flat":  # the worst and the best decide, but the reader wants to see who they are
+        return [(a, b) for i, a in enumerate(rows) for b in rows[i + 1 :]]
+    return list(itertools.pairwise(rows))
+
+
+def _step(lower: Row, upper: Row, metric: str, data_set: str, order: Order) -> Step:
+    sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
+    values = {row.name: {(c.scene, c.seed): c.figures[metric] for c in row.of(data_set)} for row in (lower, upper)}
+    by_seed: dict[int, list[float]] = {}
+    for (scene, seed), high in values[upper.name].items():
+        low = values[lower.name].get((scene, seed))
+        if high is not None and low is not None:
+            by_seed.setdefault(seed, []).append(sign * (high - low))
+    differences = [statistics.fmean(group) for group in by_seed.values()]
+    within = order.within or 0.0
+    if order.kind == "flat":
+        right = [abs(d) <= within for d in differences]
+    elif order.kind == "at least":  # not worse by more than the paper rounds away
+        right = [d >= -ROUNDING[metric] for d in differences]
+    else:
+        right = [d > 0 for d in differences]
+    spread = statistics.stdev(differences) if len(differences) > 1 else None
+    mean = statistics.fmean(differences) if differences else 0.0
+    return Step(lower.name, upper.name, metric, mean, spread, len(right), sum(right))
+
+
+ROUNDING = {"fscore": 0.005, "chamfer": 0.005, "psnr": 0.005, "ssim": 0.0005, "lpips": 0.0005}

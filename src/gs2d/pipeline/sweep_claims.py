@@ -1,0 +1,133 @@
+"""Claims: files that one process at a time holds, so that several processes can share one list of work.
+
+A claim is made with ``O_EXCL`` (atomic on local and network file systems) and names host, process and the time at
+which that process began, so that the claim of a killed process is recognised, even if its number is in use again.
+A claim of another machine is stale when it was not touched for ``FOREIGN_SECONDS``. Pure Python; never imports torch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gs2d.disk import disk_error
+from gs2d.errors import RunError
+from gs2d.io.run import RunFolder
+
+FOREIGN_SECONDS = 1800.0
+UNWRITTEN_SECONDS = 10.0
+TOUCH_SECONDS = 20.0
+
+
+@dataclass(eq=False)
+class Claim:
+    """A claim that this process holds."""
+
+    path: Path
+    text: str
+    touched: float = field(default_factory=time.monotonic)
+
+    def touch(self) -> None:
+        """Say that the holder lives (at most every ``TOUCH_SECONDS``)."""
+        if time.monotonic() - self.touched > TOUCH_SECONDS:
+            with contextlib.suppress(OSError):
+                os.utime(self.path)
+            self.touched = time.monotonic()
+
+    def release(self) -> None:
+        """Give it back, unless somebody has taken it over."""
+        with contextlib.suppress(OSError):
+            if self.path.read_text() == self.text:
+                self.path.unlink()
+
+
+def take_claim(path: Path) -> Claim | None:
+    """Claim a name; None if a living process holds it.
+
+    Raises
+    ------
+    DiskError
+        The file cannot be written.
+    """
+    claim = _create(path)
+    if claim is not None or not is_stale(path):
+        return claim
+    # Taking over is done by one process at a time: two that both saw a dead claim must not both end up with a new one.
+    try:
+        with RunFolder(path.parent).locked():
+            if is_stale(path):
+                path.unlink(missing_ok=True)
+            return _create(path)
+    except RunError:  # another process is taking something over: ask again later
+        return None
+
+
+def _create(path: Path) -> Claim | None:
+    text = json.dumps({**_me(), "token": uuid.uuid4().hex})
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+        with os.fdopen(descriptor, "w") as file:
+            file.write(text)
+    except FileExistsError:
+        return None
+    except OSError as error:
+        raise disk_error(path, error) from error
+    return Claim(path, text)
+
+
+def holder(path: Path) -> dict[str, Any] | None:
+    """Who holds a claim; None if nobody does."""
+    try:
+        return dict(json.loads(path.read_text()))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError):
+        return {}
+
+
+def is_stale(path: Path) -> bool:
+    """Whether a claim's holder is dead."""
+    found = holder(path)
+    if found is None:
+        return False
+    if not found:  # killed between making the file and writing into it, or about to write
+        return _age(path) > UNWRITTEN_SECONDS
+    if found.get("host") == socket.gethostname():
+        return _began(int(found.get("pid", -1))) != found.get("began") or found.get("began") is None
+    return _age(path) > FOREIGN_SECONDS
+
+
+def _age(path: Path) -> float:
+    """Seconds since a file was touched; 0 if it is gone."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _me() -> dict[str, Any]:
+    return {"host": socket.gethostname(), "pid": os.getpid(), "began": _began(os.getpid())}
+
+
+def _began(pid: int) -> str | None:
+    """When a process began (Linux: ticks since boot; elsewhere just "alive"); None if it is not there."""
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return None if words[0] in "ZX" else words[19]
+    except OSError:
+        if Path("/proc/self/stat").exists():
+            return None
+    try:
+        os.kill(pid, 0)
+    except PermissionError:
+        return "alive"
+    except (OSError, ValueError):
+        return None
+    return "alive"

@@ -1,0 +1,75 @@
+"""A sweep on Slurm, through submitit (extra ``slurm``): every slot is a Slurm job that works off the same list."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from gs2d.errors import BackendError, RunError
+from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.pipeline.sweep import Sweep, SweepJob, work
+from gs2d.pipeline.sweep_slots import watch
+
+
+def run_on_slurm(
+    sweep: Sweep,
+    on_event: OnEvent,
+    *,
+    slots: int,
+    parameters: Mapping[str, Any],
+    after_job: Callable[[SweepJob], None],
+    executor: Any = None,
+) -> None:
+    """Submit ``slots`` jobs, each of which works until the list is done, and wait for the list.
+
+    The folders must be on a disk that the nodes share. A Slurm job that dies is not submitted again; its runs are
+    taken over by the others, or by the next `gs2d paper` with the same --out.
+
+    Parameters
+    ----------
+    parameters : mapping
+        For the executor's ``update_parameters``: ``slurm_partition``, ``timeout_min``, ``gpus_per_node`` ...
+    executor : object, optional
+        What submits, with the interface of ``submitit.Executor``; default: Slurm.
+
+    Raises
+    ------
+    BackendError
+        submitit is not installed, or Slurm not there.
+    RunError
+        All Slurm jobs ended and runs are left.
+    """
+    if executor is None:
+        executor = _slurm_executor(sweep)
+    executor.update_parameters(**parameters)
+    submitted = [executor.submit(work, sweep) for _ in range(min(slots, len(sweep.jobs)))]
+    on_event(Notice("submitted as " + ", ".join(str(job.job_id) for job in submitted)))
+
+    def check() -> None:
+        if all(job.done() for job in submitted) and sweep.unsettled():
+            why = next((str(error).splitlines()[-1] for job in submitted if (error := job.exception())), "no message")
+            raise RunError(
+                f"the Slurm jobs ended before the runs were done ({why}); their logs are in {sweep.folder / 'slurm'}; "
+                "run the command again to go on"
+            )
+
+    try:
+        watch(sweep, on_event, after_job, check)
+    except BaseException:
+        for job in submitted:
+            if not job.done():
+                job.cancel()
+        raise
+
+
+def _slurm_executor(sweep: Sweep) -> Any:
+    try:
+        import submitit
+    except ModuleNotFoundError as error:
+        raise BackendError(
+            "--slurm needs submitit, which is not installed; pip install '2dgs-r[slurm]', or leave --slurm out"
+        ) from error
+    try:
+        return submitit.SlurmExecutor(folder=sweep.folder / "slurm")
+    except RuntimeError as error:
+        raise BackendError(f"--slurm needs Slurm's commands on this machine: {error}; or leave --slurm out") from error
