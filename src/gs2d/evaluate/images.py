@@ -103,7 +103,7 @@ def psnr_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None) -> floa
 def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend_name: str) -> float:
     """Mean SSIM over valid pixels (11x11 Gaussian window, zero padding: the SSIM of the loss); image clamped to [0, 1].
 
-    ``nan`` when no pixel is valid. ``backend_name`` is "cpu" (native) or "reference" (torch).
+    ``nan`` when no pixel is valid. ``backend_name`` is "cpu" or "cuda" (fused) or "reference" (torch).
     """
     check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
     if target.numel() == 0 or (mask is not None and not bool(mask.any())):
@@ -133,7 +133,8 @@ def _lpips(network: Lpips | None, image: Tensor, target: Tensor, mask: Tensor | 
             return Metric(None, "no valid pixel")
         image = torch.where(mask[..., None], image, target)
     with torch.no_grad():
-        return _metric(float(network(_as_8bit(image).float(), _as_8bit(target).float(), convention=convention)))
+        pair = (_as_8bit(image).float().to(network.device), _as_8bit(target).float().to(network.device))
+        return _metric(float(network(*pair, convention=convention)))
 
 
 def image_metrics(
@@ -152,7 +153,7 @@ def image_metrics(
         In [0, 1]; the image is clamped to it.
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel. LPIPS sees the target there and still averages over the whole image.
-    backend_name : "cpu" or "reference"
+    backend_name : "cpu", "cuda" or "reference"
     lpips : Lpips, optional
         From ``evaluate.lpips.load_lpips``; without it LPIPS is null with the remedy as reason.
     """

@@ -44,6 +44,11 @@ class Lpips:
 
     weights: Mapping[str, Tensor]
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are, and images must be."""
+        return next(iter(self.weights.values())).device
+
     def __call__(self, image: Tensor, target: Tensor, *, convention: str = "0..1") -> Tensor:
         """Distance [] of two images [H, W, 3] with values in [0, 1].
 

@@ -154,7 +154,7 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
     total = torch.zeros(len(splats), dtype=torch.float64)
     views = job.scene.train
     for view in counted(views, "errors of each splat", len(views), on_event):
-        image = torch.from_numpy(view.target(job.settings.background)).to(splats.dtype)
+        image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
         mask = view.mask() if job.protocol.use_mask_in_training else None
         errors = splat_errors(
             splats,
@@ -162,7 +162,7 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
             image,
             job.settings,
             backend=job.backend,
-            mask=None if mask is None else torch.from_numpy(mask),
+            mask=None if mask is None else torch.from_numpy(mask).to(splats.device),
             occlusion=action.occlusion,
         )
         total += errors.cpu()
@@ -182,7 +182,7 @@ def _first_ranking(recipe: Recipe) -> tuple[int, RankByError]:
 
 def map_limits(errors: Tensor) -> tuple[float, float]:
     """E_i at the ends of the colour scale: the median and the 99.9th percentile of those above 0."""
-    seen = errors[errors > 0].numpy()
+    seen = errors[errors > 0].cpu().numpy()
     if not len(seen):
         return 1.0, 10.0
     low, high = (float(value) for value in np.percentile(seen, MAP_PERCENTILES))

@@ -44,7 +44,8 @@ def _open(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder
     use_threads(threads)
     run = open_run(path)
     splats = finished_splats(run)
-    return run, reload_job(run, on_event), splats
+    job = reload_job(run, on_event)
+    return run, job, splats.to(job.backend.device)
 
 
 def mesh_run(
@@ -107,7 +108,7 @@ def render_run(
             old.unlink()
     for name, view in counted(views, "rendering", len(views), on_event):
         color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
-        write_image(folder / f"{name}.png", color.numpy())
+        write_image(folder / f"{name}.png", color.cpu().numpy())
     return {"folder": str(folder), "images": len(views)}
 
 

@@ -63,13 +63,13 @@ def draw_stage(
     views = []
     for split, view in shown:
         output = render_view(splats, view, job.settings, job.backend)
-        depth = output.depth(job.protocol.depth).numpy()
-        alpha = output.alpha.numpy()
+        depth = output.depth(job.protocol.depth).cpu().numpy()
+        alpha = output.alpha.cpu().numpy()
         near_far = limits.get(view.name) or list(depth_limits(depth, alpha))  # of the first stage: stages compare
-        color, photo = output.color.numpy(), view.target(job.settings.background)
+        color, photo = output.color.cpu().numpy(), view.target(job.settings.background)
         pictures = {
             "color": np.clip(color, 0, 1),
-            "normal": normal_picture(output.normal.numpy(), alpha),
+            "normal": normal_picture(output.normal.cpu().numpy(), alpha),
             "depth": depth_picture(depth, alpha, (near_far[0], near_far[1])),
             "error": error_picture(color, photo, view.mask()),
         }
@@ -116,4 +116,4 @@ def splatted(splats: Splats, values: Tensor, view: View, settings: RasterSetting
     grey = values.to(splats.dtype)[:, None].expand(-1, 3)
     marked = Splats(**{**dict(splats.items()), "sh0": rgb_to_sh0(grey), "shN": torch.zeros_like(splats.shN)})
     settings = replace(settings, background=(0.0, 0.0, 0.0))
-    return np.asarray(render_view(marked, view, settings, backend).color[..., 0].numpy())
+    return np.asarray(render_view(marked, view, settings, backend).color[..., 0].cpu().numpy())

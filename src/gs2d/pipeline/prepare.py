@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.errors import RecipeError, RunError
@@ -143,10 +144,17 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
 
 
 def choose_backend(name: str, on_event: OnEvent) -> Backend:
-    """The backend of a name; says so when "auto" had to take the slow one."""
+    """The backend of a name; says what "auto" took where that is a GPU, not one that is here, or the slow reference."""
     backend = get_backend(name)
-    if name == "auto" and backend.name == "reference":
-        cpu = next(status for status in backend_report() if status.name == "cpu")
+    if name != "auto":
+        return backend
+    statuses = {status.name: status for status in backend_report()}
+    cuda, cpu = statuses["cuda"], statuses["cpu"]
+    if backend.name == "cuda":
+        on_event(Notice(f"training on {cuda.details} (--backend cpu for the processor)"))
+    elif torch.version.cuda is not None and torch.cuda.device_count() > 0:
+        on_event(Notice(f"training without the GPU: {cuda.reason}; {cuda.remedy}"))
+    if backend.name == "reference":
         on_event(Notice(f"training with the reference backend, which is slow: {cpu.reason}; {cpu.remedy}"))
     return backend
 

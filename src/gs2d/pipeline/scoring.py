@@ -38,12 +38,12 @@ def score_views(
     with torch.no_grad():
         for done, view in enumerate(views, start=1):
             image = rasterize(splats, view.camera, settings, backend=backend).color
-            target = torch.from_numpy(view.target(settings.background)).to(image.dtype)
+            target = torch.from_numpy(view.target(settings.background)).to(image)
             mask = view.mask()
             scores[view.name] = image_metrics(
                 image,
                 target,
-                None if mask is None else torch.from_numpy(mask),
+                None if mask is None else torch.from_numpy(mask).to(image.device),
                 backend_name=backend.name,
                 lpips=lpips,
             )

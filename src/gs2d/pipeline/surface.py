@@ -14,7 +14,7 @@ import torch
 from gs2d.disk import disk_error
 from gs2d.errors import ProtocolError
 from gs2d.io.ply import write_mesh
-from gs2d.mesh.extract import Extraction, extract
+from gs2d.mesh.extract import Extraction, extract, extract_unbounded
 from gs2d.mesh.frames import Frame
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
 from gs2d.pipeline.options import MeshOptions
@@ -48,24 +48,33 @@ def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_e
     result = _extract(job, splats, options, depth, on_event)
     write_mesh(out, result.mesh)
     if result.limits.cut_fraction > MOSTLY_CUT:
-        on_event(
-            Notice(
-                f"{result.limits.cut_fraction:.0%} of the depth lies outside the fused box: the scene has a background "
-                "that is not in the mesh; --bbox or --depth-limit widen it"
-            )
-        )
+        on_event(Notice(_cut_text(result, options)))
     limits = asdict(result.limits)
     return {
         "file": str(out),
         "vertices": len(result.mesh.vertices),
         "faces": len(result.mesh.faces),
         "depth": depth,
+        "unbounded": options.unbounded,
+        "levels": result.levels,
         **limits,
         "blocks": result.blocks,
         "volume_bytes": result.volume_bytes,
         "components": result.components,
         "faces_removed": result.faces_removed,
     }
+
+
+def _cut_text(result: Extraction, options: MeshOptions) -> str:
+    """What was left out, and the option that brings it back."""
+    part = f"{result.limits.cut_fraction:.0%} of the depth lies"
+    if options.unbounded:
+        limit = result.limits.depth_limit
+        return f"{part} beyond {limit:.4g} wu, where these cameras no longer tell depth; --depth-limit widens it"
+    return (
+        f"{part} outside the fused box: the scene has a background that is not in the mesh; --unbounded takes all of "
+        "it, --bbox or --depth-limit widen the box"
+    )
 
 
 def check_mesh_options(options: MeshOptions) -> None:
@@ -75,10 +84,11 @@ def check_mesh_options(options: MeshOptions) -> None:
     ------
     ProtocolError
     """
-    for name in ("voxel", "truncation", "depth_limit"):
+    for name in ("voxel", "truncation", "depth_limit", "max_gib"):
         value = getattr(options, name)
         if value is not None and not (value > 0 and math.isfinite(value)):
-            raise ProtocolError(f"--{name.replace('_', '-')} must be a positive number of world units, got {value}")
+            unit = "GiB" if name == "max_gib" else "world units"
+            raise ProtocolError(f"--{name.replace('_', '-')} must be a positive number of {unit}, got {value}")
     if options.bbox is not None:
         low, high = np.asarray(options.bbox, np.float64).reshape(2, 3)
         if not (np.isfinite(options.bbox).all() and (low < high).all()):
@@ -93,14 +103,16 @@ def _extract(job: Job, splats: Splats, options: MeshOptions, depth: str, on_even
     fusion = job.protocol.fusion
     keep = fusion.clusters if options.keep_components is None else options.keep_components
     # A box or a voxel of the user's own makes the protocol's other limits meaningless.
-    own = options.bbox is not None
-    result = extract(
+    own = options.bbox is not None or options.unbounded
+    fuse_frames = extract_unbounded if options.unbounded else extract
+    result = fuse_frames(
         _frames(job, splats, depth, on_event),
         bbox=None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3),
         voxel=options.voxel if own else options.voxel or fusion.voxel,
         truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
         depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,
         keep=keep or None,
+        max_bytes=int(options.max_gib * 2**30),
         threads=torch.get_num_threads(),
     )
     if not len(result.mesh.faces):
@@ -113,11 +125,11 @@ def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
             output = rasterize(splats, view.camera, job.settings, backend=job.backend)
-        valid = (output.alpha >= OPAQUE).numpy()
+        valid = (output.alpha >= OPAQUE).cpu().numpy()
         mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
         if mask is not None:
             valid = valid & mask
-        yield Frame(view.camera, output.depth(depth).numpy(), surface_color(output, job).numpy(), valid)
+        yield Frame(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
     on_event(Phase("fusing", 0))
 
 
