@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import shutil
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -79,6 +83,85 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
     line = capsys.readouterr().err.strip()
     assert line.startswith(f"interrupted; resume with: gs2d train {capture} --out {tmp_path / 'run'}")
     assert line.endswith("--resume")
+
+
+@pytest.mark.parametrize("module", ["gs2d.cli.app", "tyro", "torch"])
+def test_ctrl_c_while_modules_load_is_one_line_and_exit_code_130(module: str, trained: Path) -> None:
+    code = f"""
+import os, signal, sys
+class Press:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                pass  # as torch does in places
+sys.meta_path.insert(0, Press())
+from gs2d.cli import main
+main(["report", {str(trained)!r}])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_somebody_swallowed_is_heard_at_the_next_event(
+    number: signal.Signals,
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from gs2d.pipeline import jobs
+
+    def swallowing(*_args: object) -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+
+    monkeypatch.setattr(jobs, "use_threads", swallowing, raising=False)
+    monkeypatch.setattr("gs2d.pipeline.train.use_threads", swallowing)
+    assert run(["render", str(trained), "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_ctrl_c_right_after_the_first_does_not_stop_the_cleaning_up(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.io.run import RunFolder
+    from gs2d.train.loop import Trainer
+
+    discard = RunFolder.discard
+
+    def impatient(self: RunFolder) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        discard(self)
+
+    monkeypatch.setattr(Trainer, "step", lambda _self: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(RunFolder, "discard", impatient)
+    assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("stdout", "code", "message"), [("closed pipe", 141, ""), ("full disk", 2, "No space left")])
+def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(stdout: str, code: int, message: str) -> None:
+    if stdout == "full disk":
+        if not os.path.exists("/dev/full"):
+            pytest.skip("there is no /dev/full here")
+        file = os.open("/dev/full", os.O_WRONLY)
+    else:
+        reader, file = os.pipe()
+        os.close(reader)
+    try:
+        words = [sys.executable, "-m", "gs2d", "recipes"]
+        done = subprocess.run(words, stdout=file, stderr=subprocess.PIPE, text=True, timeout=100)
+    finally:
+        os.close(file)
+    assert done.returncode == code
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == bool(message)
 
 
 def test_ctrl_c_before_the_first_checkpoint_leaves_nothing(

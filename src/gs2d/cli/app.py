@@ -1,4 +1,7 @@
-"""From arguments to an exit code: 0 done, 2 the user can mend it (one line), 1 a fault of ours, 130 interrupted."""
+"""From arguments to an exit code: 0 done, 2 the user can mend it (one line), 1 a fault of ours, 130 interrupted.
+
+141 (as of a process that SIGPIPE ended) where the reader of a pipe went away: ``gs2d recipes | head -1``.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,18 @@ import io
 import os
 import re
 import shlex
-import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from types import FrameType
+from collections.abc import Sequence
 from typing import NoReturn
 
 import gs2d
-from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Train
+from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Doctor, Info, Recipes, Train
 from gs2d.cli.console import Console
+from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.errors import Gs2dError
 
-OK, OURS, USERS, INTERRUPTED = 0, 1, 2, 130
+OK, OURS, USERS, NOBODY_READS = 0, 1, 2, 141
 _MENDABLE = {
     errno.ENOSPC,
     errno.EDQUOT,
@@ -37,21 +39,10 @@ _MENDABLE = {
     errno.EISDIR,
     errno.EIO,
 }
+_HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info))
 _COMMANDS = {command.__name__.lower() for command in COMMANDS}
 _MARKUP = re.compile(r"\[/?bold\]")  # tyro shows its own markup in one of its messages
 _BOX = str.maketrans(dict.fromkeys("╭╮╰╯│─", " "))
-
-
-def main(argv: Sequence[str] | None = None) -> NoReturn:
-    """Entry point of the command."""
-    # Before torch loads: its OpenMP threads would spin at every barrier, which costs 3x where the cores are shared.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    try:
-        code = run(sys.argv[1:] if argv is None else argv)
-    except KeyboardInterrupt:  # while the arguments were read, or once more while the first was handled
-        print("interrupted", file=sys.stderr)
-        code = INTERRUPTED
-    sys.exit(code)
 
 
 def run(argv: Sequence[str]) -> int:
@@ -67,20 +58,42 @@ def run(argv: Sequence[str]) -> int:
         return exit_.code if isinstance(exit_.code, int) else USERS
     except UsageError as error:
         return _fail(str(error))
-    console = Console(quiet=command.quiet, as_json=command.json)
+    interruptible = Interruptible()
+    console = Console(quiet=command.quiet, as_json=command.json, before_each=interruptible.check)
     try:
-        with _terminated_like_ctrl_c():
-            importlib.import_module("gs2d.cli.actions").execute(command, console)
+        actions = importlib.import_module("gs2d.cli.actions")
+        if isinstance(command, _HEAVY):
+            importlib.import_module("gs2d.pipeline.jobs")  # torch and all: see `interrupts`
+        with interruptible:
+            actions.execute(command, console)
+            console.flush()
         return OK
     except KeyboardInterrupt:
         console.close()
         return _interrupted(argv, command)
     except BrokenPipeError:  # `gs2d ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OURS
+        _drop_stdout()
+        return NOBODY_READS
     except Exception as error:
         console.close()
         return _report(error, command.debug)
+
+
+def leave(code: int) -> NoReturn:
+    """End the process; what stdout still holds is written, or silently dropped if nobody reads it."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        _drop_stdout()
+        code = NOBODY_READS if isinstance(error, BrokenPipeError) else code or _report(error, debug=False)
+    sys.exit(code)
+
+
+def _drop_stdout() -> None:
+    """What cannot be written is not written again when Python shuts down."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class UsageError(Exception):
@@ -160,21 +173,3 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
         line += f"; resume with: gs2d {shlex.join([*words, '--resume'])}"
     print(line, file=sys.stderr)
     return INTERRUPTED
-
-
-@contextlib.contextmanager
-def _terminated_like_ctrl_c() -> Iterator[None]:
-    """SIGTERM (a scheduler, `timeout`) ends a command as Ctrl-C does."""
-
-    def interrupt(_signal: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        previous = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:  # not the main thread: whoever runs us there has the signals
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)

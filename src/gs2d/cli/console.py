@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich import box
@@ -24,20 +24,28 @@ from rich.table import Table
 from gs2d.pipeline.events import Event, Notice, Phase, StageDone, Step
 
 
+class _Screen(RichConsole):
+    def on_broken_pipe(self) -> None:
+        """Say that nobody reads, where rich would end the process itself."""
+        raise BrokenPipeError
+
+
 class Console:
     """The screen. With ``quiet`` nothing but results asked for as JSON; with ``as_json`` stdout carries only JSON."""
 
-    def __init__(self, *, quiet: bool, as_json: bool) -> None:
+    def __init__(self, *, quiet: bool, as_json: bool, before_each: Callable[[], None] = lambda: None) -> None:
         self.quiet = quiet
         self.as_json = as_json
-        self._out = RichConsole(file=sys.stdout, highlight=False, soft_wrap=True)
-        self._err = RichConsole(file=sys.stderr, highlight=False)
+        self._before_each = before_each  # event; may raise
+        self._out = _Screen(file=sys.stdout, highlight=False, soft_wrap=True)
+        self._err = _Screen(file=sys.stderr, highlight=False)
         self._progress: Progress | None = None
         self._task: TaskID | None = None
         self._named: set[str] = set()  # phases that a log file has heard of
 
     def on_event(self, event: Event) -> None:
         """Draw an event of the pipeline."""
+        self._before_each()
         if self.quiet:
             return
         if isinstance(event, Phase):
@@ -81,6 +89,11 @@ class Console:
         if self._progress is not None:
             self._progress.stop()
             self._progress = self._task = None
+
+    def flush(self) -> None:
+        """Write what stdout still holds: a full disk or a closed pipe is heard of here, not when Python shuts down."""
+        if sys.stdout is not None:
+            sys.stdout.flush()
 
     def say(self, text: str) -> None:
         """A line for people, on stdout."""
