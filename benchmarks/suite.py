@@ -32,7 +32,7 @@ def workload_result(library: Library, workload: Workload, seconds: float, least:
     steps, work, peak = measured.steps, measured.work, measured.probe
     repeats = max(least, min(30, round(1e3 * seconds / max(steps["raster_backward"].median * 2, 1.0))))
     iterations = iteration_times(workload, library, repeats)
-    stages = {f"stage{index + 1}": timing for index, (timing, _) in enumerate(iterations.values())}
+    stages = {f"stage{index + 1}": row.timing for index, row in enumerate(iterations.values())}
     return {
         "splats": work.splats,
         "width": work.width,
@@ -45,8 +45,9 @@ def workload_result(library: Library, workload: Workload, seconds: float, least:
         "iteration_best_ms": {name: rounded(timing.best) for name, timing in stages.items()},
         "iteration_spread_ms": {name: rounded(timing.spread) for name, timing in stages.items()},
         "iteration_fma_gflops": {
-            f"stage{index + 1}": rounded(rate) for index, (_, rate) in enumerate(iterations.values())
+            f"stage{index + 1}": rounded(row.fma_gflops) for index, row in enumerate(iterations.values())
         },
+        "stage2_fill_ms_by_view": rounded(iterations["appearance"].extra_ms_of_first_by_view),
         "fma_fraction": {
             "forward": rounded(fraction(FORWARD, work.pairs, steps["blend_forward"].best, peak.fma_gflops)),
             "backward": rounded(fraction(BACKWARD, work.pairs, steps["blend_backward"].best, peak.fma_gflops)),
