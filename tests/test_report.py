@@ -7,6 +7,7 @@ import html
 import io
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,12 +15,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d import report_images, report_mesh
+from gs2d import report, report_images, report_mesh, report_surface
 from gs2d.camera import Camera, look_at
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.files import write_json
-from gs2d.report import RunRecord, stage_table, story, surface_table, verdict, write_report
+from gs2d.report import RunRecord, stage_table, story, verdict, write_report
 from gs2d.report_curves import curves, read_history, smoothed
+from gs2d.report_surface import surface_scores
 from gs2d.triangles import Mesh
 from report_runs import KNOT, definition, events, fabricate, scores, stage_entry
 
@@ -162,7 +164,7 @@ def test_the_verdict_states_gain_and_price() -> None:
 
 def test_the_verdict_takes_the_middle_threshold_of_the_surface() -> None:
     rows = [{"threshold": t, "f_score": f} for t, f in ((0.01, 0.4), (0.02, 0.7), (0.04, 0.9))]
-    assert "an F-score of 0.700 within 0.02 world units" in verdict(record(surface={"thresholds": rows}))
+    assert "an F-score of 0.700 within 0.02 (units of the truth)" in verdict(record(surface={"thresholds": rows}))
 
 
 def test_the_verdict_does_not_hide_a_loss_or_an_unfinished_run() -> None:
@@ -192,10 +194,30 @@ def test_the_table_marks_the_best_and_says_why_lpips_is_missing() -> None:
 
 def test_surface_figures_are_shown_or_their_absence_explained() -> None:
     row = {"threshold": 0.02, "precision": 0.91, "recall": 0.84, "f_score": 0.8736}
-    table = surface_table(record(surface={"thresholds": [row], "chamfer": 0.0123}))
+    surface = {"thresholds": [row], "chamfer": 0.0123, "truth_hidden": 0.4459, "novel": 3}
+    table = surface_scores({**surface, "ground_truth": "/somewhere/else/true.ply"}, None)
     assert "<td>0.02</td><td>0.9100</td><td>0.8400</td><td>0.8736</td>" in table
-    assert "0.0123" in table
-    assert "The surface was not scored: no camera saw it." in surface_table(record(surface_reason="no camera saw it"))
+    assert "<td>Chamfer distance</td><td>0.0123</td>" in table
+    assert '<td>Truth hidden</td><td>44.6 %</td><td class="text">share of the true surface that fewer' in table
+    assert "<td>True surface</td><td>true.ply</td>" in table  # no folder of this machine
+    assert "<td>Novel</td><td>3</td>" in table  # a later version's figure is shown, unexplained
+    assert "harmonic mean" in table
+    assert "The surface was not scored: no camera saw it." in surface_scores(None, "no camera saw it")
+
+
+def test_every_figure_of_a_surface_score_is_explained_in_the_report() -> None:
+    from dataclasses import fields
+
+    from gs2d.evaluate.surface import SurfaceScore
+
+    known = {field.name for field in fields(SurfaceScore)} - {"scores"}
+    assert known <= set(report_surface._MEANINGS)
+
+
+def test_a_run_that_was_given_a_title_has_it_as_the_heading() -> None:
+    assert report._title(record()) == "still <life>"
+    titled = replace(record(), definition={**record().definition, "title": "gs2d demo"})
+    assert report._title(titled) == "gs2d demo"
 
 
 def test_the_story_counts_what_the_log_says() -> None:

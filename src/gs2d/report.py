@@ -21,6 +21,7 @@ from gs2d.io.run import MESH, RENDERS, REPORT, open_run
 from gs2d.report_curves import curves, read_history
 from gs2d.report_html import drawing, escape, facts, missing, page, table
 from gs2d.report_pictures import hero, mesh_section, view_sections
+from gs2d.report_surface import surface_scores
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 
@@ -103,15 +104,15 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
     """
     record = read_record(run)
     renders = record.path / RENDERS
-    scene = _scene_name(record)
+    title = _title(record)
     body = [
-        f'<div class="eyebrow">gs2d report</div><h1>{escape(scene)}</h1>',
+        f'<div class="eyebrow">gs2d report</div><h1>{escape(title)}</h1>',
         f'<p class="lead">{verdict(record)}</p>',
         hero(renders),
         "<h2>Results</h2>",
         stage_table(record),
         "<h2>Surface</h2>",
-        surface_table(record),
+        surface_scores(record.surface, record.surface_reason),
         mesh_section(record.path / MESH, cameras),
         "<h2>Every stage beside the photographs</h2>",
         view_sections(renders, expected_stages=[stage["name"] for stage in record.stages]),
@@ -125,11 +126,13 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
     ]
     target = record.path / REPORT
     with atomic_write(target, "w") as file:
-        file.write(page(f"{scene}: gs2d report", [part for part in body if part]))
+        file.write(page(f"{title}: gs2d report", [part for part in body if part]))
     return target
 
 
-def _scene_name(record: RunRecord) -> str:
+def _title(record: RunRecord) -> str:
+    if record.definition.get("title"):
+        return str(record.definition["title"])
     scene = record.definition.get("scene")
     return str(scene.get("name") if isinstance(scene, Mapping) else scene or record.path.name)
 
@@ -180,7 +183,7 @@ def _surface_sentence(surface: Mapping[str, Any] | None) -> str:
     if not rows:
         return ""
     middle = rows[len(rows) // 2]  # neither the strictest nor the kindest
-    return f" The mesh has an F-score of {middle['f_score']:.3f} within {middle['threshold']:.3g} world units."
+    return f" The mesh has an F-score of {middle['f_score']:.3f} within {middle['threshold']:.3g} (units of the truth)."
 
 
 def _unfinished(record: RunRecord) -> str:
@@ -215,7 +218,9 @@ def stage_table(record: RunRecord) -> str:
             figure(stage.get("seconds"), 1),
             figure(_scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
         ]
-    notes = [_reasons(record.stages, splits), _clone_note(record)]
+    words = "PSNR and SSIM: means over the views, of pictures rounded to 8 bits. Higher is better, the best is green."
+    legend = f'<p class="soft">{words}</p>' if shown else ""
+    notes = [legend, _reasons(record.stages, splits), _clone_note(record)]
     return table(columns, rows) + "".join(notes)
 
 
@@ -268,29 +273,6 @@ def _clone_note(record: RunRecord) -> str:
                 f"from {earlier:.2f} to {after:.2f} dB."
             )
     return "".join(f'<p class="soft">{escape(line)}</p>' for line in lines)
-
-
-def surface_table(record: RunRecord) -> str:
-    """Distances and scores against the true surface."""
-    surface = record.surface
-    if not surface:
-        reason = record.surface_reason or "no true surface was given (gs2d evaluate RUN --ground-truth FILE)"
-        return missing(f"The surface was not scored: {reason}.")
-    parts = []
-    rows = [
-        [f"{row['threshold']:.4g}", *(figure(row.get(name), 4) for name in ("precision", "recall", "f_score"))]
-        for row in surface.get("thresholds") or []
-    ]
-    if rows:
-        parts.append(table(["Within, world units", "Precision", "Recall", "F-score"], rows))
-    scalars = [
-        (name.replace("_", " "), f"{value:.5g}" if isinstance(value, float) else str(value))
-        for name, value in surface.items()
-        if isinstance(value, int | float | str)
-    ]
-    if scalars:
-        parts.append(facts(scalars))
-    return "".join(parts) or missing("metrics.json has a surface entry without figures.")
 
 
 # -- training ----------------------------------------------------------------------------------------------------------

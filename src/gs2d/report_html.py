@@ -37,13 +37,15 @@ dl.facts dt { color: var(--soft); font-size: .78rem; } dl.facts dd { margin: 0; 
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; min-width: 100%; }
 th, td { text-align: right; padding: .42rem .65rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th { font-weight: 600; font-size: .8rem; color: var(--soft); } th:first-child, td:first-child { text-align: left; }
+th { font-weight: 600; font-size: .8rem; color: var(--soft); }
+th:first-child, td:first-child, th.text, td.text { text-align: left; }
+td.text { white-space: normal; color: var(--soft); font-size: .87rem; min-width: 16rem; }
 td.best { font-weight: 650; color: var(--good); }
 td .why { display: block; color: var(--soft); font-size: .72rem; white-space: normal;
   max-width: 16rem; margin-left: auto; }
 figure { margin: 0; } img { display: block; width: 100%; height: auto; border-radius: 6px; background: #fff; }
 .hero, .meshes { display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: .9rem; }
-.meshes { grid-template-columns: repeat(auto-fit, minmax(18rem, 1fr)); }
+.meshes { grid-template-columns: repeat(auto-fit, minmax(18rem, 1fr)); } .pair { display: grid; gap: .9rem; }
 figcaption { padding: .3rem .1rem 0; }
 .views { display: grid; gap: .5rem; align-items: start; min-width: 46rem; }
 .views > .head { font-size: .8rem; font-weight: 600; color: var(--soft); text-align: center; }
@@ -95,11 +97,14 @@ def facts(pairs: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML already: ``<td ...>`` elements, or text."""
-    head = "".join(f"<th>{escape(column)}</th>" for column in columns)
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, texts: Sequence[int] = ()) -> str:
+    """A table of cells that are HTML already: ``<td ...>`` elements, or text; ``texts`` are the columns of words."""
+    style = [' class="text"' if i in texts else "" for i in range(len(columns))]
+    head = "".join(f"<th{style[i]}>{escape(column)}</th>" for i, column in enumerate(columns))
     body = "".join(
-        "<tr>" + "".join(cell if cell.startswith("<td") else f"<td>{cell}</td>" for cell in row) + "</tr>"
+        "<tr>"
+        + "".join(cell if cell.startswith("<td") else f"<td{style[i]}>{cell}</td>" for i, cell in enumerate(row))
+        + "</tr>"
         for row in rows
     )
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'

@@ -189,8 +189,9 @@ def mesh_section(path: Path, cameras: Sequence[Camera]) -> str:
     where = "from cameras of the capture" if cameras else "from two sides, taking the third axis as up"
     figures = []
     for shown in mesh_pictures(mesh, chosen):
-        figures.append(picture(shown.shape, alt="the mesh as clay", width=420))
+        pair = picture(shown.shape, alt="the mesh as clay", width=420)
         if shown.color is not None:
-            figures.append(picture(shown.color, alt="the mesh in its vertex colours", width=420))
+            pair += picture(shown.color, alt="the mesh in its vertex colours", width=420)
+        figures.append(f'<div class="pair">{pair}</div>')
     words = "as clay and in its vertex colours" if mesh.colors is not None else "as clay (it has no vertex colours)"
     return f'<div class="meshes">{"".join(figures)}</div><p class="soft">The mesh, {counts}, {words}, {where}.</p>'

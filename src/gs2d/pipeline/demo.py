@@ -14,6 +14,7 @@ from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.train import train, use_threads
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
+TITLE = "gs2d demo: a still life whose true surface is known"
 TRAIN_VIEWS, TEST_VIEWS, SIZE = 40, 8, 256
 SCHEDULE_SCALE = 0.1
 
@@ -73,6 +74,7 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
             resume=options.resume,
             overwrite=overwrite,
             schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
+            title=TITLE,
             allowed=(CAPTURE,),
         ),
         on_event,

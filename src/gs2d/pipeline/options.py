@@ -44,6 +44,8 @@ class TrainOptions:
     stage2_cache_mb : int
         MiB for cached views in stages that train only the colours of a row group (cpu backend); 0 = none. A part of
         the run's definition: which views are cached decides the rounding.
+    title : str or None
+        Heading of the report; None = the name of the capture.
     shown_views : int
         Views that are rendered after each stage for the report.
     allowed : tuple of str
@@ -68,6 +70,7 @@ class TrainOptions:
     checkpoint_every: int = 1000
     checkpoint_seconds: float = 120.0
     stage2_cache_mb: int = 1024
+    title: str | None = None
     shown_views: int = 3
     allowed: tuple[str, ...] = ()
 
@@ -81,7 +84,11 @@ class MeshOptions:
     voxel, truncation, depth_limit : float or None
         wu.
     bbox : six floats or None
-        Smallest and largest corner of the box that is kept, wu.
+        Smallest and largest corner of the box that is kept, wu; with ``unbounded`` of the box with the finest voxels.
+    unbounded : bool
+        Fuse what lies far away too, in voxels that grow with the distance.
+    max_gib : float
+        The volume will not grow beyond this.
     depth : str or None
         "mean" or "median".
     keep_components : int or None
@@ -92,6 +99,8 @@ class MeshOptions:
     truncation: float | None = None
     depth_limit: float | None = None
     bbox: tuple[float, float, float, float, float, float] | None = None
+    unbounded: bool = False
+    max_gib: float = 4.0
     depth: str | None = None
     keep_components: int | None = None
 

@@ -55,7 +55,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
                     "train it again with --overwrite, or choose another --out"
                 )
         else:
-            run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale})
+            extra = {"title": options.title} if options.title else {}
+            run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         start = choose_start(run, job, options, on_event)
         splats = train_stages(run, job, options, start, on_event)
         finish(run, job, splats, on_event)
