@@ -39,13 +39,14 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; min-width
 th, td { text-align: right; padding: .42rem .65rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { font-weight: 600; font-size: .8rem; color: var(--soft); }
 th:first-child, td:first-child, th.text, td.text { text-align: left; }
-td.text { white-space: normal; color: var(--soft); font-size: .87rem; min-width: 16rem; }
+td.text { white-space: normal; color: var(--soft); font-size: .87rem; min-width: 9rem; }
 td.best { font-weight: 650; color: var(--good); }
 td .why { display: block; color: var(--soft); font-size: .72rem; white-space: normal;
   max-width: 16rem; margin-left: auto; }
 figure { margin: 0; } img { display: block; width: 100%; height: auto; border-radius: 6px; background: #fff; }
 .hero, .meshes { display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: .9rem; }
-.meshes { grid-template-columns: repeat(auto-fit, minmax(18rem, 1fr)); } .pair { display: grid; gap: .9rem; }
+.meshes { grid-template-columns: repeat(auto-fit, minmax(18rem, 1fr)); margin-top: 1rem; }
+.pair { display: grid; gap: .9rem; }
 figcaption { padding: .3rem .1rem 0; }
 .views { display: grid; gap: .5rem; align-items: start; min-width: 46rem; }
 .views > .head { font-size: .8rem; font-weight: 600; color: var(--soft); text-align: center; }

@@ -10,8 +10,8 @@ from gs2d.report_html import escape, missing, table
 
 SCORES = (
     "Precision: the share of the mesh that is nearer to the true surface than the distance in the first column. "
-    "Recall: the share of the true surface that is nearer to the mesh. F-score: their harmonic mean. Only what the training "
-    "views see counts; the distance is in the units of the true surface."
+    "Recall: the share of the true surface that is nearer to the mesh. F-score: their harmonic mean. Only what the "
+    "training views see counts; the distance is in the units of the true surface."
 )
 _MEANINGS = {  # of the entries of metrics.json, in the order of the report
     "ground_truth": ("True surface", "the file that the mesh is compared with"),
