@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gs2d.data.layouts import tnt_truth_files
 from gs2d.errors import DataError
 from gs2d.evaluate.crop import CropVolume, box, read_crop
 from gs2d.evaluate.tnt_files import match_cameras, read_tnt_truth, read_trajectory, read_transform
@@ -97,7 +98,7 @@ def test_a_transform_is_four_lines_of_four_numbers(tmp_path: Path) -> None:
 
 def test_a_missing_file_of_the_truth_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"Barn\.ply"):
-        read_tnt_truth(tmp_path, "Barn")
+        read_tnt_truth("Barn", {what: tmp_path / name for what, name in tnt_truth_files("Barn").items()})
 
 
 def test_photographs_are_matched_with_the_log_by_order_or_by_number() -> None:

@@ -12,9 +12,10 @@ from scipy.io import savemat
 from scipy.spatial import cKDTree
 
 from gs2d.camera import look_at
+from gs2d.data.layouts import dtu_truth_files
 from gs2d.errors import DataError
 from gs2d.evaluate.dtu import Silhouette, evaluate_dtu, inside_silhouettes, mesh_points, thin
-from gs2d.evaluate.dtu_files import DtuTruth, read_dtu_truth, truth_files
+from gs2d.evaluate.dtu_files import DtuTruth, read_dtu_truth
 from gs2d.io.ply_format import write_ply
 from gs2d.protocols_surface import DTU_SURFACE
 from gs2d.triangles import Mesh
@@ -208,7 +209,7 @@ def test_the_culled_part_of_the_mesh_is_not_scored() -> None:
 def write_truth(folder: Path, scan: int = 24) -> dict[str, Path]:
     """The three files of a scan in the real formats."""
     truth = flat_truth()
-    files = {name: folder / path for name, path in truth_files(scan).items()}
+    files = {name: folder / path for name, path in dtu_truth_files(scan).items()}
     for path in files.values():
         path.parent.mkdir(parents=True, exist_ok=True)
     rows = np.zeros(len(truth.points), [(c, "<f4") for c in "xyz"] + [("red", "u1"), ("green", "u1"), ("blue", "u1")])

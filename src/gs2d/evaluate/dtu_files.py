@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,17 +51,8 @@ class DtuTruth:
         return np.asarray(self.points[self.points @ self.plane[:3] + self.plane[3] > 0])
 
 
-def truth_files(scan: int) -> dict[str, str]:
-    """The three files by what they are, relative to the folders that the data set comes in."""
-    return {
-        "scan": f"Points/stl/stl{scan:03}_total.ply",
-        "mask": f"ObsMask/ObsMask{scan}_10.mat",
-        "plane": f"ObsMask/Plane{scan}.mat",
-    }
-
-
-def read_dtu_truth(scan: int, files: dict[str, Path]) -> DtuTruth:
-    """Read the ground truth of a scan from its three ``files`` (keys as ``truth_files``).
+def read_dtu_truth(scan: int, files: Mapping[str, Path]) -> DtuTruth:
+    """Read the ground truth of a scan from its three ``files`` (keys as ``data.layouts.dtu_truth_files``).
 
     Raises
     ------

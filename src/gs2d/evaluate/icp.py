@@ -21,7 +21,7 @@ CHUNK = 1 << 20  # points asked for at a time: bounds memory beside the clouds t
 def nearest(
     tree: cKDTree, queries: np.ndarray, *, limit: float = math.inf, workers: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance and index [Q] of the nearest point of a tree; infinity and the tree's size if none is within the limit."""
+    """Distance and index [Q] of the nearest point of a tree; infinity and the tree's size beyond the limit."""
     distances, index = np.empty(len(queries)), np.empty(len(queries), np.int64)
     threads = workers or os.cpu_count() or 1
     for start in range(0, len(queries), CHUNK):

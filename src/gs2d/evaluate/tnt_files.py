@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,25 +38,14 @@ class TntTruth:
     trajectory: np.ndarray
 
 
-def truth_files(folder: Path, scene: str) -> dict[str, Path]:
-    """The four files by what they are: scan, crop, transform, log."""
-    return {
-        "scan": folder / f"{scene}.ply",
-        "crop": folder / f"{scene}.json",
-        "transform": folder / f"{scene}_trans.txt",
-        "log": folder / f"{scene}_COLMAP_SfM.log",
-    }
-
-
-def read_tnt_truth(folder: Path, scene: str) -> TntTruth:
-    """Read the ground truth of a scene.
+def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
+    """Read the ground truth of a scene from its four ``files`` (keys as ``data.layouts.tnt_truth_files``).
 
     Raises
     ------
     DataError
         A file is missing or broken; names it.
     """
-    files = truth_files(folder, scene)
     points = np.asarray(read_points(files["scan"]).points)
     crop = read_crop(files["crop"])
     if not crop.contains(points).any():

@@ -1,0 +1,297 @@
+"""The paper's data sets as they are distributed: which scenes a folder holds, and every piece that is missing.
+
+A piece that is not there is named by its path, what it is for, and where to get it, one line each. Nothing is decoded
+and nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gs2d.data.layout_pieces import (
+    TESTING,
+    TRAINING,
+    Missing,
+    blender_pieces,
+    colmap_pieces,
+    dtu_pieces,
+    has_dtu_cameras,
+)
+from gs2d.errors import DataError
+from gs2d.protocols import Protocol, get_protocol, protocol_for
+from gs2d.protocols_datasets import (
+    DATASETS,
+    DTU_SCENES,
+    MIP_NERF_360_SCENES,
+    NERF_SYNTHETIC_SCENES,
+    TNT_SCENES,
+    DataSet,
+    SceneFacts,
+    get_dataset,
+)
+
+DEPTH = 3  # folders below the data folder in which scenes are looked for (TNT_GOF/TrainingSet/Barn)
+MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # beside a capture's photographs
+SCORING = "to score the surface"
+_BY_NAME = ("tnt", "mip-nerf-360")  # COLMAP models as anyone's: only the names tell them
+
+_TNT_TRUTH = "get it from tanksandtemples.org, Download, Training Data: the files of this scene"
+_TRUTH_SOURCES = {
+    ("dtu", "scan"): "get it from the archive Points of the DTU Robot Image Data Sets (MVS)",
+    ("dtu", "mask"): "get it from the archive SampleSet of the DTU Robot Image Data Sets (MVS)",
+    ("dtu", "plane"): "get it from the archive SampleSet of the DTU Robot Image Data Sets (MVS)",
+    ("tnt", "scan"): f"{_TNT_TRUTH} (ground truth)",
+    ("tnt", "crop"): f"{_TNT_TRUTH} (cropfiles)",
+    ("tnt", "transform"): f"{_TNT_TRUTH} (alignment)",
+    ("tnt", "log"): f"{_TNT_TRUTH} (camera poses); not the file of the same name in TNT_GOF",
+    ("nerf-synthetic", "mesh"): "it is not distributed: export the object of the scene's .blend file, axes unchanged",
+}
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """One scene of a data set in a folder.
+
+    Attributes
+    ----------
+    dataset, facts : DataSet, SceneFacts
+    root : Path
+        The capture.
+    truth : mapping of str to Path
+        The pieces of the ground truth that are there: "scan", "mask", "plane" (DTU), "scan", "crop", "transform", "log"
+        (Tanks and Temples), "mesh" (NeRF-Synthetic).
+    missing : tuple of Missing
+        Of the capture and of the ground truth.
+    """
+
+    dataset: DataSet
+    facts: SceneFacts
+    root: Path
+    truth: Mapping[str, Path] = field(default_factory=dict)
+    missing: tuple[Missing, ...] = ()
+
+    @property
+    def can_train(self) -> bool:
+        """Whether nothing that training or testing reads is missing."""
+        return not any(piece.purpose in (TRAINING, TESTING) for piece in self.missing)
+
+    @property
+    def can_score(self) -> bool:
+        """Whether all of the ground truth is there."""
+        return bool(self.truth) and not any(piece.purpose == SCORING for piece in self.missing)
+
+    def lines(self) -> tuple[str, ...]:
+        """One line for each missing piece."""
+        return tuple(piece.line() for piece in self.missing)
+
+
+def find_scenes(
+    data: Path, dataset: str, names: Sequence[str] = (), *, truth: Path | None = None
+) -> tuple[SceneFolder, ...]:
+    """The scenes of a data set under a folder, in the order of the paper's tables.
+
+    Parameters
+    ----------
+    data : Path
+        What was unpacked: the folder of the scenes, one above it, or one scene.
+    dataset : str
+        A name of ``DATASETS``.
+    names : sequence of str
+        Only these scenes; each must be there. Empty: all that are.
+    truth : Path, optional
+        Folder of the ground truth; None: looked for beside the captures.
+
+    Raises
+    ------
+    DataError
+        No such folder, or a scene that was asked for is not there; names it.
+    ProtocolError
+        No such data set or scene.
+    """
+    if not data.is_dir():
+        raise DataError(f"{data} must be a folder of {get_dataset(dataset).title}, got no such folder")
+    known = get_dataset(dataset)
+    wanted = [known.scene(name) for name in names] or list(known.scenes)
+    folders = list(_folders(data))
+    found = []
+    for facts in wanted:
+        root = next((folder for folder in folders if _is_scene(known, facts, folder)), None)
+        if root is not None:
+            found.append(describe(known, facts, root, truth=truth))
+        elif names:
+            raise DataError(
+                f"{data} must hold the scene {facts.name} of {known.title}, got no such folder; "
+                f"{_capture_source(known)}"
+            )
+    return tuple(found)
+
+
+def recognise(root: Path) -> tuple[DataSet, SceneFacts] | None:
+    """The data set and scene that a capture's folder is, by its name and its files; None for anyone else's."""
+    for dataset in DATASETS.values():
+        for facts in dataset.scenes:
+            if _is_scene(dataset, facts, root):
+                return dataset, facts
+    scan = re.search(r"scan_?(\d+)$", root.name.lower())
+    if scan and has_dtu_cameras(root):  # one of the scans that are not in the tables
+        number = int(scan.group(1))
+        return DTU_SCENES, SceneFacts(f"scan{number}", "dtu", 2, scan=number)
+    return None
+
+
+def describe(dataset: DataSet, facts: SceneFacts, root: Path, *, truth: Path | None = None) -> SceneFolder:
+    """The pieces of one scene: what of the ground truth is there, and all that is missing."""
+    source = _capture_source(dataset)
+    pieces = {
+        "dtu": lambda: dtu_pieces(root),
+        "tnt": lambda: [*colmap_pieces(root, ("images",), source), *_published_log(facts, root)],
+        "nerf-synthetic": lambda: blender_pieces(root, source),
+        "mip-nerf-360": lambda: colmap_pieces(root, ("images", facts.images), source),
+    }[dataset.name]()
+    found, lacking = find_truth(dataset, facts, root, truth)
+    return SceneFolder(dataset, facts, root, found, (*pieces, *lacking))
+
+
+def find_truth(
+    dataset: DataSet, facts: SceneFacts, root: Path, folder: Path | None = None
+) -> tuple[dict[str, Path], tuple[Missing, ...]]:
+    """The pieces of a scene's ground truth that are there, and those that are not.
+
+    Parameters
+    ----------
+    folder : Path, optional
+        Where it is; None: in the capture's folder, in those above it, and in the folders of those.
+    """
+    above = 2 if dataset.name == "dtu" else 3  # TNT_GOF/TrainingSet/Barn is deeper than DTU/scan24
+    places = [folder] if folder is not None else [root, *root.parents[:above]]
+    if dataset.name == "dtu":
+        names = dtu_truth_files(facts.scan or 0)
+        near = [place for base in places for place in (base, *_subfolders(base))]
+        inside = [place for base in near for place in (base, base / "MVS Data", base / "SampleSet" / "MVS Data")]
+        found = {what: path for what, name in names.items() if (path := _first(inside, name)) is not None}
+        if found:  # where the others are
+            what, path = next(iter(found.items()))
+            places = [path.parents[names[what].count("/")]]
+    elif dataset.name == "tnt":
+        names = tnt_truth_files(facts.name)
+        candidates = [
+            place
+            for base in places
+            for place in (base, base / facts.name, *(sub / facts.name for sub in _subfolders(base)))
+        ]
+        best = max(candidates, key=lambda place: _own_pieces(place, names))
+        has_any = _own_pieces(best, names) > 0
+        found = {what: best / name for what, name in names.items() if has_any and (best / name).is_file()}
+        places = [best] if has_any else places
+    elif dataset.name == "nerf-synthetic":
+        names = {"mesh": MESH_TRUTHS[0]}
+        at = folder if folder is not None else root
+        mesh = next((at / name for name in MESH_TRUTHS if (at / name).is_file()), None)
+        found = {} if mesh is None else {"mesh": mesh}
+        places = [at]
+    else:
+        return {}, ()
+    lacking = tuple(
+        Missing(places[0] / name, SCORING, _TRUTH_SOURCES[dataset.name, what])
+        for what, name in names.items()
+        if what not in found
+    )
+    return found, lacking
+
+
+def protocol_of(root: Path, scene_format: str) -> Protocol:
+    """What ``--protocol auto`` takes: the scene's of a known data set, else that of the format of the capture.
+
+    Raises
+    ------
+    ProtocolError
+        Unknown format.
+    """
+    known = recognise(root)
+    if known is None or (known[0].name in _BY_NAME) != (scene_format == "colmap"):
+        return protocol_for(scene_format)
+    return get_protocol(known[1].protocol)
+
+
+def dtu_truth_files(scan: int) -> dict[str, str]:
+    """The three files of a DTU scan by what they are, relative to the folders that the data set comes in."""
+    return {
+        "scan": f"Points/stl/stl{scan:03}_total.ply",
+        "mask": f"ObsMask/ObsMask{scan}_10.mat",
+        "plane": f"ObsMask/Plane{scan}.mat",
+    }
+
+
+def tnt_truth_files(scene: str) -> dict[str, str]:
+    """The four files of a scene of Tanks and Temples by what they are."""
+    return {
+        "scan": f"{scene}.ply",
+        "crop": f"{scene}.json",
+        "transform": f"{scene}_trans.txt",
+        "log": f"{scene}_COLMAP_SfM.log",
+    }
+
+
+def published_log(root: Path, scene: str) -> Path:
+    """The camera log beside the photographs of a scene of TNT_GOF."""
+    return root / tnt_truth_files(scene)["log"]
+
+
+def _published_log(facts: SceneFacts, root: Path) -> list[Missing]:
+    path = published_log(root, facts.name)
+    return [] if path.is_file() else [Missing(path, "only to check the frame", _capture_source(TNT_SCENES))]
+
+
+def _own_pieces(place: Path, names: Mapping[str, str]) -> int:
+    """Files of the ground truth in a folder; the log alone does not count, for captures come with one."""
+    own = sum((place / name).is_file() for what, name in names.items() if what != "log")
+    return 2 * own + (place / names["log"]).is_file() if own else 0
+
+
+def _is_scene(dataset: DataSet, facts: SceneFacts, root: Path) -> bool:
+    """By the folder's name (``scan24``, ``dtu_scan24``, ``Barn``, ``nerf_synthetic_lego``) and one telling file."""
+    name = root.name.lower()
+    if name != facts.name.lower() and not name.endswith(f"_{facts.name.lower()}"):
+        return False
+    if dataset is DTU_SCENES:
+        return has_dtu_cameras(root) or any((root / n).is_dir() for n in ("image", "images"))
+    if dataset is NERF_SYNTHETIC_SCENES:
+        return any((root / f"transforms_{split}.json").is_file() for split in ("train", "test"))
+    if not (root / "sparse").is_dir() and not (root / "images").is_dir():
+        return False
+    return dataset is not MIP_NERF_360_SCENES or (root / "poses_bounds.npy").is_file() or (root / facts.images).is_dir()
+
+
+def _capture_source(dataset: DataSet) -> str:
+    """Where the capture is distributed."""
+    return (
+        "get it from "
+        + {
+            "dtu": "the preprocessed DTU of 2DGS (linked from github.com/hbb1/2d-gaussian-splatting) or NeuS (data_DTU)",
+            "tnt": "TNT_GOF of the Hugging Face data set ZehaoYu/gaussian-opacity-fields",
+            "nerf-synthetic": "nerf_synthetic.zip of the NeRF authors (linked from github.com/bmild/nerf)",
+            "mip-nerf-360": "360_v2.zip of the Mip-NeRF 360 project page",
+        }[dataset.name]
+    )
+
+
+def _folders(data: Path) -> Iterator[Path]:
+    """A folder and those below it, nearest first."""
+    level = [data]
+    for _ in range(DEPTH + 1):
+        yield from level
+        level = [sub for folder in level for sub in _subfolders(folder)]
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    try:
+        return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    except OSError:
+        return []  # not ours to read: nothing of the data set is in it
+
+
+def _first(places: Sequence[Path], name: str) -> Path | None:
+    return next((place / name for place in places if (place / name).is_file()), None)

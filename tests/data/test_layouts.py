@@ -1,0 +1,248 @@
+"""Data sets as they are distributed, written small: every file that is taken away is named in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_writers import ColmapModel, ring, small_blender, small_colmap, small_dtu, write_picture
+from scipy.io import savemat
+
+from gs2d.data import detect_format, load_scene
+from gs2d.data.layouts import describe, find_scenes, find_truth, protocol_of, recognise
+from gs2d.errors import DataError, ProtocolError
+from gs2d.protocols_datasets import DATASETS, get_dataset
+
+
+def write_dtu_2dgs(data: Path) -> Path:
+    """DTU as 2DGS prepares it, and the official files beside it."""
+    root = data / "DTU" / "scan24"
+    cameras = small_dtu(root, count=3, images="images", archive="cameras.npz")
+    shutil.copy(root / "cameras.npz", root / "cameras_sphere.npz")
+    model = ColmapModel(cameras={1: ("PINHOLE", 40, 30, (35.0, 35.0, 20.0, 15.0))})
+    model.images = [(i + 1, c.T_cam_world, 1, f"{i:06d}.png", []) for i, c in enumerate(cameras)]
+    model.points = [(1, (0.1, 0.2, 0.3), (1, 2, 3), 0.1, [])]
+    model.write(root / "sparse/0")
+    official = data / "Official_DTU_Dataset"
+    (official / "Points/stl").mkdir(parents=True)
+    (official / "Points/stl/stl024_total.ply").write_text("ply\n")
+    (official / "ObsMask").mkdir()
+    savemat(official / "ObsMask/ObsMask24_10.mat", {"ObsMask": np.ones((2, 2, 2), np.uint8)})
+    savemat(official / "ObsMask/Plane24.mat", {"P": np.ones((4, 1))})
+    return root
+
+
+def write_dtu_neus(data: Path) -> Path:
+    """DTU as NeuS has it; the official archives as they unpack."""
+    root = data / "data_DTU" / "dtu_scan65"
+    small_dtu(root, count=3)
+    (data / "Points/stl").mkdir(parents=True)
+    (data / "Points/stl/stl065_total.ply").write_text("ply\n")
+    masks = data / "SampleSet/MVS Data/ObsMask"
+    masks.mkdir(parents=True)
+    (masks / "ObsMask65_10.mat").write_text("")
+    (masks / "Plane65.mat").write_text("")
+    return root
+
+
+def write_tnt(data: Path) -> Path:
+    """TNT_GOF, and the ground truth of the official site."""
+    root = data / "TNT_GOF/TrainingSet/Barn"
+    small_colmap(root, count=4)
+    (root / "Barn_COLMAP_SfM.log").write_text("")
+    truth = data / "TNT_GT/Barn"
+    truth.mkdir(parents=True)
+    for name in ("Barn.ply", "Barn.json", "Barn_trans.txt", "Barn_COLMAP_SfM.log"):
+        (truth / name).write_text("")
+    return root
+
+
+def write_nerf_synthetic(data: Path) -> Path:
+    root = data / "nerf_synthetic/lego"
+    small_blender(root, train=3, test=2)
+    frames = json.loads((root / "transforms_test.json").read_text())
+    for frame in frames["frames"]:
+        frame["file_path"] = frame["file_path"].replace("test", "val")
+    (root / "transforms_val.json").write_text(json.dumps(frames))
+    shutil.copytree(root / "test", root / "val")
+    (root / "mesh_gt.ply").write_text("ply\n")
+    return root
+
+
+def write_360(data: Path) -> Path:
+    root = data / "360_v2/garden"
+    model = small_colmap(root, count=3)
+    for image in model.images:
+        write_picture(root / "images_4" / image[3], 10, 8)
+    (root / "poses_bounds.npy").write_text("")
+    return root
+
+
+LAYOUTS: dict[str, tuple[str, str, Callable[[Path], Path]]] = {
+    "dtu-2dgs": ("dtu", "scan24", write_dtu_2dgs),
+    "dtu-neus": ("dtu", "scan65", write_dtu_neus),
+    "tnt": ("tnt", "Barn", write_tnt),
+    "nerf-synthetic": ("nerf-synthetic", "lego", write_nerf_synthetic),
+    "mip-nerf-360": ("mip-nerf-360", "garden", write_360),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_whole_data_set_has_its_scene_and_nothing_missing(tmp_path: Path, layout: str) -> None:
+    dataset, name, write = LAYOUTS[layout]
+    root = write(tmp_path)
+    (scene,) = find_scenes(tmp_path, dataset)
+    assert (scene.dataset.name, scene.facts.name, scene.root) == (dataset, name, root)
+    assert scene.lines() == ()
+    assert scene.can_train
+    assert scene.can_score == (dataset != "mip-nerf-360")  # which has no true surface
+    assert recognise(root) == (scene.dataset, scene.facts)
+    # the folder itself, one above it, and by name
+    assert [s.root for s in find_scenes(root, dataset)] == [root]
+    assert [s.root for s in find_scenes(root.parent, dataset, [name.upper()])] == [root]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_whole_data_set_loads(tmp_path: Path, layout: str) -> None:
+    root = LAYOUTS[layout][2](tmp_path)
+    scene = load_scene(root, downscale=4 if layout == "mip-nerf-360" else 1)
+    assert len(scene.views) >= 3
+    assert scene.skipped == ()
+
+
+def files_of(layout: str) -> list[str]:
+    """What each writer writes, so that pytest can name every case before anything is written."""
+    pictures = [f"{i:06d}.png" for i in range(3)]
+    masks = [f"{i:03d}.png" for i in range(3)]
+    model = [f"sparse/0/{stem}.bin" for stem in ("cameras", "images", "points3D")]
+    if layout == "dtu-2dgs":
+        root, official = "DTU/scan24", "Official_DTU_Dataset"
+        truth = ["Points/stl/stl024_total.ply", "ObsMask/ObsMask24_10.mat", "ObsMask/Plane24.mat"]
+        capture = [f"images/{p}" for p in pictures] + [f"mask/{m}" for m in masks] + model
+        capture += ["cameras.npz", "cameras_sphere.npz"]
+        return [f"{root}/{f}" for f in capture] + [f"{official}/{f}" for f in truth]
+    if layout == "dtu-neus":
+        capture = [f"image/{p}" for p in pictures] + [f"mask/{m}" for m in masks] + ["cameras_sphere.npz"]
+        mat = [f"SampleSet/MVS Data/ObsMask/{n}" for n in ("ObsMask65_10.mat", "Plane65.mat")]
+        return [f"data_DTU/dtu_scan65/{f}" for f in capture] + ["Points/stl/stl065_total.ply", *mat]
+    if layout == "tnt":
+        names = ("Barn.ply", "Barn.json", "Barn_trans.txt", "Barn_COLMAP_SfM.log")
+        capture = [f"images/{i}.png" for i in range(4)] + model + ["Barn_COLMAP_SfM.log"]
+        return [f"TNT_GOF/TrainingSet/Barn/{f}" for f in capture] + [f"TNT_GT/Barn/{n}" for n in names]
+    if layout == "nerf-synthetic":
+        splits = {"train": 3, "test": 2, "val": 2}
+        lists = [f"transforms_{split}.json" for split in splits]
+        capture = [f"{split}/r_{i}.png" for split, count in splits.items() for i in range(count)]
+        return [f"nerf_synthetic/lego/{f}" for f in (*lists, *capture, "mesh_gt.ply")]
+    capture = [f"{folder}/{i}.png" for folder in ("images", "images_4") for i in range(3)]
+    return [f"360_v2/garden/{f}" for f in (*model, *capture)]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_list_of_files_below_is_every_file(tmp_path: Path, layout: str) -> None:
+    LAYOUTS[layout][2](tmp_path)
+    written = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert written - {"360_v2/garden/poses_bounds.npy"} == set(files_of(layout))  # which says whose folder it is
+
+
+@pytest.mark.parametrize(("layout", "file"), [(layout, file) for layout in LAYOUTS for file in files_of(layout)])
+def test_a_file_that_is_taken_away_is_named_in_one_line(tmp_path: Path, layout: str, file: str) -> None:
+    dataset, name, write = LAYOUTS[layout]
+    root = write(tmp_path)
+    (tmp_path / file).unlink()
+    facts = get_dataset(dataset).scene(name)
+    if file.startswith(("Official", "TNT_GT", "Points", "SampleSet")) or "mesh_gt" in file:  # the ground truth
+        purpose = "to score the surface"
+    elif file.endswith("val.json") or "/val/" in file or (layout == "dtu-2dgs" and file.endswith(".npz")):
+        purpose = "distributed, but not read by gs2d"
+    else:
+        purpose = ""
+    (line,) = [line for line in describe(get_dataset(dataset), facts, root).lines() if _names(line, Path(file).name)]
+    assert line.count("\n") == 0
+    assert " is missing (" in line
+    assert purpose in line
+    assert "get it from" in line or "export the object" in line
+    lines = describe(get_dataset(dataset), facts, root).lines()
+    lists = file.endswith((".json", ".npz", "images.bin"))  # without a list, what it lists is not looked for
+    assert len(lines) == 1 or lists
+    (scene,) = find_scenes(tmp_path, dataset) or (None,)
+    assert scene is None or scene.lines() == lines
+
+
+def _names(line: str, name: str) -> bool:
+    return line.split(" is missing")[0].endswith(name)
+
+
+def test_a_scene_that_is_asked_for_and_is_not_there_is_an_error(tmp_path: Path) -> None:
+    write_tnt(tmp_path)
+    with pytest.raises(DataError, match="must hold the scene Truck of Tanks and Temples, got no such folder; get it"):
+        find_scenes(tmp_path, "tnt", ["Truck"])
+    with pytest.raises(ProtocolError, match="no scene 'Rome' in Tanks and Temples; there is Barn, Caterpillar"):
+        find_scenes(tmp_path, "tnt", ["Rome"])
+    with pytest.raises(ProtocolError, match="no data set 'kitti'; there is dtu, tnt"):
+        find_scenes(tmp_path, "kitti")
+    with pytest.raises(DataError, match="must be a folder of DTU, got no such folder"):
+        find_scenes(tmp_path / "none", "dtu")
+    assert find_scenes(tmp_path, "dtu") == ()
+
+
+def test_the_ground_truth_may_be_given(tmp_path: Path) -> None:
+    root = write_tnt(tmp_path)
+    elsewhere = tmp_path / "far/away/GT"
+    shutil.move(tmp_path / "TNT_GT", elsewhere)
+    dataset, facts = recognise(root) or (None, None)
+    assert dataset is not None
+    assert facts is not None
+    assert find_truth(dataset, facts, root, elsewhere)[1] == ()
+    assert find_truth(dataset, facts, root, elsewhere / "Barn")[1] == ()
+    found, missing = find_truth(dataset, facts, root)
+    assert found == {}  # the log beside the photographs is not a ground truth
+    assert len(missing) == 4
+
+
+def test_a_scan_outside_the_tables_is_recognised_by_its_number(tmp_path: Path) -> None:
+    small_dtu(tmp_path / "scan33", count=3)
+    dataset, facts = recognise(tmp_path / "scan33") or (None, None)
+    assert dataset is DATASETS["dtu"]
+    assert facts is not None
+    assert facts.scan == 33
+
+
+@pytest.mark.parametrize(
+    ("layout", "protocol"),
+    [("dtu-neus", "dtu"), ("tnt", "tnt"), ("nerf-synthetic", "nerf-synthetic"), ("mip-nerf-360", "mip-nerf-360")],
+)
+def test_auto_takes_the_protocol_of_a_known_scene(tmp_path: Path, layout: str, protocol: str) -> None:
+    root = LAYOUTS[layout][2](tmp_path)
+    assert protocol_of(root, detect_format(root)).name == protocol
+
+
+def test_auto_follows_the_format_of_everything_else(tmp_path: Path) -> None:
+    small_colmap(tmp_path / "garden")
+    assert protocol_of(tmp_path / "garden", "colmap").name == "generic"
+    courthouse = tmp_path / "Courthouse"
+    small_colmap(courthouse)
+    assert protocol_of(courthouse, "colmap").name == "tnt-large"
+    assert protocol_of(courthouse, "nerfstudio").name == "generic"
+
+
+def test_somebody_s_own_folder_is_of_no_data_set(tmp_path: Path) -> None:
+    small_colmap(tmp_path / "truck_stop")
+    small_colmap(tmp_path / "garden")  # the name alone is not enough
+    small_blender(tmp_path / "scan24")
+    for name in ("truck_stop", "garden", "scan24"):
+        assert recognise(tmp_path / name) is None, name
+
+
+@pytest.mark.parametrize("archive", ["cameras.npz", "cameras_sphere.npz"])
+def test_raw_dtu_has_the_same_cameras_under_either_name(tmp_path: Path, archive: str) -> None:
+    cameras = small_dtu(tmp_path, count=3, archive=archive)
+    scene = load_scene(tmp_path)
+    assert scene.format == "dtu"
+    for view, camera in zip(scene.train, cameras, strict=True):
+        np.testing.assert_allclose(view.camera.T_cam_world, camera.T_cam_world, atol=1e-9)
+    assert len(ring(3)) == len(scene.train)
