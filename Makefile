@@ -2,6 +2,7 @@
 #   make demo      the main job on a small synthetic capture: runs/demo/report.html
 #   make test      ruff, mypy and the tests that take minutes, not hours
 #   make test-all  the slow tests too
+#   make test-gpu  what needs an NVIDIA GPU: the contract and parity on it, streams, waiting, training; skipped without one
 #   make lint      ruff and mypy
 #   make kernels   the native library into the source tree, for development with PYTHONPATH=src
 VENV := .venv
@@ -18,7 +19,7 @@ SOURCES := $(shell find src CMakeLists.txt pyproject.toml README.md LICENSE -typ
 # One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts.
 TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo test test-all lint kernels install clean
+.PHONY: demo test test-all test-gpu lint kernels install clean
 
 demo: $(VENV)/installed
 	$(VENV)/bin/gs2d demo
@@ -28,6 +29,10 @@ test: lint
 
 test-all: lint
 	$(TEST_ENV) $(PY) -m pytest -n $(WORKERS) -q $(TEST_ARGS)
+
+# One process: the tests share the device.
+test-gpu: $(VENV)/installed
+	$(TEST_ENV) $(PY) -m pytest -m gpu -q $(TEST_ARGS)
 
 lint: $(VENV)/installed
 	$(PY) -m ruff check .

@@ -1,17 +1,38 @@
-"""``backend`` runs a test on every rasterizer that this machine has."""
+"""``backend`` runs a test on every rasterizer that this machine has; the CUDA kernels also run emulated on the CPU."""
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
+import torch
+from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "cuda"))  # emulate
+
+import emulate
+
+from gs2d.camera import Camera
 from gs2d.errors import BackendError
+from gs2d.kernels.cuda.launch import Launcher
+from gs2d.render import cuda
 from gs2d.render.backend import Backend, get_backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import Splats
 
 
-@pytest.fixture(params=["reference", "cpu"])
+@pytest.fixture(params=["reference", "cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])
 def backend(request: pytest.FixtureRequest) -> Backend:
-    """Every available backend; the ones that cannot run here skip with their reason."""
-    return _available(request.param)
+    """Every available backend; the ones that cannot run here skip with their reason.
+
+    ``cuda`` takes tensors in host memory, as the tests make them, and gives its results back there; ``emulated`` runs
+    the same kernels on the CPU.
+    """
+    if request.param == "emulated":
+        return _emulated(request.getfixturevalue("emulator"))
+    found = _available(request.param)
+    return _from_host(found) if request.param == "cuda" else found
 
 
 @pytest.fixture
@@ -20,8 +41,54 @@ def cpu() -> Backend:
     return _available("cpu")
 
 
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def native(request: pytest.FixtureRequest) -> Backend:
+    """A backend of kernels, to be compared with the reference on many scenes: the native one, and a real GPU."""
+    found = _available(request.param)
+    return _from_host(found) if request.param == "cuda" else found
+
+
+@pytest.fixture(scope="session")
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> emulate.Emulator:
+    """A launcher that runs the CUDA kernels on the CPU."""
+    return emulate.Emulator(tmp_path_factory.mktemp("kernels"))
+
+
 def _available(name: str) -> Backend:
     try:
         return get_backend(name)
     except BackendError as error:
         pytest.skip(str(error))
+
+
+def _emulated(launcher: Launcher) -> Backend:
+    def rasterize(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
+        return cuda.rasterize_with(launcher, s, c, r, p)
+
+    def splat_errors(
+        s: Splats, c: Camera, image: Tensor, r: RasterSettings, mask: Tensor | None = None, occlusion: bool = False
+    ) -> Tensor:
+        if occlusion:
+            pytest.skip("splat errors with occlusion have no CUDA kernel")
+        return cuda.splat_errors_with(launcher, s, c, image, r, mask)
+
+    return Backend("cuda", rasterize, splat_errors)
+
+
+def _from_host(backend: Backend) -> Backend:
+    """The same backend for tensors in host memory: they go to the device and come back, gradients too."""
+    device = torch.device(backend.device)
+
+    def there(tensor: Tensor | None) -> Tensor | None:
+        return None if tensor is None else tensor.to(device)
+
+    def rasterize(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
+        output = backend.rasterize(Splats(**{k: t.to(device) for k, t in s.items()}), c, r, there(p))
+        return RenderOutput(**{k: t.cpu() for k, t in vars(output).items()})
+
+    def splat_errors(
+        s: Splats, c: Camera, image: Tensor, r: RasterSettings, mask: Tensor | None = None, occlusion: bool = False
+    ) -> Tensor:
+        return backend.splat_errors(s.to(device), c, image.to(device), r, there(mask), occlusion).cpu()
+
+    return Backend(backend.name, rasterize, splat_errors)

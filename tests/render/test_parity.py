@@ -67,11 +67,11 @@ def quantile(values: Tensor, q: float) -> float:
     return float(np.quantile(values.numpy(), q))
 
 
-def test_images_and_radii_agree_on_hundreds_of_random_scenes(cpu: Backend) -> None:
+def test_images_and_radii_agree_on_hundreds_of_random_scenes(native: Backend) -> None:
     differences: dict[str, list[Tensor]] = {name: [] for name in IMAGES}
     radii = []
     for case in cases(300):
-        low = cpu.rasterize(case.splats, case.camera, SETTINGS)
+        low = native.rasterize(case.splats, case.camera, SETTINGS)
         high = reference.rasterize(double(case.splats), case.camera, SETTINGS)
         for name in IMAGES:
             a, b = getattr(low, name).double(), getattr(high, name)
@@ -92,12 +92,12 @@ def test_images_and_radii_agree_on_hundreds_of_random_scenes(cpu: Backend) -> No
     assert float((merged > 1e-3).double().mean()) <= 2e-3
 
 
-def test_a_larger_image_with_many_tiles_and_layers_agrees(cpu: Backend) -> None:
+def test_a_larger_image_with_many_tiles_and_layers_agrees(native: Backend) -> None:
     rng = np.random.default_rng(5)
     camera = random_camera(rng).resized(150, 110)
     splats = random_splats(rng, camera, 1500)
     splats = replace(splats, log_scales=splats.log_scales - 1).to(dtype=torch.float32)
-    low = cpu.rasterize(splats, camera, SETTINGS)
+    low = native.rasterize(splats, camera, SETTINGS)
     high = reference.rasterize(double(splats), camera, SETTINGS)
     assert float(high.alpha.mean()) > 0.8
     for name in ("color", "alpha", "normal"):
@@ -117,12 +117,12 @@ def test_a_larger_image_with_many_tiles_and_layers_agrees(cpu: Backend) -> None:
     ],
     ids=str,
 )
-def test_every_setting_is_used_alike(cpu: Backend, change: dict[str, float]) -> None:
+def test_every_setting_is_used_alike(native: Backend, change: dict[str, float]) -> None:
     settings = replace(SETTINGS, **change)  # type: ignore[arg-type]
     differences = []
     moved = 0.0
     for case in cases(20):
-        low = cpu.rasterize(case.splats, case.camera, settings)
+        low = native.rasterize(case.splats, case.camera, settings)
         high = reference.rasterize(double(case.splats), case.camera, settings)
         default = reference.rasterize(double(case.splats), case.camera, SETTINGS)
         for name in ("color", "alpha", "distortion"):
@@ -133,12 +133,14 @@ def test_every_setting_is_used_alike(cpu: Backend, change: dict[str, float]) -> 
 
 
 @pytest.mark.parametrize("columns", [2, 4])
-def test_gradients_agree_where_every_decision_has_a_margin(cpu: Backend, clear_cases: list[Case], columns: int) -> None:
+def test_gradients_agree_where_every_decision_has_a_margin(
+    native: Backend, clear_cases: list[Case], columns: int
+) -> None:
     """Random cotangents on all images at once; relative Frobenius norm per attribute."""
     errors: dict[str, list[float]] = {name: [] for name in (*ATTRIBUTES, "signed", "absolute")}
     for case in clear_cases[columns // 4 :: 2]:
         cotangents = random_cotangents(np.random.default_rng(case.seed), case.camera)
-        low = gradients(cpu, case.splats, case.camera, cotangents, columns)
+        low = gradients(native, case.splats, case.camera, cotangents, columns)
         high = gradients(None, double(case.splats), case.camera, cotangents, columns)
         for name, expected in high.items():
             norm = float(expected.norm())
@@ -153,12 +155,12 @@ def test_gradients_agree_where_every_decision_has_a_margin(cpu: Backend, clear_c
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_gradients_of_each_image_alone_agree(cpu: Backend, clear_cases: list[Case], name: str) -> None:
+def test_gradients_of_each_image_alone_agree(native: Backend, clear_cases: list[Case], name: str) -> None:
     """So that a wrong sign in a small channel is not drowned by a large one."""
     errors = []
     for case in clear_cases[:20]:
         cotangents = {name: random_cotangents(np.random.default_rng(case.seed), case.camera)[name]}
-        low = gradients(cpu, case.splats, case.camera, cotangents, 4)
+        low = gradients(native, case.splats, case.camera, cotangents, 4)
         high = gradients(None, double(case.splats), case.camera, cotangents, 4)
         a = torch.cat([low[attribute].double().flatten() for attribute in ATTRIBUTES])
         b = torch.cat([high[attribute].flatten() for attribute in ATTRIBUTES])
@@ -186,20 +188,20 @@ def gradients(
     return {name: grad for name, grad in grads.items() if grad is not None}
 
 
-def test_gradients_are_finite_on_every_scene(cpu: Backend) -> None:
+def test_gradients_are_finite_on_every_scene(native: Backend) -> None:
     for case in cases(100):
-        gradients(cpu, case.splats, case.camera, random_cotangents(np.random.default_rng(case.seed), case.camera), 4)
+        gradients(native, case.splats, case.camera, random_cotangents(np.random.default_rng(case.seed), case.camera), 4)
 
 
 @pytest.mark.parametrize("occlusion", [False, True])
-def test_splat_errors_agree(cpu: Backend, occlusion: bool) -> None:
+def test_splat_errors_agree(native: Backend, occlusion: bool) -> None:
     relative = []
     for case in cases(100):
         rng = np.random.default_rng(case.seed)
         H, W = case.camera.height, case.camera.width
         image = torch.tensor(rng.uniform(size=(H, W, 3)), dtype=torch.float32)
         mask = torch.tensor(rng.uniform(size=(H, W)) < 0.8) if case.seed % 2 else None
-        low = cpu.splat_errors(case.splats, case.camera, image, SETTINGS, mask, occlusion).double()
+        low = native.splat_errors(case.splats, case.camera, image, SETTINGS, mask, occlusion).double()
         high = reference_errors.splat_errors(
             double(case.splats), case.camera, image.double(), SETTINGS, mask, occlusion
         )
@@ -211,11 +213,11 @@ def test_splat_errors_agree(cpu: Backend, occlusion: bool) -> None:
     assert float((merged > 0.05).double().mean()) < 0.01  # one flipped pixel of a few
 
 
-def test_unused_degrees_and_missing_coefficients_agree(cpu: Backend) -> None:
+def test_unused_degrees_and_missing_coefficients_agree(native: Backend) -> None:
     for case in cases(8, ("plain",)):
         for held, degree in ((15, 0), (15, 2), (3, 1), (0, 0)):
             part = replace(case.splats, shN=case.splats.shN[:, :held].contiguous())
             settings = replace(SETTINGS, sh_degree=degree)
-            low = cpu.rasterize(part, case.camera, settings).color.double()
+            low = native.rasterize(part, case.camera, settings).color.double()
             high = reference.rasterize(double(part), case.camera, settings).color
             assert quantile((low - high).abs(), 0.99) < 1e-4, (case.seed, held, degree)
