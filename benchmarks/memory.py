@@ -1,20 +1,26 @@
 """Memory that the native rasterizer holds for one view between forward and backward, as a formula.
 
-N splats, E entries (tile, splat) that the binning lists, S slots (entries some pixel saw), P pixels, t tiles; float32::
+N splats, E entries (tile, splat) that the binning lists, C slots (entries some pixel saw) of the largest chunk of
+tiles, P pixels, t tiles; float32, a densification signal of two columns::
 
-    bytes = 5/4 (140 N + 8 E + 85 S + 16 P + 84 t) + a constant below 50 kB
+    bytes = 64 N + max(56 N, 162 C) + 8 E + 16 P + 84 t + a constant below 2 kB
 
-140 N: record 64, cull record 32, tile rectangle 2 x 8, order 4, sort 16, list of slots 8. 85 S: gradients 64, extra 16
-with its flag 1, index 4. 16 P: T, M1, M2, 1/z of the first pair. Buffers grow by a quarter more than asked, so that a
-few more splats do not mean new memory; buffers of 2 MiB or more are rounded up to 2 MiB (not counted here).
+64 N: records. 56 N: cull record 32, tile rectangle 8, sort 16; the backward pass puts the slots of two chunks there,
+each gradients 64, extra 16 and its flag 1. A chunk takes N / 3 slots where no single tile has more, at least 4096, so
+from 12,000 splats on the maximum is 56 N. 16 P: T, M1, M2, 1/z of the first pair. The sums of gradients lie in the rows
+of the gradient of shN; where that is not wanted or has fewer than 6 coefficients, they take 72 N more. Buffers that
+grow for a later view take 1/16 more than asked.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-CHUNKS, PASSES, DIGITS = 16, 3, 1 << 11  # of bin.cpp
-TILE = 16
+CHUNKS = 16  # of bin.cpp
+LEAST_SLOTS = 4096  # of gradient_sums.cpp
+TILE, LINE = 16, 64
+SLOT = 64 + 16 + 1  # bytes
+FORWARD_SCRATCH = 32 + 8 + 2 * 8  # bytes per splat
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,7 @@ class ViewWork:
     lane_pairs: int  # (pixel, splat) that the backward pass computes, seen or not
     width: int
     height: int
+    largest_chunk: int  # slots; 0 before the backward pass
 
     @property
     def tiles(self) -> int:
@@ -36,9 +43,14 @@ class ViewWork:
         return -(-self.width // TILE) * -(-self.height // TILE)
 
 
-def _room(count: int) -> int:
-    """Capacity of a fresh buffer (Buffer::reserve of frame.h)."""
-    return count + count // 4 + 64
+def _lines(size: int) -> int:
+    """Bytes in whole cache lines."""
+    return -(-size // LINE) * LINE
+
+
+def _room(count: int, size: int) -> int:
+    """Bytes of a fresh buffer of that many elements (Buffer::reserve of frame.h)."""
+    return _lines(count * size) // size * size
 
 
 def view_bytes(work: ViewWork) -> int:
@@ -46,21 +58,15 @@ def view_bytes(work: ViewWork) -> int:
     n, t, s = work.splats, work.tiles, work.slots
     elements = (
         (16 * n, 4),  # records
-        (n, 32),  # cull records
-        (n, 8),  # tile rectangles
-        (n, 4),  # order
-        (n, 8),  # rectangles in depth order
-        (2 * n * 8 + PASSES * DIGITS * 4, 1),  # radix sort
-        (CHUNKS * t, 4),  # histogram
         (t + 1, 8),  # tile_begin
         (work.entries, 8),
         (t, 4),  # tile_count
         (4 * work.width * work.height, 4),  # saved
+        (CHUNKS * t, 4),  # histogram
         (t + 1, 8),  # slot_begin
-        (16 * s, 4),  # gradients
-        (4 * s, 4),  # extra gradients
-        (s, 1),  # has_extra
-        (n + 2, 8),  # splat_begin
-        (s, 4),  # splat_slots
+        (min(t, s // (LEAST_SLOTS // 2)) + 3, 40),  # chunks
     )
-    return sum(_room(count) * size for count, size in elements)
+    scratch, slots = _room(FORWARD_SCRATCH * n, 1), 2 * _lines(SLOT * work.largest_chunk)
+    if slots > scratch:  # it grows
+        scratch = _room(slots + slots // 16, 1)
+    return scratch + sum(_room(count, size) for count, size in elements)

@@ -61,15 +61,15 @@ def frame_bytes(library: Library, output: RenderOutput) -> int:
 
 
 def count_work(library: Library, output: RenderOutput, splats: int) -> ViewWork:
-    """Exact counts of the view that was rendered."""
+    """Exact counts of the view that was rendered; of its largest chunk, after the backward pass."""
     frame: Any = output.color.grad_fn
-    counts = (ctypes.c_int64 * 5)()
+    counts = (ctypes.c_int64 * 6)()
     function = library.function("gs2d_frame_counts", ctypes.c_int, [ctypes.c_void_p] * 2)
     if function(frame.frame.pointer, counts) != 0:
         raise MemoryError("no memory to count the pairs of a view")
-    pairs, lanes, entries, slots, visible = counts
+    pairs, lanes, entries, slots, visible, chunk = counts
     height, width = output.alpha.shape
-    return ViewWork(splats, visible, entries, slots, pairs, lanes, width, height)
+    return ViewWork(splats, visible, entries, slots, pairs, lanes, width, height, chunk)
 
 
 class Passes:
@@ -188,8 +188,8 @@ def measure_stages(library: Library, workload: Workload, seconds: float, least: 
     trim(library)
     passes = Passes(library, workload, 3)
     output = passes.forward()
-    work = count_work(library, output, len(workload.splats))
     passes.backward(output)
+    work = count_work(library, output, len(workload.splats))
     held = frame_bytes(library, output)
     losses = loss_step(output, workload)
     del output

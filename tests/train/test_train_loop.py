@@ -13,6 +13,7 @@ from gs2d.data.scene import Scene, View
 from gs2d.protocols import GENERIC, NERF_SYNTHETIC
 from gs2d.recipe import GradDensify, LossTerm, Recipe, Stage
 from gs2d.recipes import PHOTOMETRIC, get_recipe, refine, surface
+from gs2d.render.backend import get_backend
 from gs2d.train import events
 from gs2d.train.loop import raster_settings
 
@@ -81,6 +82,15 @@ def test_clones_only_leaves_the_others_alone(scene: Scene) -> None:
     for name, tensor in trainer.splats.items():
         assert torch.equal(tensor[~clones], dict(start.items())[name][~clones]), name
     assert not torch.equal(trainer.splats.means[clones], start.means[clones])
+
+
+def test_skipping_the_gradients_of_frozen_rows_changes_no_bit_of_the_training(scene: Scene, backend: str) -> None:
+    recipe = short()
+    recipe = replace(recipe, stages=(*recipe.stages[:2], replace(refine(rows="clones"), iterations=4)))
+    skipping = get_backend(backend)
+    full = replace(skipping, rasterize_rows=lambda *a: skipping.rasterize(*a[:4]))  # computes all gradients
+    (one, _), (other, _) = (train(scene, recipe, backend=chosen) for chosen in (skipping, full))
+    assert same(one.splats, other.splats)
 
 
 def test_a_densification_updates_nothing_and_a_reset_everything_but_opacity(scene: Scene) -> None:

@@ -47,6 +47,8 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     not) of sum over channels |c_i - image|. Pixels where mask is False do not count. With ``occlusion`` a pixel counts
     only while it has not stopped (7) at or before this splat. No gradients. Culled splats have e_i = 0 (a splat is not
     culled for its opacity here).
+18. *Gradient rows.* With ``gradient_rows`` (bool [N]) the gradients of every other splat, and of its row of
+    screen_probe, are zero; images, and the gradients of these rows, are the same bit for bit as without it.
 """
 
 from __future__ import annotations
@@ -75,6 +77,7 @@ def rasterize(
     *,
     backend: str | Backend = "auto",
     screen_probe: Tensor | None = None,
+    gradient_rows: Tensor | None = None,
 ) -> RenderOutput:
     """Render splats: all images of one view, differentiable (the contract is in this module's docstring).
 
@@ -89,6 +92,8 @@ def rasterize(
     screen_probe : Tensor [N, 2] or [N, 4], optional
         Zeros with ``requires_grad``; its gradient is the densification signal (rule 13). That it is zeros is checked
         on the CPU only.
+    gradient_rows : Tensor [N] bool, optional
+        The splats that learn: all others get zero gradients (rule 18), which the cpu backend saves computing.
 
     Returns
     -------
@@ -117,7 +122,25 @@ def rasterize(
         # On a GPU the look would make the host wait in every iteration.
         if screen_probe.device.type == "cpu" and bool((screen_probe.detach() != 0).any()):
             raise ShapeError("screen_probe must be all zeros (its gradient is what matters), got other values")
-    return chosen.rasterize(splats, camera, settings, screen_probe)
+    if gradient_rows is None:
+        return chosen.rasterize(splats, camera, settings, screen_probe)
+    check_shapes({"means": (splats.means, "N 3"), "gradient_rows": (gradient_rows, "N")})
+    if gradient_rows.dtype != torch.bool or gradient_rows.device != splats.device:
+        raise ShapeError(
+            f"gradient_rows must be bool on {splats.device} (True = has gradients), got {gradient_rows.dtype} "
+            f"on {gradient_rows.device}"
+        )
+    if chosen.rasterize_rows is not None:
+        return chosen.rasterize_rows(splats, camera, settings, screen_probe, gradient_rows)
+    learning = Splats(**{name: _only_rows(tensor, gradient_rows) for name, tensor in splats.items()})
+    probe = None if screen_probe is None else _only_rows(screen_probe, gradient_rows)
+    return chosen.rasterize(learning, camera, settings, probe)
+
+
+def _only_rows(tensor: Tensor, rows: Tensor) -> Tensor:
+    """The same values; gradients reach only these rows."""
+    shape = (-1, *[1] * (tensor.dim() - 1))
+    return torch.where(rows.reshape(shape), tensor, tensor.detach()) if tensor.requires_grad else tensor
 
 
 def splat_errors(

@@ -24,6 +24,17 @@ class _Rasterize(Protocol):
     ) -> RenderOutput: ...
 
 
+class _RasterizeRows(Protocol):
+    def __call__(
+        self,
+        splats: Splats,
+        camera: Camera,
+        settings: RasterSettings,
+        screen_probe: Tensor | None,
+        gradient_rows: Tensor | None,
+    ) -> RenderOutput: ...
+
+
 class _SplatErrors(Protocol):
     def __call__(
         self,
@@ -46,12 +57,15 @@ class Backend:
     rasterize, splat_errors : callable
     device : str
         Where a program that has no tensors yet should make them: training, scoring and meshing do.
+    rasterize_rows : callable, optional
+        ``rasterize`` with gradients of some rows only, where that saves work; without it render/api.py masks them.
     """
 
     name: str
     rasterize: _Rasterize
     splat_errors: _SplatErrors
     device: str = "cpu"
+    rasterize_rows: _RasterizeRows | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +103,7 @@ def _cpu() -> Backend:
     load()  # BackendError with the reason and the remedy if it is not there or does not load
     from gs2d.render import cpu
 
-    return Backend("cpu", cpu.rasterize, cpu.splat_errors)
+    return Backend("cpu", cpu.rasterize, cpu.splat_errors, rasterize_rows=cpu.rasterize)
 
 
 def _cuda() -> Backend:

@@ -60,6 +60,7 @@ class _ParameterGradients(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_void_p) for name in (*ATTRIBUTES, "probe")),
         ("probe_columns", ctypes.c_int64),
+        ("rows", ctypes.c_void_p),
     )
 
 
@@ -139,16 +140,16 @@ def _forward(library: Library, view: _View, tensors: Sequence[Tensor]) -> tuple[
 
 
 class _Rasterize(torch.autograd.Function):
-    """Images and radii from the six parameter tensors; the seventh input is the screen probe or None."""
+    """Images and radii from the six parameter tensors; ``rows`` are those whose gradients are wanted, None for all."""
 
     @staticmethod
     def forward(
-        ctx: Any, library: Library, view: _View, probe: Tensor | None, *parameters: Tensor
+        ctx: Any, library: Library, view: _View, probe: Tensor | None, rows: Tensor | None, *parameters: Tensor
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         images, radii, frame = _forward(library, view, tensors)
         if any(ctx.needs_input_grad):
-            ctx.library, ctx.frame = library, frame
+            ctx.library, ctx.frame, ctx.rows = library, frame, rows
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
             saved = [images[name] for name in ("color", "alpha", "normal", "depth_mean", "distortion")]
             ctx.save_for_backward(*saved, *tensors)
@@ -163,16 +164,16 @@ class _Rasterize(torch.autograd.Function):
         color, alpha, normal, depth_mean, distortion, *tensors = ctx.saved_tensors
         images = _Images(*(_address(t) for t in (color, alpha, normal, depth_mean, None, distortion, None)))
         given = [None if g is None else g.detach().to(library.dtype).contiguous() for g in upstream[: len(IMAGES)]]
-        _, _, want_probe, *want = ctx.needs_input_grad
+        _, _, want_probe, _, *want = ctx.needs_input_grad
         grads = [torch.empty_like(t) if wanted else None for t, wanted in zip(tensors, want, strict=True)]
         probe = torch.empty(ctx.probe_shape, dtype=library.dtype) if want_probe else None
         columns = 0 if probe is None else int(probe.shape[1])
-        out = _ParameterGradients(*(_address(g) for g in grads), _address(probe), columns)
+        out = _ParameterGradients(*(_address(g) for g in grads), _address(probe), columns, _address(ctx.rows))
         backward = library.function("gs2d_raster_backward", ctypes.c_int, [ctypes.c_void_p] * 5)
         native_splats, native_given = _parameters(tensors), _ImageGradients(*(_address(g) for g in given))
         arguments = (native_splats, images, native_given, out)
         _check(backward(ctx.frame.pointer, *(ctypes.byref(a) for a in arguments)))
-        return None, None, probe, *grads
+        return None, None, probe, None, *grads
 
 
 def rasterize_with(
@@ -181,18 +182,29 @@ def rasterize_with(
     camera: Camera,
     settings: RasterSettings,
     screen_probe: Tensor | None = None,
+    gradient_rows: Tensor | None = None,
     *,
     exact_masks: bool = True,
 ) -> RenderOutput:
     """:func:`rasterize` on a given variant of the library; ``exact_masks=False`` turns off culling inside tiles."""
     _check_tensors(splats, settings, library.dtype)
+    if gradient_rows is not None:
+        if tuple(gradient_rows.shape) != (len(splats),) or gradient_rows.dtype != torch.bool:
+            raise ShapeError(
+                f"gradient_rows must be bool [{len(splats)}], got {gradient_rows.dtype} {list(gradient_rows.shape)}"
+            )
+        gradient_rows = gradient_rows.to("cpu", copy=True).contiguous()  # it may change before the backward pass
     view = _view(camera, settings, exact_masks)
-    *images, radii = _Rasterize.apply(library, view, screen_probe, *(t for _, t in splats.items()))
+    *images, radii = _Rasterize.apply(library, view, screen_probe, gradient_rows, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
 
 
 def rasterize(
-    splats: Splats, camera: Camera, settings: RasterSettings, screen_probe: Tensor | None = None
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    screen_probe: Tensor | None = None,
+    gradient_rows: Tensor | None = None,
 ) -> RenderOutput:
     """Render one view on the CPU; the contract is in :mod:`gs2d.render.api`.
 
@@ -206,6 +218,8 @@ def rasterize(
     settings : RasterSettings
     screen_probe : Tensor [N, 2] or [N, 4], optional
         Zeros; its gradient is the densification signal.
+    gradient_rows : Tensor [N] bool, optional
+        Gradients are wanted of these splats only; the work for the others is skipped, the bits of these are the same.
 
     Raises
     ------
@@ -214,7 +228,7 @@ def rasterize(
     BackendError
         If the native library is missing, memory runs out, or a setting is one of the reference backend only.
     """
-    return rasterize_with(prepare(), splats, camera, settings, screen_probe)
+    return rasterize_with(prepare(), splats, camera, settings, screen_probe, gradient_rows)
 
 
 def splat_errors_with(

@@ -83,7 +83,8 @@ class WholeViews:
             columns = 4 if densify is not None and densify.absolute else 2
             probe = splats.means.new_zeros(len(splats), columns, requires_grad=True)
         camera, settings = self.scene.train[index].camera, self.settings(stage, iteration)
-        output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe)
+        rows = None if gather else _learning_rows(state, stage)  # the signal is of every splat
+        output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
         losses, gradients = self.differentiate(stage, iteration, index, output, dict(leaves.items()))
         return Evaluated(losses, gradients, None if probe is None else _gradient(probe), output.radii)
 
@@ -145,6 +146,14 @@ def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tens
     if not math.isfinite(sum(values.values())):
         raise diverged(stage, iteration, f"the loss ({', '.join(f'{k} {v:g}' for k, v in values.items())})")
     return values
+
+
+def _learning_rows(state: TrainState, stage: Stage) -> Tensor | None:
+    """The splats [N] of which the stage trains anything; None where it trains an attribute of all."""
+    groups = set(stage.train.values())
+    if not groups or "all" in groups:
+        return None
+    return torch.stack([state.groups[group] for group in sorted(groups)]).any(dim=0)
 
 
 def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:

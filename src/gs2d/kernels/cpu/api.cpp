@@ -14,9 +14,9 @@ int free_count = 0;
 constexpr int KEEP = 2;  // frames whose memory is kept for the next view
 
 template <class F> void for_each_buffer(Frame& f, F&& visit) {
-    visit(f.records), visit(f.cull), visit(f.rects), visit(f.order), visit(f.ordered_rects), visit(f.sort_memory);
-    visit(f.histogram), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.saved), visit(f.slot_begin);
-    visit(f.gradients), visit(f.extra_gradients), visit(f.has_extra), visit(f.splat_begin), visit(f.splat_slots);
+    visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.saved), visit(f.scratch);
+    visit(f.histogram), visit(f.slot_begin), visit(f.chunks), visit(f.own_sums);
+    visit(f.target), visit(f.splat_begin), visit(f.splat_slots);
 }
 
 void release_all(Frame& f) {
@@ -31,6 +31,7 @@ void set_view(Frame& f, const View& v) {
     f.tiles_x = (v.width + TILE - 1) / TILE;
     f.tiles_y = (v.height + TILE - 1) / TILE;
     f.tiles = int64_t(f.tiles_x) * f.tiles_y;
+    f.largest_chunk = 0;
 }
 
 }  // namespace
@@ -92,7 +93,7 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
 // Gradients of the parameters of the same call's splats; `images` are that call's outputs.
 GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, const Images* images,
                                      const ImageGradients* upstream, const ParameterGradients* out) {
-    if (!blend_tiles_vjp(*frame, *images, *upstream, *out)) return NO_MEMORY;
+    if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out)) return NO_MEMORY;
     StageClock clock;
     project_splats_vjp(*frame, *splats, *out);
     clock.done(PROJECT_BACKWARD);

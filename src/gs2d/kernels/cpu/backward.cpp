@@ -1,6 +1,7 @@
-// Gradients of the blending, one tile per task: splat by splat, front to back, the sums over a splat's pixels in
-// registers. Every (tile, splat) has its own slot of gradients, so nothing depends on the order of the tiles.
+// Gradients of the blending: tile by tile, splat by splat, front to back, the sums over a splat's pixels in registers.
+// Every (tile, splat) has its own slot of gradients (gradient_sums.h), so nothing depends on the order of the tiles.
 #include "cpu/frame.h"
+#include "cpu/gradient_sums.h"
 #include "cpu/stages.h"
 #include "cpu/threads.h"
 #include "cpu/tile.h"
@@ -102,17 +103,62 @@ struct Hits {
 
 constexpr int AHEAD = 8;  // records lie far apart: ask for them this many splats early
 
+// Up to where a block is of interest: behind its last splat that has gradients, nothing needs its pixels any more.
+struct Interest {
+    uint32_t blocks = ALL_BLOCKS;
+    int32_t last[BLOCKS];
+    Interest(const Entry* entries, int32_t count, const uint8_t* rows) {
+        if (!rows) return;
+        blocks = 0;
+        for (int32_t i = 0; i < count; ++i) {
+            if (!rows[entries[i].splat]) continue;
+            blocks |= entries[i].blocks;
+            for (uint32_t left = entries[i].blocks; left; left &= left - 1) last[__builtin_ctz(left)] = i;
+        }
+    }
+    void passed(const Entry& entry, int32_t i) {
+        for (uint32_t left = entry.blocks; left; left &= left - 1) blocks &= ~(uint32_t(last[__builtin_ctz(left)] == i) << __builtin_ctz(left));
+    }
+};
+
+// A splat without gradients: only T and S move on. The same arithmetic as below, so the splats behind it get the same bits.
+template <bool Geo, bool Dist>
+__attribute__((noinline)) void pass_by(const real* record, uint32_t blocks, Planes s, V lx, V ly, const BlendLimits<V>& limits) {
+    const Record<V> splat = broadcast(record);
+    const V inverse_zc = V(real(1) / record[8]), zero = V(0);
+    for (; blocks; blocks &= blocks - 1) {
+        const int b = __builtin_ctz(blocks);
+        const V dx = lx + V(real(block_x(b))) - splat.cx, dy = ly + V(real(block_y(b))) - splat.cy;
+        const Hit<V> h = intersect(splat, dx, dy, limits);
+        V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
+        PairSums<V> nobody = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
+                              zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};  // the compiler drops them
+        composite_vjp<Geo, Dist, false>(splat, inverse_zc, dx, dy, h, limits, load_gradient(s, b), pixel_T, pixel_S, nobody);
+        store(&s[T][b * LANES], pixel_T);
+        store(&s[S][b * LANES], pixel_S);
+    }
+}
+
 // Two passes per splat: intersections first, whose long chains then overlap, and compositing after.
 template <bool Geo, bool Dist, bool Abs>
-void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
+void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
     alignas(64) real px[BLOCKS][LANES], py[BLOCKS][LANES];
-    for (int b = 0; b < BLOCKS; ++b) store(px[b], lane_x(area.x0 + block_x(b))), store(py[b], lane_y(area.y0 + block_y(b)));
+    const V lx = lane_x(area.x0), ly = lane_y(area.y0);
+    for (int b = 0; b < BLOCKS; ++b) store(px[b], lx + V(real(block_x(b)))), store(py[b], ly + V(real(block_y(b))));
     Hits hits;
     const Entry* entry = &f.entries[f.tile_begin[tile]];
-    const int64_t end = f.slot_begin[tile + 1];
-    for (int64_t slot = f.slot_begin[tile]; slot < end; ++slot, ++entry) {
-        if (slot + AHEAD < end) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
+    const int32_t count = f.tile_count[tile];
+    Interest interest(entry, count, rows);
+    for (int32_t at = 0; at < count && interest.blocks; ++at, ++entry) {
+        if (at + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
         const real* record = &f.records[size_t(entry->splat) * RECORD];
+        if (rows) {
+            if (!rows[entry->splat]) {
+                pass_by<Geo, Dist>(record, entry->blocks & interest.blocks, s, lx, ly, limits);
+                continue;
+            }
+            interest.passed(*entry, at);
+        }
         const Record<V> splat = broadcast(record);
         const V inverse_zc = V(real(1) / record[8]), zero = V(0);
         bool filtered = false;  // whether the low-pass filter decided any pair
@@ -139,29 +185,32 @@ void tile_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, cons
             store(&s[S][b * LANES], pixel_S);
         }
         RecordGradient<V> g = finish(splat, sums, limits);
-        if (!f.probe) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
+        if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
         const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz,
                               g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
-        transpose_reduce<GRADIENT>(fields, &f.gradients[size_t(slot) * GRADIENT]);
-        if (!f.probe) continue;
-        f.has_extra[slot] = Abs || filtered;
-        if (Abs || filtered) {
+        transpose_reduce<GRADIENT>(fields, to.gradients);
+        if (to.extras) {
+            *to.has_extra = Abs || filtered;
             const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
-            transpose_reduce<GRADIENT_EXTRA>(extra, &f.extra_gradients[size_t(slot) * GRADIENT_EXTRA]);
+            if (Abs || filtered) transpose_reduce<GRADIENT_EXTRA>(extra, to.extras);
         }
+        to = to.from(1);
     }
 }
 
 // Only the colours' gradients: no geometry, no opacity.
-void tile_color_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
+void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
+                    const BlendLimits<V>& limits) {
     const V lx = lane_x(area.x0), ly = lane_y(area.y0);
     const Entry* entry = &f.entries[f.tile_begin[tile]];
-    const int64_t end = f.slot_begin[tile + 1];
-    for (int64_t slot = f.slot_begin[tile]; slot < end; ++slot, ++entry) {
-        if (slot + AHEAD < end) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
+    const int32_t count = f.tile_count[tile];
+    Interest interest(entry, count, rows);
+    for (int32_t i = 0; i < count && interest.blocks; ++i, ++entry) {
+        if (i + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
         const Record<V> splat = broadcast(&f.records[size_t(entry->splat) * RECORD]);
+        const bool wanted = !rows || rows[entry->splat];
         Vec3<V> sum = {V(0), V(0), V(0)};
-        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
+        for (uint32_t blocks = entry->blocks & interest.blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks);
             const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
             const V dx = lx + V(real(block_x(b))) - splat.cx, dy = ly + V(real(block_y(b))) - splat.cy;
@@ -169,14 +218,17 @@ void tile_color_vjp(const Frame& f, int64_t tile, Planes s, const TileArea& area
             composite_color_vjp(intersect(splat, dx, dy, limits), limits, {at(RED), at(GREEN), at(BLUE)}, pixel_T, sum);
             store(&s[T][b * LANES], pixel_T);
         }
+        if (!wanted) continue;
+        if (rows) interest.passed(*entry, i);
         const V fields[4] = {sum.x, sum.y, sum.z, V(0)};
-        real* to = &f.gradients[size_t(slot) * GRADIENT];
-        memset(to, 0, GRADIENT * sizeof(real));
-        transpose_reduce<4>(fields, to + 10);  // red, green, blue
+        memset(to.gradients, 0, GRADIENT * sizeof(real));
+        transpose_reduce<4>(fields, to.gradients + 10);  // red, green, blue
+        if (to.extras) *to.has_extra = 0;
+        to = to.from(1);
     }
 }
 
-using TileVjp = void (*)(const Frame&, int64_t, Planes, const TileArea&, const BlendLimits<V>&);
+using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&);
 
 TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
     if (color_only) return tile_color_vjp;
@@ -187,27 +239,21 @@ TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
 
 }  // namespace
 
-bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, const ParameterGradients& out) {
-    f.probe = out.probe != nullptr;
+bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t sh_rest, const ParameterGradients& out) {
     StageClock clock;
-    if (!index_slots(f)) return false;
+    GradientSums sums(f, sh_rest, out);
+    if (!sums.prepare()) return false;
     clock.done(INDEX_SLOTS);
-    const int64_t slots = f.slot_begin[f.tiles];
-    if (!f.gradients.reserve(slots * GRADIENT) || !f.extra_gradients.reserve(slots * GRADIENT_EXTRA) || !f.has_extra.reserve(slots))
-        return false;
     const bool dist = g.distortion != nullptr;
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
-    const TileVjp vjp = variant(geo, dist, f.probe && out.probe_columns == 4, !wants_geometry(out));
+    const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, !wants_geometry(out));
     const BlendLimits<V> limits = limits_of(f.view);
-    parallel_ranges(f.tiles, 4, [&](int64_t begin, int64_t end) {
-        for (int64_t tile = begin; tile < end; ++tile) {
-            prefetch_tile(f, images, g, tile + 1);
-            if (f.tile_count[tile] == 0) continue;
-            alignas(64) real planes[PLANES][PIXELS];
-            const TileArea area = tile_area(f, tile);
-            start(f, images, g, area, planes);
-            vjp(f, tile, planes, area, limits);
-        }
+    sums.for_each_tile([&](int64_t tile, int64_t next, Slots to) {
+        prefetch_tile(f, images, g, next);
+        alignas(64) real planes[PLANES][PIXELS];
+        const TileArea area = tile_area(f, tile);
+        start(f, images, g, area, planes);
+        vjp(f, tile, to, out.rows, planes, area, limits);
     });
     clock.done(BLEND_BACKWARD);
     return true;

@@ -8,11 +8,11 @@ namespace {
 
 enum Plane { RED, GREEN, BLUE, COUNTS, PLANES };  // COUNTS: 1 where a pixel counts, else 0
 
-// The photograph in block order, tile after tile, in f.gradients.
+// The photograph in block order, tile after tile.
 bool load_target(Frame& f, const real* image, const uint8_t* mask) {
-    if (!f.gradients.reserve(size_t(f.tiles) * PLANES * PIXELS)) return false;
+    if (!f.target.reserve(size_t(f.tiles) * PLANES * PIXELS)) return false;
     parallel_for(f.tiles, [&](int64_t tile) {
-        real* to = &f.gradients[size_t(tile) * PLANES * PIXELS];
+        real* to = &f.target[size_t(tile) * PLANES * PIXELS];
         const TileArea a = tile_area(f, tile);
         read_planes<3>(image, f.view.width, a, to);
         for (int y = 0; y < TILE; ++y)
@@ -35,6 +35,18 @@ inline M counts(const Record<V>& s, const Hit<V>& h, const BlendLimits<V>& limit
     return (h.rho <= cutoff2) & (s.zc * h.rq >= limits.near) & (load(target + COUNTS * PIXELS + b * LANES) > V(0));
 }
 
+// Entries of every splat, in tile order.
+bool list_entries(Frame& f) {
+    const int64_t entries = f.tile_begin[f.tiles];
+    if (!f.splat_slots.reserve(entries) || !f.splat_begin.reserve(f.count + 2)) return false;
+    int64_t* begin = f.splat_begin.data;
+    memset(begin, 0, (f.count + 2) * sizeof(int64_t));
+    for (int64_t e = 0; e < entries; ++e) ++begin[f.entries[e].splat + 2];
+    for (int64_t i = 0; i < f.count; ++i) begin[i + 2] += begin[i + 1];
+    for (int64_t e = 0; e < entries; ++e) f.splat_slots[begin[f.entries[e].splat + 1]++] = static_cast<uint32_t>(e);
+    return true;  // filling has moved every begin to its end, which is the next one's begin: begin[i] is right again
+}
+
 }  // namespace
 
 bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
@@ -52,7 +64,7 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
             for (int ty = r.y0; ty < r.y1; ++ty)
                 for (int tx = r.x0; tx < r.x1; ++tx) {
                     const real x0 = real(tx * TILE), y0 = real(ty * TILE);
-                    const real* target = &f.gradients[(size_t(ty) * f.tiles_x + tx) * PLANES * PIXELS];
+                    const real* target = &f.target[(size_t(ty) * f.tiles_x + tx) * PLANES * PIXELS];
                     for (uint32_t left = blocks_touched(f.cull[i], boxes, x0, y0); left; left &= left - 1) {
                         const int b = __builtin_ctz(left);
                         const V x = lx + V(x0 + real(block_x(b))), y = ly + V(y0 + real(block_y(b)));
@@ -67,15 +79,13 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
 }
 
 bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
-    if (!bin_splats(f) || !f.tile_count.reserve(f.tiles)) return false;
-    for (int64_t t = 0; t < f.tiles; ++t) f.tile_count[t] = static_cast<int32_t>(f.tile_begin[t + 1] - f.tile_begin[t]);
-    if (!index_slots(f) || !load_target(f, image, mask) || !f.saved.reserve(f.slot_begin[f.tiles])) return false;
+    if (!bin_splats(f) || !list_entries(f) || !load_target(f, image, mask) || !f.saved.reserve(f.tile_begin[f.tiles])) return false;
     const BlockBoxes boxes;
     const BlendLimits<V> limits = limits_of(f.view);
     const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff));
     parallel_for(f.tiles, [&](int64_t tile) {
         const TileArea a = tile_area(f, tile);
-        const real* target = &f.gradients[size_t(tile) * PLANES * PIXELS];
+        const real* target = &f.target[size_t(tile) * PLANES * PIXELS];
         const V lx = lane_x(a.x0), ly = lane_y(a.y0);
         alignas(64) real T[PIXELS];
         for (real& t : T) t = 1;
@@ -93,7 +103,7 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
                 store(&T[b * LANES], keep(open, after));  // stopped pixels stay at 0
                 total = total + keep(counts(s, h, limits, cutoff2, target, b) & open, difference(s, target, b));
             }
-            f.saved[f.slot_begin[tile] + (e - f.tile_begin[tile])] = sum(total);
+            f.saved[e] = sum(total);
         }
     });
     for (int64_t i = 0; i < f.count; ++i) {

@@ -1,6 +1,7 @@
 // Everything one view needs between its forward and its backward pass.
 #pragma once
 
+#include <atomic>
 #include <stdlib.h>
 #include <string.h>
 #if defined(__linux__)
@@ -13,22 +14,24 @@
 
 namespace gs2d {
 
-constexpr size_t HUGE_PAGE = size_t(2) << 20;
+constexpr size_t LINE = 64, HUGE_PAGE = size_t(2) << 20;
 
 // Grow-only memory on cache lines. Kept when a Frame goes back to the free list: fresh pages cost more than the work.
 template <class T> struct Buffer {
     T* data = nullptr;
     size_t capacity = 0;
-    // Contents are lost. False when there is no memory.
+    // Contents are lost. False when there is no memory. A buffer that must grow takes 1/16 more than asked: views differ
+    // a little, and a new one should not mean new memory each time.
     bool reserve(size_t n) {
         if (n <= capacity) return true;
+        const size_t wanted = (capacity ? n + n / 16 : n) * sizeof(T), bytes = (wanted + LINE - 1) / LINE * LINE;
+        const size_t alignment = bytes >= HUGE_PAGE ? HUGE_PAGE : LINE;
         free(data);
-        const size_t wanted = n + n / 4 + 64;
-        const size_t page = wanted * sizeof(T) >= HUGE_PAGE ? HUGE_PAGE : 64, bytes = (wanted * sizeof(T) + page - 1) / page * page;
-        data = static_cast<T*>(aligned_alloc(page, bytes));
-        capacity = data ? wanted : 0;
+        void* memory = nullptr;
+        data = posix_memalign(&memory, alignment, bytes) == 0 ? static_cast<T*>(memory) : nullptr;
+        capacity = data ? bytes / sizeof(T) : 0;
 #if defined(MADV_HUGEPAGE)
-        if (data && page == HUGE_PAGE) madvise(data, bytes, MADV_HUGEPAGE);  // access is scattered; a wish, not a need
+        if (data && alignment == HUGE_PAGE) madvise(data, bytes, MADV_HUGEPAGE);  // access is scattered; a wish, not a need
 #endif
         return data != nullptr;
     }
@@ -66,6 +69,7 @@ struct ImageGradients {  // null where there is no gradient
 struct ParameterGradients {  // null where not wanted
     real *means, *quats, *log_scales, *opacity_logits, *sh0, *shN, *probe;
     int64_t probe_columns;  // 2 or 4
+    const uint8_t* rows;    // [N] 0: this splat's gradients are 0; null: all are wanted
 };
 
 // Whether anything but colours is wanted.
@@ -90,6 +94,37 @@ struct Entry {  // one splat in one tile
     uint32_t blocks;  // bit b: some live pixel of block b saw the splat (before the forward pass: undefined)
 };
 
+#if defined(GS2D_DOUBLE)
+using DepthKey = uint64_t;
+#else
+using DepthKey = uint32_t;
+#endif
+struct DepthItem {
+    DepthKey key;  // bits of z_c > 0: positive floats sort like integers
+    uint32_t splat;
+};
+
+// Consecutive tiles whose gradients are in memory at the same time.
+struct GradientChunk {
+    int64_t first_tile;
+    int64_t first_task;  // of those that blend it
+    int64_t first_slot;
+    std::atomic<int64_t> tasks_left, sums_left;  // tasks that blend it, and that add its slots to the sums
+};
+
+// Sums of the gradients of each splat's record over the tiles: GRADIENT reals, then `extras` of GRADIENT_EXTRA.
+struct Sums {
+    real* data;
+    int64_t stride;  // in reals
+    int extras;      // 0, or 2 or 4 where the densification signal is wanted
+    real* row(int64_t splat) const { return data + splat * stride; }
+};
+
+// Bytes of the arrays of a forward pass over n splats.
+inline size_t forward_scratch(int64_t n) {
+    return static_cast<size_t>(n) * (sizeof(CullRecord) + sizeof(TileRect) + 2 * sizeof(DepthItem));
+}
+
 struct Frame {
     View view;
     PinholeCamera<real> camera;
@@ -97,26 +132,33 @@ struct Frame {
     int32_t tiles_x = 0, tiles_y = 0;
     int64_t tiles = 0;
 
-    Buffer<real> records;       // [N, RECORD]
-    Buffer<CullRecord> cull;    // [N]
-    Buffer<TileRect> rects;     // [N]
-    Buffer<uint32_t> order;     // visible splats by depth
-    Buffer<TileRect> ordered_rects;
-    Buffer<char> sort_memory;
-    int64_t visible = 0;
-    Buffer<uint32_t> histogram;  // [chunks, tiles]
+    // Kept from the forward to the backward pass.
+    Buffer<real> records;        // [N, RECORD]
     Buffer<int64_t> tile_begin;  // [tiles + 1]
     Buffer<Entry> entries;
     Buffer<int32_t> tile_count;  // entries that survive the forward pass; they are moved to the front of their tile
     Buffer<real> saved;          // [4, H W]: T_final, M1, M2, inverse_depth0
+    int64_t visible = 0;
 
-    Buffer<int64_t> slot_begin;     // [tiles + 1], survivors only
-    Buffer<real> gradients;         // [slots, GRADIENT]
-    Buffer<real> extra_gradients;   // [slots, GRADIENT_EXTRA], only where has_extra
-    Buffer<uint8_t> has_extra;      // [slots]
-    bool probe = false;             // whether the densification signal is wanted; without it there are no extras
-    Buffer<int64_t> splat_begin;    // [N + 1]
-    Buffer<uint32_t> splat_slots;   // slots of each splat, in tile order
+    // One piece of memory for what a single pass needs: in the forward pass the arrays below, in the backward pass slots.
+    Buffer<char> scratch;
+    CullRecord* cull = nullptr;       // [N]
+    TileRect* rects = nullptr;        // [N]
+    DepthItem* order = nullptr;       // [visible], by depth
+    TileRect* ordered_rects = nullptr;  // [visible], like order
+    Buffer<uint32_t> histogram;       // [chunks, tiles]
+
+    // Backward pass.
+    Buffer<int64_t> slot_begin;    // [tiles + 1]
+    Buffer<GradientChunk> chunks;  // [tiles + 1] at most
+    int64_t largest_chunk = 0;     // slots
+    Buffer<real> own_sums;         // where no parameter's gradient has room for the sums
+    Sums sums = {};
+
+    // Splat errors.
+    Buffer<real> target;           // [tiles, 4, PIXELS]
+    Buffer<int64_t> splat_begin;   // [N + 2]
+    Buffer<uint32_t> splat_slots;  // entries of each splat, in tile order
 
     Frame* next_free = nullptr;
 };
@@ -163,9 +205,8 @@ enum class Reach {
 bool project_splats(Frame& frame, const Parameters& splats, Reach reach, real* radii);
 bool bin_splats(Frame& frame);
 bool blend_tiles(Frame& frame, const Images& images);
-// Gives each of the first tile_count entries of every tile a slot, and lists the slots of every splat in tile order.
-bool index_slots(Frame& frame);
-bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, const ParameterGradients& out);
+bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, int64_t sh_rest,
+                     const ParameterGradients& out);
 bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 bool occluded_splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 void project_splats_vjp(Frame& frame, const Parameters& splats, const ParameterGradients& out);

@@ -53,14 +53,15 @@ GS2D_EXPORT int gs2d_stage_times(int64_t* ns) {
 }
 
 // Work in the view of a forward pass: visible pairs (pixel, splat); lane pairs that the backward pass computes;
-// entries (tile, splat) before and after the forward pass; splats in the view.
-GS2D_EXPORT int gs2d_frame_counts(Frame* frame, int64_t counts[5]) {
+// entries (tile, splat) before and after the forward pass; splats in the view; slots of the largest chunk of the last
+// backward pass.
+GS2D_EXPORT int gs2d_frame_counts(Frame* frame, int64_t counts[6]) {
     const Frame& f = *frame;
     const BlendLimits<V> limits = limits_of(f.view);
     Buffer<PairCounts> tiles;
     if (!tiles.reserve(f.tiles)) return 1;
     parallel_for(f.tiles, [&](int64_t tile) { tiles[tile] = count_tile(f, tile, limits); });
-    memset(counts, 0, 5 * sizeof(int64_t));
+    memset(counts, 0, 6 * sizeof(int64_t));
     for (int64_t t = 0; t < f.tiles; ++t) {
         counts[0] += tiles[t].visible;
         counts[1] += tiles[t].lanes;
@@ -68,6 +69,7 @@ GS2D_EXPORT int gs2d_frame_counts(Frame* frame, int64_t counts[5]) {
     }
     counts[2] = f.tile_begin[f.tiles];
     counts[4] = f.visible;
+    counts[5] = f.largest_chunk;
     tiles.release();
     return 0;
 }

@@ -74,7 +74,10 @@ inline real clipped_radius(const View& v, real x_min, real y_min, real x_max, re
 bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
     const int64_t n = s.count;
     f.count = n;
-    if (!f.records.reserve(n * RECORD) || !f.cull.reserve(n) || !f.rects.reserve(n)) return false;
+    if (!f.records.reserve(n * RECORD) || !f.scratch.reserve(forward_scratch(n))) return false;
+    f.cull = reinterpret_cast<CullRecord*>(f.scratch.data);
+    f.rects = reinterpret_cast<TileRect*>(f.cull + n);
+    f.order = reinterpret_cast<DepthItem*>(f.rects + n);
     const bool blending = reach == Reach::BLEND;
     const V error_k2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), log2_alpha_min = V(real(log2(f.view.alpha_min)));
     parallel_ranges(n, 64 * LANES, [&](int64_t begin, int64_t end) {
@@ -111,33 +114,20 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
 
 namespace {
 
-// Sums of the gradient slots of LANES splats, in tile order, and their extra slots.
-inline void gather(const Frame& f, int64_t first, int lanes, V* fields, V* extras) {
-    constexpr int PARTS = GRADIENT / LANES;
-    alignas(64) real sums[LANES][GRADIENT], extra[LANES][GRADIENT_EXTRA];
-    memset(sums, 0, sizeof sums), memset(extra, 0, sizeof extra);
-    for (int l = 0; l < lanes; ++l) {
-        V total[PARTS];
-        for (V& v : total) v = V(0);
-        for (int64_t e = f.splat_begin[first + l]; e < f.splat_begin[first + l + 1]; ++e) {
-            const size_t slot = f.splat_slots[e];
-            for (int k = 0; k < PARTS; ++k) total[k] = total[k] + load(&f.gradients[slot * GRADIENT + k * LANES]);
-            if (f.probe && f.has_extra[slot])
-                for (int k = 0; k < GRADIENT_EXTRA; ++k) extra[l][k] += f.extra_gradients[slot * GRADIENT_EXTRA + k];
-        }
-        for (int k = 0; k < PARTS; ++k) store(&sums[l][k * LANES], total[k]);
-    }
-    load_rows<GRADIENT>(sums[0], GRADIENT, LANES, fields);
-    load_rows<GRADIENT_EXTRA>(extra[0], GRADIENT_EXTRA, LANES, extras);
+// Sums of LANES splats; extras of no densification signal are 0.
+inline void load_sums(const Sums& sums, int64_t first, int lanes, V* fields, V* extras) {
+    load_rows<GRADIENT>(sums.row(first), sums.stride, lanes, fields);
+    for (int k = 0; k < GRADIENT_EXTRA; ++k) extras[k] = V(0);
+    if (sums.extras == 2) load_rows<2>(sums.row(first) + GRADIENT, sums.stride, lanes, extras);
+    if (sums.extras == 4) load_rows<4>(sums.row(first) + GRADIENT, sums.stride, lanes, extras);
 }
 
-// The slots of a splat lie far apart: ask for those of the splats to come.
-inline void prefetch_slots(const Frame& f, int64_t first, int64_t last) {
-    for (int64_t e = f.splat_begin[first]; e < f.splat_begin[last]; ++e) {
-        const size_t slot = f.splat_slots[e];
-        __builtin_prefetch(&f.gradients[slot * GRADIENT]);
-        if (f.probe && f.has_extra[slot]) __builtin_prefetch(&f.extra_gradients[slot * GRADIENT_EXTRA]);
-    }
+// Whether a sum is not 0 (NaN counts): else no pixel saw the splat, or all of its gradients are 0.
+inline M not_all_zero(const V* fields, const V* extras) {
+    V size = V(0);
+    for (int k = 0; k < GRADIENT; ++k) size = size + abs(fields[k]);
+    for (int k = 0; k < GRADIENT_EXTRA; ++k) size = size + abs(extras[k]);
+    return ~(size <= V(0));
 }
 
 }  // namespace
@@ -146,18 +136,15 @@ void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients&
     parallel_ranges(s.count, 16 * LANES, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i += LANES) {
             const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
-            if (f.splat_begin[i + lanes] == f.splat_begin[i]) {  // nobody here was seen
+            V g[GRADIENT], e[GRADIENT_EXTRA];
+            load_sums(f.sums, i, lanes, g, e);  // before anything is written: they may lie in the rows of out.shN
+            const M seen = not_all_zero(g, e) & first(lanes);
+            if (!any(seen)) {
                 zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes), zero_rows(out.log_scales, i, 2, lanes);
                 zero_rows(out.opacity_logits, i, 1, lanes), zero_rows(out.sh0, i, 3, lanes);
                 zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes);
                 continue;
             }
-            uint32_t seen_bits = 0;
-            for (int l = 0; l < lanes; ++l) seen_bits |= uint32_t(f.splat_begin[i + l + 1] > f.splat_begin[i + l]) << l;
-            const M seen = mask_of(seen_bits);
-            V g[GRADIENT], e[GRADIENT_EXTRA];
-            prefetch_slots(f, i + LANES < s.count ? i + LANES : s.count, i + 2 * LANES < s.count ? i + 2 * LANES : s.count);
-            gather(f, i, lanes, g, e);
             const RecordGradient<V> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8],  g[9],
                                           g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
             const SplatParameters<V> p = load_parameters(s, i, lanes);

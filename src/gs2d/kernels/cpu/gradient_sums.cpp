@@ -1,0 +1,117 @@
+#include "cpu/gradient_sums.h"
+
+namespace gs2d {
+namespace {
+
+constexpr int64_t LEAST_SLOTS = 4096;  // of a chunk, where there are as many
+constexpr int BATCH = 256;             // entries looked at before their slots are added
+
+// Reals of sums of each splat.
+int sums_width(const ParameterGradients& out) { return GRADIENT + (out.probe ? static_cast<int>(out.probe_columns) : 0); }
+
+// The row of a splat's coefficients' gradients is written last, and read by nobody else: the sums wait there.
+bool fits_in_coefficients(const ParameterGradients& out, int64_t sh_rest) { return out.shN && 3 * sh_rest >= sums_width(out); }
+
+constexpr size_t slot_bytes(bool extras) { return GRADIENT * sizeof(real) + (extras ? GRADIENT_EXTRA * sizeof(real) + 1 : 0); }
+
+size_t chunk_bytes(int64_t slots, bool extras) { return (size_t(slots) * slot_bytes(extras) + LINE - 1) / LINE * LINE; }
+
+}  // namespace
+
+bool GradientSums::prepare() {
+    Frame& f = f_;
+    if (!f.slot_begin.reserve(f.tiles + 1)) return false;
+    parallel_ranges(f.tiles, 64, [&](int64_t first, int64_t last) {
+        for (int64_t t = first; t < last; ++t) {
+            int64_t slots = f.tile_count[t];
+            if (out_.rows) {
+                const Entry* const entries = &f.entries[f.tile_begin[t]];
+                slots = 0;
+                for (int32_t i = 0; i < f.tile_count[t]; ++i) slots += out_.rows[entries[i].splat] != 0;
+            }
+            f.slot_begin[t + 1] = slots;
+        }
+    });
+    f.slot_begin[0] = 0;
+    for (int64_t t = 0; t < f.tiles; ++t) f.slot_begin[t + 1] += f.slot_begin[t];
+    // Two chunks in a row hold more than LEAST_SLOTS.
+    const int64_t most = f.slot_begin[f.tiles] / (LEAST_SLOTS / 2);
+    if (!f.chunks.reserve((most < f.tiles ? most : f.tiles) + 3)) return false;
+    cut_into_chunks();
+    f.sums = {out_.shN, 3 * sh_rest_, sums_width(out_) - GRADIENT};
+    if (!fits_in_coefficients(out_, sh_rest_)) {
+        f.sums.stride = sums_width(out_);
+        if (!f.own_sums.reserve(f.count * f.sums.stride)) return false;
+        f.sums.data = f.own_sums.data;
+    }
+    parallel_ranges(f.count, 1024, [&](int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) memset(f.sums.row(i), 0, sums_width(out_) * sizeof(real));
+    });
+    return f.scratch.reserve(2 * chunk_bytes(f.largest_chunk, out_.probe));
+}
+
+// A chunk takes as many slots as the memory of the forward pass holds twice: large chunks, so that a thread seldom waits
+// for another that was interrupted.
+void GradientSums::cut_into_chunks() {
+    Frame& f = f_;
+    const int64_t room = static_cast<int64_t>(forward_scratch(f.count) / (2 * slot_bytes(out_.probe)));
+    const int64_t limit = room > LEAST_SLOTS ? room : LEAST_SLOTS;
+    f.largest_chunk = chunks_ = tasks_ = 0;
+    f.chunks[0].first_tile = f.chunks[0].first_slot = 0;
+    for (int64_t t = 1; t <= f.tiles; ++t) {
+        const int64_t slots = f.slot_begin[t] - f.chunks[chunks_].first_slot;
+        if (t < f.tiles && f.slot_begin[t + 1] - f.chunks[chunks_].first_slot <= limit) continue;
+        if (slots > f.largest_chunk) f.largest_chunk = slots;
+        ++chunks_;
+        f.chunks[chunks_].first_tile = t, f.chunks[chunks_].first_slot = f.slot_begin[t];
+    }
+    for (parts_ = 1; parts_ < static_cast<uint32_t>(get_threads()) && parts_ < 16;) parts_ *= 2;
+    for (int64_t c = 0; c <= chunks_; ++c) {
+        GradientChunk& chunk = f.chunks[c];
+        chunk.first_task = tasks_;
+        chunk.tasks_left.store(blend_tasks(c), std::memory_order_relaxed);
+        chunk.sums_left.store(parts_, std::memory_order_relaxed);
+        tasks_ += blend_tasks(c) + (c > 0 ? parts_ : 0);
+    }
+}
+
+Slots GradientSums::slots(int64_t c) const {
+    char* const memory = f_.scratch.data + (c % 2) * chunk_bytes(f_.largest_chunk, out_.probe);
+    real* const gradients = reinterpret_cast<real*>(memory);
+    if (!out_.probe) return {gradients, nullptr, nullptr};
+    real* const extras = gradients + f_.largest_chunk * GRADIENT;
+    return {gradients, extras, reinterpret_cast<uint8_t*>(extras + f_.largest_chunk * GRADIENT_EXTRA)};
+}
+
+void GradientSums::add(int64_t c, uint32_t part) const {
+    constexpr int VECTORS = GRADIENT / LANES, AHEAD = 8;
+    const Frame& f = f_;
+    const Slots from = slots(c);
+    uint32_t splats[BATCH + AHEAD] = {};
+    int64_t slots[BATCH];
+    int64_t slot = 0;
+    for (int64_t tile = f.chunks[c].first_tile; tile < f.chunks[c + 1].first_tile; ++tile) {
+        const Entry* const entries = &f.entries[f.tile_begin[tile]];
+        for (int32_t begin = 0; begin < f.tile_count[tile]; begin += BATCH) {
+            const int32_t end = begin + BATCH < f.tile_count[tile] ? begin + BATCH : f.tile_count[tile];
+            int count = 0;
+            for (int32_t i = begin; i < end; ++i) {
+                const uint32_t splat = entries[i].splat;
+                const bool has_slot = !out_.rows || out_.rows[splat];
+                splats[count] = splat, slots[count] = slot;
+                count += has_slot && (splat >> 4 & (parts_ - 1)) == part;
+                slot += has_slot;
+            }
+            for (int i = 0; i < count; ++i) {
+                __builtin_prefetch(f.sums.row(splats[i + AHEAD]), 1);
+                real* const row = f.sums.row(splats[i]);
+                const Slots s = from.from(slots[i]);
+                for (int k = 0; k < VECTORS; ++k) store(row + k * LANES, load(row + k * LANES) + load(s.gradients + k * LANES));
+                if (s.extras && *s.has_extra)
+                    for (int k = 0; k < f.sums.extras; ++k) row[GRADIENT + k] += s.extras[k];
+            }
+        }
+    }
+}
+
+}  // namespace gs2d

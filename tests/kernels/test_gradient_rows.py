@@ -1,0 +1,140 @@
+"""Rows without gradients, and sums of gradients over chunks of tiles: the bits of everything else do not change."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from render_scenes import IMAGES, front_camera, requiring_grad, splat
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.stages import Passes, count_work
+from benchmarks.workload import Workload, room_workload
+
+from gs2d.errors import ShapeError
+from gs2d.kernels.library import Library
+from gs2d.render import cpu
+from gs2d.render.api import rasterize
+from gs2d.render.backend import get_backend
+from gs2d.render.types import RasterSettings
+
+
+@pytest.fixture(scope="module")
+def room() -> Workload:
+    return room_workload(3000, 150, 113)
+
+
+def gradients(
+    library: Library,
+    room: Workload,
+    images: tuple[str, ...],
+    probe: int,
+    rows: Tensor | None,
+    names: tuple[str, ...] = (),
+) -> tuple[list[Tensor], dict[str, Tensor]]:
+    """Images, and the gradients of the parameters (or those named) and of the probe."""
+    leaves = requiring_grad(room.splats.to(dtype=library.dtype))
+    zeros = torch.zeros(len(leaves), max(probe, 2), dtype=library.dtype, requires_grad=probe > 0)
+    settings = RasterSettings(background=(0.2, 0.5, 0.7))
+    output = cpu.rasterize_with(library, leaves, room.cameras[0], settings, zeros if probe else None, rows)
+    chosen = [getattr(output, name) for name in images]
+    generator = torch.Generator().manual_seed(7)
+    given = [torch.randn(image.shape, generator=generator).to(image) for image in chosen]
+    inputs = {name: tensor for name, tensor in leaves.items() if not names or name in names}
+    inputs |= {"probe": zeros} if probe else {}
+    found = torch.autograd.grad(chosen, list(inputs.values()), given)
+    return [image.detach() for image in chosen], dict(zip(inputs, found, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("images", "probe"), [(IMAGES, 0), (IMAGES, 4), (("color", "normal", "depth_mean"), 2), (("color",), 0)]
+)
+def test_rows_with_gradients_keep_their_bits_and_the_others_get_zero(
+    any_native: Library, room: Workload, images: tuple[str, ...], probe: int
+) -> None:
+    if any_native.variant == "f64":
+        room = replace(room, splats=room.splats.to(dtype=torch.float64))
+    rows = torch.rand(len(room.splats), generator=torch.Generator().manual_seed(8)) < 0.05
+    pictures, whole = gradients(any_native, room, images, probe, None)
+    same, some = gradients(any_native, room, images, probe, rows)
+    assert all(torch.equal(a, b) for a, b in zip(pictures, same, strict=True))
+    for name, gradient in some.items():
+        assert torch.equal(gradient[rows], whole[name][rows]), name
+        assert not gradient[~rows].any(), name
+        assert gradient[rows].any(), name
+
+
+def test_the_same_where_only_colours_learn(native: Library, room: Workload) -> None:
+    rows = torch.arange(len(room.splats)) % 9 == 0
+    names = ("sh0", "shN")
+    _, whole = gradients(native, room, ("color",), 0, None, names)
+    _, some = gradients(native, room, ("color",), 0, rows, names)
+    for name in names:
+        assert torch.equal(some[name][rows], whole[name][rows])
+        assert not some[name][~rows].any()
+        assert some[name][rows].any()
+
+
+def test_no_rows_and_all_rows(native: Library, room: Workload) -> None:
+    everything = torch.ones(len(room.splats), dtype=torch.bool)
+    _, whole = gradients(native, room, IMAGES, 4, None)
+    _, all_rows = gradients(native, room, IMAGES, 4, everything)
+    _, none = gradients(native, room, IMAGES, 4, ~everything)
+    for name, gradient in whole.items():
+        assert torch.equal(gradient, all_rows[name])
+        assert not none[name].any()
+
+
+def test_many_chunks_of_tiles_add_up_to_the_same_bits_on_any_number_of_threads(native: Library) -> None:
+    workload = room_workload(3000, 300, 257)
+    passes = Passes(native, workload, 3)
+    output = passes.forward()
+    passes.backward(output)
+    work = count_work(native, output, 3000)
+    assert work.largest_chunk <= 4096 < work.slots / 3  # at least four chunks
+    found = []
+    for threads in (1, 2, 3, 8, 2, 8):
+        native.use_threads(threads)
+        found.append(gradients(native, workload, IMAGES, 4, None)[1])
+    for other in found[1:]:
+        assert all(torch.equal(gradient, other[name]) for name, gradient in found[0].items())
+
+
+def test_sums_are_the_same_with_and_without_room_in_the_gradient_of_the_coefficients(
+    native: Library, room: Workload
+) -> None:
+    # with all parameters the sums lie in the rows of shN's gradient, without shN in memory of their own
+    names = ("means", "quats", "log_scales", "opacity_logits", "sh0")
+    _, inside = gradients(native, room, IMAGES, 4, None)
+    _, outside = gradients(native, room, IMAGES, 4, None, names)
+    assert all(torch.equal(inside[name], outside[name]) for name in (*names, "probe"))
+
+
+@pytest.mark.parametrize("name", ["reference", "cpu"])
+def test_every_backend_masks_rows(name: str) -> None:
+    backend = get_backend(name)
+    scene = splat()
+    two = type(scene)(**{k: torch.cat([t, t]) for k, t in scene.items()})
+    two.means[1, 2] += 0.1
+    rows = torch.tensor([False, True])
+    whole, some = requiring_grad(two), requiring_grad(two)
+    probes = [torch.zeros(2, 2, requires_grad=True) for _ in range(2)]
+    rasterize(whole, front_camera(), backend=backend, screen_probe=probes[0]).color.sum().backward()
+    rasterize(some, front_camera(), backend=backend, screen_probe=probes[1], gradient_rows=rows).color.sum().backward()
+    for a, b in (*zip((t for _, t in whole.items()), (t for _, t in some.items()), strict=True), probes):
+        if a.numel():
+            assert a.grad is not None
+            assert b.grad is not None
+            assert torch.equal(a.grad[1], b.grad[1])
+            assert not b.grad[0].any()
+
+
+@pytest.mark.parametrize("rows", [torch.ones(2, dtype=torch.bool), torch.ones(1), torch.ones(1, 1, dtype=torch.bool)])
+def test_gradient_rows_must_be_one_bool_per_splat(rows: Tensor) -> None:
+    with pytest.raises(ShapeError, match="gradient_rows must be"):
+        rasterize(splat(), front_camera(), backend="reference", gradient_rows=rows)
