@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -27,6 +27,7 @@ __all__ = [
     "architecture_for",
     "cache_folder",
     "compile_source",
+    "compile_text",
     "cubin",
     "is_writable",
     "kernel_sources",
@@ -189,11 +190,34 @@ def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cu
     BackendError
         If NVRTC is missing, does not know the architecture, or refuses the source (with its first error).
     """
-    nvrtc = _nvrtc()
     files = sources()
     headers = {key: text for key, text in files.items() if key.endswith(".h")}
+    return compile_text(files[name], name, arch, headers=headers, options=options)
+
+
+def compile_text(
+    text: str, name: str, arch: str, *, headers: Mapping[str, str] | None = None, options: Sequence[str] = OPTIONS
+) -> Cubin:
+    """Compile a source that is not of the package (the benchmarks' probes).
+
+    Parameters
+    ----------
+    text, name : str
+        The source, and what the compiler calls it.
+    arch, options
+        As for :func:`compile_source`.
+    headers : mapping of str to str
+        What it may include, by name.
+
+    Raises
+    ------
+    BackendError
+        As for :func:`compile_source`.
+    """
+    nvrtc = _nvrtc()
+    headers = {} if headers is None else headers
     status, program = nvrtc.nvrtcCreateProgram(
-        files[name].encode(),
+        text.encode(),
         name.encode(),
         len(headers),
         [t.encode() for t in headers.values()],

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, Protocol
@@ -58,6 +58,8 @@ class GpuLauncher:
         The current stream's handle, and the architecture (``"sm_90"``), of a device.
     code_of : callable
         Machine code of a source file for an architecture.
+    source_of : mapping of str to str, optional
+        The file of each kernel; by default the package's.
 
     Raises
     ------
@@ -73,6 +75,7 @@ class GpuLauncher:
         stream_of: Callable[[torch.device], int] = _stream_of,
         architecture_of: Callable[[torch.device], str] = _architecture_of,
         code_of: Callable[[str, str], bytes] = lambda name, arch: nvrtc.cubin(name, arch).code,
+        source_of: Mapping[str, str] | None = None,
     ) -> None:
         self.device = device
         self._driver = load_driver() if driver is None else driver
@@ -81,7 +84,7 @@ class GpuLauncher:
         call(self._driver, "cuInit", 0)
         self._handle = call(self._driver, "cuDeviceGet", device.index or 0)
         self._context = call(self._driver, "cuDevicePrimaryCtxRetain", self._handle)  # torch's; for good
-        self._source_of = nvrtc.kernel_sources()
+        self._source_of = nvrtc.kernel_sources() if source_of is None else source_of
         self._libraries: dict[str, tuple[Any, bytes]] = {}  # by source; the code stays alive beside its library
         self._functions: dict[str, Any] = {}  # by kernel
         self._allowed: dict[str, int] = {}  # dynamic shared memory asked for so far, by kernel
