@@ -21,7 +21,7 @@ from gs2d.io.files import read_json, write_json
 from gs2d.io.run import SPLATS, RunFolder, make_folder, now
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, StageDone, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
-from gs2d.pipeline.sweep_claims import Claim, is_stale, take_claim
+from gs2d.pipeline.sweep_claims import Claim, take_claim
 
 MAX_DEATHS = 3  # so often may the process of a job die before the job counts as failed
 POLL_SECONDS = 0.5
@@ -178,7 +178,7 @@ def work(
             return
         taken = _take_one(sweep, left)
         if taken is None:
-            if not wait and all(_is_held(sweep, job) for job in left):
+            if not wait:
                 return
             time.sleep(POLL_SECONDS)
             continue
@@ -191,11 +191,6 @@ def work(
             stages.release()
             claim.release()
         after_job(job)
-
-
-def _is_held(sweep: Sweep, job: SweepJob) -> bool:
-    path = sweep.claim_file(job)
-    return path.exists() and not is_stale(path)
 
 
 def _take_one(sweep: Sweep, jobs: Sequence[SweepJob]) -> tuple[SweepJob, Claim, StageClaims] | None:
