@@ -9,7 +9,7 @@ import pytest
 from capture_writers import SCALE_MAT, ColmapModel, ring, small_dtu, write_picture
 
 from gs2d.data import load_scene
-from gs2d.data.dtu import decompose_projection
+from gs2d.data.dtu import decompose_projection, dtu_silhouettes
 from gs2d.errors import DataError
 
 
@@ -113,3 +113,55 @@ def test_an_alpha_channel_is_a_silhouette_and_the_background_stays(tmp_path: Pat
     np.testing.assert_array_equal(view.image(), pixels[..., :3])
     np.testing.assert_array_equal(view.object_mask(), pixels[..., 3] >= 128)
     assert view.alpha() is None
+
+
+def preprocessed(root: Path) -> list:
+    """As 2DGS prepares DTU: photographs undistorted to 38x28 with alpha, a model for them, masks of 40x30."""
+    cameras = small_dtu(root, images="images", archive="cameras.npz")
+    model = ColmapModel(cameras={1: ("PINHOLE", 38, 28, (35.0, 35.0, 17.0, 15.5))})
+    model.images = [(i + 1, c.T_cam_world, 1, f"{i:06d}.png", []) for i, c in enumerate(cameras)]
+    model.points = [(1, (0.1, 0.2, 0.3), (1, 2, 3), 0.1, [])]
+    model.write(root / "sparse/0")
+    for i in range(len(cameras)):
+        write_picture(root / f"images/{i:06d}.png", 38, 28, seed=i, alpha=True)
+    return cameras
+
+
+def test_photographs_of_another_size_take_the_cameras_of_their_model(tmp_path: Path) -> None:
+    cameras = preprocessed(tmp_path)
+    scene = load_scene(tmp_path)
+    assert scene.points is not None
+    np.testing.assert_array_equal(scene.T_metric_scene, SCALE_MAT)
+    for view, camera in zip(scene.train, cameras, strict=True):
+        assert (view.camera.width, view.camera.height) == (38, 28)
+        assert (view.camera.cx, view.camera.cy, view.camera.fx) == (17.0, 15.5, 35.0)
+        np.testing.assert_allclose(view.camera.center, camera.center, atol=1e-9)
+        assert view.object_mask().shape == (28, 38)  # of the alpha channel: the mask files are of the originals
+    assert any("5 of 5 views are those of sparse/0" in note for note in scene.notes)
+
+
+def test_masks_are_given_at_their_own_size_with_the_cameras_of_the_archive(tmp_path: Path) -> None:
+    cameras = preprocessed(tmp_path)
+    found = dtu_silhouettes(tmp_path)
+    assert [s.path.name for s in found] == [f"{i:03d}.png" for i in range(5)]
+    for silhouette, camera in zip(found, cameras, strict=True):
+        assert (silhouette.camera.width, silhouette.camera.height) == (40, 30)
+        np.testing.assert_allclose(silhouette.camera.K, camera.K, atol=1e-8)
+        np.testing.assert_allclose(silhouette.camera.T_cam_world, camera.T_cam_world, atol=1e-9)
+    for path in (tmp_path / "mask").iterdir():
+        path.unlink()
+    assert dtu_silhouettes(tmp_path) == ()
+
+
+def test_of_two_archives_the_one_in_the_frame_of_the_model_is_read(tmp_path: Path) -> None:
+    """cameras_sphere.npz comes first, unless sparse/0 was made in the frame of cameras.npz."""
+    preprocessed(tmp_path)
+    other = dict(np.load(tmp_path / "cameras.npz"))
+    wide = np.diag([2.0, 2, 2, 1])
+    other |= {name: matrix @ wide for name, matrix in other.items() if name.startswith("scale_mat")}
+    np.savez(tmp_path / "cameras_sphere.npz", **other)
+    np.testing.assert_array_equal(load_scene(tmp_path).T_metric_scene, SCALE_MAT)
+    (tmp_path / "cameras.npz").unlink()
+    scene = load_scene(tmp_path)
+    np.testing.assert_array_equal(scene.T_metric_scene, SCALE_MAT @ wide)
+    assert any("another frame" in note for note in scene.notes)

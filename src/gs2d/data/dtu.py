@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import rq
 
+from gs2d.camera import Camera
 from gs2d.data.capture import Capture, Frame
 from gs2d.data.colmap import model_points
-from gs2d.data.colmap_model import find_model, read_images
-from gs2d.data.lens import Intrinsics
+from gs2d.data.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images
+from gs2d.data.lens import Intrinsics, colmap_intrinsics
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError
 from gs2d.images import image_size
@@ -28,17 +30,16 @@ def read_dtu(root: Path) -> Capture:
     scene's frame, to pixels whose centres are whole numbers; ours are at + 0.5, so 0.5 is added to cx and cy.
     T_metric_scene = scale_mat_0 maps the scene to millimetres. Masks (``mask/NNN.png``) are silhouettes
     (``View.object_mask``), as is an alpha channel: the background is trained. All views train.
-    Sparse points of ``sparse/0`` are used if its cameras stand where these do.
+    Where ``sparse/0`` has cameras that stand where these do, its points are used, and its intrinsics if they are of the
+    photographs' size and these are not: 2DGS undistorted its photographs to another size, and made the model for them.
 
     Raises
     ------
     DataError
         A missing or broken file, another number of images than cameras, or matrices that are no cameras.
     """
-    path = next((root / name for name in CAMERA_FILES if (root / name).is_file()), None)
-    if path is None:
-        raise DataError(f"{root} must hold {' or '.join(CAMERA_FILES)}, got neither")
-    world, scale = _read_matrices(path)
+    model = _read_model(root)
+    path, world, scale = _matrices_of(root, model)
     images = _files(root, ("image", "images"))
     if not images:
         raise DataError(f"{root} must have its photographs in the folder image or images, got none")
@@ -65,7 +66,7 @@ def read_dtu(root: Path) -> Capture:
         )
     missing = sorted(set(world) - set(indices))
     skipped += [f"view {index}: no photograph" for index in missing]
-    points, notes = _sparse_points(root, frames)
+    frames, points, notes = _with_model(frames, model)
     if masks:
         notes += (f"masks: {sum(f.object_mask is not None for f in frames)} of {len(frames)} views have a silhouette",)
     return Capture(
@@ -106,6 +107,54 @@ def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), T
+
+
+@dataclass(frozen=True, eq=False)
+class DtuSilhouette:
+    """A view's camera at the size of its mask, and the mask's file; the scene's frame."""
+
+    camera: Camera
+    path: Path
+
+
+def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
+    """The mask files of a scan at their full size, with the cameras of the archive, which were made for that size.
+
+    What the official evaluation culls with, whatever the size of the photographs. Empty without mask files.
+
+    Raises
+    ------
+    DataError
+    """
+    masks = _files(root, ("mask", "masks"))
+    if not masks:
+        return ()
+    path, world, scale = _matrices_of(root, _read_model(root))
+    found = []
+    for index, mask in zip(_view_indices(masks, sorted(world), path), masks, strict=True):
+        if index in world:
+            width, height = image_size(mask)
+            fx, fy, cx, cy, T = decompose_projection(world[index] @ scale[index], f"{path}: view {index}")
+            found.append(DtuSilhouette(Camera(width, height, fx, fy, cx + 0.5, cy + 0.5, T), mask))
+    return tuple(found)
+
+
+def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """The archive, its world_mat and its scale_mat: of two, the one whose frame is that of ``sparse/0``."""
+    paths = [root / name for name in CAMERA_FILES if (root / name).is_file()]
+    if not paths:
+        raise DataError(f"{root} must hold {' or '.join(CAMERA_FILES)}, got neither")
+    if len(paths) > 1 and model is not None:
+        names = [Path(name).stem for name in sorted(model.images)]
+        for path in paths:
+            world, scale = _read_matrices(path)
+            centers = {
+                name: _center(decompose_projection(world[i] @ scale[i], f"{path}: view {i}")[4])
+                for name, i in zip(names, sorted(world), strict=False)
+            }
+            if _same_places(centers, model):
+                return path, world, scale
+    return (paths[0], *_read_matrices(paths[0]))
 
 
 def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
@@ -155,23 +204,73 @@ def _view_indices(files: list[Path], views: list[int], path: Path) -> list[int]:
     )
 
 
-def _sparse_points(root: Path, frames: list[Frame]) -> tuple[PointCloud | None, tuple[str, ...]]:
-    """The points of ``sparse/0``, if its cameras stand where the frames' do."""
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """What ``sparse/0`` holds: images by name, cameras by number, points."""
+
+    folder: Path
+    kind: str
+    images: dict[str, ColmapImage]
+    cameras: dict[int, ColmapCamera]
+    points: PointCloud | None
+
+
+def _read_model(root: Path) -> _Model | None:
     folder = root / "sparse" / "0"
     kind = find_model(folder)
-    points = model_points(folder, kind) if kind is not None else None
-    if kind is None or points is None:
-        return None, ()
+    if kind is None:
+        return None
+    images = {image.name: image for image in read_images(folder, kind)}
+    return _Model(folder, kind, images, read_cameras(folder, kind), model_points(folder, kind))
 
-    def center(T: np.ndarray) -> np.ndarray:
-        return np.asarray(-T[:3, :3].T @ T[:3, 3])
 
-    ours = {Path(frame.name).stem: center(frame.T_cam_world) for frame in frames}
-    theirs = {Path(image.name).stem: center(image.T_cam_world) for image in read_images(folder, kind)}
-    common = sorted(set(ours) & set(theirs))
-    if common:
-        a, b = np.stack([ours[name] for name in common]), np.stack([theirs[name] for name in common])
-        spread = max(float(np.linalg.norm(a - a.mean(axis=0), axis=1).max()), 1e-12)
-        if np.linalg.norm(a - b, axis=1).max() < 0.02 * spread:
-            return points, ()
-    return None, ("the points of sparse/0 are in another frame than the cameras and are not used",)
+def _center(T: np.ndarray) -> np.ndarray:
+    return np.asarray(-T[:3, :3].T @ T[:3, 3])
+
+
+def _same_places(centers: dict[str, np.ndarray], model: _Model) -> bool:
+    """Whether the model's cameras stand where those of the same name do: within 2 % of their spread."""
+    theirs = {Path(name).stem: _center(image.T_cam_world) for name, image in model.images.items()}
+    common = sorted(set(centers) & set(theirs))
+    if not common:
+        return False
+    a, b = np.stack([centers[name] for name in common]), np.stack([theirs[name] for name in common])
+    spread = max(float(np.linalg.norm(a - a.mean(axis=0), axis=1).max()), 1e-12)
+    return bool(np.linalg.norm(a - b, axis=1).max() < 0.02 * spread)
+
+
+def _with_model(frames: list[Frame], model: _Model | None) -> tuple[list[Frame], PointCloud | None, tuple[str, ...]]:
+    """The frames with the model's cameras where those were made for the photographs; its points; what was decided."""
+    if model is None or (model.points is None and not model.images):
+        return frames, None, ()
+    if not _same_places({Path(frame.name).stem: _center(frame.T_cam_world) for frame in frames}, model):
+        return frames, None, ("the points of sparse/0 are in another frame than the cameras and are not used",)
+    images = {Path(name).stem: image for name, image in model.images.items()}
+    fitted = [_of_model(frame, images.get(Path(frame.name).stem), model) for frame in frames]
+    changed = sum(new is not old for new, old in zip(fitted, frames, strict=True))
+    notes = (
+        (f"cameras of {changed} of {len(frames)} views are those of sparse/0, made for photographs of this size",)
+        if changed
+        else ()
+    )
+    return fitted, model.points, notes
+
+
+def _of_model(frame: Frame, image: ColmapImage | None, model: _Model) -> Frame:
+    """The frame, or one with the model's camera if that has the photograph's size and another focal length or centre.
+
+    A mask of another size than such a photograph is of the original one: the photograph's alpha channel replaces it.
+    """
+    camera = None if image is None else model.cameras.get(image.camera_id)
+    ours = frame.intrinsics
+    if image is None or camera is None or (camera.width, camera.height) != (ours.width, ours.height):
+        return frame
+    where = f"{model.folder}: camera {image.camera_id}"
+    theirs = colmap_intrinsics(where, camera.model, camera.width, camera.height, camera.params)
+    apart = np.array([theirs.fx - ours.fx, theirs.fy - ours.fy, theirs.cx - ours.cx, theirs.cy - ours.cy])
+    if np.abs(apart).max() < 0.01 * ours.width:
+        return frame
+    mask = frame.object_mask
+    if mask is not None and image_size(mask) != (ours.width, ours.height):
+        mask = None
+    return replace(frame, intrinsics=theirs, T_cam_world=image.T_cam_world, object_mask=mask)

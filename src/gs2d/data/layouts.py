@@ -270,7 +270,7 @@ def _capture_source(dataset: DataSet) -> str:
     return (
         "get it from "
         + {
-            "dtu": "the preprocessed DTU of 2DGS (linked from github.com/hbb1/2d-gaussian-splatting) or NeuS (data_DTU)",
+            "dtu": "the preprocessed DTU of 2DGS (linked from github.com/hbb1/2d-gaussian-splatting) or NeuS",
             "tnt": "TNT_GOF of the Hugging Face data set ZehaoYu/gaussian-opacity-fields",
             "nerf-synthetic": "nerf_synthetic.zip of the NeRF authors (linked from github.com/bmild/nerf)",
             "mip-nerf-360": "360_v2.zip of the Mip-NeRF 360 project page",
