@@ -3,79 +3,22 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import render_oracle
 import torch
 from emulate import Emulator
-from render_scenes import (
-    IMAGES,
-    KINDS,
-    contraction,
-    front_camera,
-    random_camera,
-    random_cotangents,
-    random_splats,
-    requiring_grad,
-    splat,
-    stack,
-)
+from kernel_cases import SETTINGS, Case, cases, double, gradients, many_tiles, quantile, render
+from render_scenes import IMAGES, front_camera, random_cotangents, requiring_grad, splat, stack
 from torch import Tensor
 
-from gs2d.camera import Camera
 from gs2d.errors import ShapeError
 from gs2d.render import cuda, reference, reference_errors
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend
-from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import ATTRIBUTES, Splats
 
 pytestmark = pytest.mark.timeout(120)  # a kernel that does not end
-SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
-
-
-def render(
-    launcher: Emulator,
-    splats: Splats,
-    camera: Camera,
-    settings: RasterSettings,
-    probe: Tensor | None = None,
-    exact_masks: bool = True,
-) -> RenderOutput:
-    """Through the public function, as a backend."""
-
-    def run(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
-        return cuda.rasterize_with(launcher, s, c, r, p, exact_masks=exact_masks)
-
-    backend = Backend("cuda", run, reference_errors.splat_errors)  # its own splat errors do not exist yet
-    return rasterize(splats, camera, settings, backend=backend, screen_probe=probe)
-
-
-@dataclass(frozen=True)
-class Case:
-    seed: int
-    splats: Splats
-    camera: Camera
-
-
-def cases(count: int, kinds: tuple[str, ...] = KINDS) -> Iterator[Case]:
-    for seed in range(count):
-        rng = np.random.default_rng(seed)
-        camera = random_camera(rng)
-        splats = random_splats(rng, camera, int(rng.integers(1, 60)), kinds)
-        splats = replace(splats, log_scales=splats.log_scales + 0.7 * (seed % 3))
-        yield Case(seed, splats.to(dtype=torch.float32), camera)
-
-
-def double(splats: Splats) -> Splats:
-    return splats.to(dtype=torch.float64)
-
-
-def quantile(values: Tensor, q: float) -> float:
-    return float(np.quantile(values.numpy(), q))
 
 
 def test_images_and_radii_agree_with_the_reference_on_random_scenes(emulator: Emulator) -> None:
@@ -98,44 +41,6 @@ def test_images_and_radii_agree_with_the_reference_on_random_scenes(emulator: Em
         assert quantile(merged, 0.998) < 1e-4, name
         assert float((merged > 2 / 255).double().mean()) < 2e-4, name
     assert float((torch.cat(radii) > 1e-3).double().mean()) <= 2e-3
-
-
-@pytest.fixture(scope="module")
-def clear_cases() -> list[Case]:
-    """Small scenes in which no decision is within 1e-4 of its threshold."""
-    clear = []
-    for case in cases(60, tuple(kind for kind in KINDS if kind != "twins")):
-        camera = case.camera.resized(min(case.camera.width, 8), min(case.camera.height, 8))
-        splats = case.splats.rows(torch.arange(min(len(case.splats), 12)))
-        if render_oracle.render(splats, camera, SETTINGS).margin >= 1e-4:
-            clear.append(Case(case.seed, splats, camera))
-    assert len(clear) >= 12
-    return clear
-
-
-def gradients(
-    launcher: Emulator | None,
-    splats: Splats,
-    camera: Camera,
-    cotangents: dict[str, Tensor],
-    columns: int,
-    exact_masks: bool = True,
-) -> dict[str, Tensor]:
-    """Vector-Jacobian products of all parameters and the probe; None is the reference."""
-    scene = requiring_grad(splats)
-    probe = torch.zeros(len(splats), columns, dtype=splats.dtype, requires_grad=True)
-    output: RenderOutput
-    if launcher is None:
-        output = rasterize(scene, camera, SETTINGS, backend="reference", screen_probe=probe)
-    else:
-        output = render(launcher, scene, camera, SETTINGS, probe, exact_masks)
-    contraction(output, cotangents).backward()
-    assert probe.grad is not None
-    grads = {name: tensor.grad for name, tensor in scene.items()} | {"signed": probe.grad[:, :2]}
-    if columns == 4:
-        grads["absolute"] = probe.grad[:, 2:]
-    assert all(grad is not None and bool(grad.isfinite().all()) for grad in grads.values())
-    return {name: grad for name, grad in grads.items() if grad is not None}
 
 
 @pytest.mark.parametrize("columns", [2, 4])
@@ -211,13 +116,6 @@ def test_a_pixel_that_stops_on_the_last_bit_of_a_chunk_stays_stopped(emulator: E
     assert float(grads["sh0"][:31].abs().max()) > 0
     assert float(grads["sh0"][31:].abs().max()) == 0
     assert float(grads["opacity_logits"][31:].abs().max()) == 0
-
-
-def many_tiles() -> Case:
-    rng = np.random.default_rng(5)
-    camera = random_camera(rng).resized(70, 45)  # no multiple of 16, 8 or 4
-    splats = random_splats(rng, camera, 150)
-    return Case(5, replace(splats, log_scales=splats.log_scales - 0.7).to(dtype=torch.float32), camera)
 
 
 def test_culling_inside_tiles_changes_no_bit_of_the_image_and_no_gradient(emulator: Emulator) -> None:
@@ -303,17 +201,23 @@ def test_unused_degrees_and_missing_coefficients_agree(emulator: Emulator, held:
             assert float((tensor.grad.double() - expected).norm()) <= 1e-3 * float(expected.norm()) + 1e-6, name
 
 
-def test_splat_errors_agree_with_the_reference(emulator: Emulator) -> None:
+@pytest.mark.parametrize("occlusion", [False, True])
+def test_splat_errors_agree_with_the_reference(emulator: Emulator, occlusion: bool) -> None:
     relative = []
     for case in cases(12):
         rng = np.random.default_rng(case.seed)
         H, W = case.camera.height, case.camera.width
         image = torch.tensor(rng.uniform(size=(H, W, 3)), dtype=torch.float32)
         mask = torch.tensor(rng.uniform(size=(H, W)) < 0.8) if case.seed % 2 else None
-        low = cuda.splat_errors_with(emulator, case.splats, case.camera, image, SETTINGS, mask).double()
-        high = reference_errors.splat_errors(double(case.splats), case.camera, image.double(), SETTINGS, mask, False)
+        given = (case.splats, case.camera, image, SETTINGS, mask, occlusion)
+        low = cuda.splat_errors_with(emulator, *given)
+        if occlusion:  # whole numbers: no order of additions shows
+            assert torch.equal(low, cuda.splat_errors_with(replace(emulator, descending=True), *given))
+        high = reference_errors.splat_errors(
+            double(case.splats), case.camera, image.double(), SETTINGS, mask, occlusion
+        )
         assert low.shape == high.shape
-        relative.append((low - high).abs() / high.clamp(min=1))
+        relative.append((low.double() - high).abs() / high.clamp(min=1))
     merged = torch.cat(relative)
     assert quantile(merged, 0.5) < 1e-6
     assert quantile(merged, 0.97) < 1e-4

@@ -6,6 +6,7 @@ one runs the same sources on the CPU. Everything else (memory, sorts, order) is 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -13,11 +14,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.camera import Camera
-from gs2d.errors import BackendError, ShapeError
+from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_passes import IMAGES, PARAMETERS, Frame, backward, errors, forward
+from gs2d.render.cuda_passes import IMAGES, PARAMETERS, Frame, Wanted, backward, errors, forward
 from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
@@ -39,22 +40,35 @@ def _check_tensors(splats: Splats, settings: RasterSettings) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Options:
+    """What _Rasterize takes besides the tensors that have gradients."""
+
+    launcher: Launcher
+    view: View
+    exact_masks: bool
+    distortion: bool
+    deterministic: bool
+    learns: Tensor | None
+
+
+SAVED = tuple(field.name for field in fields(Frame) if field.name not in ("view", "images"))
+
+
 class _Rasterize(torch.autograd.Function):
     """Images and radii from the six parameter tensors."""
 
     @staticmethod
-    def forward(
-        ctx: Any, launcher: Launcher, view: View, exact: bool, probe: Tensor | None, *parameters: Tensor
-    ) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, options: _Options, probe: Tensor | None, *parameters: Tensor) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
-        frame = forward(launcher, view, tensors, exact=exact)
+        launcher, view = options.launcher, options.view
+        frame = forward(launcher, view, tensors, exact=options.exact_masks, distortion=options.distortion)
         if any(ctx.needs_input_grad):
             # The images returned to the user may be changed in place: save_for_backward would notice, a plain
             # attribute would not. The rest is nobody else's.
-            ctx.launcher, ctx.view = launcher, view
+            ctx.options = options
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
-            hidden = (frame.records, frame.tile_counts, frame.entries, frame.ranges, frame.tiles, frame.seen)
-            ctx.save_for_backward(*hidden, frame.radii, *frame.images.values(), *tensors)
+            ctx.save_for_backward(*(getattr(frame, name) for name in SAVED), *frame.images.values(), *tensors)
             ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(frame.radii)
         return (*(frame.images[name] for name in IMAGES), frame.radii)
@@ -62,20 +76,24 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        options: _Options = ctx.options
         saved = ctx.saved_tensors
         tensors = saved[-len(PARAMETERS) :]
-        images = dict(zip((*IMAGES, "final_T", "moments"), saved[7 : -len(PARAMETERS)], strict=True))
-        records, tile_counts, entries, ranges, tiles, seen, radii = saved[:7]
-        frame = Frame(ctx.view, records, tile_counts, entries, ranges, tiles, seen, images, radii)
+        images = dict(zip((*IMAGES, "final_T", "moments"), saved[len(SAVED) : -len(PARAMETERS)], strict=True))
+        hidden = dict(zip(SAVED, saved[: len(SAVED)], strict=True))
+        frame = Frame(view=options.view, images=images, **hidden)
         given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[: len(IMAGES)]]
-        want_probe, *want = ctx.needs_input_grad[3:]
-        wanted = {
+        if not options.distortion:
+            given[IMAGES.index("distortion")] = None  # a constant
+        want_probe, *want = ctx.needs_input_grad[1:]
+        gradients = {
             name: torch.empty_like(t) if w else None for name, t, w in zip(PARAMETERS, tensors, want, strict=True)
         }
         device = tensors[0].device
         probe = torch.empty(ctx.probe_shape, dtype=torch.float32, device=device) if want_probe else None
-        backward(ctx.launcher, frame, tensors, dict(zip(IMAGES, given, strict=True)), {**wanted, "probe": probe})
-        return None, None, None, probe, *wanted.values()
+        wanted = Wanted({**gradients, "probe": probe}, options.learns, options.deterministic)
+        backward(options.launcher, frame, tensors, dict(zip(IMAGES, given, strict=True)), wanted)
+        return None, probe, *gradients.values()
 
 
 def rasterize_with(
@@ -84,12 +102,16 @@ def rasterize_with(
     camera: Camera,
     settings: RasterSettings,
     screen_probe: Tensor | None = None,
+    gradient_rows: Tensor | None = None,
     *,
+    distortion: bool = True,
     exact_masks: bool = True,
+    deterministic: bool | None = None,
 ) -> RenderOutput:
     """Render one view with the CUDA kernels; the contract is in :mod:`gs2d.render.api`.
 
-    Images are deterministic. Gradients are sums by atomic additions: their last digits vary from run to run on a GPU.
+    Images are deterministic. Gradients are sums by atomic additions, so that their last digits vary from run to run on
+    a GPU, unless ``deterministic``. Where only ``sh0`` and ``shN`` have gradients a shorter backward pass runs.
 
     Parameters
     ----------
@@ -101,8 +123,15 @@ def rasterize_with(
     settings : RasterSettings
     screen_probe : Tensor [N, 2] or [N, 4], optional
         Zeros; its gradient is the densification signal.
+    gradient_rows : Tensor [N] bool, optional
+        Gradients are wanted of these splats only; all others get zeros.
+    distortion : bool
+        False leaves that image out, which is then NaN: blending is a tenth shorter.
     exact_masks : bool
         False turns off culling inside tiles; the image must not change by a bit (tests).
+    deterministic : bool, optional
+        The same gradients bit for bit from run to run, for 320 bytes a pair of splat and tile and one more pass.
+        None: as torch.use_deterministic_algorithms says.
 
     Raises
     ------
@@ -112,16 +141,27 @@ def rasterize_with(
         If there are too many splats or pairs, or a setting is one of the reference backend only.
     """
     _check_tensors(splats, settings)
-    parameters = [t for _, t in splats.items()]
-    *images, radii = _Rasterize.apply(launcher, _view(camera, settings), exact_masks, screen_probe, *parameters)
+    if gradient_rows is not None:
+        found = (tuple(gradient_rows.shape), gradient_rows.dtype, gradient_rows.device)
+        if found != ((len(splats),), torch.bool, splats.device):
+            raise ShapeError(f"gradient_rows must be bool [{len(splats)}] on {splats.device}, got {found}")
+        gradient_rows = gradient_rows.clone()  # whatever happens to it before the backward pass
+    if deterministic is None:
+        deterministic = torch.are_deterministic_algorithms_enabled()
+    options = _Options(launcher, _view(camera, settings), exact_masks, distortion, deterministic, gradient_rows)
+    *images, radii = _Rasterize.apply(options, screen_probe, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
 
 
 def rasterize(
-    splats: Splats, camera: Camera, settings: RasterSettings, screen_probe: Tensor | None = None
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    screen_probe: Tensor | None = None,
+    gradient_rows: Tensor | None = None,
 ) -> RenderOutput:
     """:func:`rasterize_with` on the device on which the splats lie, on torch's current stream there."""
-    return rasterize_with(launch.launcher_for(splats.device), splats, camera, settings, screen_probe)
+    return rasterize_with(launch.launcher_for(splats.device), splats, camera, settings, screen_probe, gradient_rows)
 
 
 def splat_errors_with(
@@ -131,8 +171,9 @@ def splat_errors_with(
     image: Tensor,
     settings: RasterSettings,
     mask: Tensor | None = None,
+    occlusion: bool = False,
 ) -> Tensor:
-    """Inner sum of the paper's E_i for one view [N]; rule 17 of the contract, without ``occlusion``. Deterministic.
+    """Inner sum of the paper's E_i for one view [N]; rule 17 of the contract. Deterministic.
 
     Parameters
     ----------
@@ -141,6 +182,8 @@ def splat_errors_with(
     image : Tensor [H, W, 3] float32
     mask : Tensor [H, W] bool, optional
         False = ignore.
+    occlusion : bool
+        A pixel counts until it has stopped at or before the splat; an error of more than 1e9 in 8x8 pixels counts 1e9.
 
     Raises
     ------
@@ -160,7 +203,7 @@ def splat_errors_with(
         )
     parameters = [t.detach().contiguous() for _, t in splats.items()]
     image, mask = image.detach().contiguous(), None if mask is None else mask.contiguous()
-    return errors(launcher, _view(camera, settings), parameters, image, mask)
+    return errors(launcher, _view(camera, settings), parameters, image, mask, occlusion)
 
 
 def splat_errors(
@@ -171,13 +214,5 @@ def splat_errors(
     mask: Tensor | None = None,
     occlusion: bool = False,
 ) -> Tensor:
-    """:func:`splat_errors_with` on the device on which the splats lie.
-
-    Raises
-    ------
-    BackendError
-        Also for ``occlusion``, which has no CUDA kernel.
-    """
-    if occlusion:
-        raise BackendError("the cuda backend has no splat errors with occlusion; use --backend cpu for this recipe")
-    return splat_errors_with(launch.launcher_for(splats.device), splats, camera, image, settings, mask)
+    """:func:`splat_errors_with` on the device on which the splats lie."""
+    return splat_errors_with(launch.launcher_for(splats.device), splats, camera, image, settings, mask, occlusion)

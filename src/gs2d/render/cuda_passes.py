@@ -19,24 +19,29 @@ from gs2d.camera import Camera
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.arguments import (
     BlendArguments,
+    BlendColorsArguments,
     BlendVjpArguments,
     EmitArguments,
     ErrorArguments,
+    OccludedArguments,
     ProjectArguments,
+    ProjectColorsArguments,
     ProjectVjpArguments,
     RangeArguments,
+    SlotArguments,
     View,
 )
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.types import RasterSettings
 
-__all__ = ["IMAGES", "PARAMETERS", "Frame", "backward", "errors", "forward", "view_of"]
+__all__ = ["IMAGES", "PARAMETERS", "Frame", "Wanted", "backward", "errors", "forward", "view_of"]
 
 TILE = 16
 THREADS = 128
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MOST_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MOST_CANDIDATES = 1 << 31
+ERROR_UNIT = 2.0**-24  # occluded.cu
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 
 
@@ -62,6 +67,12 @@ class Frame:
     images : dict of Tensor
         The outputs, ``final_T`` [H, W] and ``moments`` [H, W, 3].
     radii : Tensor [N] float32
+    order : Tensor [N] int64
+        Splats by depth.
+    ends : Tensor [N] int64
+        Running sum, in that order, of the pairs of splat and tile.
+    permutation : Tensor [M] int64
+        The pair that each entry was.
     """
 
     view: View
@@ -73,6 +84,21 @@ class Frame:
     seen: Tensor
     images: dict[str, Tensor]
     radii: Tensor
+    order: Tensor
+    ends: Tensor
+    permutation: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Lists:
+    """The splats of each tile, front to back; fields as in Frame."""
+
+    entries: Tensor
+    ranges: Tensor
+    tiles: Tensor
+    order: Tensor
+    ends: Tensor
+    permutation: Tensor
 
 
 def view_of(camera: Camera, settings: RasterSettings) -> View:
@@ -147,10 +173,13 @@ def _project(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, er
     return _Projected(**arrays)
 
 
-def forward(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, exact: bool = True) -> Frame:
+def forward(
+    launcher: Launcher, view: View, parameters: Sequence[Tensor], *, exact: bool = True, distortion: bool = True
+) -> Frame:
     """Render one view; ``exact=False`` turns off culling inside tiles (tests).
 
-    The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device.
+    The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device. Without
+    ``distortion`` that image is NaN: it is a tenth of the blending, and few recipes want it.
     """
     device = parameters[0].device
 
@@ -158,25 +187,36 @@ def forward(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, exa
         return torch.empty(shape, dtype=torch.float32, device=device)
 
     projected = _project(launcher, view, parameters, errors=False)
-    entries, ranges = _bin(launcher, view, projected, exact)
-    tiles = torch.argsort(ranges[:-1, 1] - ranges[:-1, 0], descending=True, stable=True).to(torch.int32)
-    words = (len(entries) >> 5) + len(tiles) + 1
+    lists = _bin(launcher, view, projected, exact)
+    words = (len(lists.entries) >> 5) + len(lists.tiles) + 1
     seen = torch.zeros(words, 8, dtype=torch.int32, device=device)
     H, W = int(view.height), int(view.width)
     images = {name: floats(H, W, 3) if name in ("color", "normal") else floats(H, W) for name in IMAGES}
-    images |= {"final_T": floats(H, W), "moments": floats(H, W, 3)}
+    images |= {"final_T": floats(H, W), "moments": floats(H, W, 3) if distortion else floats(0)}
+    if not distortion:
+        images["distortion"].fill_(math.nan)
     blend = BlendArguments(view=view)
-    _fill(
-        blend,
-        {"records": projected.records, "entries": entries, "ranges": ranges, "tiles": tiles, "seen": seen, **images},
+    _fill(blend, {"records": projected.records, "seen": seen, **images})
+    _fill(blend, {name: getattr(lists, name) for name in ("entries", "ranges", "tiles")})
+    launcher.launch(f"blend_forward{'_distortion' if distortion else ''}", len(lists.tiles), THREADS, blend)
+    return Frame(
+        view=view,
+        records=projected.records,
+        tile_counts=projected.tile_counts,
+        entries=lists.entries,
+        ranges=lists.ranges,
+        tiles=lists.tiles,
+        seen=seen,
+        images=images,
+        radii=projected.radii,
+        order=lists.order,
+        ends=lists.ends,
+        permutation=lists.permutation,
     )
-    launcher.launch("blend_forward_distortion", len(tiles), THREADS, blend)
-    hidden = (entries, ranges, tiles, seen, images)
-    return Frame(view, projected.records, projected.tile_counts, *hidden, projected.radii)
 
 
-def _bin(launcher: Launcher, view: View, projected: _Projected, exact: bool) -> tuple[Tensor, Tensor]:
-    """Entries and ranges: a stable sort by depth, emission of candidates, a stable sort by tile."""
+def _bin(launcher: Launcher, view: View, projected: _Projected, exact: bool) -> _Lists:
+    """A stable sort by depth, emission of candidates, a stable sort by tile."""
     device = projected.records.device
     tiles = int(view.tiles_x) * int(view.tiles_y)
     order = torch.sort(projected.depth_keys, stable=True).indices
@@ -188,23 +228,47 @@ def _bin(launcher: Launcher, view: View, projected: _Projected, exact: bool) -> 
         )
     ranges = torch.zeros(tiles + 1, 2, dtype=torch.int64, device=device)
     entries = torch.empty(candidates, dtype=torch.int32, device=device)
-    if candidates == 0:
-        return entries, ranges
-    bits = 16 if tiles < 1 << 15 else 32  # the sentinel is `tiles`
-    keys = torch.empty(candidates, dtype=torch.int16 if bits == 16 else torch.int32, device=device)
-    payloads = torch.empty(candidates, dtype=torch.int32, device=device)
-    emit = EmitArguments(candidates=candidates, visible=len(order), exact=int(exact))
-    for name in ("width", "height", "tiles_x", "tiles_y"):
-        setattr(emit, name, getattr(view, name))
-    _fill(emit, {"order": order, "ends": ends, "cull": projected.cull, "rects": projected.rects})
-    _fill(emit, {"keys": keys, "payloads": payloads})
-    launcher.launch(f"emit_entries_{bits}", _blocks(candidates), THREADS, emit)
-    sorted_keys, permutation = torch.sort(keys, stable=True)
-    find = RangeArguments(candidates=candidates)
-    _fill(find, {"keys": sorted_keys, "permutation": permutation, "payloads": payloads})
-    _fill(find, {"entries": entries, "ranges": ranges})
-    launcher.launch(f"find_ranges_{bits}", _blocks(candidates), THREADS, find)
-    return entries, ranges
+    permutation = torch.empty(0, dtype=torch.int64, device=device)
+    if candidates > 0:
+        bits = 16 if tiles < 1 << 15 else 32  # the sentinel is `tiles`
+        keys = torch.empty(candidates, dtype=torch.int16 if bits == 16 else torch.int32, device=device)
+        payloads = torch.empty(candidates, dtype=torch.int32, device=device)
+        emit = EmitArguments(candidates=candidates, visible=len(order), exact=int(exact))
+        for name in ("width", "height", "tiles_x", "tiles_y"):
+            setattr(emit, name, getattr(view, name))
+        _fill(emit, {"order": order, "ends": ends, "cull": projected.cull, "rects": projected.rects})
+        _fill(emit, {"keys": keys, "payloads": payloads})
+        launcher.launch(f"emit_entries_{bits}", _blocks(candidates), THREADS, emit)
+        sorted_keys, permutation = torch.sort(keys, stable=True)
+        find = RangeArguments(candidates=candidates)
+        _fill(find, {"keys": sorted_keys, "permutation": permutation, "payloads": payloads})
+        _fill(find, {"entries": entries, "ranges": ranges})
+        launcher.launch(f"find_ranges_{bits}", _blocks(candidates), THREADS, find)
+    heavy_first = torch.argsort(ranges[:-1, 1] - ranges[:-1, 0], descending=True, stable=True).to(torch.int32)
+    return _Lists(entries, ranges, heavy_first, order, ends, permutation)
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """Which gradients a backward pass is to compute.
+
+    Attributes
+    ----------
+    parameters : dict of Tensor or None
+        To be filled, by name of the parameter and ``probe``; None is not computed.
+    learns : Tensor [N] bool, optional
+        The splats that have gradients; all others get zeros.
+    deterministic : bool
+        Nothing is added up by atomics: 320 bytes for each pair of splat and tile, and one more pass.
+    """
+
+    parameters: dict[str, Tensor | None]
+    learns: Tensor | None = None
+    deterministic: bool = False
+
+    @property
+    def only_colors(self) -> bool:
+        return all(tensor is None for name, tensor in self.parameters.items() if name not in ("sh0", "shN"))
 
 
 def backward(
@@ -212,43 +276,107 @@ def backward(
     frame: Frame,
     parameters: Sequence[Tensor],
     upstream: dict[str, Tensor | None],
-    wanted: dict[str, Tensor | None],
+    wanted: Wanted,
 ) -> None:
-    """Fill the gradient tensors in ``wanted`` (of the parameters and ``probe``); None is not computed."""
-    count, device = parameters[0].shape[0], parameters[0].device
-    if count == 0:
+    """Fill the gradient tensors in ``wanted``."""
+    if len(parameters[0]) == 0:
         return
-    probe = wanted["probe"]
+    if wanted.only_colors:
+        return _backward_colors(launcher, frame, parameters, upstream["color"], wanted)
+    probe = wanted.parameters["probe"]
     absolute = probe is not None and probe.shape[1] == 4
     kind = "color"
     if any(upstream[name] is not None for name in ("normal", "depth_mean", "depth_median")):
         kind = "geometry"
     if upstream["distortion"] is not None:
         kind = "distortion"
-    gradients = torch.zeros(count, 16, dtype=torch.float32, device=device)
-    extras = torch.zeros(count, 4, dtype=torch.float32, device=device)
+    sums = _Sums(frame, wanted.deterministic, columns=16)
     blend = BlendVjpArguments(view=frame.view)
     _fill(blend, {name: getattr(frame, name) for name in ("records", "entries", "ranges", "tiles", "seen")})
     _fill(blend, {name: image for name, image in frame.images.items() if name != "depth_median"})
     _fill(blend, {f"g_{name}": upstream[name] for name in IMAGES})
-    _fill(blend, {"gradients": gradients, "extras": extras})
+    _fill(blend, {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns})
     launcher.launch(f"blend_vjp_{kind}{'_abs' if absolute else ''}", len(frame.tiles), THREADS, blend)
+    gradients, extras = sums.of_splats(launcher)
 
-    project = ProjectVjpArguments(view=frame.view, count=count, sh_rest=parameters[5].shape[1])
+    project = ProjectVjpArguments(view=frame.view, count=len(parameters[0]), sh_rest=parameters[5].shape[1])
     _fill(project, dict(zip(PARAMETERS, parameters, strict=True)))
-    _fill(project, {"tile_counts": frame.tile_counts, "gradients": gradients, "extras": extras})
-    _fill(project, {f"g_{name}": tensor for name, tensor in wanted.items()})
+    _fill(project, {"tile_counts": frame.tile_counts, "learns": wanted.learns})
+    _fill(project, {"gradients": gradients, "extras": extras})
+    _fill(project, {f"g_{name}": tensor for name, tensor in wanted.parameters.items()})
     project.probe_columns = 0 if probe is None else int(probe.shape[1])
-    launcher.launch("project_splats_vjp", _blocks(count), THREADS, project)
+    launcher.launch("project_splats_vjp", _blocks(len(parameters[0])), THREADS, project)
 
 
-def errors(launcher: Launcher, view: View, parameters: Sequence[Tensor], image: Tensor, mask: Tensor | None) -> Tensor:
+def _backward_colors(
+    launcher: Launcher, frame: Frame, parameters: Sequence[Tensor], g_color: Tensor | None, wanted: Wanted
+) -> None:
+    """Of sh0 and shN alone: no geometry, and no work behind the last splat that learns."""
+    means, *_, sh0, shN = parameters
+    g_sh0, g_shN = wanted.parameters["sh0"], wanted.parameters["shN"]
+    if g_color is None:
+        for tensor in (g_sh0, g_shN):
+            if tensor is not None:
+                tensor.zero_()
+        return
+    sums = _Sums(frame, wanted.deterministic, columns=0)
+    blend = BlendColorsArguments(view=frame.view)
+    _fill(blend, {name: getattr(frame, name) for name in ("records", "entries", "ranges", "tiles", "seen")})
+    _fill(blend, {"learns": wanted.learns, "g_color": g_color, "slots": sums.slots, "gradients": sums.extras})
+    launcher.launch("blend_vjp_learning", len(frame.tiles), THREADS, blend)
+    _, gradients = sums.of_splats(launcher)
+    project = ProjectColorsArguments(view=frame.view, count=len(means), sh_rest=shN.shape[1])
+    _fill(project, {"means": means, "sh0": sh0, "shN": shN, "tile_counts": frame.tile_counts})
+    _fill(project, {"learns": wanted.learns, "gradients": gradients, "g_sh0": g_sh0, "g_shN": g_shN})
+    launcher.launch("project_colors_vjp", _blocks(len(means)), THREADS, project)
+
+
+class _Sums:
+    """Where the blending's gradients are added up: rows of the splats, or a slot for each (entry, warp)."""
+
+    def __init__(self, frame: Frame, deterministic: bool, *, columns: int) -> None:
+        self.frame = frame
+        self.slots = frame.permutation if deterministic else None  # [M] int64
+        rows = len(frame.records) if self.slots is None else 4 * len(self.slots)
+        self.extras = torch.zeros(rows, 4, dtype=torch.float32, device=frame.records.device)
+        self.gradients = self.extras.new_zeros(rows, columns) if columns else None
+
+    def of_splats(self, launcher: Launcher) -> tuple[Tensor | None, Tensor]:
+        """[N, columns] and [N, 4]."""
+        if self.slots is None:
+            return self.gradients, self.extras
+        count = len(self.frame.records)
+        extras = self.extras.new_empty(count, 4)
+        gradients = None if self.gradients is None else self.gradients.new_empty(count, self.gradients.shape[1])
+        slots = SlotArguments(count=count)
+        _fill(slots, {"order": self.frame.order, "ends": self.frame.ends})
+        _fill(slots, {"slots": self.gradients, "extra_slots": self.extras, "gradients": gradients, "extras": extras})
+        launcher.launch("sum_slots", _blocks(32 * count), THREADS, slots)
+        return gradients, extras
+
+
+def errors(
+    launcher: Launcher,
+    view: View,
+    parameters: Sequence[Tensor],
+    image: Tensor,
+    mask: Tensor | None,
+    occlusion: bool = False,
+) -> Tensor:
     """Splat errors [N] of one view; all tensors contiguous, image float32 [H, W, 3], mask bool [H, W]."""
     count = parameters[0].shape[0]
     projected = _project(launcher, view, parameters, errors=True)
-    total = torch.empty(count, dtype=torch.float32, device=image.device)
     if count == 0:
-        return total
+        return torch.empty(0, dtype=torch.float32, device=image.device)
+    if occlusion:
+        lists = _bin(launcher, view, projected, True)
+        units = torch.zeros(count, dtype=torch.int64, device=image.device)
+        occluded = OccludedArguments(view=view)
+        _fill(occluded, {name: getattr(lists, name) for name in ("entries", "ranges", "tiles")})
+        _fill(occluded, {"records": projected.records, "image": image, "mask": mask, "errors": units})
+        launcher.launch("splat_errors_occluded", len(lists.tiles), THREADS, occluded)
+        return (units.to(torch.float64) * ERROR_UNIT).to(torch.float32)
+    total = torch.empty(count, dtype=torch.float32, device=image.device)
     arguments = ErrorArguments(view=view, count=count)
     _fill(arguments, {name: getattr(projected, name) for name in ("records", "cull", "rects", "tile_counts")})
     _fill(arguments, {"image": image, "mask": mask, "errors": total})

@@ -68,6 +68,16 @@ template <class V, class S> GS2D_HD Vec3<V> rotate_back(const S* R, Vec3<V> a) {
             fma(V(R[2]), a.x, fma(V(R[5]), a.y, V(R[8]) * a.z))};
 }
 
+template <class V, class S> GS2D_HD Vec3<V> center_of(const PinholeCamera<S>& cam) {
+    return {V(cam.center[0]), V(cam.center[1]), V(cam.center[2])};
+}
+
+// The unit vector along d, and 1 / |d|.
+template <class V> GS2D_HD Vec3<V> direction_of(Vec3<V> d, V& inverse_length) {
+    inverse_length = V(1.0f) / sqrt(dot(d, d));
+    return inverse_length * d;
+}
+
 template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>& s, const PinholeCamera<S>& cam) {
     Frame3<V> f;
     const V one = V(S(1)), two = V(S(2)), tiny = V(S(1e-18));
@@ -91,9 +101,8 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     f.row1 = (inv / sv) * cross(f.p, tu);
     f.row2 = inv * f.n;
 
-    const Vec3<V> d = s.mean - Vec3<V>{V(cam.center[0]), V(cam.center[1]), V(cam.center[2])};
-    f.inverse_distance = one / sqrt(dot(d, d));
-    f.to_splat = f.inverse_distance * d;
+    const Vec3<V> d = s.mean - center_of<V>(cam);
+    f.to_splat = direction_of(d, f.inverse_distance);
     f.sign = select(dot(f.n_world, d) > V(S(0)), V(S(-1)), one);
     return f;
 }

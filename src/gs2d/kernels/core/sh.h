@@ -37,6 +37,14 @@ template <class V> GS2D_HD void sh_basis(Vec3<V> d, int degree, V* basis) {
     basis[15] = -(a3 * x * (xx - three * yy));
 }
 
+// Colour + 1/2, not clamped, from the coefficients sh[3 * k + channel].
+template <class V> GS2D_HD Vec3<V> sh_color(const V* sh, const V* basis, int degree) {
+    const V half = V(0.5f);
+    Vec3<V> c = {half, half, half};
+    for (int k = 0; k < sh_count(degree); ++k) c = axpy(basis[k], Vec3<V>{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}, c);
+    return c;
+}
+
 // Gradient with respect to d of sum_k g[k] basis[k], d taken as a free vector (its length is dealt with by the caller).
 template <class V> GS2D_HD Vec3<V> sh_basis_vjp(Vec3<V> d, int degree, const V* g) {
     Vec3<V> r = {V(0.0), V(0.0), V(0.0)};

@@ -10,6 +10,7 @@ __all__ = [
     "AdamArguments",
     "AdamAttribute",
     "BlendArguments",
+    "BlendColorsArguments",
     "BlendVjpArguments",
     "BlurArguments",
     "EmitArguments",
@@ -17,11 +18,14 @@ __all__ = [
     "FinishArguments",
     "MeanArguments",
     "NormalArguments",
+    "OccludedArguments",
     "PhotometricArguments",
     "PhotometricVjpArguments",
     "ProjectArguments",
+    "ProjectColorsArguments",
     "ProjectVjpArguments",
     "RangeArguments",
+    "SlotArguments",
     "View",
     "fill",
 ]
@@ -104,8 +108,42 @@ class BlendVjpArguments(ctypes.Structure):
         ("view", View),
         *_pointers("records", "entries", "ranges", "tiles", "seen"),
         *_pointers("color", "alpha", "normal", "depth_mean", "distortion", "final_T", "moments"),
-        *_pointers(*(f"g_{name}" for name in IMAGES), "slots", "gradients", "extras"),
+        *_pointers(*(f"g_{name}" for name in IMAGES), "learns", "slots", "gradients", "extras"),
     )
+
+
+class SlotArguments(ctypes.Structure):
+    """Of slots.cu."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        *_pointers("order", "ends", "slots", "extra_slots", "gradients", "extras"),
+    )
+
+
+class BlendColorsArguments(ctypes.Structure):
+    """Of blend_colors.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_pointers("records", "entries", "ranges", "tiles", "seen", "learns", "g_color", "slots", "gradients"),
+    )
+
+
+class ProjectColorsArguments(ctypes.Structure):
+    """Of blend_colors.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_all(ctypes.c_int64, "count", "sh_rest"),
+        *_pointers("means", "sh0", "shN", "tile_counts", "learns", "gradients", "g_sh0", "g_shN"),
+    )
+
+
+class OccludedArguments(ctypes.Structure):
+    """Of occluded.cu."""
+
+    _fields_ = (("view", View), *_pointers("records", "entries", "ranges", "tiles", "image", "mask", "errors"))
 
 
 class ProjectVjpArguments(ctypes.Structure):
@@ -114,7 +152,7 @@ class ProjectVjpArguments(ctypes.Structure):
     _fields_ = (
         ("view", View),
         *_all(ctypes.c_int64, "count", "sh_rest"),
-        *_pointers(*PARAMETERS, "tile_counts", "gradients", "extras"),
+        *_pointers(*PARAMETERS, "tile_counts", "learns", "gradients", "extras"),
         *_pointers(*(f"g_{name}" for name in PARAMETERS), "g_probe"),
         ("probe_columns", ctypes.c_int64),
     )

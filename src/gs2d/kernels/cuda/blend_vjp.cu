@@ -4,6 +4,7 @@
 // the warp by a transposing reduction (16 shuffles), after which 16 lanes hold one sum each and add it to the splat's
 // gradient record: one 64-byte line. The order of those additions varies from run to run, and with it the last digits.
 #include "cuda/pixels.h"
+#include "cuda/reduce.h"
 
 namespace gs2d {
 
@@ -16,6 +17,7 @@ struct BlendVjpArguments {
     const uint* seen;
     const float *color, *alpha, *normal, *depth_mean, *distortion, *final_T, *moments;  // of the forward pass
     const float *g_color, *g_alpha, *g_normal, *g_depth_mean, *g_depth_median, *g_distortion;  // null: no gradient
+    const uchar* learns; // [N], 0 = no gradient; or null: all
     const int64* slots;  // [entries]: the candidate that each was, or null
     float* gradients;    // [N, 16], zeros on entry; with slots [4 * candidates, 16]
     float* extras;       // the same rows of 4: low-pass centre, absolute densification signal
@@ -52,24 +54,6 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
         g.M1 = a.moments[3 * i], g.M2 = a.moments[3 * i + 1], g.inverse_depth0 = a.moments[3 * i + 2];
     }
     return g;
-}
-
-// Sums of N = 16, 4 or 2 values over the warp, by exchange: with each step a lane keeps half of the values. Lane l ends with
-// the sum of value l / (32 / N).
-template <int N, int STEP = 16> __device__ __forceinline__ float transpose_reduce(float* v, int lane) {
-    if constexpr (N == 1) {
-#pragma unroll
-        for (int step = STEP; step > 0; step >>= 1) v[0] = v[0] + __shfl_xor_sync(FULL_MASK, v[0], step);
-        return v[0];
-    } else {
-        const bool upper = lane & STEP;
-#pragma unroll
-        for (int k = 0; k < N / 2; ++k) {
-            const float kept = upper ? v[k + N / 2] : v[k], given = upper ? v[k] : v[k + N / 2];
-            v[k] = kept + __shfl_xor_sync(FULL_MASK, given, STEP);
-        }
-        return transpose_reduce<N / 2, STEP / 2>(v, lane);
-    }
 }
 
 // `row` is the splat's, or with slots the one of this entry and warp.
@@ -133,11 +117,14 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane), uniform(words[at.sub_block[1]], at.lane)};
         const uint wanted = hits[0] | hits[1];
         if (wanted == 0u) continue;  // the same for all lanes
+        bool learns = true;
         if (wanted >> at.lane & 1u) {
             const uint splat = a.entries[i + at.lane] >> 8;
+            if (a.learns) learns = a.learns[splat];
             fetch_record(a.records, splat, staged.records, at.lane);
             staged.rows[at.lane] = a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
         }
+        const uint learning = __ballot_sync(FULL_MASK, learns);
         __syncwarp();
         for (uint todo = wanted; todo; todo &= todo - 1) {
             const int j = __ffs(int(todo)) - 1;
@@ -154,6 +141,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                 upstream.get<GEO>(h, g[h]);
                 composite_vjp<GEO, DIST, ABS, true>(s, inverse_zc, dx, dy, hit, limits, g[h], T[h], S[h], sums);
             }
+            if (!(learning & bit)) continue;  // the same for all lanes
             finish_column(dx, sums);
             add_gradient<ABS>(a, staged.rows[j], finish(s, sums, limits), at.lane);
         }

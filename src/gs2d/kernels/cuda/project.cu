@@ -1,5 +1,5 @@
 // Projection of all splats: activations, SH colour, record, cull record, tile rectangle, depth key, radius.
-#include "cuda/common.h"
+#include "cuda/colors.h"
 
 namespace gs2d {
 
@@ -21,35 +21,6 @@ __device__ __forceinline__ SplatParameters<float> load_parameters(const ProjectA
     return {{m[0], m[1], m[2]}, q[0], q[1], q[2], q[3], l[0], l[1], a.opacity_logits[i]};
 }
 
-// SH colour + 1/2, not clamped; `size` is finite only if every coefficient is.
-template <int DEGREE>
-__device__ __forceinline__ Vec3<float> color_of(const ProjectArguments& a, int64 i, Vec3<float> direction, float& size) {
-    constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1);
-    float basis[COUNT], sh[3 * COUNT];
-    sh_basis(direction, DEGREE, basis);
-    for (int k = 0; k < 3; ++k) sh[k] = a.sh0[3 * i + k];
-    const float* rest = a.shN + 3 * a.sh_rest * i;
-#pragma unroll
-    for (int k = 3; k < 3 * COUNT; ++k) sh[k] = rest[k - 3];
-    Vec3<float> c = {0.5f, 0.5f, 0.5f};
-    size = 0.f;
-#pragma unroll
-    for (int k = 0; k < COUNT; ++k) {
-        size = size + (abs(sh[3 * k]) + abs(sh[3 * k + 1]) + abs(sh[3 * k + 2]));
-        c = axpy(basis[k], Vec3<float>{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}, c);
-    }
-    return c;
-}
-
-__device__ __forceinline__ Vec3<float> color_of(const ProjectArguments& a, int64 i, Vec3<float> direction, float& size) {
-    switch (a.view.sh_degree) {
-        case 0: return color_of<0>(a, i, direction, size);
-        case 1: return color_of<1>(a, i, direction, size);
-        case 2: return color_of<2>(a, i, direction, size);
-        default: return color_of<3>(a, i, direction, size);
-    }
-}
-
 extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArguments a) {
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.count) return;
@@ -65,7 +36,8 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     if (!is_finite(size) || !(r.zc > v.near)) return;
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
     float sh_size;
-    const Vec3<float> c = color_of(a, i, frame.to_splat, sh_size);
+    const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
+    const Vec3<float> c = color_of(v.sh_degree, sh, frame.to_splat, sh_size);
     if (!is_finite(sh_size)) return;
     r.red = max(c.x, 0.f), r.green = max(c.y, 0.f), r.blue = max(c.z, 0.f);
 

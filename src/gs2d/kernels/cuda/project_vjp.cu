@@ -1,5 +1,5 @@
 // From gradients of records to gradients of parameters, SH and the densification signal: one thread per splat.
-#include "cuda/common.h"
+#include "cuda/colors.h"
 
 namespace gs2d {
 
@@ -8,6 +8,7 @@ struct ProjectVjpArguments {
     int64 count, sh_rest;
     const float *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
     const int* tile_counts;  // 0: not drawn, all gradients are 0
+    const uchar* learns;     // [N], 0: all gradients are 0; or null
     const float* gradients;  // [N, 16]
     const float* extras;     // [N, 4]
     float *g_means, *g_quats, *g_log_scales, *g_opacity_logits, *g_sh0, *g_shN, *g_probe;  // null where not wanted
@@ -30,50 +31,24 @@ __device__ __forceinline__ void write_zeros(const ProjectVjpArguments& a, int64 
         for (int64 k = 0; k < 3 * a.sh_rest; ++k) a.g_shN[3 * a.sh_rest * i + k] = 0.f;
 }
 
-// Writes the gradients of the coefficients; returns that of the unit vector to the splat.
-template <int DEGREE>
-__device__ __forceinline__ Vec3<float> color_vjp(const ProjectVjpArguments& a, int64 i, Vec3<float> direction, Vec3<float> g) {
-    constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1);
-    float basis[COUNT], along[COUNT], sh[3 * COUNT];
-    sh_basis(direction, DEGREE, basis);
-#pragma unroll
-    for (int k = 0; k < 3 * COUNT; ++k) sh[k] = k < 3 ? a.sh0[3 * i + k] : a.shN[3 * a.sh_rest * i + k - 3];
-    Vec3<float> c = {0.5f, 0.5f, 0.5f};
-#pragma unroll
-    for (int k = 0; k < COUNT; ++k) c = axpy(basis[k], Vec3<float>{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}, c);
-    g = {keep(c.x > 0.f, g.x), keep(c.y > 0.f, g.y), keep(c.z > 0.f, g.z)};  // clamped channels
-#pragma unroll
-    for (int k = 0; k < COUNT; ++k) {
-        along[k] = fma(g.x, sh[3 * k], fma(g.y, sh[3 * k + 1], g.z * sh[3 * k + 2]));
-        float* to = k == 0 ? a.g_sh0 : a.g_shN;
-        if (!to) continue;
-        to += k == 0 ? 3 * i : 3 * (a.sh_rest * i + k - 1);
-        to[0] = basis[k] * g.x, to[1] = basis[k] * g.y, to[2] = basis[k] * g.z;
-    }
-    if (a.g_shN)
-        for (int64 k = 3 * (COUNT - 1); k < 3 * a.sh_rest; ++k) a.g_shN[3 * a.sh_rest * i + k] = 0.f;
-    return sh_basis_vjp(direction, DEGREE, along);
-}
-
-extern "C" __global__ void __launch_bounds__(128) project_splats_vjp(ProjectVjpArguments a) {
+extern "C" __global__ void __launch_bounds__(128, 5) project_splats_vjp(ProjectVjpArguments a) {
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.count) return;
-    if (a.tile_counts[i] == 0) return write_zeros(a, i);
-    const float *m = a.means + 3 * i, *q = a.quats + 4 * i, *l = a.log_scales + 2 * i;
+    if (a.tile_counts[i] == 0 || (a.learns && !a.learns[i])) return write_zeros(a, i);
+    const float *g = a.gradients + 16 * i, *e = a.extras + 4 * i, *m = a.means + 3 * i;
+    // Colours first, so that coefficients and geometry are not in registers at the same time.
+    const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
+    const CoefficientGradients g_sh = {a.g_sh0 ? a.g_sh0 + 3 * i : nullptr, a.g_shN ? a.g_shN + 3 * a.sh_rest * i : nullptr};
+    float inverse_distance;
+    const Vec3<float> direction = direction_of(Vec3<float>{m[0], m[1], m[2]} - center_of<float>(a.view.camera), inverse_distance);
+    const Vec3<float> g_direction = color_vjp(a.view.sh_degree, sh, int(a.sh_rest), g_sh, direction, {g[10], g[11], g[12]});
+
+    const float *q = a.quats + 4 * i, *l = a.log_scales + 2 * i;
     const SplatParameters<float> p = {{m[0], m[1], m[2]}, q[0], q[1], q[2], q[3], l[0], l[1], a.opacity_logits[i]};
     const Frame3<float> frame = frame_of(p, a.view.camera);
     const Record<float> r = project(p, frame, a.view.camera);
-    const float *g = a.gradients + 16 * i, *e = a.extras + 4 * i;
     const RecordGradient<float> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8], g[9],
                                       g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
-    const Vec3<float> g_color = {gr.red, gr.green, gr.blue};
-    Vec3<float> g_direction;
-    switch (a.view.sh_degree) {
-        case 0: g_direction = color_vjp<0>(a, i, frame.to_splat, g_color); break;
-        case 1: g_direction = color_vjp<1>(a, i, frame.to_splat, g_color); break;
-        case 2: g_direction = color_vjp<2>(a, i, frame.to_splat, g_color); break;
-        default: g_direction = color_vjp<3>(a, i, frame.to_splat, g_color);
-    }
     const ParameterGradient<float> d = project_vjp(p, frame, r, gr, g_direction, a.view.camera);
     write_row(a.g_means, i, 3, d.mean.x, d.mean.y, d.mean.z);
     write_row(a.g_quats, i, 4, d.qw, d.qx, d.qy, d.qz);

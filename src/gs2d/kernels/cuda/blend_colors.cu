@@ -1,0 +1,108 @@
+// The gradients of colours alone, of all splats or some, while everything else is frozen (stage 2): the blending walked once more for its
+// weights. No remaining sum, no alpha or geometry; splats that do not learn only change the transmittance, and a warp
+// stops behind the last one that does.
+#include "cuda/colors.h"
+#include "cuda/pixels.h"
+#include "cuda/reduce.h"
+
+namespace gs2d {
+
+struct BlendColorsArguments {
+    View view;
+    const float* records;
+    const uint* entries;
+    const int64* ranges;
+    const int* tiles;
+    const uint* seen;
+    const uchar* learns;   // [N], 0 = no gradient; or null: all
+    const float* g_color;  // [H, W, 3]
+    const int64* slots;    // as in blend_vjp.cu
+    float* gradients;      // [N, 4]: of the colours, and nothing; zeros on entry; with slots [4 * candidates, 4]
+};
+
+struct ProjectColorsArguments {
+    View view;
+    int64 count, sh_rest;
+    const float *means, *sh0, *shN;
+    const int* tile_counts;   // [N]; 0: not drawn
+    const uchar* learns;      // or null
+    const float* gradients;   // [N, 4]
+    float *g_sh0, *g_shN;     // null where not wanted
+};
+
+extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendColorsArguments a) {
+    __shared__ float4 staged[4][4][32];  // warp, quarter of a record, entry
+    __shared__ uint rows[4][32];
+    const Place at = place_of(a.view, a.tiles);
+    float4(*records)[32] = staged[at.warp];
+    const BlendLimits<float> limits = limits_of(a.view);
+    Vec3<float> g[HALVES];
+    float T[HALVES];
+#pragma unroll
+    for (int h = 0; h < HALVES; ++h) {
+        const float* from = a.g_color + 3 * (int64(at.y + 4 * h) * a.view.width + at.x);
+        T[h] = at.inside[h] ? 1.f : 0.f;
+        g[h] = at.inside[h] ? Vec3<float>{from[0], from[1], from[2]} : Vec3<float>{0.f, 0.f, 0.f};
+    }
+    const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
+    const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];
+    const auto learning = [&](int64 i, uint wanted) {  // of the chunk's entries
+        const bool mine = wanted >> at.lane & 1u && (!a.learns || a.learns[a.entries[i + at.lane] >> 8]);
+        return __ballot_sync(FULL_MASK, mine);
+    };
+    const auto wanted_in = [&](int64 i, int h) {
+        return uniform(a.seen[word_of(begin, at.tile, (i - begin) >> 5) + at.sub_block[h]], at.lane);
+    };
+    int64 last = begin;  // chunks from here on hold nobody who learns
+    for (int64 i = begin; i < end; i += 32)
+        if (learning(i, wanted_in(i, 0) | wanted_in(i, 1))) last = i + 1;
+
+    for (int64 i = begin; i < last; i += 32) {
+        const uint hits[HALVES] = {wanted_in(i, 0), wanted_in(i, 1)};
+        const uint wanted = hits[0] | hits[1];
+        if (wanted == 0u) continue;  // the same for all lanes
+        const uint learn = learning(i, wanted);
+        if (wanted >> at.lane & 1u) {
+            const uint splat = a.entries[i + at.lane] >> 8;
+            fetch_record(a.records, splat, records, at.lane);
+            rows[at.warp][at.lane] = a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
+        }
+        __syncwarp();
+        for (uint todo = wanted; todo; todo &= todo - 1) {
+            const int j = __ffs(int(todo)) - 1;
+            const uint bit = todo & (0u - todo);
+            const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
+            Vec3<float> sum = {0.f, 0.f, 0.f};
+#pragma unroll
+            for (int h = 0; h < HALVES; ++h) {
+                if (!(hits[h] & bit)) continue;
+                const Hit<float> hit = intersect(s, x - s.cx, y + float(4 * h) - s.cy, limits);
+                composite_color_vjp(hit, limits, g[h], T[h], sum);
+            }
+            if (!(learn & bit)) continue;  // the same for all lanes
+            float v[4] = {sum.x, sum.y, sum.z, 0.f};
+            const float mine = transpose_reduce<4>(v, at.lane);
+            if (!(at.lane & 7)) atomicAdd(a.gradients + 4 * int64(rows[at.warp][j]) + (at.lane >> 3), mine);
+        }
+        __syncwarp();  // before the records are overwritten
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(128) project_colors_vjp(ProjectColorsArguments a) {
+    const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
+    if (i >= a.count) return;
+    const int rest = int(a.sh_rest);
+    const CoefficientGradients to = {a.g_sh0 ? a.g_sh0 + 3 * i : nullptr, a.g_shN ? a.g_shN + 3 * a.sh_rest * i : nullptr};
+    if (a.tile_counts[i] == 0 || (a.learns && !a.learns[i])) {
+        if (to.first) to.first[0] = to.first[1] = to.first[2] = 0.f;
+        for (int k = 0; to.rest && k < 3 * rest; ++k) to.rest[k] = 0.f;
+        return;
+    }
+    const float *m = a.means + 3 * i, *g = a.gradients + 4 * i;
+    float inverse_distance;
+    const Vec3<float> direction = direction_of(Vec3<float>{m[0], m[1], m[2]} - center_of<float>(a.view.camera), inverse_distance);
+    const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
+    color_vjp(a.view.sh_degree, sh, rest, to, direction, {g[0], g[1], g[2]});
+}
+
+}  // namespace gs2d

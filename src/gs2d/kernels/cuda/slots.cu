@@ -1,0 +1,31 @@
+// Gradients that do not vary from run to run: instead of adding to a splat's record, each warp writes to a slot of its own
+// (blend_vjp.cu with `slots`), and the slots of a splat, which lie together, are added up here in a fixed order.
+#include "cuda/common.h"
+
+namespace gs2d {
+
+struct SlotArguments {
+    int64 count;
+    const int64* order;  // [N]: splats by depth
+    const int64* ends;   // [N]: running sum of candidates in that order; four slots each, one for each warp of a tile
+    const float *slots, *extra_slots;  // [4 * candidates, 16] or null, [4 * candidates, 4]
+    float *gradients, *extras;         // [N, 16] or null, [N, 4]
+};
+
+// One warp per splat.
+extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
+    const int64 place = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
+    const int lane = threadIdx.x & 31;
+    if (place >= a.count) return;  // the whole warp
+    const int64 splat = a.order[place], first = place > 0 ? 4 * a.ends[place - 1] : 0, last = 4 * a.ends[place];
+    float sum = 0.f, extra = 0.f;
+    for (int64 row = first + (lane >> 4); a.slots && row < last; row += 2) sum = sum + a.slots[16 * row + (lane & 15)];
+    for (int64 row = first + (lane >> 2); row < last; row += 8) extra = extra + a.extra_slots[4 * row + (lane & 3)];
+    sum = sum + __shfl_xor_sync(FULL_MASK, sum, 16);
+#pragma unroll
+    for (int step = 16; step >= 4; step >>= 1) extra = extra + __shfl_xor_sync(FULL_MASK, extra, step);
+    if (lane < 16 && a.gradients) a.gradients[16 * splat + lane] = sum;
+    if (lane < 4) a.extras[4 * splat + lane] = extra;
+}
+
+}  // namespace gs2d

@@ -1,0 +1,107 @@
+"""Scenes for the CUDA kernels, and ways to run them by the emulator and by the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import render_oracle
+import torch
+from emulate import Emulator
+from render_scenes import KINDS, contraction, random_camera, random_splats, requiring_grad
+from torch import Tensor
+
+from gs2d.camera import Camera
+from gs2d.render import cuda, reference_errors
+from gs2d.render.api import rasterize
+from gs2d.render.backend import Backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import Splats
+
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
+
+
+def render(
+    launcher: Emulator,
+    splats: Splats,
+    camera: Camera,
+    settings: RasterSettings,
+    probe: Tensor | None = None,
+    exact_masks: bool = True,
+) -> RenderOutput:
+    """Through the public function, as a backend."""
+
+    def run(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
+        return cuda.rasterize_with(launcher, s, c, r, p, exact_masks=exact_masks)
+
+    backend = Backend("cuda", run, reference_errors.splat_errors)  # errors are not asked for here
+    return rasterize(splats, camera, settings, backend=backend, screen_probe=probe)
+
+
+@dataclass(frozen=True)
+class Case:
+    seed: int
+    splats: Splats
+    camera: Camera
+
+
+def cases(count: int, kinds: tuple[str, ...] = KINDS) -> Iterator[Case]:
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        camera = random_camera(rng)
+        splats = random_splats(rng, camera, int(rng.integers(1, 60)), kinds)
+        splats = replace(splats, log_scales=splats.log_scales + 0.7 * (seed % 3))
+        yield Case(seed, splats.to(dtype=torch.float32), camera)
+
+
+def double(splats: Splats) -> Splats:
+    return splats.to(dtype=torch.float64)
+
+
+def quantile(values: Tensor, q: float) -> float:
+    return float(np.quantile(values.numpy(), q))
+
+
+def cases_with_margins() -> list[Case]:
+    """Small scenes in which no decision is within 1e-4 of its threshold."""
+    clear = []
+    for case in cases(60, tuple(kind for kind in KINDS if kind != "twins")):
+        camera = case.camera.resized(min(case.camera.width, 8), min(case.camera.height, 8))
+        splats = case.splats.rows(torch.arange(min(len(case.splats), 12)))
+        if render_oracle.render(splats, camera, SETTINGS).margin >= 1e-4:
+            clear.append(Case(case.seed, splats, camera))
+    assert len(clear) >= 12
+    return clear
+
+
+def gradients(
+    launcher: Emulator | None,
+    splats: Splats,
+    camera: Camera,
+    cotangents: dict[str, Tensor],
+    columns: int,
+    exact_masks: bool = True,
+) -> dict[str, Tensor]:
+    """Vector-Jacobian products of all parameters and the probe; None is the reference."""
+    scene = requiring_grad(splats)
+    probe = torch.zeros(len(splats), columns, dtype=splats.dtype, requires_grad=True)
+    output: RenderOutput
+    if launcher is None:
+        output = rasterize(scene, camera, SETTINGS, backend="reference", screen_probe=probe)
+    else:
+        output = render(launcher, scene, camera, SETTINGS, probe, exact_masks)
+    contraction(output, cotangents).backward()
+    assert probe.grad is not None
+    grads = {name: tensor.grad for name, tensor in scene.items()} | {"signed": probe.grad[:, :2]}
+    if columns == 4:
+        grads["absolute"] = probe.grad[:, 2:]
+    assert all(grad is not None and bool(grad.isfinite().all()) for grad in grads.values())
+    return {name: grad for name, grad in grads.items() if grad is not None}
+
+
+def many_tiles() -> Case:
+    rng = np.random.default_rng(5)
+    camera = random_camera(rng).resized(70, 45)  # no multiple of 16, 8 or 4
+    splats = random_splats(rng, camera, 150)
+    return Case(5, replace(splats, log_scales=splats.log_scales - 0.7).to(dtype=torch.float32), camera)

@@ -1,0 +1,248 @@
+"""Variants of the CUDA passes, run by the emulator: colours alone, some rows, no distortion, the same bits each run."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from emulate import Emulator
+from kernel_cases import SETTINGS, Case, cases, double, many_tiles
+from render_scenes import contraction, front_camera, random_cotangents, requiring_grad, splat, stack
+from torch import Tensor
+
+from gs2d.camera import Camera
+from gs2d.errors import ShapeError
+from gs2d.render import cuda, cuda_passes, reference
+from gs2d.splats import ATTRIBUTES, Splats
+
+pytestmark = pytest.mark.timeout(120)
+COLORS = ("sh0", "shN")
+
+
+class Recording:
+    """Runs kernels and notes their names."""
+
+    def __init__(self, emulator: Emulator) -> None:
+        self.emulator, self.names = emulator, list[str]()
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+        self.names.append(name)
+        self.emulator.launch(name, blocks, threads, arguments, shared_bytes)
+
+
+def gradients(
+    launcher: Any,
+    case: Case,
+    cotangents: Mapping[str, Tensor],
+    *,
+    trained: tuple[str, ...] = ATTRIBUTES,
+    columns: int = 0,
+    **options: Any,
+) -> dict[str, Tensor]:
+    """Of the trained attributes, and with ``columns`` of the probe; ``options`` go to rasterize_with."""
+    scene = Splats(**{name: t.clone().requires_grad_(name in trained) for name, t in case.splats.items()})
+    probe = torch.zeros(len(scene), columns, requires_grad=True) if columns else None
+    settings = replace(SETTINGS, sh_degree=3 if scene.shN.shape[1] else 0)
+    output = cuda.rasterize_with(launcher, scene, case.camera, settings, probe, **options)
+    contraction(output, dict(cotangents)).backward()
+    found = {name: tensor.grad for name, tensor in scene.items() if name in trained}
+    if probe is not None:
+        found["probe"] = probe.grad
+    return {name: grad for name, grad in found.items() if grad is not None}
+
+
+def some_rows(count: int, seed: int) -> Tensor:
+    return torch.rand(count, generator=torch.Generator().manual_seed(seed)) < 0.4
+
+
+def color_cotangent(case: Case) -> dict[str, Tensor]:
+    return {"color": random_cotangents(np.random.default_rng(case.seed), case.camera)["color"]}
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))
+
+
+def test_gradients_of_colours_alone_agree_with_the_reference(emulator: Emulator, clear_cases: list[Case]) -> None:
+    launcher = Recording(emulator)
+    errors = []
+    for case in clear_cases:
+        cotangents = color_cotangent(case)
+        found = gradients(launcher, case, cotangents, trained=COLORS)
+        scene = requiring_grad(double(case.splats))
+        contraction(reference.rasterize(scene, case.camera, SETTINGS), cotangents).backward()
+        for name in COLORS:
+            expected = getattr(scene, name).grad
+            if expected is not None and float(expected.norm()) > 1e-3:
+                errors.append(relative_error(found[name], expected))
+    assert {"blend_vjp_learning", "project_colors_vjp"} <= set(launcher.names)
+    assert not any(name.startswith(("blend_vjp_color", "project_splats_vjp")) for name in launcher.names)
+    assert len(errors) >= 16
+    assert np.median(errors) < 1e-5
+    assert max(errors) < 2e-3
+
+
+@pytest.mark.parametrize("trained", [COLORS, ("sh0",), ("shN",), ATTRIBUTES])
+def test_rows_that_learn_have_the_gradients_they_have_anyway_and_all_others_zero(
+    emulator: Emulator, trained: tuple[str, ...]
+) -> None:
+    """With sums in a fixed order: bit for bit."""
+    case = many_tiles()
+    rows = some_rows(len(case.splats), 2)
+    cotangents = (
+        color_cotangent(case) if trained != ATTRIBUTES else random_cotangents(np.random.default_rng(3), case.camera)
+    )
+    columns = 4 if trained == ATTRIBUTES else 0
+    whole, part = (
+        gradients(emulator, case, cotangents, trained=trained, columns=columns, deterministic=True, gradient_rows=r)
+        for r in (None, rows)
+    )
+    assert whole.keys() == part.keys() == {*trained, *(["probe"] if columns else [])}
+    for name in whole:
+        assert torch.equal(part[name][rows], whole[name][rows]), name
+        assert not part[name][~rows].any(), name
+        assert bool(whole[name][~rows].any()), name
+
+
+def test_colours_have_no_gradient_where_no_image_of_colour_has(emulator: Emulator) -> None:
+    case = many_tiles()
+    alpha = {"alpha": torch.ones(case.camera.height, case.camera.width)}
+    found = gradients(emulator, case, alpha, trained=COLORS)
+    assert not any(bool(grad.any()) for grad in found.values())
+
+
+def test_a_warp_stops_behind_the_last_splat_that_learns(emulator: Emulator) -> None:
+    """100 faint layers; of those that learn the last is in the first, the second, or no chunk of 32."""
+    layers = stack(*(splat((0.0, 0.0, 2.0 + 0.01 * i), (3.0, 3.0), 0.02, (i % 3 / 2, 0.5, 0.2)) for i in range(100)))
+    case = Case(0, layers, front_camera(9, 5))
+    cotangents = color_cotangent(case)
+    whole = gradients(emulator, case, cotangents, trained=("sh0",))["sh0"]
+    for last in (0, 31, 32, 50, None):
+        rows = torch.zeros(100, dtype=torch.bool)
+        if last is not None:
+            rows[last] = True
+        found = gradients(emulator, case, cotangents, trained=("sh0",), gradient_rows=rows)["sh0"]
+        assert torch.equal(found[rows], whole[rows])
+        assert not found[~rows].any()
+
+
+@pytest.mark.parametrize("trained", [ATTRIBUTES, COLORS])
+def test_deterministic_gradients_do_not_depend_on_order_or_culling(
+    emulator: Emulator, trained: tuple[str, ...]
+) -> None:
+    case = many_tiles()
+    cotangents = random_cotangents(np.random.default_rng(1), case.camera)
+    columns = 4 if trained == ATTRIBUTES else 0
+    options: dict[str, Any] = {"trained": trained, "columns": columns, "deterministic": True}
+    usual = gradients(emulator, case, cotangents, **options)
+    downwards = gradients(replace(emulator, descending=True), case, cotangents, **options)
+    everywhere = gradients(emulator, case, cotangents, **options, exact_masks=False)
+    atomic = gradients(emulator, case, cotangents, trained=trained, columns=columns)
+    for name, grad in usual.items():
+        assert torch.equal(grad, downwards[name]), name
+        assert torch.equal(grad, everywhere[name]), name
+        assert float((grad - atomic[name]).norm()) <= 1e-5 * float(grad.norm()), name
+
+
+def test_torchs_switch_asks_for_deterministic_gradients(emulator: Emulator) -> None:
+    case = next(cases(1))
+    launcher = Recording(emulator)
+    try:
+        torch.use_deterministic_algorithms(True)
+        gradients(launcher, case, color_cotangent(case))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert "sum_slots" in launcher.names
+    launcher.names.clear()
+    gradients(launcher, case, color_cotangent(case))
+    assert "sum_slots" not in launcher.names
+
+
+def test_without_distortion_the_other_images_and_gradients_keep_every_bit(emulator: Emulator) -> None:
+    case = many_tiles()
+    full = cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS)
+    part = cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS, distortion=False)
+    assert bool(part.distortion.isnan().all())  # whoever uses it by mistake will notice
+    for name in ("color", "alpha", "normal", "depth_mean", "depth_median", "radii"):
+        assert torch.equal(getattr(full, name), getattr(part, name)), name
+    cotangents = random_cotangents(np.random.default_rng(1), case.camera)
+    del cotangents["distortion"]
+    a, b = (gradients(emulator, case, cotangents, distortion=d, deterministic=True) for d in (True, False))
+    assert all(torch.equal(a[name], b[name]) for name in ATTRIBUTES)
+
+
+def test_a_mask_of_rows_that_does_not_fit_is_refused(emulator: Emulator) -> None:
+    case = next(cases(1))
+    for bad in (torch.ones(len(case.splats)), torch.ones(len(case.splats) + 1, dtype=torch.bool)):
+        with pytest.raises(ShapeError, match="gradient_rows"):
+            cuda.rasterize_with(emulator, case.splats, case.camera, SETTINGS, gradient_rows=bad)
+
+
+class FewBlocks(Recording):
+    """Of the blending only the first blocks: those of the longest lists."""
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+        super().launch(name, min(blocks, 3) if name.startswith("blend") else blocks, threads, arguments, shared_bytes)
+
+
+def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None:
+    """3200 x 3200 px are 40000 tiles. The last one, against a camera that sees nothing else."""
+    camera = front_camera(3200, 3200, 1600.0)
+    near = Camera(16, 16, camera.fx, camera.fy, camera.cx - 3184, camera.cy - 3184, camera.T_cam_world)
+    x, y = (3192.0 - 1600.0) / 800, (3192.0 - 1600.0) / 800  # px at depth 2
+    scene = stack(splat((x, y, 2.0), (2e-3, 1e-3), 0.7, (0.9, 0.2, 0.1)), splat((x, y - 1e-3, 2.01), (2e-3, 2e-3), 0.8))
+    settings = replace(SETTINGS, sh_degree=0)
+    parameters = [t for _, t in scene.items()]
+    g_color = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
+    found: list[tuple[Tensor, Tensor]] = []
+    for cam in (camera, near):
+        frame = cuda_passes.forward(FewBlocks(emulator), cuda_passes.view_of(cam, settings), parameters)
+        upstream: dict[str, Tensor | None] = dict.fromkeys(cuda_passes.IMAGES)
+        upstream["color"] = torch.zeros(cam.height, cam.width, 3)
+        upstream["color"][-16:, -16:] = g_color
+        means = torch.empty_like(scene.means)
+        wanted = cuda_passes.Wanted({**dict.fromkeys(cuda_passes.PARAMETERS), "means": means, "probe": None})
+        cuda_passes.backward(FewBlocks(emulator), frame, parameters, upstream, wanted)
+        found.append((frame.images["color"][-16:, -16:], means))
+    (far_color, far_means), (near_color, near_means) = found
+    assert float((near_color - torch.tensor(SETTINGS.background)).abs().max()) > 0.3
+    assert float((far_color - near_color).abs().max()) < 1e-3  # a float at 3200 px has 2e-4 px
+    assert relative_error(far_means, near_means.double()) < 1e-2
+
+
+def test_the_highest_splat_ids_are_read_and_written_where_they_are(emulator: Emulator) -> None:
+    """Ids up to 2^24 - 1 fill the entry's 24 bits (negative as int32). Arrays are moved instead of being that long."""
+    case = many_tiles()
+    count = len(case.splats)
+    base = (1 << 24) - count
+    parameters = [t for _, t in case.splats.items()]
+    frame = cuda_passes.forward(emulator, cuda_passes.view_of(case.camera, SETTINGS), parameters)
+    shift = torch.tensor((base << 8) - (1 << 32) if base << 8 >= 1 << 31 else base << 8, dtype=torch.int64)
+    moved = (frame.entries.to(torch.int64) + shift).to(torch.int32)
+    assert bool((moved < 0).all())
+
+    class Moved:
+        """Pointers to rows of splats stand ``base`` rows before their arrays."""
+
+        def launch(self, name: str, blocks: int, threads: int, arguments: Any, shared_bytes: int = 0) -> None:
+            if name.startswith("blend_vjp"):
+                arguments.entries = moved.data_ptr()
+                for field, row_bytes in (("records", 64), ("gradients", 64), ("extras", 16)):
+                    setattr(arguments, field, getattr(arguments, field) - row_bytes * base)
+            emulator.launch(name, blocks, threads, arguments, shared_bytes)
+
+    upstream: dict[str, Tensor | None] = dict.fromkeys(cuda_passes.IMAGES)
+    upstream["color"] = color_cotangent(case)["color"].float()
+    results = []
+    for launcher in (emulator, Moved()):
+        means = torch.empty_like(case.splats.means)
+        wanted = cuda_passes.Wanted({**dict.fromkeys(cuda_passes.PARAMETERS), "means": means, "probe": None})
+        cuda_passes.backward(launcher, frame, parameters, upstream, wanted)
+        results.append(means)
+    assert bool(results[0].any())
+    assert torch.equal(*results)
