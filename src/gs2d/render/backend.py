@@ -113,7 +113,7 @@ def _cuda() -> Backend:
     lacking = missing(gather())
     if lacking is not None:
         raise BackendError(f"backend 'cuda' cannot run: {lacking.reason}; {lacking.remedy}")
-    return Backend("cuda", cuda.rasterize, cuda.splat_errors, "cuda")
+    return Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize, device="cuda")
 
 
 _LOADERS: dict[str, Callable[[], Backend]] = {"cpu": _cpu, "cuda": _cuda, "reference": _reference}
