@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.frames import Frame, Spool
-from gs2d.mesh.fuse import fuse
+from gs2d.mesh.fuse import Volume, fuse
 from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths, widen_truncation
+from gs2d.mesh.nest import derive_nest
+from gs2d.mesh.nested import FAR_VIEWS, fuse_nested, nested_marching_cubes
 from gs2d.mesh.surface import components, keep_components, marching_cubes
 from gs2d.triangles import Mesh
 
@@ -27,6 +29,7 @@ class Extraction:
     volume_bytes: int
     components: int  # before small ones went
     faces_removed: int
+    levels: int = 1  # of the nest of an unbounded scene
 
 
 def extract(
@@ -95,13 +98,87 @@ def extract(
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
         volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads)
     whole = marching_cubes(volume, min_weight=min_weight)
+    return _extraction(whole, limits, [volume], min_faces=min_faces, keep=keep)
+
+
+def extract_unbounded(
+    frames: Iterable[Frame],
+    *,
+    resolution: int = 512,
+    bbox: np.ndarray | None = None,
+    voxel: float | None = None,
+    truncation: float | None = None,
+    depth_limit: float | None = None,
+    min_weight: float = 1.0,
+    far_views: float = FAR_VIEWS,
+    min_faces: int = 50,
+    keep: int | None = None,
+    max_bytes: int = 4 << 30,
+    threads: int | None = None,
+    folder: str | os.PathLike[str] | None = None,
+) -> Extraction:
+    """Fuse frames of a scene without bounds into a mesh, in voxels that grow with the distance from its centre.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        As for ``extract``.
+    resolution, bbox, voxel, truncation, depth_limit
+        See ``nest.derive_nest``; ``bbox``, ``voxel`` and ``truncation`` are those of the innermost level. A truncation
+        that is not given grows with the disagreement of the depth maps, as in ``extract``.
+    min_weight : float
+        See ``marching_cubes``.
+    far_views : float
+        The same outside the innermost level, at most a quarter of the views.
+    min_faces, keep, max_bytes, threads, folder
+        As for ``extract``.
+
+    Returns
+    -------
+    Extraction
+        ``limits`` are those of the innermost level, but ``lower`` and ``upper`` those of the outermost.
+
+    Raises
+    ------
+    ProtocolError, ShapeError, DiskError
+        As ``extract``.
+    """
+    with Spool(folder) as spool:
+        spool.extend(frames)
+        samples = [sample_depths(item) for item in spool]
+        nest = derive_nest(
+            samples,
+            spool.cameras,
+            resolution=resolution,
+            bbox=bbox,
+            voxel=voxel,
+            truncation=truncation,
+            depth_limit=depth_limit,
+        )
+        if truncation is None:
+            inner = nest.levels[0]
+            # far depths contradict each other more, but their levels have wider bands
+            noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
+            nest = nest.with_truncation(widen_truncation(inner, noise).truncation, noise)
+        volumes = fuse_nested(spool, nest, max_bytes=max_bytes, threads=threads)
+    far_weight = min(far_views, volumes[0].frames / 4)
+    whole = nested_marching_cubes(volumes, nest, min_weight=min_weight, far_weight=far_weight)
+    limits = replace(nest.levels[0], lower=nest.levels[-1].lower, upper=nest.levels[-1].upper)
+    return _extraction(whole, limits, volumes, min_faces=min_faces, keep=keep)
+
+
+def _extraction(
+    whole: Mesh, limits: FusionLimits, volumes: Sequence[Volume], *, min_faces: int, keep: int | None
+) -> Extraction:
+    """Without small pieces, with the figures."""
     mesh = keep_components(whole, min_faces=min_faces, keep=keep)
     return Extraction(
         mesh=mesh,
         limits=limits,
-        frames=volume.frames,
-        blocks=len(volume.keys),
-        volume_bytes=volume.nbytes,
+        frames=volumes[0].frames,
+        blocks=sum(len(volume.keys) for volume in volumes),
+        volume_bytes=sum(volume.nbytes for volume in volumes),
         components=int(components(whole).max(initial=-1)) + 1,
         faces_removed=len(whole.faces) - len(mesh.faces),
+        levels=len(volumes),
     )

@@ -103,7 +103,7 @@ def fuse(
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     threads = threads or os.cpu_count() or 1
     dims = block_grid(limits)
-    budget = _Budget(limits, max_bytes)
+    budget = Budget(limits, max_bytes)
     keys = np.zeros(0, dtype=np.int64)
     colored, count = False, 0
     for item in frames:
@@ -113,8 +113,19 @@ def fuse(
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
         raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
+    volume = unknown_volume(limits, dims, keys, colored=colored, frames=count)
+    with ThreadPoolExecutor(threads) as pool:
+        for item in frames:
+            integrate(volume, prepare(item, limits), pool)
+    return volume
+
+
+def unknown_volume(
+    limits: FusionLimits, dims: tuple[int, int, int], keys: np.ndarray, *, colored: bool, frames: int
+) -> Volume:
+    """Blocks of which nothing is known yet."""
     m = len(keys)
-    volume = Volume(
+    return Volume(
         limits=limits,
         dims=dims,
         keys=keys,
@@ -122,12 +133,8 @@ def fuse(
         weight=np.zeros((m, VOXELS), np.float32),
         color=np.zeros((m, VOXELS, 3), np.float32) if colored else None,
         color_weight=np.zeros((m, VOXELS), np.float32) if colored else None,
-        frames=count,
+        frames=frames,
     )
-    with ThreadPoolExecutor(threads) as pool:
-        for item in frames:
-            _integrate(volume, prepare(item, limits), pool)
-    return volume
 
 
 def block_grid(limits: FusionLimits) -> tuple[int, int, int]:
@@ -184,11 +191,13 @@ def touched_blocks(item: DepthMap, limits: FusionLimits, dims: tuple[int, int, i
 
 
 @dataclass(frozen=True)
-class _Budget:
+class Budget:
     """The bound on memory, and the advice when it is reached."""
 
     limits: FusionLimits
     max_bytes: int
+    side: float | None = None  # wu, of a cube that is made of whole steps of blocks
+    step: int = 1  # voxels
 
     def check(self, blocks: int, colored: bool, *, partial: bool) -> None:
         """Stop when over the bound. While frames still come, count on (keys are small) up to 16 times the bound."""
@@ -196,6 +205,8 @@ class _Budget:
         if need <= self.max_bytes or (partial and need <= 16 * self.max_bytes):
             return
         voxel = self.limits.voxel * (need / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
+        if self.side is not None:
+            voxel = self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
         least = "at least " if partial else ""
         raise ProtocolError(
             f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} wu "
@@ -203,7 +214,7 @@ class _Budget:
         )
 
 
-def _integrate(volume: Volume, view: View, pool: ThreadPoolExecutor) -> None:
+def integrate(volume: Volume, view: View, pool: ThreadPoolExecutor) -> None:
     """Add one view to every block it can see."""
     size = BLOCK * volume.limits.voxel
     origins = np.asarray(volume.limits.lower) + volume.blocks * size  # [M, 3]

@@ -126,11 +126,11 @@ def derive_limits(
     footprints = np.concatenate([s.footprints for s in picked]) if picked else np.zeros(0)
     if not len(depths):
         raise ProtocolError("depth maps with at least one seen pixel were expected, got none; is the scene empty?")
-    _positive(voxel=voxel, truncation=truncation, depth_limit=depth_limit, resolution=resolution)
+    check_positive(voxel=voxel, truncation=truncation, depth_limit=depth_limit, resolution=resolution)
     median, high = float(np.median(depths)), float(np.percentile(depths, DEPTH_PERCENTILE))
 
     if bbox is not None:
-        lower, upper = _box(bbox)
+        lower, upper = checked_box(bbox)
         limit = _farthest_corner(lower, upper, cameras)
         side = float((upper - lower).max())
     else:
@@ -183,7 +183,8 @@ def _widened(
     return lower - margin, upper + margin
 
 
-def _box(bbox: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def checked_box(bbox: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both corners of a box, or ProtocolError."""
     box = np.asarray(bbox, dtype=np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
         raise ProtocolError(f"bbox must be a lower and a higher corner [2, 3], got {np.asarray(bbox).tolist()}")
@@ -198,7 +199,8 @@ def _farthest_corner(lower: np.ndarray, upper: np.ndarray, cameras: Sequence[Cam
     return float(max(depths))
 
 
-def _positive(**values: float | None) -> None:
+def check_positive(**values: float | None) -> None:
+    """Raise ProtocolError for a given number that is not positive and finite."""
     for name, value in values.items():
         if value is not None and not (np.isfinite(value) and value > 0):
             raise ProtocolError(f"{name} must be positive, got {value}")

@@ -55,16 +55,20 @@ class View:
         return depth, pixel
 
 
-def prepare(item: DepthMap, limits: FusionLimits) -> View:
-    """Make a depth map ready: cut at the depth limit, pad, take slopes, build the pyramid of farthest depths."""
+def prepare(item: DepthMap, limits: FusionLimits, truncation: np.ndarray | None = None) -> View:
+    """Make a depth map ready: cut at the depth limit, pad, take slopes, build the pyramid of farthest depths.
+
+    ``truncation`` [H, W] wu is that of each pixel, where it is not the same everywhere.
+    """
     camera = item.camera
     K = camera.K.copy()
     K[:2, 2] += 1.0  # the border
     depth = np.pad(np.where(item.depth <= limits.depth_limit, item.depth, 0), 1).astype(np.float32)
     seen = np.where(depth > 0, depth, np.float32(np.nan))
     # A slope moves depth by at most half a truncation within the pixel; steeper is an edge, not a surface.
-    slope_x = _minmod(seen, axis=1, largest=limits.truncation)
-    slope_y = _minmod(seen, axis=0, largest=limits.truncation)
+    largest = limits.truncation if truncation is None else np.pad(truncation, 1)
+    slope_x = _minmod(seen, axis=1, largest=largest)
+    slope_y = _minmod(seen, axis=0, largest=largest)
     color = None if item.color is None else np.pad(item.color, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
     return View(
         projection=K @ camera.T_cam_world[:3],
@@ -81,7 +85,7 @@ def prepare(item: DepthMap, limits: FusionLimits) -> View:
     )
 
 
-def _minmod(depth: np.ndarray, *, axis: int, largest: float) -> np.ndarray:
+def _minmod(depth: np.ndarray, *, axis: int, largest: float | np.ndarray) -> np.ndarray:
     """The smaller of the two one-sided differences along an axis; 0 at unseen neighbours, sign changes and edges."""
     step = np.diff(depth, axis=axis)
     pad = [(0, 0), (0, 0)]

@@ -34,6 +34,23 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
         float32 vertices in the world, faces counter-clockwise seen from the side of positive distance (from where the
         cameras look), colours where the volume has them. Empty where nothing is known.
     """
+    edges, faces, ends = cell_surface(volume, min_weight)
+    vertices, colors = _edge_vertices(volume, edges, ends)
+    return Mesh(vertices, faces.astype(np.int32), colors)
+
+
+def cell_surface(volume: Volume, min_weight: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the cells of a volume make, before it has positions.
+
+    Returns
+    -------
+    edges : ndarray [P] int64
+        The grid edges that carry a vertex, sorted: 3 * (512 * row + voxel) + axis, of the voxel at the lower end.
+    faces : ndarray [F, 3]
+        Rows of ``edges``.
+    ends : ndarray [P] int64
+        The voxel at the upper end of each edge, as 512 * row + voxel; larger than that at the lower end.
+    """
     shifted = _neighbours(volume)
     triangles = [
         _chunk_triangles(volume, shifted, np.arange(start, min(start + _CHUNK, len(volume.keys))), min_weight)
@@ -41,8 +58,7 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
     ]
     corners = np.concatenate(triangles) if triangles else np.zeros((0, 3), np.int64)
     edges, faces = np.unique(corners, return_inverse=True)
-    vertices, colors = _edge_vertices(volume, shifted, edges)
-    return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32), colors)
+    return edges, faces.reshape(-1, 3), _upper_ends(shifted, edges)
 
 
 def _neighbours(volume: Volume) -> np.ndarray:
@@ -103,29 +119,47 @@ def _edge_numbers(shifted: np.ndarray, row: np.ndarray, voxel: np.ndarray, edges
     return 3 * (owner * VOXELS + (at[..., 0] * BLOCK + at[..., 1]) * BLOCK + at[..., 2]) + axis
 
 
-def _edge_vertices(volume: Volume, shifted: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions [P, 3] of the zero crossings on edges, and their colours."""
+def _upper_ends(shifted: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """The voxel [P] at the upper end of each edge."""
     low, axis = edges // 3, edges % 3
     row, voxel = low // VOXELS, low % VOXELS
-    at = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1)
-    step = np.eye(3, dtype=np.int64)[axis]
-    up = at + step
+    up = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1) + np.eye(3, dtype=np.int64)[axis]
     over = up >= BLOCK
     up_row = shifted[row, (over * np.array([1, 2, 4])).sum(axis=1)]
     up = up - BLOCK * over
-    high = up_row * VOXELS + (up[:, 0] * BLOCK + up[:, 1]) * BLOCK + up[:, 2]
+    return np.asarray(up_row * VOXELS + (up[:, 0] * BLOCK + up[:, 1]) * BLOCK + up[:, 2])
+
+
+def _edge_vertices(volume: Volume, edges: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Positions [P, 3] of the zero crossings on edges, and their colours."""
+    low = edges // 3
+    row, voxel = low // VOXELS, low % VOXELS
+    at = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1)
+    step = np.eye(3, dtype=np.int64)[edges % 3]
     tsdf = volume.tsdf.reshape(-1)
     a, b = tsdf[low], tsdf[high]
-    t = np.clip(a / np.where(a == b, 1, a - b), _EDGE_GUARD, 1 - _EDGE_GUARD)  # signs differ, so a != b
+    t = crossing(a, b)
     grid = volume.blocks[row] * BLOCK + at + t[:, None].astype(np.float64) * step
     vertices = (np.asarray(volume.limits.lower) + grid * volume.limits.voxel).astype(np.float32)
     if volume.color is None or volume.color_weight is None:
         return vertices, None
     colors, weights = volume.color.reshape(-1, 3), volume.color_weight.reshape(-1)
-    # an end that no view saw near its surface has no colour: the other end's counts alone
-    wa, wb = (1 - t) * (weights[low] > 0), t * (weights[high] > 0)
-    mixed = (wa[:, None] * colors[low] + wb[:, None] * colors[high]) / np.maximum(wa + wb, np.float32(1e-12))[:, None]
-    return vertices, np.rint(np.clip(mixed, 0, 255)).astype(np.uint8)
+    return vertices, mixed_colors(t, colors[low], colors[high], weights[low] > 0, weights[high] > 0)
+
+
+def crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Where the field is 0 between ends with values of different sign: 0 at a, 1 at b, and kept off both."""
+    t = a / np.where(a == b, 1, a - b)  # signs differ, so a != b
+    return np.asarray(np.clip(t, _EDGE_GUARD, 1 - _EDGE_GUARD))
+
+
+def mixed_colors(
+    t: np.ndarray, low: np.ndarray, high: np.ndarray, low_has: np.ndarray, high_has: np.ndarray
+) -> np.ndarray:
+    """Colour uint8 [P, 3] at t between two ends. One that no view saw near its surface has none: the other's counts."""
+    wa, wb = (1 - t) * low_has, t * high_has
+    mixed = (wa[:, None] * low + wb[:, None] * high) / np.maximum(wa + wb, np.float32(1e-12))[:, None]
+    return np.rint(np.clip(mixed, 0, 255)).astype(np.uint8)
 
 
 def components(mesh: Mesh) -> np.ndarray:

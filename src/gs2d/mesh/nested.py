@@ -1,0 +1,275 @@
+"""Fusion into a nest of levels, and one mesh of all of them without gaps.
+
+Each level is a volume of its own (``fuse``). Between two levels the cells of marching cubes are those of the dual grid:
+around every corner of the finer voxels on the border lie eight voxels, fine ones inside and coarse ones (some of them
+several times over) outside. Such a cell is a cube with some edges of no length, so the table of cases holds, faces of
+neighbouring cells have the same four voxels, and a vertex is known by the two voxels it lies between. Hence the mesh
+is as closed as within a level. (Dual marching cubes on an octree: Schaefer and Warren 2004.)
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gs2d.errors import ProtocolError
+from gs2d.mesh.cases import CORNERS, EDGES, case_table
+from gs2d.mesh.frames import DepthMap
+from gs2d.mesh.fuse import BLOCK, VOXELS, Budget, Volume, integrate, touched_blocks, unknown_volume
+from gs2d.mesh.limits import backproject
+from gs2d.mesh.nest import STEP, Nest
+from gs2d.mesh.sampling import prepare
+from gs2d.mesh.surface import cell_surface, crossing, mixed_colors
+from gs2d.triangles import Mesh
+
+FAR_VIEWS = 5.0  # weight from which a voxel outside the innermost level is known: so many views seldom agree on a sky
+
+
+def fuse_nested(
+    frames: Iterable[DepthMap], nest: Nest, *, max_bytes: int = 4 << 30, threads: int | None = None
+) -> tuple[Volume, ...]:
+    """Fuse depth maps into every level of a nest.
+
+    Parameters
+    ----------
+    frames : iterable of DepthMap
+        Read twice, one at a time: a sequence or a ``Spool``, not a generator.
+    nest : Nest
+    max_bytes : int
+        The volumes together will not grow beyond this.
+    threads : int, optional
+        Default: as many as the machine has. The result does not depend on it.
+
+    Returns
+    -------
+    tuple of Volume
+        One for each level, finest first; levels where nothing was seen have no blocks.
+
+    Raises
+    ------
+    ProtocolError
+        As for ``fuse``.
+    """
+    if iter(frames) is frames:
+        raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
+    budget = Budget(nest.levels[0], max_bytes, side=2 * nest.half, step=STEP)
+    keys = [np.zeros(0, dtype=np.int64) for _ in nest.levels]
+    colored, count = False, 0
+    for item in frames:
+        colored, count = colored or item.color is not None, count + 1
+        for k, found in enumerate(_touched(item, nest)):
+            keys[k] = np.union1d(keys[k], found)
+        budget.check(sum(map(len, keys)), colored, partial=True)
+    budget.check(sum(map(len, keys)), colored, partial=False)
+    if not any(map(len, keys)):
+        raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
+    volumes = tuple(
+        unknown_volume(limits, nest.dims, found, colored=colored, frames=count)
+        for limits, found in zip(nest.levels, keys, strict=True)
+    )
+    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+        for item in frames:
+            view = prepare(item, nest.levels[0], truncation=_truncations(item, nest))
+            for volume in volumes:
+                if len(volume.keys):
+                    integrate(volume, view, pool)
+    return volumes
+
+
+def _distances(item: DepthMap, nest: Nest) -> np.ndarray:
+    """Distance [H, W] of what each pixel saw from the centre, along the farthest axis, in halves; 0 where nothing."""
+    rows, columns = np.nonzero(item.depth > 0)
+    points = backproject(item.camera, item.depth[rows, columns].astype(np.float64), rows, columns)
+    distance = np.zeros(item.depth.shape)
+    distance[rows, columns] = np.abs(points - np.asarray(nest.center)).max(axis=1) / nest.half
+    return distance
+
+
+def _truncations(item: DepthMap, nest: Nest) -> np.ndarray:
+    """Truncation [H, W] wu of the level that owns what each pixel saw."""
+    level = np.ceil(np.log2(np.maximum(_distances(item, nest), 1.0)))
+    return nest.levels[0].truncation * np.exp2(np.minimum(level, len(nest.levels) - 1))
+
+
+def _touched(item: DepthMap, nest: Nest) -> list[np.ndarray]:
+    """Keys of each level's own blocks near what a depth map saw."""
+    distance = _distances(item, nest)
+    first, last = nest.hole
+    found = []
+    for k, limits in enumerate(nest.levels):
+        # what lies so near the level that a band round it, slanted, may reach in
+        margin = (3 * limits.truncation + 2 * BLOCK * limits.voxel) / nest.half
+        inner = 2.0 ** (k - 1) if k else 0.0
+        near = (distance > inner - margin) & (distance < 2.0**k + margin)
+        part = replace(item, depth=np.where(near, item.depth, 0).astype(np.float32))
+        # a block more on every side: what lies just outside the level touches its border too
+        step = BLOCK * limits.voxel
+        lower = (limits.lower[0] - step, limits.lower[1] - step, limits.lower[2] - step)
+        dims = (nest.dims[0] + 2,) * 3
+        blocks = np.stack(np.unravel_index(touched_blocks(part, replace(limits, lower=lower), dims), dims), axis=1) - 1
+        blocks = blocks[((blocks >= 0) & (blocks < nest.dims[0])).all(axis=1)]
+        if k:
+            blocks = blocks[~((blocks >= first) & (blocks < last)).all(axis=1)]
+        found.append((blocks[:, 0] * nest.dims[1] + blocks[:, 1]) * nest.dims[2] + blocks[:, 2])
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """The voxels of all levels under one numbering: offset of the level + 512 * row + voxel."""
+
+    volumes: Sequence[Volume]
+    known_from: Sequence[float]
+
+    @property
+    def offsets(self) -> np.ndarray:
+        return np.concatenate([[0], np.cumsum([len(v.keys) * VOXELS for v in self.volumes])])
+
+    def gather(self, arrays: Sequence[np.ndarray], ids: np.ndarray) -> np.ndarray:
+        """``arrays`` [M, 512, ...] of each level, at node numbers ``ids`` [...]."""
+        tail = arrays[0].shape[2:]
+        out = np.zeros((*ids.shape, *tail), arrays[0].dtype)
+        offsets = self.offsets
+        for k, values in enumerate(arrays):
+            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
+            out[here] = values.reshape(-1, *tail)[ids[here] - offsets[k]]
+        return out
+
+    def distances(self, ids: np.ndarray) -> np.ndarray:
+        """Signed distance, wu: truncations differ between levels."""
+        out = np.zeros(ids.shape, np.float32)
+        offsets = self.offsets
+        for k, volume in enumerate(self.volumes):
+            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
+            out[here] = volume.tsdf.reshape(-1)[ids[here] - offsets[k]] * np.float32(volume.limits.truncation)
+        return out
+
+    def known(self, ids: np.ndarray) -> np.ndarray:
+        """Whether enough views saw the voxel."""
+        out = np.zeros(ids.shape, bool)
+        offsets = self.offsets
+        for k, volume in enumerate(self.volumes):
+            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
+            out[here] = volume.weight.reshape(-1)[ids[here] - offsets[k]] >= max(self.known_from[k], 1e-12)
+        return out
+
+    def positions(self, ids: np.ndarray) -> np.ndarray:
+        """World points [P, 3] of nodes [P]."""
+        out = np.zeros((*ids.shape, 3))
+        offsets = self.offsets
+        for k, volume in enumerate(self.volumes):
+            here = (ids >= offsets[k]) & (ids < offsets[k + 1])
+            local = ids[here] - offsets[k]
+            within = np.stack(np.unravel_index(local % VOXELS, (BLOCK,) * 3), axis=-1)
+            grid = volume.blocks[local // VOXELS] * BLOCK + within
+            out[here] = np.asarray(volume.limits.lower) + grid * volume.limits.voxel
+        return out
+
+
+def nested_marching_cubes(volumes: Sequence[Volume], nest: Nest, *, min_weight: float = 1.0, far_weight: float) -> Mesh:
+    """The zero set of all levels as one mesh.
+
+    Parameters
+    ----------
+    volumes : sequence of Volume
+        Of ``fuse_nested``.
+    nest : Nest
+    min_weight, far_weight : float
+        A voxel of the innermost level, and of all others, is known from this weight on.
+
+    Returns
+    -------
+    Mesh
+        As of ``surface.marching_cubes``.
+    """
+    known_from = [min_weight if k == 0 else max(min_weight, far_weight) for k in range(len(volumes))]
+    nodes = _Nodes(volumes, known_from)
+    offsets = nodes.offsets
+    pairs, triangles, count = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3), np.int64)], 0
+    for k, volume in enumerate(volumes):
+        edges, faces, ends = cell_surface(volume, known_from[k])
+        pairs.append(np.stack([edges // 3, ends], axis=1) + offsets[k])
+        triangles.append(faces + count)
+        count += len(edges)
+    for k in range(len(volumes) - 1):
+        ends = _join_triangles(nodes, _join_cells(volumes[k], volumes[k + 1], nest, offsets[k], offsets[k + 1]))
+        pairs.append(ends.reshape(-1, 2))
+        triangles.append(count + np.arange(3 * len(ends)).reshape(-1, 3))
+        count += 3 * len(ends)
+    both = np.concatenate(pairs)
+    # a vertex is a pair of nodes, the same from whichever cell it is seen
+    flat, number = np.unique(both[:, 0] * int(offsets[-1] + 1) + both[:, 1], return_inverse=True)
+    low, high = flat // int(offsets[-1] + 1), flat % int(offsets[-1] + 1)
+    faces = number.reshape(-1)[np.concatenate(triangles)]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]  # edges of no length in the cells of a join
+    vertices, colors = _vertices(nodes, low, high)
+    return Mesh(vertices, faces.astype(np.int32), colors)
+
+
+def _vertices(nodes: _Nodes, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Positions [P, 3] of the zero crossings between nodes, and their colours."""
+    t = crossing(nodes.distances(low), nodes.distances(high))
+    start = nodes.positions(low)
+    vertices = (start + t[:, None].astype(np.float64) * (nodes.positions(high) - start)).astype(np.float32)
+    colors = [volume.color for volume in nodes.volumes if volume.color is not None]
+    weights = [volume.color_weight for volume in nodes.volumes if volume.color_weight is not None]
+    if not colors:
+        return vertices, None
+    has = [nodes.gather(weights, ids) > 0 for ids in (low, high)]
+    return vertices, mixed_colors(t, nodes.gather(colors, low), nodes.gather(colors, high), *has)
+
+
+def _join_cells(inner: Volume, outer: Volume, nest: Nest, inner_offset: int, outer_offset: int) -> np.ndarray:
+    """Nodes [C, 8] of the cells across the border of a level, where all eight voxels exist."""
+    n = nest.voxels
+    local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
+    corners = [np.zeros(0, np.int64)]
+    for axis in range(3):
+        for side, layer in ((0, 0), (1, BLOCK - 1)):
+            blocks = inner.blocks[inner.blocks[:, axis] == side * (n // BLOCK - 1)]
+            voxels = (blocks[:, None] * BLOCK + local[local[:, axis] == layer]).reshape(-1, 3)
+            for shift in CORNERS[CORNERS[:, axis] == side]:  # the four corners of the voxel on the border
+                corner = voxels + shift
+                corners.append((corner[:, 0] * (n + 1) + corner[:, 1]) * (n + 1) + corner[:, 2])
+    corner = np.stack(np.unravel_index(np.unique(np.concatenate(corners)), (n + 1,) * 3), axis=1)
+    nodes = np.empty((len(corner), 8), np.int64)
+    for o, octant in enumerate(CORNERS):
+        voxel = corner - 1 + octant
+        inside = ((voxel >= 0) & (voxel < n)).all(axis=1)
+        fine = _find(inner, np.where(inside[:, None], voxel, 0))
+        coarse = _find(outer, (voxel + n // 2) >> 1)
+        nodes[:, o] = np.where(
+            inside, np.where(fine < 0, -1, fine + inner_offset), np.where(coarse < 0, -1, coarse + outer_offset)
+        )
+    return nodes[(nodes >= 0).all(axis=1)]
+
+
+def _find(volume: Volume, voxels: np.ndarray) -> np.ndarray:
+    """512 * row + voxel of grid voxels [P, 3], -1 where there is no block."""
+    block, at = voxels // BLOCK, voxels % BLOCK
+    key = (block[:, 0] * volume.dims[1] + block[:, 1]) * volume.dims[2] + block[:, 2]
+    if not len(volume.keys):
+        return np.full(len(voxels), -1, np.int64)
+    row = np.minimum(np.searchsorted(volume.keys, key), len(volume.keys) - 1)
+    flat = row * VOXELS + (at[:, 0] * BLOCK + at[:, 1]) * BLOCK + at[:, 2]
+    return np.where(volume.keys[row] == key, flat, -1)
+
+
+def _join_triangles(nodes: _Nodes, cells: np.ndarray) -> np.ndarray:
+    """Triangles [T, 3, 2] of cells [C, 8], each vertex by the two nodes that it lies between, the smaller first."""
+    cells = cells[nodes.known(cells).all(axis=1)]
+    case = ((nodes.distances(cells) < 0) << np.arange(8)).sum(axis=1)
+    table = case_table()
+    counts = table.starts[case + 1] - table.starts[case]
+    owner = np.repeat(np.arange(len(cells)), counts)
+    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    edges = table.edges[table.starts[case[owner]] + within]  # [T, 3] edge of the cell
+    low = np.array([corner for _, corner in EDGES])[edges]
+    high = low | 1 << np.array([axis for axis, _ in EDGES])[edges]
+    rows = owner[:, None]
+    return np.sort(np.stack([cells[rows, low], cells[rows, high]], axis=2), axis=2)

@@ -1,0 +1,71 @@
+"""Nests made by hand, fields on them, and an outdoor scene with a sky that is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from surface_shapes import rays, sphere_depth
+
+from gs2d.camera import look_at
+from gs2d.mesh.frames import Frame
+from gs2d.mesh.fuse import BLOCK, VOXELS, Volume
+from gs2d.mesh.limits import FusionLimits
+from gs2d.mesh.nest import Nest
+
+GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it
+
+
+def nest_of(
+    count: int, *, voxels: int = 32, half: float = 1.0, truncation: float | None = None, depth_limit: float = 1e9
+) -> Nest:
+    """``count`` levels around the origin."""
+    size = 2 * half / voxels
+    levels = []
+    for k in range(count):
+        first, last = (-half + 0.5 * size) * 2**k, half * 2**k
+        band = (truncation or 5 * size) * 2**k
+        low, high = (first, first, first), (last, last, last)
+        levels.append(FusionLimits(low, high, 2 * last, size * 2**k, band, depth_limit, 1.0, 1.0, size, 0.0))
+    return Nest(tuple(levels), voxels, (0.0, 0.0, 0.0), half)
+
+
+def volumes_of(nest: Nest, field: Callable[[np.ndarray], np.ndarray]) -> list[Volume]:
+    """Every level full of a field of points [P, 3] -> signed distance [P], all known."""
+    volumes = []
+    local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
+    for k, limits in enumerate(nest.levels):
+        blocks = np.stack(np.unravel_index(np.arange(nest.dims[0] ** 3), nest.dims), axis=1)
+        first, last = nest.hole
+        blocks = blocks[~((blocks >= first) & (blocks < last)).all(axis=1)] if k else blocks
+        keys = (blocks[:, 0] * nest.dims[1] + blocks[:, 1]) * nest.dims[2] + blocks[:, 2]
+        at = np.asarray(limits.lower) + (blocks[:, None] * BLOCK + local) * limits.voxel
+        tsdf = np.clip(field(at.reshape(-1, 3)).reshape(-1, VOXELS) / limits.truncation, -1, 1).astype(np.float32)
+        volumes.append(Volume(limits, nest.dims, keys, tsdf, np.ones_like(tsdf), None, None, 1))
+    return volumes
+
+
+def outdoor_frames(sky: str, *, views: int = 24, size: int = 96, seed: int = 0) -> list[Frame]:
+    """A ball on a plane to the horizon, seen by a ring of cameras. What the sky's pixels say:
+
+    "unseen": nothing; "thin": a depth of 30, but alpha 0.3; "scattered": a random depth from 15 to 80 at every pixel;
+    "cards": one random depth for each view.
+    """
+    rng = np.random.default_rng(seed)
+    frames = []
+    for k in range(views):
+        eye = 3.0 * np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.25 + 0.1 * (k % 3)])
+        camera = look_at(eye, np.array([0, 0, 0.2]), np.array([0, 0, 1.0]), width=size, height=size, fx=0.73 * size)
+        origin, step = rays(camera)
+        ball = sphere_depth(camera, BALL)
+        down = np.minimum(step[..., 2], -1e-9)
+        depth = np.where(ball > 0, ball, np.where(step[..., 2] < -1e-9, (GROUND - origin[2]) / down, 0))
+        above, alpha = depth <= 0, np.ones(depth.shape)
+        if sky == "scattered":
+            depth = np.where(above, rng.uniform(15, 80, depth.shape), depth)
+        elif sky == "cards":
+            depth = np.where(above, rng.uniform(15, 80), depth)
+        elif sky == "thin":
+            depth, alpha = np.where(above, 30.0, depth), np.where(above, 0.3, 1.0)
+        frames.append(Frame(camera, depth, np.full((*depth.shape, 3), 0.5), alpha >= 0.5))
+    return frames
