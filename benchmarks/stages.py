@@ -6,6 +6,7 @@ import ctypes
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -161,22 +162,28 @@ def optimizer_step(workload: Workload) -> Callable[[], float]:
     return step
 
 
-def densification_step(workload: Workload) -> Callable[[], float]:
+def densification_case(splats: Splats) -> Callable[[], object]:
     """One densification in which 5 % of the splats pass the threshold: half of them, the larger, are split."""
     stage = two_dgs_r().stages[0]
     assert isinstance(stage.densify, GradDensify)
-    size = float(workload.splats.scales.amax(dim=1).median())
+    size = float(splats.scales.amax(dim=1).median())
     densify = replace(stage.densify, percent_dense=size)  # at an extent of 1
-    n = len(workload.splats)
+    n = len(splats)
     passes = torch.rand(n, generator=torch.Generator().manual_seed(5)) < 0.05
     signal = torch.where(passes, 2.0, 0.5) * densify.grad_threshold
+    state = TrainState(splats.clone(), torch.Generator().manual_seed(6))
+    begin_stage(state, stage)
+    state.statistics = Statistics(signal, signal.clone(), torch.ones(n))
+    return partial(densify_and_prune, state, densify, iteration=600, extent=1.0, white=False)
+
+
+def densification_step(workload: Workload) -> Callable[[], float]:
+    """The same, each time from the same state."""
 
     def step() -> float:
-        state = TrainState(workload.splats.clone(), torch.Generator().manual_seed(6))
-        begin_stage(state, stage)
-        state.statistics = Statistics(signal.clone(), signal.clone(), torch.ones(n))
+        work = densification_case(workload.splats)
         start = time.perf_counter()
-        densify_and_prune(state, densify, iteration=600, extent=1.0, white=False)
+        work()
         return 1e3 * (time.perf_counter() - start)
 
     return step

@@ -1,0 +1,167 @@
+"""Where a whole run spends its time: reading, each stage, scoring, meshing, report, and within them what.
+
+::
+
+    python -m benchmarks.profile_run --out FILE.json --demo [--schedule-scale 0.1] [--threads 2]
+    python -m benchmarks.profile_run --out FILE.json --capture FOLDER [--downscale 2] [--schedule-scale 0.03]
+                                     [--keep RUN]
+
+The first form is `gs2d demo`, the second `gs2d train FOLDER`. The file also holds the digest of ``splats.ply``: two
+versions of the code that train the same have the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+
+import torch
+
+from benchmarks.sampler import Rule, Sampler, Seconds
+from benchmarks.timing import machine, peak_probe
+from gs2d.kernels.library import load
+from gs2d.pipeline.demo import SCHEDULE_SCALE, DemoOptions, demo
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.train import train
+
+RECORDER, LOOP = "pipeline/recorder.py", "train/loop.py"
+PHASES = (
+    Rule("photograph the demo scene", (("data/toy.py", "write_demo_capture"),)),
+    Rule("read the capture", (("pipeline/prepare.py", "prepare"), ("pipeline/prepare.py", "reload_job"))),
+    Rule("PSNR curve", ((RECORDER, "_probe_psnr"),)),
+    Rule("pictures", (("pipeline/pictures.py", "draw_stage"),)),
+    Rule("score a stage", ((RECORDER, "_score_stage"), (RECORDER, "_score_entry"))),
+    Rule("checkpoints", ((RECORDER, "_save"),)),
+    Rule("initial splats", ((LOOP, "_new_state"),)),
+    Rule("rank by E_i", (("train/actions.py", "rank_by_error"),)),
+    Rule("fill the stage 2 cache", (("train/cached_views.py", "choose_evaluator"),)),
+    Rule("mesh", (("pipeline/surface.py", "extract_mesh"),)),
+    Rule("report", (("pipeline/jobs.py", "report_run"),)),
+    Rule("evaluate", (("pipeline/jobs.py", "evaluate_run"),)),
+    Rule("training iterations", ((LOOP, "step"),)),
+    Rule("enter a stage", ((LOOP, "enter"),)),
+)
+PARTS = (
+    Rule("rasterizer", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
+    Rule("losses and metrics", (("gs2d/losses.py", ""), ("kernels/ops.py", ""), ("evaluate/images.py", ""))),
+    Rule("Adam", (("train/optimizer.py", ""),)),
+    Rule("densification", (("train/densify.py", "densify_and_prune"),)),
+    Rule("densification statistics", (("train/densify.py", "accumulate"),)),
+    Rule("checks for NaN", (("train/views.py", "finite"),)),
+    Rule("photographs", (("gs2d/images.py", ""), ("data/scene.py", ""), ("train/targets.py", ""))),
+    Rule("fusion", (("mesh/fuse.py", ""), ("mesh/sampling.py", ""))),
+    Rule("depth maps", (("mesh/frames.py", ""), ("mesh/limits.py", ""), ("mesh/consistency.py", ""))),
+    Rule("marching cubes", (("mesh/surface.py", ""), ("mesh/cases.py", ""))),
+    Rule("surface score", (("evaluate/surface.py", ""), ("evaluate/distance.py", ""), ("evaluate/visibility.py", ""))),
+    Rule("neighbours", (("gs2d/geometry.py", "nearest_distances"),)),
+    Rule("imports", (("importlib._bootstrap>", ""),)),
+    Rule("log and progress", ((RECORDER, ""), ("io/run.py", ""), ("io/files.py", ""), (LOOP, "_progress"))),
+)
+
+
+def table(seconds: Seconds) -> dict[str, Any]:
+    """Seconds by phase and part, largest first, and the rasterizer's share of all."""
+    total = sum(sum(parts.values()) for parts in seconds.phases.values())
+    rows = sorted(seconds.phases.items(), key=lambda row: -sum(row[1].values()))
+    raster = sum(parts.get("rasterizer", 0.0) for parts in seconds.phases.values())
+    return {
+        "seconds": round(total, 2),
+        "rasterizer_share": round(raster / max(total, 1e-9), 3),
+        "phases": {
+            name: {
+                "seconds": round(sum(parts.values()), 2),
+                "parts": {part: round(s, 2) for part, s in sorted(parts.items(), key=lambda p: -p[1])},
+            }
+            for name, parts in rows
+        },
+        "elsewhere": {k: round(s, 2) for k, s in sorted(seconds.deepest.items(), key=lambda p: -p[1])[:12]},
+    }
+
+
+def profile(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
+    """One run into ``out``, sampled."""
+    library = load()
+    probe = peak_probe(library)
+    began = time.perf_counter(), time.process_time()
+    with Sampler(PHASES, PARTS) as seconds:
+        if arguments.demo:
+            scale = SCHEDULE_SCALE if arguments.schedule_scale is None else arguments.schedule_scale
+            run = demo(DemoOptions(out=out, backend="cpu", schedule_scale=scale, threads=arguments.threads))
+        else:
+            scale = 0.03 if arguments.schedule_scale is None else arguments.schedule_scale
+            run = train(
+                TrainOptions(
+                    scene=arguments.capture,
+                    out=out,
+                    backend="cpu",
+                    downscale=arguments.downscale,
+                    schedule_scale=scale,
+                    threads=arguments.threads,
+                    overwrite=True,
+                )
+            )
+    stages = run.metrics()["stages"]
+    return {
+        "what": "demo" if arguments.demo else arguments.capture.resolve().name,
+        "schedule_scale": scale,
+        "downscale": arguments.downscale,
+        "splats": stages[-1]["splats"],
+        "stage_seconds": {stage["name"]: stage["seconds"] for stage in stages},
+        "splats_sha256": hashlib.sha256(run.file("splats.ply").read_bytes()).hexdigest(),
+        "wall_seconds": round(time.perf_counter() - began[0], 2),
+        "cpu_seconds": round(time.process_time() - began[1], 2),
+        "fma_gflops": round(max(probe, peak_probe(library)), 1),
+        **table(seconds),
+    }
+
+
+def show(result: dict[str, Any]) -> None:
+    """The table on the screen."""
+    print(f"{result['what']}: {result['wall_seconds']} s, rasterizer {100 * result['rasterizer_share']:.0f} %")
+    for name, phase in result["phases"].items():
+        parts = ", ".join(f"{part} {s}" for part, s in phase["parts"].items() if s >= 0.1)
+        print(f"{phase['seconds']:8.2f} s  {name}: {parts}")
+    print("elsewhere:", ", ".join(f"{name} {s}" for name, s in result["elsewhere"].items() if s >= 0.1))
+    print("splats.ply", result["splats_sha256"])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run and write the file."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.profile_run",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--demo", action="store_true")
+    what.add_argument("--capture", type=Path)
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--schedule-scale", type=float)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="the run folder; otherwise a temporary one")
+    args = parser.parse_args(arguments)
+    before = torch.get_num_threads()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            result = profile(args, args.keep or Path(folder) / "run")
+    finally:
+        torch.set_num_threads(before)
+    show(result)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps({"machine": machine(), **result}, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
