@@ -19,14 +19,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from gs2d.camera import Camera
-from gs2d.check import check_shapes
 from gs2d.errors import DataError
+from gs2d.evaluate.align import similarity_scale
 from gs2d.evaluate.distance import distances_to_mesh, distances_to_points, sample_surface
 from gs2d.evaluate.visibility import frustum_counts, visible_counts
+from gs2d.protocols_surface import VISIBLE_SURFACE
 from gs2d.triangles import Mesh
 
-FRACTIONS = (0.0025, 0.005, 0.01)  # of the truth's bounding-box diagonal
-SEEN_TOLERANCE = 0.002  # of the same diagonal: how far behind the depth buffer a point still counts as visible
+FRACTIONS = VISIBLE_SURFACE.fractions  # of the truth's bounding-box diagonal
+SEEN_TOLERANCE = VISIBLE_SURFACE.seen_tolerance  # of the same diagonal: how far behind the depth buffer one sees
 
 
 @dataclass(frozen=True)
@@ -88,10 +89,10 @@ def evaluate_surface(
     *,
     cameras: Sequence[Camera] = (),
     seen: np.ndarray | None = None,
-    min_views: int = 3,
+    min_views: int = VISIBLE_SURFACE.min_views,
     T_truth_mesh: np.ndarray | None = None,
     thresholds: Sequence[float] | None = None,
-    samples: int = 200_000,
+    samples: int = VISIBLE_SURFACE.samples,
     seed: int = 0,
     workers: int | None = None,
 ) -> SurfaceScore:
@@ -122,7 +123,7 @@ def evaluate_surface(
         If the truth is empty, no part of it is seen, or ``seen`` is of another length than its faces.
     """
     T = np.eye(4) if T_truth_mesh is None else np.asarray(T_truth_mesh, dtype=np.float64)
-    scale = _similarity_scale(T)
+    scale = similarity_scale(T, "T_truth_mesh")
     truth_points = np.asarray(truth.vertices[np.unique(truth.faces)] if isinstance(truth, Mesh) else truth, np.float64)
     if not len(truth_points) or not np.isfinite(truth_points).all():
         raise DataError("a ground truth with finite points was expected, got none; check the file")
@@ -212,16 +213,6 @@ def _reconstructed_side(
         return _Side(points, 0.0)
     keep = visible_counts(points, mesh, cameras, tolerance=tolerance, workers=workers) > 0
     return _Side(points[keep], float(1.0 - keep.mean()))
-
-
-def _similarity_scale(T: np.ndarray) -> float:
-    """Scale of a similarity transform."""
-    check_shapes({"T_truth_mesh": (T, "4 4")})
-    A = T[:3, :3]
-    scale = float(np.cbrt(np.linalg.det(A)))
-    if not (scale > 0 and np.allclose(A @ A.T, scale**2 * np.eye(3), rtol=0, atol=1e-4 * scale**2)):
-        raise DataError("T_truth_mesh must be a rotation, a shift and one positive scale, got another matrix")
-    return scale
 
 
 def _moved(truth: Mesh | np.ndarray, T: np.ndarray) -> Mesh | np.ndarray:

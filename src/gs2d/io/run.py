@@ -34,7 +34,7 @@ from gs2d.io.event_log import EventLog
 from gs2d.io.files import read_json, write_json
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
-CHECKPOINTS, RENDERS = "checkpoints", "renders"
+CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
 SPLATS, MESH, REPORT = "splats.ply", "mesh.ply", "report.html"
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
@@ -174,7 +174,7 @@ class RunFolder:
 
     def clear(self) -> None:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
-        for name in (CHECKPOINTS, RENDERS):
+        for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
         for name in (EVENTS, METRICS, SPLATS, MESH, REPORT, RUN_JSON):
             self.file(name).unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from gs2d.evaluate.lpips import load_lpips
 from gs2d.geometry import focus_point
 from gs2d.images import write_image
 from gs2d.io.ply import read_mesh, read_splats, write_splats
-from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, RunFolder, make_folder, open_run
-from gs2d.pipeline.events import OnEvent, counted, ignore
+from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, SURFACE, RunFolder, make_folder, open_run
+from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.pictures import file_name, render_view, shown_cameras
 from gs2d.pipeline.prepare import Job, reload_job
@@ -70,6 +71,7 @@ def mesh_run(
         metrics = run.metrics()
         if metrics.get("surface"):  # was of the mesh before
             run.write_metrics({**metrics, "surface": None})
+            shutil.rmtree(run.file(SURFACE), ignore_errors=True)
     report_run(path)
     return result
 
@@ -148,22 +150,29 @@ def evaluate_run(
     ------
     RunError, DataError
     """
-    from gs2d.pipeline.truth import check_thresholds, read_truth, score_surface
+    from gs2d.pipeline.truth import OfficialTruth, Truth, check_thresholds, choose_truth, read_truth, score_surface
 
     check_thresholds(options.thresholds)
-    truth = None if options.ground_truth is None else read_truth(options.ground_truth)
+    given = options.ground_truth
+    truth: Truth | OfficialTruth | None = None if given is None or given.is_dir() else read_truth(given)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, job, splats = _open(path, threads, on_event)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
+    if truth is None and job.scene.root is not None:
+        truth = choose_truth(given, job.scene.root, on_event)
+    has_mesh = run.file(MESH).exists()
+    if truth is not None and not has_mesh and given is not None:
+        raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         name = f"scoring {split} views"
         scores = score_views(splats, views, job.settings, job.backend, name=name, on_event=on_event, lpips=lpips)
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
-    if truth is not None:
-        if not run.file(MESH).exists():
-            raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
-        result["surface"] = score_surface(read_mesh(run.file(MESH)), truth, job, options, on_event)
+    if truth is not None and has_mesh:
+        mesh = read_mesh(run.file(MESH))
+        result["surface"] = score_surface(mesh, truth, job, options, on_event, folder=run.file(SURFACE))
+    elif truth is not None:
+        on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
     with run.locked():
         metrics = run.metrics()
         last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}

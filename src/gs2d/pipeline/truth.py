@@ -1,28 +1,35 @@
-"""The ground truth of a surface: read from a file, compared with a mesh."""
+"""The ground truth of a surface: found, read, compared with a mesh by the protocol of its data set."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gs2d.data.layouts import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
-from gs2d.evaluate.surface import evaluate_surface
+from gs2d.evaluate.surface import SurfaceScore, evaluate_surface
 from gs2d.io.ply import ply_kind, read_mesh, read_points
+from gs2d.io.run import make_folder
 from gs2d.pipeline.events import Notice, OnEvent, Phase
 from gs2d.pipeline.options import EvaluateOptions
 from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.truth_official import score_dtu, score_tnt
+from gs2d.protocols_datasets import DataSet, SceneFacts
+from gs2d.protocols_surface import VISIBLE_SURFACE
 from gs2d.triangles import Mesh
 
+APART = 0.05  # of the truth's diagonal: farther, and it is hardly the same surface in the same frame
 SEEN_SUFFIX = "_seen.npy"  # beside FILE.ply: FILE_seen.npy, how many views see each face
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A true surface.
+    """A true surface, compared by the visible-surface protocol.
 
     Attributes
     ----------
@@ -35,6 +42,22 @@ class Truth:
     path: Path
     surface: Mesh | np.ndarray
     seen: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class OfficialTruth:
+    """The files of an official ground truth, compared by its data set's protocol.
+
+    Attributes
+    ----------
+    dataset, facts : DataSet, SceneFacts
+    files : mapping of str to Path
+        Keys as ``gs2d.data.layouts`` names them.
+    """
+
+    dataset: DataSet
+    facts: SceneFacts
+    files: Mapping[str, Path]
 
 
 def read_truth(path: Path) -> Truth:
@@ -62,6 +85,41 @@ def read_truth(path: Path) -> Truth:
     return Truth(path, mesh, seen)
 
 
+def choose_truth(given: Path | None, root: Path, on_event: OnEvent) -> Truth | OfficialTruth | None:
+    """What a capture's surface is compared with: a folder that was given, or what lies beside the capture.
+
+    Beside a scene of DTU or Tanks and Temples its official files; beside any other ``mesh_gt.ply``, ``mesh_gt.obj`` or
+    ``points_gt.ply``. (A file that was given is read by ``read_truth``.)
+
+    Raises
+    ------
+    DataError
+        A folder was given, and it does not hold the official ground truth of this scene; names each missing file.
+    """
+    known = recognise(root)
+    if known is not None and known[0].evaluator in ("dtu", "tnt"):
+        dataset, facts = known
+        files, missing = find_truth(dataset, facts, root, given)
+        if not missing:
+            return OfficialTruth(dataset, facts, files)
+        if given is not None:
+            lines = "; ".join(piece.line() for piece in missing)
+            raise DataError(f"{given} must hold the ground truth of {facts.name} ({dataset.title}): {lines}")
+        for piece in missing if files else ():
+            on_event(Notice(piece.line()))
+    folder = given or root
+    path = next((folder / name for name in MESH_TRUTHS if (folder / name).is_file()), None)
+    if path is not None:
+        on_event(Notice(f"ground truth: {path}"))
+        return read_truth(path)
+    if given is not None:
+        raise DataError(
+            f"{given} must hold the official ground truth of a scene of DTU or Tanks and Temples, or one of "
+            f"{', '.join(MESH_TRUTHS)}, got neither for the capture {root.name}; give a PLY or OBJ file"
+        )
+    return None
+
+
 def check_thresholds(thresholds: tuple[float, ...]) -> None:
     """Raise for a threshold that is no distance, before anything slow happens.
 
@@ -73,14 +131,32 @@ def check_thresholds(thresholds: tuple[float, ...]) -> None:
         raise DataError(f"--thresholds must be positive distances, got {', '.join(map(str, thresholds))}")
 
 
-def score_surface(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, on_event: OnEvent) -> dict[str, Any]:
-    """Chamfer distance, precision, recall and F-score of a mesh, over what the training views see.
+def score_surface(
+    mesh: Mesh, truth: Truth | OfficialTruth, job: Job, options: EvaluateOptions, on_event: OnEvent, *, folder: Path
+) -> dict[str, Any]:
+    """The ``surface`` entry of ``metrics.json`` (docs/architecture.md); the coloured clouds go to ``folder``.
 
     Raises
     ------
-    DataError
+    DataError, DiskError
     """
     on_event(Phase("scoring the surface", 0))
+    if isinstance(truth, Truth):
+        return _score_visible(mesh, truth, job, options, on_event)
+    if options.thresholds:
+        on_event(Notice(f"--thresholds are not used: {truth.dataset.title} has its own protocol"))
+    make_folder(folder)
+    if truth.dataset.evaluator == "dtu":
+        facts = score_dtu(mesh, truth.facts, truth.files, job, folder)
+    else:
+        facts = score_tnt(mesh, truth.facts, truth.files, job, folder)
+    for message in facts["self_check"]["messages"]:
+        on_event(Notice(message))
+    return {**facts, "ground_truth": str(truth.files["scan"])}
+
+
+def _score_visible(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, on_event: OnEvent) -> dict[str, Any]:
+    """Chamfer distance, precision, recall and F-score of a mesh, over what the training views see."""
     if truth.seen is not None:
         on_event(Notice(f"which true faces count is taken from {truth.path.stem}{SEEN_SUFFIX}"))
     score = evaluate_surface(
@@ -92,5 +168,28 @@ def score_surface(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, 
         thresholds=options.thresholds or None,
     )
     facts = asdict(score)
-    facts["thresholds"] = list(facts.pop("scores"))
-    return {"ground_truth": str(truth.path), **facts}
+    rows = list(facts.pop("scores"))
+    headline = rows[len(rows) // 2 if options.thresholds else VISIBLE_SURFACE.headline]
+    check = _self_check(score, truth)
+    for message in check["messages"]:
+        on_event(Notice(message))
+    return {
+        "evaluator": "visible-surface",
+        "unit": "world units",
+        "ground_truth": str(truth.path),
+        **{name: headline[name] for name in ("threshold", "precision", "recall", "f_score")},
+        **facts,
+        "thresholds": rows,
+        "self_check": check,
+        "protocol": asdict(VISIBLE_SURFACE),
+    }
+
+
+def _self_check(score: SurfaceScore, truth: Truth) -> dict[str, Any]:
+    """Whether both surfaces lie in one place at all."""
+    far = score.accuracy_median is not None and score.accuracy_median > APART * score.diagonal
+    line = (
+        f"half of the mesh is more than {APART:.0%} of the true size away from {truth.path.name}: "
+        "is it in the capture's frame, and in its units?"
+    )
+    return {"ok": not far and score.reason is None, "messages": [line] if far else []}
