@@ -12,15 +12,7 @@ from types import MappingProxyType
 
 from gs2d.recipes import TABLES
 
-# Data sets as the paper names them -> the scenes of its protocol (section "Datasets and Metrics" and its sources).
-TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"
-SCENES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        TNT: ("Barn", "Caterpillar", "Courthouse", "Ignatius", "Meetingroom", "Truck"),
-        NERF_SYNTHETIC: ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"),
-        DTU: tuple(f"scan{n}" for n in (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)),
-    }
-)
+TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result
 # Which way is better, and how many digits the paper prints.
 METRICS: Mapping[str, str] = MappingProxyType(
     {"fscore": "F-score", "chamfer": "Chamfer", "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}

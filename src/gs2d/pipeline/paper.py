@@ -145,7 +145,7 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
             slurm=options.slurm,
             after_job=lambda _job: _tabulate_so_far(plan),
         )
-    return tabulate(plan)
+    return tabulate(plan, on_event)
 
 
 def _tabulate_so_far(plan: Plan) -> None:
@@ -209,7 +209,7 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
 
 
 def _job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int, cache: Path) -> SweepJob:
-    downscale = options.downscale or scene.protocol.downscale
+    downscale = options.downscale or scene.downscale
     train = TrainOptions(
         scene=scene.path,
         out=options.out / "runs" / f"{scene.name}-{name}-s{seed}",
@@ -226,7 +226,7 @@ def _job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, se
         threads=options.threads,
     )
     evaluate = None
-    if scene.truth is not None or options.lpips_weights is not None:
+    if scene.scored or options.lpips_weights is not None:
         evaluate = EvaluateOptions(ground_truth=scene.truth, lpips_weights=options.lpips_weights)
     facts = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
     return SweepJob(
@@ -263,7 +263,7 @@ def _defining(options: PaperOptions) -> dict[str, Any]:
 
 
 # -- tabulating ------------------------------------------------------------------------------------------------------
-def tabulate(plan: Plan, *, pictures: bool = True) -> PaperResult:
+def tabulate(plan: Plan, on_event: OnEvent = ignore, *, pictures: bool = True) -> PaperResult:
     """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     verdicts = judge(plan.table, results)
@@ -283,7 +283,8 @@ def tabulate(plan: Plan, *, pictures: bool = True) -> PaperResult:
             file.write(text)
     files = [out / name for name in ("table.json", *texts, ABOUT)]
     if pictures:
-        files.append(write_page(plan.table, results, verdicts, deviations, commands, about(plan, results, ()), out))
+        facts = about(plan, results, verdicts)
+        files.append(write_page(plan.table, results, verdicts, deviations, commands, facts, out, on_event))
     unfinished = sum(plan.sweep.record(job)["state"] not in ("done", "failed") for job in plan.sweep.jobs)
     return PaperResult(plan.table, tuple(files), results, verdicts, plan.sweep.failures(), unfinished)
 
@@ -346,8 +347,9 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
 
 
 def _scene_facts(scene: FoundScene) -> dict[str, Any]:
-    truth = None if scene.truth is None else str(scene.truth)
-    return {"path": str(scene.path), "format": scene.format, "ground_truth": truth, "protocol": asdict(scene.protocol)}
+    truth = "found beside it" if scene.scored and scene.truth is None else scene.truth and str(scene.truth)
+    facts = {"path": str(scene.path), "format": scene.format, "downscale": scene.downscale, "ground_truth": truth}
+    return {**facts, "missing": list(scene.missing), "protocol": asdict(scene.protocol)}
 
 
 def paper_command(options: PaperOptions) -> str:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from gs2d.paper_tables import METRICS, NERF_SYNTHETIC, SCENES, PaperTable
-from gs2d.pipeline.paper_rows import Results
+from gs2d.errors import Gs2dError
+from gs2d.images import image_size
+from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, PaperTable
+from gs2d.pipeline.paper_rows import NOT_YET, Results
 from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes
 
 if TYPE_CHECKING:
     from gs2d.pipeline.paper import PaperOptions
+
+NERF_SYNTHETIC_SIZE = (800, 800)  # px
 
 
 def deviations_of(
@@ -20,52 +24,61 @@ def deviations_of(
     found = []
     if options.schedule_scale != 1.0:
         found.append(f"the schedule is {options.schedule_scale:g} of the paper's (30k + 10k + 20k iterations)")
-    for scene in scenes:
-        factor = options.downscale or scene.protocol.downscale
-        if factor != scene.protocol.downscale:
-            found.append(
-                f"{scene.name}: photographs shrunk by {factor}, the protocol {scene.protocol.name} says "
-                f"{scene.protocol.downscale}"
-            )
-    for data_set, absent in missing_scenes(scenes).items():
-        found.append(
-            f"{data_set}: {len(absent)} of the paper's {len(SCENES[data_set])} scenes missing: {', '.join(absent)}"
-        )
-    for data_set in dict.fromkeys(scene.data_set for scene in scenes):
-        if data_set not in table.columns:
-            which = ", ".join(scene.name for scene in scenes if scene.data_set == data_set)
-            found.append(
-                f"{which}: not a data set of this table ({', '.join(table.columns)}): no figures of the paper beside"
-            )
+    found += _scenes(options, scenes, table)
     found += [f"changed in the recipes: {text}" for text in options.overrides]
     found += _missing_figures(results)
-    if any(scene.data_set == NERF_SYNTHETIC and scene.truth for scene in scenes):
+    if any(scene.data_set == NERF_SYNTHETIC and scene.scored for scene in scenes):
         found.append("F-score on NeRF-Synthetic is by this project's own protocol: the paper states none")
-    seeds, names = len(options.seeds), ", ".join(map(str, options.seeds))
-    found.append(f"{seeds} seed{'s' if seeds > 1 else ''} ({names}); the paper does not say how many")
+    count, names = len(options.seeds), ", ".join(map(str, options.seeds))
+    found.append(f"{count} seed{'s' if count > 1 else ''} ({names}); the paper does not say how many")
     return found
 
 
+def _scenes(options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
+    """Other photographs, other scenes, pieces of them that are missing."""
+    for data_set in dict.fromkeys(scene.data_set for scene in scenes):
+        if data_set not in table.columns:
+            names = ", ".join(scene.name for scene in scenes if scene.data_set == data_set)
+            yield f"trained on {names} ({data_set}); the paper's table is of {', '.join(table.columns)}"
+    for data_set, (absent, count) in missing_scenes(scenes).items():
+        yield f"{data_set}: {len(absent)} of its {count} scenes are not here: {', '.join(absent)}"
+    for scene in scenes:
+        factor = options.downscale or scene.downscale
+        if factor != scene.downscale:
+            yield f"{scene.name}: photographs shrunk by {factor}, its protocol says {scene.downscale}"
+        size = _size(scene)
+        if scene.data_set == NERF_SYNTHETIC and size is not None and size != NERF_SYNTHETIC_SIZE:
+            yield f"{scene.name}: photographs of {size[0]}x{size[1]} px, the data set has 800x800"
+        yield from (f"{scene.name}: {line}" for line in scene.missing)
+
+
+def _size(scene: FoundScene) -> tuple[int, int] | None:
+    """Of a photograph of a NeRF-Synthetic scene."""
+    path = next(iter(sorted((scene.path / "train").glob("*.png"))), None)
+    try:
+        return None if path is None else image_size(path)
+    except Gs2dError:
+        return None
+
+
 def _missing_figures(results: Results) -> list[str]:
-    """Failed runs, and figures that nothing has."""
-    found, told = [], set()
+    """Runs that failed or are not there yet, and figures that nothing has."""
+    found, waiting = [], 0
     for row in results.rows:
         for cell in row.cells:
-            if cell.figures["psnr"] is None and (reason := cell.reasons.get("psnr")):
-                text = f"{cell.scene}, seed {cell.seed}: no figures ({reason})"
-                if (row.recipe, text) not in told:
-                    told.add((row.recipe, text))
-                    found.append(f"{row.name}, {text}")
+            if cell.figures["bytes"] is None:
+                if cell.reasons["bytes"] in NOT_YET:
+                    waiting += 1
+                else:
+                    found.append(f"{row.name}, {cell.scene}, seed {cell.seed}: failed ({cell.reasons['bytes']})")
+    if waiting:
+        found.append(f"{waiting} runs are not finished yet")
     for data_set in results.data_sets:
-        for metric in ("lpips", "chamfer" if data_set == "DTU" else "fscore"):
-            reasons = {
-                cell.reasons.get(metric, "")
-                for row in results.rows
-                for cell in row.of(data_set)
-                if cell.figures[metric] is None and cell.figures["psnr"] is not None
-            }
-            if reasons:
-                found.append(
-                    f"{data_set}: {METRICS[metric]} is missing for some or all runs ({'; '.join(sorted(reasons))})"
-                )
+        for metric in ("lpips", "chamfer" if data_set == DTU else "fscore"):
+            cells = [cell for row in results.rows for cell in row.of(data_set) if cell.figures["bytes"] is not None]
+            lacking = [cell for cell in cells if cell.figures[metric] is None]
+            reasons = sorted({cell.reasons.get(metric, "") for cell in lacking})
+            if lacking:
+                some = "" if len(lacking) == len(cells) else f" of {len(lacking)} runs"
+                found.append(f"{data_set}: no {METRICS[metric]}{some} ({'; '.join(reasons)})")
     return found

@@ -7,15 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.disk import atomic_write
+from gs2d.errors import Gs2dError
 from gs2d.images import read_image
 from gs2d.io.files import read_json
 from gs2d.io.run import RENDERS
 from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
+from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.paper_rows import Cell, Results, Row, Verdict
 from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, shown, verdict_text
-from gs2d.report_html import escape, facts, missing, page, picture, table
+from gs2d.recipes import get_recipe
+from gs2d.report_html import drawing, escape, facts, missing, page, picture, table
 
 PICTURE_WIDTH = 300
+FIGURE_TITLES = {
+    "traces": "Mean coverage K_a and mean opacity over the iterations",
+    "changes": "How much each attribute changes an iteration",
+}
 SHOWN = {"color": "Colour", "normal": "Normals", "error": "Error"}
 STYLE = """<style>
 td .paper, td .pm { display: block; color: var(--soft); font-size: .74rem; font-weight: 400; }
@@ -24,7 +31,8 @@ td.claim { text-align: left; white-space: normal; min-width: 16rem; }
 td.steps { text-align: left; white-space: normal; color: var(--soft); font-size: .85rem; }
 .yes, .no, .open, .unknown { font-weight: 650; } .yes { color: var(--good); } .no { color: var(--accent); }
 .open, .unknown { color: var(--soft); }
-.figures { display: grid; grid-template-columns: repeat(auto-fit, minmax(24rem, 1fr)); gap: 1rem; }
+.figures { display: grid; gap: 1.4rem; margin-bottom: 2rem; }
+.figures img { background: #fff; }
 </style>"""
 
 
@@ -36,6 +44,7 @@ def write_page(
     commands: Sequence[str],
     about: dict[str, Any],
     out: Path,
+    on_event: OnEvent = ignore,
 ) -> Path:
     """Write ``index.html`` into a folder.
 
@@ -47,10 +56,12 @@ def write_page(
     body += [f"<h1>{escape(paper_table.title)}</h1>", lead(verdicts, about)]
     for data_set in results.data_sets:
         body += [f"<h2>{escape(data_set)}</h2>", figures_table(paper_table, results, data_set)]
+    if any(data_set not in paper_table.columns for data_set in results.data_sets):
+        body += ["<h2>The paper&#8217;s figures</h2>", papers_table(paper_table)]
     body += ["<h2>Do the paper&#8217;s orders hold?</h2>", orders_table(verdicts)]
     body += ["<h2>How this differs from the paper</h2>", _list(deviations)]
     body += ["<h2>Side by side</h2>", *side_by_side(results)]
-    body += own_figures(results, out)
+    body += own_figures(results, out, on_event)
     body += ["<h2>Every run</h2>", runs_table(results)]
     body += ["<h2>How it was made</h2>", made_with(about, commands)]
     path = out / "index.html"
@@ -93,7 +104,7 @@ def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> s
     built = table(["", *heads], rows)
     for row in results.rows:
         if row.recipe is None:  # quoted rows are grey
-            built = built.replace(f"<tr><td>{escape(row.name)}", f'<tr class="quoted"><td>{escape(row.name)}')
+            built = built.replace(f"<tr><td>{escape(row.name)}<", f'<tr class="quoted"><td>{escape(row.name)}<')
     counted = sorted({scene for scene, _ in results.counted("psnr", data_set)})
     scenes = (
         f"Means over {len(counted)} scene{'s' if len(counted) != 1 else ''}: {', '.join(counted)}. " if counted else ""
@@ -188,33 +199,51 @@ def _picture(path: Path, alt: str) -> str:
     return picture(read_image(path), alt=alt, width=PICTURE_WIDTH) if path.exists() else '<div class="soft">none</div>'
 
 
-def own_figures(results: Results, out: Path) -> list[str]:
-    """The paper's figures (K_a and opacity, traces of the attributes, maps of E_i), from the runs of this table."""
-    runs: dict[str, Path] = {}
-    for row in (row for row in results.rows if row.recipe is not None):
-        for scene in dict.fromkeys(cell.scene for cell in row.cells):
-            run = _first_run(row, scene)
-            if run is not None:
-                runs[f"{scene}: {row.name}"] = run
-    write_figures = _figure_writer()
-    if write_figures is None or not runs:
-        return []
-    sections = ["<h2>Figures</h2>", '<div class="figures">']
-    for path in write_figures(runs, out / "figures"):
-        if path.suffix == ".svg":
-            sections.append(f"<figure>{path.read_text(encoding='utf-8')}</figure>")
-        elif path.suffix in (".png", ".jpg"):
-            sections.append(picture(read_image(path), path.stem.replace("_", " "), alt=path.stem, width=900))
-    return [*sections, "</div>"]
+def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[str]:
+    """The paper's figures (K_a and opacity, traces of the attributes, a map of E_i), a set for each scene."""
+    from gs2d.pipeline.figures import write_figures  # loads torch
+
+    rows = [row for row in results.rows if row.recipe is not None]
+    sections: list[str] = []
+    for scene in dict.fromkeys(cell.scene for row in rows for cell in row.cells):
+        runs = {row.name: run for row in rows if (run := _first_run(row, scene)) is not None}
+        if not runs:
+            continue
+        maps = [name for name in runs if _ranks(name, rows)][-1:]  # they need the photographs: one is enough
+        try:
+            drawn = [_drawing(path) for path in write_figures(runs, out / "figures" / scene, on_event, maps=maps)]
+        except Gs2dError as error:
+            drawn = [missing(str(error))]
+        sections += [f"<h3>{escape(scene)}</h3>", '<div class="figures">', *drawn, "</div>"] if drawn else []
+    return ["<h2>How the splats change in training</h2>", *sections] if sections else []
 
 
-def _figure_writer() -> Any:
-    """``pipeline.figures.write_figures``."""
-    try:
-        from gs2d.pipeline.figures import write_figures
-    except ModuleNotFoundError:
-        return None
-    return write_figures
+def _ranks(name: str, rows: Sequence[Row]) -> bool:
+    """Whether the recipe of a row ranks splats by their error."""
+    recipe = next(row.recipe for row in rows if row.name == name)
+    return recipe is not None and any(stage.name == "appearance" for stage in get_recipe(recipe).stages)
+
+
+def _drawing(path: Path) -> str:
+    title = FIGURE_TITLES.get(path.stem, "E_i, the colour error of each splat, and the high-error splats")
+    if path.suffix == ".svg":
+        return drawing(path.read_text(encoding="utf-8"), title)
+    return picture(read_image(path), title, alt=title, width=1400)
+
+
+def papers_table(paper_table: PaperTable) -> str:
+    """The paper's figures alone, for rows that were trained on other scenes."""
+    heads = [f"{TITLES[m]}, {d}" for d, metrics in paper_table.columns.items() for m in metrics]
+    rows = [
+        [escape(row.name)]
+        + [
+            printed(m, d, row.paper[d][m]) if m in row.paper.get(d, {}) else "-"
+            for d, metrics in paper_table.columns.items()
+            for m in metrics
+        ]
+        for row in paper_table.rows
+    ]
+    return table(["", *heads], rows)
 
 
 def runs_table(results: Results) -> str:

@@ -15,6 +15,7 @@ from gs2d.paper_tables import DTU, LOWER_IS_BETTER, METRICS, Order, PaperTable
 
 FIGURES = (*METRICS, "bytes", "seconds")
 IMAGE_METRICS = ("psnr", "ssim", "lpips")
+NOT_YET = ("not trained yet", "under way or interrupted")
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
     place: dict[str, Any] = {"scene": scene, "data_set": data_set, "seed": seed, "run": run}
     if record["state"] != "done":
-        why = record.get("reason") or ("interrupted" if record["state"] == "running" else "not trained yet")
+        why = record.get("reason") or NOT_YET[record["state"] == "running"]
         return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, str(why)), **place)
     try:
         metrics = open_run(run).metrics() if is_run(run) else {"stages": []}

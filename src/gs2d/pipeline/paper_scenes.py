@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.data import detect_format
-from gs2d.errors import DataError
-from gs2d.paper_tables import DTU, NERF_SYNTHETIC, SCENES, TNT
-from gs2d.protocols import Protocol, get_protocol, protocol_for
+from gs2d.data.layouts import MESH_TRUTHS, SCORING, describe, find_truth, protocol_of, recognise
+from gs2d.errors import DataError, Gs2dError
+from gs2d.paper_tables import DTU, NERF_SYNTHETIC, TNT
+from gs2d.protocols import Protocol, get_protocol
+from gs2d.protocols_datasets import DATASETS, DataSet, SceneFacts
 
 DEPTH = 3  # folders below the data folder in which captures are looked for (TNT_GOF/TrainingSet/Barn)
-TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")
-_DATA_SETS = {"dtu": DTU, "tnt": TNT, "tnt-large": TNT, "nerf-synthetic": NERF_SYNTHETIC}
+PAPER_NAMES = {"dtu": DTU, "tnt": TNT, "nerf-synthetic": NERF_SYNTHETIC, "mip-nerf-360": "Mip-NeRF 360"}
+OFFICIAL = ("dtu", "tnt")  # evaluators that need several files
 
 
 @dataclass(frozen=True)
@@ -27,20 +30,30 @@ class FoundScene:
     path : Path
     format : str
     protocol : Protocol
+    downscale : int
+        What its protocol divides the image size by.
+    data_set : str
+        By the paper's name; "other (PROTOCOL)" for captures that are no scene of a known data set.
+    scene : str
+        The data set's name of it; the folder's for others.
     truth : Path or None
-        The true surface, if one lies beside it.
+        Ground truth to give to the evaluation; None: none, or what it finds itself.
+    scored : bool
+        Whether there is a ground truth.
+    missing : tuple of str
+        One line for each piece of the ground truth that is not there, for scenes of known data sets.
     """
 
     name: str
     path: Path
     format: str
     protocol: Protocol
+    downscale: int
+    data_set: str
+    scene: str
     truth: Path | None
-
-    @property
-    def data_set(self) -> str:
-        """The data set by the paper's name; the protocol's own name for those the paper does not have."""
-        return _DATA_SETS.get(self.protocol.name, self.protocol.name)
+    scored: bool
+    missing: tuple[str, ...]
 
 
 def find_scenes(
@@ -55,9 +68,10 @@ def find_scenes(
     names : sequence of str
         Only these; "lego" also finds a folder "nerf_synthetic_lego".
     protocol : str
-        A name, or "auto": by the format of each capture.
+        A name, or "auto": by data set and format of each capture.
     truths : Path, optional
-        Folder of ground truths: ``NAME.ply``, ``NAME.obj`` or ``NAME/mesh_gt.ply``.
+        Folder of ground truths: ``NAME.ply``, ``NAME.obj``, ``NAME/mesh_gt.ply``, or the official files of DTU and
+        Tanks and Temples.
 
     Raises
     ------
@@ -76,11 +90,7 @@ def find_scenes(
         raise DataError(f"{data} must be a capture or hold captures (Blender, nerfstudio, DTU, COLMAP), found none")
     if names:
         captures = {name: captures[name] for name in dict.fromkeys(_match(want, captures, data) for want in names)}
-    scenes = []
-    for name, path in captures.items():
-        kind = detect_format(path)
-        scenes.append(FoundScene(name, path, kind, named or protocol_for(kind), _truth(name, path, truths)))
-    return tuple(scenes)
+    return tuple(_look_at(name, path.resolve(), named, truths) for name, path in captures.items())
 
 
 def _captures(folder: Path, depth: int) -> dict[str, Path]:
@@ -89,16 +99,20 @@ def _captures(folder: Path, depth: int) -> dict[str, Path]:
         detect_format(folder)
     except DataError:
         found: dict[str, Path] = {}
-        if depth:
-            for inner in sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")):
-                for name, path in _captures(inner, depth - 1).items():
-                    if name in found:
-                        raise DataError(
-                            f"{found[name]} and {path} have the same name; give --data one of them"
-                        ) from None
-                    found[name] = path
+        for inner in _subfolders(folder) if depth else ():
+            for name, path in _captures(inner, depth - 1).items():
+                if name in found:
+                    raise DataError(f"{found[name]} and {path} have the same name; give --data one of them") from None
+                found[name] = path
         return found
     return {folder.resolve().name: folder}
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    try:
+        return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    except OSError:
+        return []  # not ours to read
 
 
 def _match(want: str, captures: dict[str, Path], data: Path) -> str:
@@ -110,24 +124,55 @@ def _match(want: str, captures: dict[str, Path], data: Path) -> str:
     return close[0]
 
 
-def _truth(name: str, capture: Path, folder: Path | None) -> Path | None:
-    candidates = [capture / file for file in TRUTHS]
+def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None) -> FoundScene:
+    kind = detect_format(path)
+    protocol = named or protocol_of(path, kind)
+    known = recognise(path)
+    if known is not None and protocol.name not in {scene.protocol for scene in known[0].scenes}:
+        known = None  # a capture that only happens to have the name of a scene, or is treated as something else
+    if known is None:
+        data_set = DTU if protocol.name == "dtu" else f"other ({protocol.name})"
+        truth = _plain_truth(name, path, truths)
+        return FoundScene(name, path, kind, protocol, protocol.downscale, data_set, name, truth, truth is not None, ())
+    dataset, facts = known
+    truth, scored = _truth_of(dataset, facts, name, path, truths)
+    missing: tuple[str, ...] = ()
+    with contextlib.suppress(Gs2dError):  # a broken capture says so when it is trained
+        pieces = describe(dataset, facts, path, truth=truths).missing
+        missing = () if scored else tuple(piece.line() for piece in pieces if piece.purpose == SCORING)
+    place = (PAPER_NAMES[dataset.name], facts.name)
+    downscale = facts.downscale if named is None else protocol.downscale
+    return FoundScene(name, path, kind, protocol, downscale, *place, truth, scored, missing)
+
+
+def _truth_of(
+    dataset: DataSet, facts: SceneFacts, name: str, path: Path, truths: Path | None
+) -> tuple[Path | None, bool]:
+    """What to give to the evaluation of a scene of a known data set, and whether it will find a ground truth."""
+    if dataset.evaluator in OFFICIAL:
+        files, lacking = find_truth(dataset, facts, path, truths)
+        if files and not lacking:
+            return truths, True
+    own = _plain_truth(name, path, truths) or _plain_truth(facts.name, path, truths)
+    return own, own is not None
+
+
+def _plain_truth(name: str, capture: Path, folder: Path | None) -> Path | None:
+    """A mesh or a cloud of points, in a folder or beside the capture."""
+    candidates = [capture / file for file in MESH_TRUTHS]
     if folder is not None:
-        own = [folder / f"{name}.ply", folder / f"{name}.obj", *(folder / name / file for file in TRUTHS)]
+        own = [folder / f"{name}.ply", folder / f"{name}.obj", *(folder / name / file for file in MESH_TRUTHS)]
         candidates = [*own, *candidates]
     return next((path for path in candidates if path.is_file()), None)
 
 
-def missing_scenes(scenes: Sequence[FoundScene]) -> dict[str, list[str]]:
-    """Data set -> the scenes of the paper's protocol that were not given, for the data sets of which some were."""
-    found: dict[str, list[str]] = {}
-    for data_set in dict.fromkeys(scene.data_set for scene in scenes):
-        have = [scene.name.lower() for scene in scenes if scene.data_set == data_set]
-        missing = [
-            name
-            for name in SCENES.get(data_set, ())
-            if not any(n == name.lower() or n.endswith("_" + name.lower()) for n in have)
-        ]
-        if missing:
-            found[data_set] = missing
+def missing_scenes(scenes: Sequence[FoundScene]) -> dict[str, tuple[list[str], int]]:
+    """Data set -> (scenes that were not given, how many it has), for the data sets of which some were given."""
+    found: dict[str, tuple[list[str], int]] = {}
+    for key, data_set in PAPER_NAMES.items():
+        have = {scene.scene for scene in scenes if scene.data_set == data_set}
+        known = [facts.name for facts in DATASETS[key].scenes]
+        absent = [name for name in known if name not in have]
+        if have and absent:
+            found[data_set] = (absent, len(known))
     return found

@@ -18,7 +18,11 @@ def shown(metric: str, value: float | None) -> str:
     if value is None:
         return "-"
     value = value / 1e6 if metric == "bytes" else value
-    digits = 5 if metric == "chamfer" and abs(value) < 0.1 else DIGITS[metric]  # world units, not millimetres
+    digits = DIGITS[metric]
+    if metric == "chamfer" and abs(value) < 0.1:  # world units, not millimetres
+        digits = 5
+    if metric == "seconds" and abs(value) < 10:
+        digits = 1
     return f"{value:.{digits}f}"
 
 
