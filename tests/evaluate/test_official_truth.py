@@ -26,7 +26,7 @@ from gs2d.triangles import Mesh
 
 FIGURES = json.loads((Path(__file__).parent / "oracle_open3d.json").read_text())
 HEADLINE = {"evaluator", "unit", "f_score", "chamfer", "accuracy", "completeness", "mesh_points", "truth_points",
-            "reason", "thresholds", "self_check", "protocol", "ground_truth"}  # fmt: skip
+            "reason", "thresholds", "self_check", "protocol", "ground_truth", "files"}  # fmt: skip
 
 
 def notices(heard: list[Event]) -> list[str]:
@@ -171,6 +171,8 @@ def test_the_visible_surface_has_its_headline_at_half_a_per_cent_of_the_true_siz
     assert (result["precision"], result["recall"], result["f_score"]) == (1, 1, 1)
     assert result["chamfer"] == pytest.approx(0.01, rel=1e-3)
     assert result["self_check"] == {"ok": True, "messages": []}
+    assert len(read_points(tmp_path / "recall.ply").points) == result["truth_points"]
+    assert result["files"]["picture"].endswith("/surface.png")
     far: list[Event] = []
     elsewhere = score_surface(flat(0.5), truth, job, EvaluateOptions(), far.append, folder=tmp_path)
     assert not elsewhere["self_check"]["ok"]

@@ -14,7 +14,8 @@ The protocol (ours; docs/decisions.md, Evaluation):
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,10 +23,12 @@ from gs2d.camera import Camera
 from gs2d.errors import DataError
 from gs2d.evaluate.align import similarity_scale
 from gs2d.evaluate.distance import distances_to_mesh, distances_to_points, sample_surface
+from gs2d.evaluate.surface_clouds import ScoredClouds
 from gs2d.evaluate.visibility import frustum_counts, visible_counts
 from gs2d.protocols_surface import VISIBLE_SURFACE
 from gs2d.triangles import Mesh
 
+_T = TypeVar("_T")
 FRACTIONS = VISIBLE_SURFACE.fractions  # of the truth's bounding-box diagonal
 SEEN_TOLERANCE = VISIBLE_SURFACE.seen_tolerance  # of the same diagonal: how far behind the depth buffer one sees
 
@@ -59,6 +62,8 @@ class SurfaceScore:
     mesh_hidden, truth_hidden : float
         Part of the area (of the points, for a cloud) that did not count because cameras do not see it.
     reason : str or None
+    clouds : ScoredClouds or None
+        The points that counted with their distances, in the mesh's frame and units; tau is the headline threshold.
     """
 
     accuracy: float | None
@@ -73,6 +78,7 @@ class SurfaceScore:
     mesh_hidden: float
     truth_hidden: float
     reason: str | None = None
+    clouds: ScoredClouds | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +163,15 @@ def evaluate_surface(
         truth_points=len(theirs.points),
         mesh_hidden=ours.hidden,
         truth_hidden=theirs.hidden,
+        clouds=ScoredClouds(
+            ours.points, accuracy / scale, theirs.points, completeness / scale, headline(tau, thresholds) / scale
+        ),
     )
+
+
+def headline(rows: Sequence[_T], thresholds: Sequence[float] | None) -> _T:
+    """What stands at the headline threshold: the protocol's, or the middle one of those that were asked for."""
+    return rows[len(rows) // 2 if thresholds else VISIBLE_SURFACE.headline]
 
 
 def _threshold_score(accuracy: np.ndarray, completeness: np.ndarray, threshold: float) -> ThresholdScore:

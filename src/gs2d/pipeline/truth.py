@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ import numpy as np
 
 from gs2d.data.layouts import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
-from gs2d.evaluate.surface import SurfaceScore, evaluate_surface
+from gs2d.evaluate.surface import SurfaceScore, evaluate_surface, headline
+from gs2d.evaluate.surface_clouds import write_clouds
 from gs2d.io.ply import ply_kind, read_mesh, read_points
 from gs2d.io.run import make_folder
 from gs2d.pipeline.events import Notice, OnEvent, Phase
@@ -142,7 +143,7 @@ def score_surface(
     """
     on_event(Phase("scoring the surface", 0))
     if isinstance(truth, Truth):
-        return _score_visible(mesh, truth, job, options, on_event)
+        return _score_visible(mesh, truth, job, options, on_event, folder)
     if options.thresholds:
         on_event(Notice(f"--thresholds are not used: {truth.dataset.title} has its own protocol"))
     make_folder(folder)
@@ -155,7 +156,9 @@ def score_surface(
     return {**facts, "ground_truth": str(truth.files["scan"])}
 
 
-def _score_visible(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, on_event: OnEvent) -> dict[str, Any]:
+def _score_visible(
+    mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions, on_event: OnEvent, folder: Path
+) -> dict[str, Any]:
     """Chamfer distance, precision, recall and F-score of a mesh, over what the training views see."""
     if truth.seen is not None:
         on_event(Notice(f"which true faces count is taken from {truth.path.stem}{SEEN_SUFFIX}"))
@@ -167,9 +170,14 @@ def _score_visible(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions,
         T_truth_mesh=job.scene.T_metric_scene,
         thresholds=options.thresholds or None,
     )
-    facts = asdict(score)
+    facts = asdict(replace(score, clouds=None))
+    facts.pop("clouds")
     rows = list(facts.pop("scores"))
-    headline = rows[len(rows) // 2 if options.thresholds else VISIBLE_SURFACE.headline]
+    first = headline(rows, options.thresholds)
+    files = {}
+    if score.clouds is not None:
+        make_folder(folder)
+        files = {what: f"{folder.name}/{name}" for what, name in write_clouds(folder, score.clouds).items()}
     check = _self_check(score, truth)
     for message in check["messages"]:
         on_event(Notice(message))
@@ -177,11 +185,12 @@ def _score_visible(mesh: Mesh, truth: Truth, job: Job, options: EvaluateOptions,
         "evaluator": "visible-surface",
         "unit": "world units",
         "ground_truth": str(truth.path),
-        **{name: headline[name] for name in ("threshold", "precision", "recall", "f_score")},
+        **{name: first[name] for name in ("threshold", "precision", "recall", "f_score")},
         **facts,
         "thresholds": rows,
         "self_check": check,
         "protocol": asdict(VISIBLE_SURFACE),
+        "files": files,
     }
 
 
