@@ -95,6 +95,8 @@ def mesh(command: c.Mesh, console: Console) -> None:
         truncation=command.truncation,
         depth_limit=command.depth_limit,
         bbox=command.bbox,
+        unbounded=command.unbounded,
+        max_gib=command.max_gib,
         depth=command.depth,
         keep_components=command.keep_components,
     )
@@ -278,4 +280,4 @@ def _surface_table(surface: dict[str, Any] | None, console: Console) -> None:
     ]
     console.table("", ["surface within", "precision", "recall", "F-score"], rows)
     if surface.get("chamfer") is not None:
-        console.say(f"Chamfer distance {surface['chamfer']:.5g} (world units)")
+        console.say(f"Chamfer distance {surface['chamfer']:.5g} {surface.get('unit', 'world units')}")

@@ -99,7 +99,11 @@ class Mesh(Common):
     depth_limit: float | None = None
     """Ignore depth beyond this, in world units (default: from the scene)."""
     bbox: tuple[float, float, float, float, float, float] | None = None
-    """Keep only this box: x0 y0 z0 x1 y1 z1."""
+    """Keep only this box: x0 y0 z0 x1 y1 z1. With --unbounded: where the voxels are finest."""
+    unbounded: bool = False
+    """Mesh what lies far away too, in voxels that grow with the distance."""
+    max_gib: float = 4.0
+    """Memory for the fused volume; more is an error that names a voxel that fits."""
     depth: Literal["mean", "median"] | None = None
     """Depth that is fused (default: the run's protocol)."""
     keep_components: int | None = None
@@ -131,7 +135,7 @@ class Evaluate(Common):
     run: RunPath
     """Run folder."""
     ground_truth: Annotated[Path | None, arg(metavar="MESH_OR_POINTS")] = None
-    """PLY file of the true surface, in the frame of the capture (DTU: of the data set, in millimetres)."""
+    """True surface (PLY, OBJ) in the capture's frame (DTU: mm), or the official folder of DTU or Tanks and Temples."""
     thresholds: tuple[float, ...] = ()
     """Distances at which precision and recall are taken, world units (default: 0.25, 0.5, 1 % of its size)."""
     lpips_weights: Path | None = None

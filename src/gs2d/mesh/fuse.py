@@ -206,7 +206,7 @@ class Budget:
             return
         voxel = self.limits.voxel * (need / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
         if self.side is not None:
-            voxel = self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
+            voxel = 1.005 * self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
         least = "at least " if partial else ""
         raise ProtocolError(
             f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} wu "

@@ -94,9 +94,7 @@ def check_mesh_options(options: MeshOptions) -> None:
         if not (np.isfinite(options.bbox).all() and (low < high).all()):
             raise ProtocolError(f"--bbox must be a lower corner and a higher one, got {low.tolist()} {high.tolist()}")
     if options.keep_components is not None and options.keep_components < 0:
-        raise ProtocolError(
-            f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}"
-        )
+        raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
 
 
 def _extract(job: Job, splats: Splats, options: MeshOptions, depth: str, on_event: OnEvent) -> Extraction:

@@ -1,0 +1,64 @@
+"""``gs2d mesh RUN --unbounded``: a tiny run meshed without bounds, and what the user is told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs2d.cli import main
+from gs2d.errors import ProtocolError
+from gs2d.io.ply import read_mesh
+from gs2d.pipeline.jobs import mesh_run
+from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.train import train
+from tiny import RADIUS, write_capture
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    capture = write_capture(folder / "ball", size=32)
+    overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
+    out = folder / "run"
+    options = TrainOptions(
+        scene=capture, out=out, recipe="2dgs", schedule_scale=0.002, overrides=overrides, threads=1, shown_views=0
+    )
+    return train(options).path
+
+
+def test_a_run_is_meshed_without_bounds_and_its_levels_are_told(run: Path, tmp_path: Path) -> None:
+    result = mesh_run(run, MeshOptions(unbounded=True, voxel=0.05), out=tmp_path / "far.ply", threads=1)
+    assert result["unbounded"] is True
+    assert result["levels"] >= 1
+    mesh = read_mesh(tmp_path / "far.ply")
+    assert len(mesh.faces) == result["faces"] > 100
+    assert np.median(np.linalg.norm(mesh.vertices, axis=1)) == pytest.approx(
+        RADIUS, rel=0.4
+    )  # trained for a moment only
+    assert json.dumps(result)
+
+
+def test_without_bounds_the_box_says_where_voxels_are_finest(run: Path, tmp_path: Path) -> None:
+    options = MeshOptions(unbounded=True, bbox=(-0.4, -0.4, -0.4, 0.4, 0.4, 0.4), voxel=0.025)
+    result = mesh_run(run, options, out=tmp_path / "far.ply", threads=1)
+    assert result["voxel"] == 0.025
+    assert result["side"] == pytest.approx(0.8)  # 32 voxels
+    assert result["levels"] > 1
+    assert np.abs(read_mesh(tmp_path / "far.ply").vertices).max() > 0.5  # not cut by the box
+
+
+def test_memory_is_bounded_by_an_option_of_the_command(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "far.ply"
+    with pytest.raises(SystemExit) as ended:
+        main(["mesh", str(run), "--unbounded", "--max-gib", "1e-5", "--out", str(out)])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert "use a voxel of about" in error
+    assert not out.exists()
+    with pytest.raises(ProtocolError, match="--max-gib must be a positive number of GiB"):
+        mesh_run(run, MeshOptions(max_gib=0.0), out=out)
