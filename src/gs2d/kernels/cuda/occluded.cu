@@ -47,7 +47,7 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors_occluded(Occluded
         for (int h = 0; h < HALVES; ++h) {
             const bool live = __any_sync(FULL_MASK, T[h] > 0.f);
             const uint touched = __ballot_sync(FULL_MASK, entry >> at.sub_block[h] & 1u);
-            hits[h] = live ? touched : 0u;
+            hits[h] = uniform(live ? touched : 0u, at.lane);
         }
         if (!__any_sync(FULL_MASK, T[0] > 0.f || T[1] > 0.f)) break;
         const uint wanted = hits[0] | hits[1];
