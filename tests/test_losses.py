@@ -231,7 +231,15 @@ def test_what_was_rendered_at_an_ignored_pixel_has_no_influence(
         }
         output = RenderOutput(**leaves, radii=clean.radii)
         losses = compute_losses(
-            output, target, mask, camera, [LossTerm(kind, 1.0)], iteration=1, depth_kind="mean", backend_name=backend
+            output,
+            target,
+            mask,
+            camera,
+            [LossTerm(kind, 1.0)],
+            iteration=1,
+            depth_kind="mean",
+            backend_name=backend,
+            silhouette=target[..., 0],
         )
         values.append(losses[kind].item())
         found = torch.autograd.grad(losses[kind], list(leaves.values()), allow_unused=True)
@@ -250,7 +258,17 @@ def test_an_all_true_mask_changes_nothing(kind: str) -> None:
     output, camera, target = make_output(12, 13), make_camera(13, 12), torch.rand(12, 13, 3, dtype=torch.float64)
     term = [LossTerm(kind, 1.0)]
     plain, masked = (
-        compute_losses(output, target, mask, camera, term, iteration=1, depth_kind="median", backend_name="reference")
+        compute_losses(
+            output,
+            target,
+            mask,
+            camera,
+            term,
+            iteration=1,
+            depth_kind="median",
+            backend_name="reference",
+            silhouette=target[..., 0],
+        )
         for mask in (None, torch.ones(12, 13, dtype=torch.bool))
     )
     torch.testing.assert_close(plain[kind], masked[kind])
@@ -261,7 +279,15 @@ def test_a_view_without_valid_pixels_has_loss_zero_except_for_the_constant_of_ss
     output, camera = make_output(5, 6), make_camera(6, 5)
     mask, target = torch.zeros(5, 6, dtype=torch.bool), torch.rand(5, 6, 3, dtype=torch.float64)
     losses = compute_losses(
-        output, target, mask, camera, [LossTerm(kind, 1.0)], iteration=1, depth_kind="mean", backend_name="reference"
+        output,
+        target,
+        mask,
+        camera,
+        [LossTerm(kind, 1.0)],
+        iteration=1,
+        depth_kind="mean",
+        backend_name="reference",
+        silhouette=target[..., 0],
     )
     assert losses[kind].item() == (1.0 if kind == "ssim" else 0.0)
 
@@ -282,7 +308,15 @@ def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked:
         rendered = RenderOutput(**dict(zip(images, values, strict=True)), radii=output.radii)
         terms = [LossTerm(kind, 1.0)]
         return compute_losses(
-            rendered, target, mask, camera, terms, iteration=1, depth_kind="mean", backend_name="reference"
+            rendered,
+            target,
+            mask,
+            camera,
+            terms,
+            iteration=1,
+            depth_kind="mean",
+            backend_name="reference",
+            silhouette=target[..., 0],
         )[kind]
 
     assert torch.autograd.gradcheck(loss, tuple(images.values()), atol=1e-7)
@@ -394,3 +428,23 @@ def test_a_cache_of_another_target_is_refused(native: None) -> None:
 
 def test_both_implementations_know_the_same_kinds() -> None:
     assert list(LOSSES) == list(FUSED_LOSSES)
+
+
+def test_the_silhouette_loss_sees_a_splat_that_has_the_colour_of_the_background() -> None:
+    # Two empty pixels and two of the object; alpha 0.5 on one empty pixel: |0.5 - 0| / 4 = 0.125.
+    alpha = torch.tensor([[0.5, 0.0], [1.0, 1.0]], requires_grad=True)
+    wanted = torch.tensor([[0.0, 0.0], [1.0, 1.0]])
+    value = reference.silhouette(alpha, wanted)
+    assert value.item() == 0.125
+    assert torch.autograd.grad(value, alpha)[0].tolist() == [[0.25, 0.0], [0.0, 0.0]]
+    # Ignoring that pixel leaves nothing wrong among the other three.
+    assert reference.silhouette(alpha, wanted, torch.tensor([[False, True], [True, True]])).item() == 0.0
+
+
+def test_a_silhouette_term_without_an_alpha_channel_says_so() -> None:
+    output, camera = make_output(5, 6), make_camera(6, 5)
+    term = [LossTerm("silhouette", 0.1)]
+    with pytest.raises(RecipeError, match="alpha channel, got one without"):
+        compute_losses(
+            output, torch.rand(5, 6, 3), None, camera, term, iteration=1, depth_kind="mean", backend_name="reference"
+        )

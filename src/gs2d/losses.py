@@ -109,6 +109,8 @@ class LossInputs:
         Of the active terms. Not applied here: the native operations prepare their gradients for them.
     fused : FusedOperations or None
         What FUSED_LOSSES are made of; None for the reference.
+    silhouette : Tensor [H, W] or None
+        Alpha of the photograph, in [0, 1], if it has one.
     """
 
     output: RenderOutput
@@ -118,6 +120,7 @@ class LossInputs:
     target_mean: Tensor | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
     fused: FusedOperations | None = None
+    silhouette: Tensor | None = None
 
     @cached_property
     def fused_photometric(self) -> tuple[Tensor, Tensor]:
@@ -133,6 +136,14 @@ LossFunction = Callable[[LossInputs, str], Tensor]
 def _normals(inputs: LossInputs, depth_kind: str) -> tuple[Tensor, Tensor, Tensor, Camera, Tensor | None]:
     output = inputs.output
     return output.normal, output.depth(depth_kind), output.alpha, inputs.camera, inputs.mask
+
+
+def _silhouette(inputs: LossInputs, _: str) -> Tensor:
+    if inputs.silhouette is None:
+        raise RecipeError(
+            "loss 'silhouette' needs photographs with an alpha channel, got one without; take a recipe without it"
+        )
+    return reference.silhouette(inputs.output.alpha, inputs.silhouette, inputs.mask)
 
 
 def _fused(inputs: LossInputs) -> FusedOperations:
@@ -153,6 +164,7 @@ LOSSES: Mapping[str, LossFunction] = MappingProxyType(
         "normal_consistency": lambda x, depth: reference.normal_consistency(*_normals(x, depth)),
         "normal_consistency_per_splat": lambda x, depth: reference.normal_consistency_per_splat(*_normals(x, depth)),
         "distortion": lambda x, _: reference.distortion(x.output.distortion, x.mask),
+        "silhouette": _silhouette,
     }
 )
 """Every kind of loss in plain torch, unweighted."""
@@ -164,6 +176,7 @@ FUSED_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
         "normal_consistency": lambda x, depth: _fused_normals(x, depth, "normal_consistency"),
         "normal_consistency_per_splat": lambda x, depth: _fused_normals(x, depth, "normal_consistency_per_splat"),
         "distortion": lambda x, _: _fused(x).masked_mean(x.output.distortion, x.mask),
+        "silhouette": _silhouette,  # one subtraction and a mean: not worth an operation of its own
     }
 )
 """The same kinds as fused operations."""
@@ -184,6 +197,7 @@ def compute_losses(
     depth_kind: str,
     backend_name: str,
     target_cache: TargetMaps | None = None,
+    silhouette: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Weighted values of the active terms; their sum is the loss.
 
@@ -205,6 +219,8 @@ def compute_losses(
         Resolved name of the backend that rendered ``output`` (not "auto").
     target_cache : TargetMaps, optional
         Of this target: spares the native SSIM one blur of four. It never changes the value.
+    silhouette : Tensor [H, W], optional
+        Alpha of the photograph, for the loss of that name.
 
     Returns
     -------
@@ -216,13 +232,15 @@ def compute_losses(
     ShapeError
         Target, mask or camera of another size than the image, or a cache of another target.
     RecipeError
-        A kind that is not in LOSSES, or a term without a weight.
+        A kind that is not in LOSSES, a term without a weight, or a silhouette term without a silhouette.
     BackendError
         A backend without losses.
     """
     sizes = check_shapes({"color": (output.color, "H W 3"), "target": (target, "H W 3")})
     if mask is not None:
         check_shapes({"target": (target, "H W 3"), "mask": (mask, "H W")})
+    if silhouette is not None:
+        check_shapes({"target": (target, "H W 3"), "silhouette": (silhouette, "H W")})
     if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
         raise ShapeError(f"camera is {camera.width}x{camera.height}, but the image is {sizes['W']}x{sizes['H']}")
     if backend_name not in _BY_BACKEND:
@@ -242,7 +260,7 @@ def compute_losses(
             weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
     mean = target_cache.mean if target_cache is not None else None
     fused = _fused_operations(backend_name, output.color.device)
-    inputs = LossInputs(output, target, mask, camera, mean, weights, fused)
+    inputs = LossInputs(output, target, mask, camera, mean, weights, fused, silhouette)
     values: dict[str, Tensor] = {}
     for term, weight in active:
         value = weight * functions[term.kind](inputs, term.depth or depth_kind)

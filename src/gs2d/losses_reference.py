@@ -147,3 +147,11 @@ def normal_consistency_per_splat(
 def distortion(distortion_map: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean of the rendered distortion map over valid pixels."""
     return masked_mean(distortion_map, mask)
+
+
+def silhouette(alpha: Tensor, target_alpha: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean of |alpha - target_alpha| over valid pixels: what is empty in the photograph stays empty.
+
+    Colour alone cannot see a splat that has the colour of the background.
+    """
+    return masked_mean((fill_ignored(alpha, target_alpha, mask) - target_alpha).abs(), mask)

@@ -17,7 +17,7 @@ from gs2d.errors import RecipeError
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
-LOSS_KINDS = ("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion")
+LOSS_KINDS = ("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette")
 LARGEST_SEED = 2**63 - 1  # torch takes no larger one
 DEPTH_KINDS = ("mean", "median")
 
@@ -29,8 +29,8 @@ class LossTerm:
     Attributes
     ----------
     kind : str
-        "l1", "ssim" (1 - SSIM), "normal_consistency", "normal_consistency_per_splat" (the paper's Eq. 7 form) or
-        "distortion".
+        "l1", "ssim" (1 - SSIM), "normal_consistency", "normal_consistency_per_splat" (the paper's Eq. 7 form),
+        "distortion" or "silhouette" (alpha against that of the photographs, which must have one).
     weight : float or None
         None, for "distortion" only: the protocol's weight (Table 1 of the paper writes it 100/10).
     start : int

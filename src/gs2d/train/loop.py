@@ -178,6 +178,7 @@ class Trainer:
             background,
             use_masks=use_masks,
             with_maps=self.backend.name == "cpu",
+            with_silhouettes=any(t.kind == "silhouette" for stage in self.recipe.stages for t in stage.losses),
             dtype=dtype,
             device=device,
             limit_bytes=1 << 29 if limit_bytes is None else limit_bytes,

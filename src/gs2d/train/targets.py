@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -25,16 +25,19 @@ class Target:
         False = ignore this pixel.
     maps : TargetMaps or None
         What the native SSIM needs of the image alone; kept with images that are kept.
+    silhouette : Tensor [H, W] or None
+        Alpha of the photograph in [0, 1], where it has one and a loss asks for it.
     """
 
     image: Tensor
     mask: Tensor | None
     maps: TargetMaps | None
+    silhouette: Tensor | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        tensors = [self.image, self.mask, None if self.maps is None else self.maps.mean]
+        tensors = [self.image, self.mask, self.silhouette, None if self.maps is None else self.maps.mean]
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors if tensor is not None)
 
 
@@ -57,6 +60,7 @@ class Targets:
         *,
         use_masks: bool,
         with_maps: bool,
+        with_silhouettes: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
         limit_bytes: int = 1 << 29,
@@ -64,7 +68,7 @@ class Targets:
         self._views = views
         self._background = background
         self._use_masks = use_masks
-        self._with_maps = with_maps
+        self._with_maps, self._with_silhouettes = with_maps, with_silhouettes
         self._dtype, self._device = dtype, device
         self._room = limit_bytes
         self._kept: dict[int, Target] = {}
@@ -76,11 +80,17 @@ class Targets:
         view = self._views[index]
         image = torch.as_tensor(view.target(self._background)).to(self._device, self._dtype)
         mask = view.mask() if self._use_masks else None
-        target = Target(image, None if mask is None else torch.as_tensor(mask).to(self._device), None)
+        alpha = view.alpha() if self._with_silhouettes else None
+        target = Target(
+            image,
+            None if mask is None else torch.as_tensor(mask).to(self._device),
+            None,
+            None if alpha is None else torch.as_tensor(alpha).to(self._device, self._dtype),
+        )
         if target.nbytes + (image.nbytes if self._with_maps else 0) > self._room:
             return target
         if self._with_maps:
-            target = Target(image, target.mask, target_maps(image))
+            target = replace(target, maps=target_maps(image))
         self._room -= target.nbytes
         self._kept[index] = target
         return target
@@ -143,9 +153,11 @@ class DeviceTargets:
             picture = self._take_in(index)
         there = picture.map(lambda tensor: tensor.to(self._device, non_blocking=True))
         color = there.image[..., :3].to(self._dtype) / 255
+        alpha = None
         if there.image.shape[2] == 4:  # as images.composite
-            color = (color - self._background) * (there.image[..., 3:].to(self._dtype) / 255) + self._background
-        return Target(color, there.mask, None)
+            alpha = there.image[..., 3].to(self._dtype) / 255
+            color = (color - self._background) * alpha[..., None] + self._background
+        return Target(color, there.mask, None, alpha)
 
     def _take_in(self, index: int) -> _Picture:
         """Decode a photograph, and keep it where there is room."""

@@ -110,6 +110,7 @@ class WholeViews:
             depth_kind=self.protocol.depth,
             backend_name=self.backend.name,
             target_cache=target.maps,
+            silhouette=target.silhouette,
         )
         loss = torch.stack(list(terms.values())).sum()
         watched = not waits(loss.device)
