@@ -112,7 +112,8 @@ class EvaluateOptions:
     Attributes
     ----------
     ground_truth : Path or None
-        PLY file of the true surface: a mesh or points.
+        A PLY or OBJ file of the true surface (a mesh or points), or the folder of the official ground truth of DTU or
+        Tanks and Temples; None: what lies beside the capture, if anything does.
     thresholds : tuple of float
         Distances at which precision and recall are taken, wu; empty = 0.25, 0.5 and 1 % of the true diagonal.
     lpips_weights : Path or None

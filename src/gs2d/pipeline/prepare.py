@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
+from gs2d.data.layouts import protocol_of
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
@@ -134,7 +135,9 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
         named = get_protocol(named)
     backend = choose_backend(options.backend, on_event)
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
-    protocol = protocol_for(scene_format) if isinstance(named, str) else named
+    protocol = protocol_of(options.scene, scene_format) if isinstance(named, str) else named
+    if isinstance(named, str) and protocol is not protocol_for(scene_format):
+        on_event(Notice(f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"))
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     digest = scene_digest(scene, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
