@@ -1,0 +1,1 @@
+"""Three commands that measure the CUDA backend on a GPU: METHOD.md."""

@@ -1,0 +1,210 @@
+"""What the three commands share: the device or its emulator, clocks, the result file."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.timing import machine
+from gs2d.kernels.cuda import diagnose, launch
+from gs2d.kernels.cuda.launch import Launcher
+from gs2d.render import backend as backends
+from gs2d.render import cuda
+from gs2d.render.backend import Backend, get_backend
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+CLOCKS = "clocks.sm,clocks.mem,clocks.max.sm,temperature.gpu,power.draw,driver_version"
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Where things run.
+
+    Attributes
+    ----------
+    backend : Backend
+        "cuda"; with ``dry`` its kernels run emulated on the CPU, at toy size, and no time means anything.
+    launcher : Launcher
+    dry : bool
+    """
+
+    backend: Backend
+    launcher: Launcher
+    dry: bool
+
+    @property
+    def device(self) -> torch.device:
+        """Where tensors belong."""
+        return torch.device("cpu") if self.dry else torch.device("cuda", torch.cuda.current_device())
+
+    def wait(self) -> None:
+        """Until the device is idle."""
+        if not self.dry:
+            torch.cuda.synchronize()
+
+    def times(self, work: Callable[[int], object], *, repeats: int, warmup: int) -> dict[str, float]:
+        """Milliseconds of ``work(i)``, i = 0, 1, ...: median, best and interquartile distance, by events."""
+        if self.dry:
+            repeats, warmup = 2, 0
+        for i in range(warmup):
+            work(i)
+        values = []
+        for i in range(repeats):
+            clock = _Clock(self.dry)
+            work(warmup + i)
+            values.append(clock.stop())
+        found = [value() for value in values]
+        quartiles = statistics.quantiles(found, n=4)
+        return rounded({"median": quartiles[1], "best": min(found), "spread": quartiles[2] - quartiles[0]})
+
+    def peak_memory(self, work: Callable[[], object]) -> int:
+        """Bytes that torch's allocator held at most during ``work``, beyond those before."""
+        if self.dry:
+            work()
+            return 0
+        self.wait()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        work()
+        self.wait()
+        return int(torch.cuda.max_memory_allocated() - before)
+
+
+class _Clock:
+    """Runs from its making; ``stop`` returns what will give the milliseconds."""
+
+    def __init__(self, dry: bool) -> None:
+        self._start = time.perf_counter()
+        self._events = None if dry else [torch.cuda.Event(enable_timing=True) for _ in range(2)]
+        if self._events is not None:
+            self._events[0].record()
+
+    def stop(self) -> Callable[[], float]:
+        if self._events is None:
+            passed = 1e3 * (time.perf_counter() - self._start)
+            return lambda: passed
+        first, last = self._events
+        last.record()
+
+        def read() -> float:
+            last.synchronize()
+            return float(first.elapsed_time(last))
+
+        return read
+
+
+@dataclass(eq=False)
+class TimingLauncher:
+    """Times every launch of another launcher, by kernel."""
+
+    inner: Launcher
+    dry: bool
+    spans: dict[str, list[Callable[[], float]]] = field(default_factory=dict)
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: Any, shared_bytes: int = 0) -> None:
+        clock = _Clock(self.dry)
+        self.inner.launch(name, blocks, threads, arguments, shared_bytes)
+        self.spans.setdefault(name, []).append(clock.stop())
+
+    def medians(self, skip: int) -> dict[str, float]:
+        """Milliseconds by kernel; the first ``skip`` launches of each warm up."""
+        return rounded(
+            {
+                name: statistics.median([span() for span in (spans[skip:] or spans)])
+                for name, spans in self.spans.items()
+            }
+        )
+
+
+@contextmanager
+def opened(dry: bool) -> Iterator[Bench]:
+    """The bench; with ``dry`` every launcher and the backend "cuda" are the emulator's until the end."""
+    if not dry:
+        backend = get_backend("cuda")
+        device = torch.device("cuda", torch.cuda.current_device())
+        yield Bench(backend, launch.launcher_for(device), False)
+        return
+    sys.path.insert(0, str(ROOT / "tests" / "cuda"))
+    from emulate import Emulator
+
+    with tempfile.TemporaryDirectory() as folder:
+        emulator = Emulator(Path(folder))
+        backend = Backend("cuda", cuda.rasterize, cuda.splat_errors)
+        before = launch.launcher_for, backends._LOADERS["cuda"]
+        launch.launcher_for = lambda device: emulator
+        backends._LOADERS["cuda"] = lambda: backend
+        try:
+            yield Bench(backend, emulator, True)
+        finally:
+            launch.launcher_for, backends._LOADERS["cuda"] = before
+
+
+def facts(bench: Bench) -> dict[str, Any]:
+    """What the numbers were measured on, and with which versions."""
+    found: dict[str, Any] = {**machine(), "dry_run": bench.dry}
+    if bench.dry:
+        return found
+    properties = torch.cuda.get_device_properties(bench.device)
+    found["gpu"] = {
+        "name": properties.name,
+        "multiprocessors": properties.multi_processor_count,
+        "memory_bytes": properties.total_memory,
+        "l2_bytes": getattr(properties, "L2_cache_size", None),
+        "details": diagnose.describe(diagnose.gather()),
+        "torch_cuda": torch.version.cuda,
+    }
+    found["clocks"] = clocks()
+    return found
+
+
+def clocks() -> dict[str, str] | str:
+    """Clocks, temperature and power now; or why they are not known."""
+    command = ["nvidia-smi", f"--query-gpu={CLOCKS}", "--format=csv,noheader", "-i", str(torch.cuda.current_device())]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError) as error:
+        return f"not known: {error}"
+    return dict(zip(CLOCKS.split(","), (word.strip() for word in done.stdout.split(",")), strict=False))
+
+
+def commit() -> str:
+    """The checkout that was measured."""
+    done = subprocess.run(
+        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip() or "not a git checkout"
+
+
+def rounded(values: dict[str, float], digits: int = 4) -> dict[str, float]:
+    """Numbers as a result file holds them."""
+    return {name: round(value, digits) for name, value in values.items()}
+
+
+def attempt(name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """The result of ``work``, or what stopped it: one failing part must not lose the others of an expensive run."""
+    try:
+        return work()
+    except Exception as error:
+        text = (str(error).strip().splitlines() or [""])[0]
+        print(f"{name}: {type(error).__name__}: {text}", file=sys.stderr)
+        return {"failed": f"{type(error).__name__}: {text}"}
+
+
+def write(path: Path, document: dict[str, Any]) -> None:
+    """The result file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".part")
+    temporary.write_text(json.dumps(document, indent=1, sort_keys=False) + "\n")
+    temporary.rename(path)

@@ -1,0 +1,185 @@
+"""Command 1: what the machine can do, whether the kernels are right on it, and what the sanitizer says."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.gpu.bench import ROOT, Bench, attempt
+from benchmarks.gpu.probes import ceilings
+from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, source_names
+from gs2d.render import cuda, reference
+from gs2d.render.api import rasterize, splat_errors
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+TOOLS = ("memcheck", "racecheck", "initcheck")
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
+IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
+
+
+def run(bench: Bench) -> dict[str, Any]:
+    """Ceilings, registers, parity, determinism, the tests marked gpu, and the sanitizer."""
+    return {
+        "ceilings": attempt("ceilings", lambda: ceilings(bench)),
+        "registers": attempt("registers", lambda: registers(bench)),
+        "parity": attempt("parity", lambda: parity(bench, 2 if bench.dry else 60)),
+        "determinism": attempt("determinism", lambda: determinism(bench)),
+        "tests": attempt("tests", lambda: gpu_tests(bench)),
+        "sanitizer": {tool: attempt(tool, lambda tool=tool: sanitize(bench, tool)) for tool in TOOLS},  # type: ignore[misc]
+    }
+
+
+def registers(bench: Bench) -> dict[str, Any]:
+    """Registers, spills and shared memory of each kernel for this device."""
+    arch = ARCHITECTURES[4] if bench.dry else str(bench.launcher.architecture)  # type: ignore[attr-defined]
+    names = source_names()[:1] if bench.dry else source_names()
+    used = {kernel: usage for name in names for kernel, usage in compile_source(name, arch).usage().items()}
+    return {"architecture": arch, **{kernel: vars(usage) for kernel, usage in used.items()}}
+
+
+def _scenes() -> Any:
+    """The random scenes of the rasterizer's tests."""
+    sys.path.insert(0, str(ROOT / "tests" / "render"))
+    import render_scenes
+
+    return render_scenes
+
+
+def parity(bench: Bench, count: int) -> dict[str, Any]:
+    """Images and gradients of random scenes against the float64 reference: medians, quantiles, flipped pixels."""
+    scenes = _scenes()
+    differences: dict[str, list[Tensor]] = {name: [] for name in IMAGES}
+    gradients: dict[str, list[float]] = {}
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        camera = scenes.random_camera(rng)
+        splats = scenes.random_splats(rng, camera, int(rng.integers(1, 60))).to(dtype=torch.float32)
+        cotangents = scenes.random_cotangents(rng, camera)
+        low, low_grads = _differentiate(bench, scenes, splats.to(bench.device), camera, cotangents, bench.backend)
+        high, high_grads = _differentiate(
+            bench, scenes, splats.to(dtype=torch.float64), camera, cotangents, "reference"
+        )
+        for name in IMAGES:
+            a, b = getattr(low, name).detach().double().cpu(), getattr(high, name).detach()
+            differences[name].append((a - b).abs().flatten())
+        for name, expected in high_grads.items():
+            if float(expected.norm()) > 1e-3:
+                error = (low_grads[name].double().cpu() - expected).norm() / expected.norm()
+                gradients.setdefault(name, []).append(float(error))
+    images = {}
+    for name, parts in differences.items():
+        merged = torch.cat(parts).numpy()
+        images[name] = {
+            "median": float(np.median(merged)),
+            "q999": float(np.quantile(merged, 0.999)),
+            "flipped": float((merged > 2 / 255).mean()),
+        }
+    errors = {k: {"median": float(np.median(v)), "q90": float(np.quantile(v, 0.9))} for k, v in gradients.items()}
+    return {"scenes": count, "images": images, "gradients": errors}
+
+
+def _differentiate(
+    bench: Bench, scenes: Any, splats: Splats, camera: Any, cotangents: Any, backend: Any
+) -> tuple[Any, dict[str, Tensor]]:
+    leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
+    output = rasterize(leaves, camera, SETTINGS, backend=backend)
+    given = {name: tensor.to(splats.means) for name, tensor in cotangents.items()}
+    scenes.contraction(output, given).backward()
+    return output, {name: tensor.grad for name, tensor in leaves.items() if tensor.grad is not None}
+
+
+def small_scene(bench: Bench) -> tuple[Splats, Any]:
+    """Some splats at 64 x 48 px: enough for every path, little enough for a sanitizer."""
+    scenes = _scenes()
+    rng = np.random.default_rng(7)
+    camera = scenes.random_camera(rng).resized(*((16, 12) if bench.dry else (64, 48)))
+    splats = scenes.random_splats(rng, camera, 12 if bench.dry else 200).to(bench.device, torch.float32)
+    return splats, camera
+
+
+def exercise(bench: Bench) -> None:
+    """Every kernel once: forward, all variants of backward, splat errors, losses and Adam in three short stages."""
+    sys.path.insert(0, str(ROOT / "tests" / "train"))
+    import train_toys
+
+    splats, camera = small_scene(bench)
+    for names in (("color",), ("color", "normal", "depth_median"), IMAGES):
+        for columns in (2, 4):
+            leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
+            probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
+            output = cuda.rasterize_with(bench.launcher, leaves, camera, SETTINGS, probe)
+            sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
+    image = torch.rand(camera.height, camera.width, 3, device=bench.device)
+    splat_errors(splats, camera, image, SETTINGS, backend=bench.backend)
+    recipe = train_toys.short()
+    stages = tuple(replace(stage, iterations=min(stage.iterations, 2 if bench.dry else 4)) for stage in recipe.stages)
+    train_toys.train(train_toys.make_scene(), replace(recipe, stages=stages), backend=bench.backend)
+    bench.wait()
+
+
+def determinism(bench: Bench) -> dict[str, Any]:
+    """Two renderings: images bit for bit, gradients by relative norm."""
+    scenes = _scenes()
+    splats, camera = small_scene(bench)
+    cotangents = scenes.random_cotangents(np.random.default_rng(1), camera)
+    runs = [_differentiate(bench, scenes, splats, camera, cotangents, bench.backend) for _ in range(2)]
+    (a, grads_a), (b, grads_b) = runs
+    same = {name: bool(torch.equal(getattr(a, name), getattr(b, name))) for name in IMAGES}
+    change = {
+        name: float((grad - grads_b[name]).norm() / grad.norm().clamp(min=1e-30)) for name, grad in grads_a.items()
+    }
+    judge = reference.rasterize(splats.to("cpu", torch.float64), camera, SETTINGS)
+    covered = float(judge.alpha.mean())
+    return {"images_are_the_same_bits": same, "relative_change_of_gradients": change, "mean_alpha": covered}
+
+
+def gpu_tests(bench: Bench) -> dict[str, Any]:
+    """``pytest -m gpu``: how many passed, failed and were skipped."""
+    command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-x" if bench.dry else "-q"]
+    if bench.dry:
+        command += ["--collect-only", "tests/gpu"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1500, check=False)
+    last = done.stdout.strip().splitlines()[-1:] or [done.stderr.strip()[-200:]]
+    counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed|skipped|error)", last[0])}
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return {"exit": done.returncode, "summary": last[0], "counts": counts, "failed": failed}
+
+
+def sanitize(bench: Bench, tool: str) -> dict[str, Any]:
+    """Every kernel once under a tool of compute-sanitizer, without torch's cache of memory, which would hide faults."""
+    command = [sys.executable, "-m", "benchmarks.gpu", "exercise"]
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
+    if bench.dry:
+        if tool != TOOLS[0]:
+            return {"skipped": "needs a GPU"}
+        command.append("--dry-run")
+    else:
+        program = shutil.which("compute-sanitizer")
+        if program is None:
+            return {"skipped": "compute-sanitizer is not on the PATH; it comes with the CUDA toolkit"}
+        command = [program, "--tool", tool, "--error-exitcode", "9", "--print-limit", "20", *command]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1500, check=False)
+    lines = (done.stdout + done.stderr).strip().splitlines()
+    return {"exit": done.returncode, "clean": done.returncode == 0, "last_lines": lines[-5:]}
+
+
+def table(found: dict[str, Any]) -> list[str]:
+    """A few lines for people."""
+    images = found["parity"].get("images", {})
+    lines = [
+        f"{name}: median {row['median']:.1e}, q99.9 {row['q999']:.1e}, flipped {row['flipped']:.1e}"
+        for name, row in images.items()
+    ]
+    lines.append(f"tests: {found['tests'].get('summary', found['tests'])}")
+    lines += [f"{tool}: {'clean' if row.get('clean') else row}" for tool, row in found["sanitizer"].items()]
+    return lines

@@ -1,0 +1,245 @@
+"""Command 2: the kernels alone against their floors, and whole iterations side by side with other rasterizers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.gpu.bench import Bench, TimingLauncher, attempt
+from benchmarks.gpu.peers import PEERS, PeerIteration
+from benchmarks.gpu.scenes import SIZES, TOY, GpuScene, gpu_scene
+from benchmarks.iteration import steady
+from gs2d.data.scene import Scene, View
+from gs2d.protocols import GENERIC
+from gs2d.recipe import Recipe
+from gs2d.recipes import two_dgs_r
+from gs2d.render import cuda, cuda_passes
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+from gs2d.train.loop import Trainer
+from gs2d.train.state import TrainState
+
+SETTINGS = RasterSettings()
+REPEATS, WARMUP = 50, 10
+# Counted for the design (not measured): milliseconds at the issue limit of an H200, scene A.
+FLOORS = {
+    (1_000_000, 1600): {
+        "project_splats": 0.08,
+        "blend_forward_distortion": 0.33,
+        "blend_vjp_geometry": 0.79,
+        "project_splats_vjp": 0.125,
+        "adam_step": 0.38,
+    },
+    (100_000, 800): {
+        "project_splats": 0.01,
+        "blend_forward_distortion": 0.08,
+        "blend_vjp_geometry": 0.19,
+        "project_splats_vjp": 0.013,
+        "adam_step": 0.04,
+    },
+}
+# Instructions of a warp for a visited splat, and for each half of the warp's pixels that it touches; counted in the
+# compiled code of the design's prototype.
+INSTRUCTIONS = {"blend_forward": (20, 50), "blend_vjp": (108, 77)}
+
+
+def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
+    """All scenes; ``progress`` gets the document so far after each."""
+    found: dict[str, Any] = {}
+    for count, width, height in TOY if bench.dry else SIZES:
+        for spread in "A" if bench.dry else "AB":
+            if only and not any(word in f"{count}-{width}x{height}-{spread}" for word in only):
+                continue
+            scene = gpu_scene(count, width, height, spread, bench.device)
+            if bench.dry:
+                scene = replace(scene, cameras=scene.cameras[:1])
+            found[scene.name] = measure_scene(bench, scene, FLOORS.get((count, width), {}))
+            progress(found)
+            del scene
+            if not bench.dry:
+                torch.cuda.empty_cache()
+    return found
+
+
+def measure_scene(bench: Bench, scene: GpuScene, floors: dict[str, float]) -> dict[str, Any]:
+    """Counts, kernels, passes, iterations and peers of one scene."""
+    result: dict[str, Any] = {"counts": attempt("counts", lambda: counts(bench, scene))}
+    result["kernels_ms"] = attempt("kernels", lambda: kernels(bench, scene))
+    result["floors_ms"] = {name: floor for name, floor in floors.items() if name in result["kernels_ms"]}
+    result["times_floor"] = {
+        name: round(result["kernels_ms"][name] / floor, 3) for name, floor in result["floors_ms"].items()
+    }
+    result["passes"] = attempt("passes", lambda: passes(bench, scene))
+    result["sorts_ms"] = attempt("sorts", lambda: sorts(bench, scene))
+    targets = pictures(bench, scene)
+    result["iteration"] = attempt("iteration", lambda: iterations(bench, scene, targets))
+    for name in PEERS:
+        result[name] = attempt(name, lambda name=name: peer(bench, scene, targets, name))  # type: ignore[misc]
+    ours = result["iteration"].get("surface", {}).get("median")
+    for name in PEERS:
+        theirs = result[name].get("iteration_ms", {}).get("median")
+        if ours and theirs:
+            result[f"times_faster_than_{name}"] = round(theirs / ours, 2)
+    return result
+
+
+def parameters(scene: GpuScene) -> list[Tensor]:
+    """As the passes take them."""
+    return [tensor.detach().contiguous() for _, tensor in scene.splats.items()]
+
+
+def counts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
+    """Work of one view, and the instructions that the design counts for it."""
+    frame = cuda_passes.forward(bench.launcher, cuda_passes.view_of(scene.cameras[0], SETTINGS), parameters(scene))
+    seen = frame.seen.cpu().numpy().view(np.uint32)  # [words, 8]
+    below = [(warp >> 1) * 4 + (warp & 1) for warp in range(4)]  # the upper half of a warp; the lower is two further
+    visits = sum(int(np.bitwise_count(seen[:, b] | seen[:, b + 2]).sum()) for b in below)
+    halves = int(np.bitwise_count(seen).sum())
+    drawn = int((frame.radii > 0).sum())
+    by_kernel = {name: visits * a + halves * b for name, (a, b) in INSTRUCTIONS.items()}
+    return {
+        "splats_drawn": drawn,
+        "candidates": len(frame.entries),
+        "visits": visits,
+        "halves": halves,
+        "warp_instructions_model": by_kernel,
+    }
+
+
+def kernels(bench: Bench, scene: GpuScene) -> dict[str, float]:
+    """Median time of each kernel, each between two events, over the views; all images have gradients but distortion."""
+    timing = TimingLauncher(bench.launcher, bench.dry)
+    repeats, warmup = (2, 0) if bench.dry else (REPEATS, WARMUP)
+    leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in scene.splats.items()})
+    for i in range(warmup + repeats):
+        camera = scene.cameras[i % len(scene.cameras)]
+        output = cuda.rasterize_with(timing, leaves, camera, SETTINGS)
+        (output.color.mean() + output.normal.mean() + output.depth_mean.mean()).backward()
+        for _, tensor in leaves.items():
+            tensor.grad = None
+        with torch.no_grad():
+            cuda.splat_errors_with(timing, scene.splats, camera, output.color.detach(), SETTINGS)
+    bench.wait()
+    return timing.medians(skip=warmup)
+
+
+def passes(bench: Bench, scene: GpuScene) -> dict[str, Any]:
+    """Forward alone, and forward with backward, of the public function; and what they keep in memory."""
+    leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in scene.splats.items()})
+
+    def forward(i: int) -> None:
+        with torch.no_grad():
+            cuda.rasterize_with(bench.launcher, scene.splats, scene.cameras[i % len(scene.cameras)], SETTINGS)
+
+    def both(i: int) -> None:
+        output = cuda.rasterize_with(bench.launcher, leaves, scene.cameras[i % len(scene.cameras)], SETTINGS)
+        (output.color.mean() + output.normal.mean() + output.depth_mean.mean()).backward()
+        for _, tensor in leaves.items():
+            tensor.grad = None
+
+    return {
+        "forward_ms": bench.times(forward, repeats=REPEATS, warmup=WARMUP),
+        "forward_backward_ms": bench.times(both, repeats=REPEATS, warmup=WARMUP),
+        "peak_bytes": bench.peak_memory(lambda: both(0)),
+    }
+
+
+def sorts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
+    """torch.sort as the passes call it, at this scene's sizes."""
+    frame = cuda_passes.forward(bench.launcher, cuda_passes.view_of(scene.cameras[0], SETTINGS), parameters(scene))
+    count, entries = len(scene.splats), max(len(frame.entries), 1)
+    depth = torch.randint(0, 1 << 30, (count,), dtype=torch.int32, device=bench.device)
+    found = {"depth_int32": bench.times(lambda _: torch.sort(depth, stable=True), repeats=REPEATS, warmup=WARMUP)}
+    for dtype in (torch.int16, torch.int32):
+        keys = torch.randint(0, 1 << 14, (entries,), dtype=dtype, device=bench.device)
+        name = f"tile_{str(dtype).removeprefix('torch.')}"
+        found[name] = bench.times(lambda _, keys=keys: torch.sort(keys, stable=True), repeats=REPEATS, warmup=WARMUP)
+    return found
+
+
+def pictures(bench: Bench, scene: GpuScene) -> list[Tensor]:
+    """Targets [H, W, 3] of the cameras, in [0, 1]."""
+    with torch.no_grad():
+        return [
+            cuda.rasterize_with(bench.launcher, scene.splats, camera, SETTINGS).color.clamp(0, 1)
+            for camera in scene.cameras
+        ]
+
+
+def disturbed(splats: Splats) -> Splats:
+    """The same with other colours, so that there is something to learn."""
+    start = splats.clone()
+    noise = torch.randn(start.sh0.shape, generator=torch.Generator().manual_seed(2))
+    start.sh0 += 0.2 * noise.to(start.sh0)
+    return start
+
+
+def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor]) -> dict[str, Any]:
+    """Whole iterations of the trainer in each stage of 2DGS-R, with all losses; nothing is densified."""
+    views = tuple(
+        View.from_arrays(f"{i}.png", camera, (target * 255).round().byte().cpu().numpy())
+        for i, (camera, target) in enumerate(zip(scene.cameras, targets, strict=True))
+    )
+    bounds = np.array([[-3.0] * 3, [3.0] * 3])
+    capture = Scene(name=scene.name, format="blender", train=views, test=(), points=None, extent=3.0, bounds=bounds)
+    recipe = two_dgs_r()
+    recipe = Recipe("bench", tuple(steady(stage) for stage in recipe.stages))
+    protocol = replace(GENERIC, near=0.2)
+    state = TrainState(disturbed(scene.splats), torch.Generator().manual_seed(2))
+    trainer = Trainer(capture, recipe, protocol, backend=bench.backend, state=state, progress_every=10**9)
+    found: dict[str, Any] = {}
+    for index, stage in enumerate(recipe.stages):
+        trainer.enter(index)
+        for _ in views:
+            trainer.step()  # every photograph is taken in
+        found[stage.name] = bench.times(lambda _: trainer.step(), repeats=REPEATS, warmup=WARMUP)
+        found[f"{stage.name}_peak_bytes"] = bench.peak_memory(trainer.step)
+    return found
+
+
+def peer(bench: Bench, scene: GpuScene, targets: list[Tensor], name: str) -> dict[str, Any]:
+    """The same splats and views with another rasterizer."""
+    found = PEERS[name]()
+    if bench.dry:
+        return {"skipped": "peers need a GPU"}
+    trainer = PeerIteration(found, disturbed(scene.splats), targets)
+
+    def forward(i: int) -> None:
+        with torch.no_grad():
+            trainer.forward(scene.cameras[i % len(scene.cameras)])
+
+    def both(i: int) -> None:
+        images = trainer.forward(scene.cameras[i % len(scene.cameras)])
+        (images.color.mean() + images.normal.mean()).backward()
+
+    def step(i: int) -> None:
+        trainer.step(scene.cameras[i % len(scene.cameras)], i % len(targets))
+
+    difference = (trainer.forward(scene.cameras[0]).color.detach() - targets[0]).abs()
+    return {
+        "version": found.version,
+        "ssim": trainer.ssim,
+        "mean_difference_of_disturbed_colors": round(float(difference.mean()), 5),
+        "forward_ms": bench.times(forward, repeats=REPEATS, warmup=WARMUP),
+        "forward_backward_ms": bench.times(both, repeats=REPEATS, warmup=WARMUP),
+        "iteration_ms": bench.times(step, repeats=REPEATS, warmup=WARMUP),
+        "peak_bytes": bench.peak_memory(lambda: step(0)),
+    }
+
+
+def table(found: dict[str, Any]) -> list[str]:
+    """A few lines for people."""
+    lines = []
+    for name, scene in found.items():
+        iteration = scene.get("iteration", {}).get("surface", {})
+        slow = sorted(scene["kernels_ms"].items(), key=lambda item: -item[1] if isinstance(item[1], float) else 0)[:3]
+        peers = ", ".join(f"{p}: {scene.get(f'times_faster_than_{p}', scene[p].get('failed', '?'))}" for p in PEERS)
+        lines.append(f"{name}: iteration {iteration.get('median', '?')} ms; {dict(slow)}; times faster than {peers}")
+    return lines
+
+
+__all__ = ["measure_scene", "run", "table"]

@@ -1,0 +1,187 @@
+"""Other 2DGS rasterizers on the same splats, cameras and losses, where installed; none of their code is here."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gs2d import losses_reference
+from gs2d.camera import Camera
+from gs2d.errors import BackendError
+from gs2d.splats import ATTRIBUTES, Splats
+
+NEAR, FAR = 0.2, 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class PeerImages:
+    """What a peer renders: colour [H, W, 3]; normal and its depth's normal [H, W, 3] in one frame; alpha [H, W]."""
+
+    color: Tensor
+    normal: Tensor
+    depth_normal: Tensor
+    alpha: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Peer:
+    """A rasterizer: from activated parameters and a camera to images."""
+
+    name: str
+    version: str
+    render: Callable[[dict[str, Tensor], Camera], PeerImages]
+
+
+def activated(leaves: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Parameters as peers take them: normalised, exponentiated, squashed, SH in one tensor."""
+    scales = leaves["log_scales"].exp()
+    return {
+        "means": leaves["means"],
+        "quats": torch.nn.functional.normalize(leaves["quats"], dim=1),
+        "scales": scales,
+        "opacities": leaves["opacity_logits"].sigmoid(),
+        "sh": torch.cat([leaves["sh0"], leaves["shN"]], dim=1),
+    }
+
+
+def _module(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except (ImportError, OSError) as error:
+        raise BackendError(f"{name} is not installed here ({error})") from error
+
+
+def gsplat() -> Peer:
+    """gsplat's 2DGS.
+
+    Raises
+    ------
+    BackendError
+        It is not installed.
+    """
+    module = _module("gsplat")
+
+    def render(p: dict[str, Tensor], camera: Camera) -> PeerImages:
+        pose = torch.as_tensor(camera.T_cam_world, dtype=torch.float32, device=p["means"].device)
+        K = torch.tensor(
+            [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=pose.device
+        )
+        colors, alphas, normals, depth_normals, *_ = module.rasterization_2dgs(
+            means=p["means"],
+            quats=p["quats"],
+            scales=torch.cat([p["scales"], torch.ones_like(p["scales"][:, :1])], dim=1),
+            opacities=p["opacities"],
+            colors=p["sh"],
+            viewmats=pose[None],
+            Ks=K[None],
+            width=camera.width,
+            height=camera.height,
+            near_plane=NEAR,
+            far_plane=FAR,
+            sh_degree=math.isqrt(p["sh"].shape[1]) - 1,
+            packed=False,
+            render_mode="RGB+ED",
+        )
+        size = (camera.height, camera.width)
+        normal, depth_normal = (x.reshape(*size, 3) for x in (normals, depth_normals))
+        return PeerImages(colors.reshape(*size, -1)[..., :3], normal, depth_normal, alphas.reshape(size))
+
+    return Peer("gsplat", getattr(module, "__version__", "?"), render)
+
+
+def official() -> Peer:
+    """The official 2DGS rasterizer (non-commercial licence: only to compare with, where the user has built it).
+
+    Raises
+    ------
+    BackendError
+        It is not installed.
+    """
+    module = _module("diff_surfel_rasterization")
+
+    def render(p: dict[str, Tensor], camera: Camera) -> PeerImages:
+        means = p["means"]
+        device = means.device
+        tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
+        pose = torch.as_tensor(camera.T_cam_world, dtype=torch.float32, device=device)
+        projection = torch.zeros(4, 4, device=device)
+        projection[0, 0], projection[1, 1] = 1 / tan_x, 1 / tan_y
+        projection[2, 2], projection[2, 3], projection[3, 2] = FAR / (FAR - NEAR), -FAR * NEAR / (FAR - NEAR), 1.0
+        settings = module.GaussianRasterizationSettings(
+            image_height=camera.height,
+            image_width=camera.width,
+            tanfovx=tan_x,
+            tanfovy=tan_y,
+            bg=torch.zeros(3, device=device),
+            scale_modifier=1.0,
+            viewmatrix=pose.T.contiguous(),
+            projmatrix=(projection @ pose).T.contiguous(),
+            sh_degree=math.isqrt(p["sh"].shape[1]) - 1,
+            campos=torch.as_tensor(camera.center, dtype=torch.float32, device=device),
+            prefiltered=False,
+            debug=False,
+        )
+        screen = torch.zeros_like(means, requires_grad=True)
+        color, _, planes = module.GaussianRasterizer(raster_settings=settings)(
+            means3D=means,
+            means2D=screen,
+            shs=p["sh"],
+            opacities=p["opacities"][:, None],
+            scales=p["scales"],
+            rotations=p["quats"],
+        )
+        # Planes: depth sum, alpha, normal (3, camera frame), median depth, distortion.
+        alpha, normal = planes[1], planes[2:5].permute(1, 2, 0) @ pose[:3, :3]
+        depth = torch.nan_to_num(planes[0] / alpha, 0, 0)
+        return PeerImages(color.permute(1, 2, 0), normal, losses_reference.normals_from_depth(depth, camera), alpha)
+
+    return Peer("official", "?", render)
+
+
+PEERS: dict[str, Callable[[], Peer]] = {"gsplat": gsplat, "official": official}
+
+
+class PeerIteration:
+    """A training iteration around a peer's rasterizer: activations, losses in torch, backward, torch's fused Adam.
+
+    The fused SSIM of the package ``fused_ssim`` is used where it is installed, as these trainers do; else the SSIM of
+    the reference losses.
+    """
+
+    def __init__(self, peer: Peer, splats: Splats, targets: list[Tensor]) -> None:
+        self._peer, self._targets = peer, targets
+        self.leaves = {name: getattr(splats, name).detach().clone().requires_grad_() for name in ATTRIBUTES}
+        fused = next(iter(self.leaves.values())).device.type == "cuda"
+        self._adam = torch.optim.Adam(list(self.leaves.values()), lr=1e-4, eps=1e-15, fused=fused)
+        try:
+            self._fused_ssim: Any = importlib.import_module("fused_ssim").fused_ssim
+        except (ImportError, OSError):
+            self._fused_ssim = None
+        self.ssim = "reference losses, torch" if self._fused_ssim is None else "fused_ssim"
+
+    def forward(self, camera: Camera) -> PeerImages:
+        """Images with their graph."""
+        return self._peer.render(activated(self.leaves), camera)
+
+    def loss(self, images: PeerImages, index: int) -> Tensor:
+        """0.8 L1 + 0.2 (1 - SSIM) + 0.05 normal consistency."""
+        target = self._targets[index]
+        if self._fused_ssim is None:
+            ssim = losses_reference.ssim(images.color, target)
+        else:
+            ssim = self._fused_ssim(images.color.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None])
+        l1 = (images.color - target).abs().mean()
+        agreement = (images.normal * images.depth_normal).sum(dim=-1) * images.alpha.detach()
+        return 0.8 * l1 + 0.2 * (1 - ssim) + 0.05 * (1 - agreement).mean()
+
+    def step(self, camera: Camera, index: int) -> None:
+        """One iteration."""
+        self._adam.zero_grad(set_to_none=True)
+        self.loss(self.forward(camera), index).backward()
+        self._adam.step()

@@ -1,0 +1,56 @@
+// What one GPU can issue: the ceilings against which the kernels are held. 16 independent chains per thread, so that
+// latency is hidden; the result is written behind a test that never holds, so that nothing is optimised away.
+typedef unsigned int uint;
+typedef unsigned long long uint64;
+
+struct ProbeArguments {
+    float* out;
+    uint64 rounds;
+    int stride;  // of red: floats between the addresses of neighbouring lanes
+    int lanes;   // of red: how many lanes of a warp add
+};
+
+constexpr int CHAINS = 16;
+
+extern "C" __global__ void __launch_bounds__(128) probe_fma(ProbeArguments a) {
+    float v[CHAINS];
+    for (int k = 0; k < CHAINS; ++k) v[k] = float(threadIdx.x + k);
+    for (uint64 i = 0; i < a.rounds; ++i)
+#pragma unroll
+        for (int k = 0; k < CHAINS; ++k) v[k] = fmaf(v[k], 0.999f, 0.001f);
+    float sum = 0.f;
+    for (int k = 0; k < CHAINS; ++k) sum += v[k];
+    if (sum == -1.f) a.out[threadIdx.x] = sum;
+}
+
+extern "C" __global__ void __launch_bounds__(128) probe_shuffle(ProbeArguments a) {
+    float v[CHAINS];
+    for (int k = 0; k < CHAINS; ++k) v[k] = float(threadIdx.x + k);
+    for (uint64 i = 0; i < a.rounds; ++i)
+#pragma unroll
+        for (int k = 0; k < CHAINS; ++k) v[k] = __shfl_xor_sync(0xffffffffu, v[k], 1 + k);
+    float sum = 0.f;
+    for (int k = 0; k < CHAINS; ++k) sum += v[k];
+    if (sum == -1.f) a.out[threadIdx.x] = sum;
+}
+
+extern "C" __global__ void __launch_bounds__(128) probe_exp2(ProbeArguments a) {
+    float v[CHAINS];
+    for (int k = 0; k < CHAINS; ++k) v[k] = float(threadIdx.x + k) * 1e-3f;
+    for (uint64 i = 0; i < a.rounds; ++i)
+#pragma unroll
+        for (int k = 0; k < CHAINS; ++k) asm volatile("ex2.approx.ftz.f32 %0, %0;" : "+f"(v[k]));
+    float sum = 0.f;
+    for (int k = 0; k < CHAINS; ++k) sum += v[k];
+    if (sum == -1.f) a.out[threadIdx.x] = sum;
+}
+
+// One addition to global memory per warp and round, by `lanes` lanes; blocks spread over the array.
+extern "C" __global__ void __launch_bounds__(128) probe_red(ProbeArguments a) {
+    const int lane = threadIdx.x & 31;
+    const uint64 warp = (uint64(blockIdx.x) * 128 + threadIdx.x) >> 5;
+    for (uint64 i = 0; i < a.rounds; ++i) {
+        const uint64 line = (warp * 2654435761ull + i * 40503ull) & ((1ull << 20) - 1);
+        if (lane < a.lanes) atomicAdd(a.out + line * 32 + uint64(lane) * a.stride, 1.f);
+    }
+}

@@ -1,0 +1,36 @@
+"""The scenes of the GPU measurements: two spheres, a floor and a wall, in the two spreads of the counted design."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from benchmarks.workload import PLACES, camera, room
+from gs2d.camera import Camera
+from gs2d.splats import Splats
+
+SIZES = ((100_000, 800, 800), (1_000_000, 1600, 1060), (3_000_000, 1600, 1060))
+TOY = ((60, 32, 16),)
+
+
+@dataclass(frozen=True, eq=False)
+class GpuScene:
+    """Splats on a device, and eight cameras so that the cache does not hold the inputs of the next repeat."""
+
+    name: str
+    splats: Splats
+    cameras: tuple[Camera, ...]
+
+
+def gpu_scene(count: int, width: int, height: int, spread: str, device: torch.device) -> GpuScene:
+    """Scene A (scales spread by exp(0.4 N)) or B (more like a trained one: elongated, scales spread by exp(0.8 N))."""
+    splats = room(count)
+    if spread == "B":
+        generator = torch.Generator().manual_seed(1)
+        size, shape = (torch.randn(count, 1, generator=generator) for _ in range(2))
+        splats.log_scales += 0.69 * size + 0.5 * shape * torch.tensor([1.0, -1.0])  # 0.4^2 + 0.69^2 = 0.8^2
+        splats.opacity_logits = 1.5 * torch.randn(count, generator=generator)
+    near = [(x + 0.07, y - 0.05, z + 0.1) for x, y, z in PLACES]
+    cameras = tuple(camera(width, height, place) for place in (*PLACES, *near))
+    return GpuScene(f"{count}-{width}x{height}-{spread}", splats.to(device), cameras)

@@ -1,0 +1,103 @@
+"""Command 3: whole runs of 2DGS-R on the GPU, by the path that users take, with their metrics."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.gpu.bench import ROOT, Bench, attempt
+from gs2d.pipeline.events import Phase
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.train import train
+
+
+def run(
+    bench: Bench, captures: list[Path], scale: float, downscale: int, out: Path | None, progress: Any
+) -> dict[str, Any]:
+    """Every capture; ``progress`` gets the document so far after each."""
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) if out is None else out
+        if bench.dry:
+            captures, scale = [toy_capture(Path(temporary))], 0.0005
+        for capture in captures:
+            found[capture.resolve().name] = attempt(
+                str(capture),
+                lambda capture=capture: whole_run(bench, capture, scale, downscale, folder),  # type: ignore[misc]
+            )
+            progress(found)
+    return found
+
+
+def toy_capture(folder: Path) -> Path:
+    """The tests' ball, 24 x 24 px."""
+    import sys
+
+    sys.path.insert(0, str(ROOT / "tests"))
+    import tiny
+
+    return Path(tiny.write_capture(folder / "ball"))
+
+
+def whole_run(bench: Bench, capture: Path, scale: float, downscale: int, folder: Path) -> dict[str, Any]:
+    """Train to the end; seconds of each stage without loading and scoring, quality, memory, and all of it together."""
+    overrides = ("init_points=60", "surface.densify.max_splats=90") if bench.dry else ()
+    options = TrainOptions(
+        scene=capture,
+        out=folder / f"run-{capture.resolve().name}",
+        backend="cuda",
+        downscale=downscale,
+        schedule_scale=scale,
+        overrides=overrides,
+        checkpoint_seconds=1e9,
+        checkpoint_every=10**9,
+    )
+    if not bench.dry:
+        torch.cuda.reset_peak_memory_stats()
+    phases: dict[str, float] = {}
+    started = [("start", time.perf_counter())]
+
+    def on_event(event: Any) -> None:
+        if isinstance(event, Phase):
+            now = time.perf_counter()
+            name, since = started[-1]
+            phases[name] = round(phases.get(name, 0.0) + now - since, 3)
+            started.append((event.name, now))
+
+    begun = time.perf_counter()
+    finished = train(options, on_event)
+    metrics = finished.metrics()
+    stages = [
+        {k: stage.get(k) for k in ("name", "iterations", "seconds", "splats", "bytes", "train", "test", "after_clone")}
+        for stage in metrics["stages"]
+    ]
+    return {
+        "schedule_scale": scale,
+        "stages": stages,
+        "training_seconds": round(sum(stage["seconds"] for stage in stages), 2),
+        "all_seconds": round(time.perf_counter() - begun, 2),
+        "seconds_by_phase": phases,
+        "ms_per_iteration": {s["name"]: round(1e3 * s["seconds"] / s["iterations"], 3) for s in stages},
+        "peak_gpu_bytes": 0 if bench.dry else int(torch.cuda.max_memory_allocated()),
+        "reserved_gpu_bytes": 0 if bench.dry else int(torch.cuda.max_memory_reserved()),
+    }
+
+
+def table(found: dict[str, Any]) -> list[str]:
+    """A few lines for people."""
+    lines = []
+    for name, row in found.items():
+        if "stages" not in row:
+            lines.append(f"{name}: {row}")
+            continue
+        last = row["stages"][-1]
+        quality = (last.get("test") or last.get("train") or {}).get("psnr")
+        lines.append(
+            f"{name}: {row['training_seconds']} s training, {row['ms_per_iteration']} ms, {last['splats']} splats, "
+            f"PSNR {quality}, peak {row['peak_gpu_bytes'] / 1e9:.2f} GB"
+        )
+    return lines
