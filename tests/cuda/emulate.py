@@ -48,8 +48,13 @@ class EmulatedKernels:
             raise RuntimeError(f"{name}: {error.decode()}")
 
 
-def build(sources: Sequence[Path], include: Path, folder: Path, name: str) -> EmulatedKernels:
-    """Compile; the compiler gets two minutes. ``folder`` receives a wrapper and the library. Skips without g++."""
+def build(
+    sources: Sequence[Path], include: Path, folder: Path, name: str, *, approximate: bool = False
+) -> EmulatedKernels:
+    """Compile; the compiler gets two minutes. ``folder`` receives a wrapper and the library. Skips without g++.
+
+    ``approximate``: with the largest errors of the GPU's approximate instructions.
+    """
     if shutil.which("g++") is None:
         pytest.skip("no g++ here, which runs the CUDA kernels on the CPU; install one")
     names = [kernel for source in sources for kernel in KERNEL.findall(source.read_text())]
@@ -62,7 +67,8 @@ def build(sources: Sequence[Path], include: Path, folder: Path, name: str) -> Em
         lines.append(f'extern "C" const char* launch_{kernel}{signature} {{ {body} }}')
     wrapper.write_text("\n".join(lines) + "\n")
     library = folder / f"{name}.so"
-    command = ["g++", *FLAGS, f"-I{include}", str(wrapper), "-o", str(library)]
+    chosen = ["-DEMULATE_APPROXIMATIONS"] if approximate else []
+    command = ["g++", *FLAGS, *chosen, f"-I{include}", str(wrapper), "-o", str(library)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"g++ failed on {', '.join(s.name for s in sources)}:\n{done.stderr[-4000:]}")
@@ -78,6 +84,7 @@ class Emulator:
 
     folder: Path
     descending: bool = False
+    approximate: bool = False
     _built: dict[str, EmulatedKernels] = field(default_factory=dict)
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
@@ -86,6 +93,6 @@ class Emulator:
             return
         if name not in self._built:
             source = next(s for s in sorted((KERNELS / "cuda").glob("*.cu")) if name in KERNEL.findall(s.read_text()))
-            built = build([source], KERNELS, self.folder, source.stem)
+            built = build([source], KERNELS, self.folder, source.stem, approximate=self.approximate)
             self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
         self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending)

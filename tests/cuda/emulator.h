@@ -200,3 +200,18 @@ inline int __popc(unsigned v) { return __builtin_popcount(v); }
 inline int __ffs(int v) { return __builtin_ffs(v); }
 inline int __float_as_int(float v) { return emulator::from_bits<int>(emulator::to_bits(v)); }
 inline float __int_as_float(int v) { return emulator::from_bits<float>(emulator::to_bits(v)); }
+
+#ifdef EMULATE_APPROXIMATIONS
+// The GPU's approximate instructions err by up to 1 (rcp.approx) and 2 (ex2.approx) units in the last place. Here they err
+// by that much always, upwards or downwards by the bits of their argument. Preferred to the exact templates of core/base.h.
+namespace gs2d {
+inline float off_by(float v, int units, float argument) {
+    if (!(fabsf(v) > 1e-30f && fabsf(v) < 1e30f)) return v;
+    const int sign = (emulator::to_bits(argument) * 2654435761u >> 31) ? 1 : -1;
+    return emulator::from_bits<float>(emulator::to_bits(v) + uint32_t(sign * units));
+}
+inline float exp2_small(float x) { return off_by(exp2f(x), 2, x); }
+inline float reciprocal(float a) { return off_by(1.f / a, 1, a); }
+inline float quotient(float a, float b) { return a * reciprocal(b); }
+}  // namespace gs2d
+#endif
