@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
+from typing import Any
+
 import pytest
 
 from gs2d.errors import ProtocolError
 from gs2d.protocols import DTU, GENERIC, NERF_SYNTHETIC, PROTOCOLS, TNT, TNT_LARGE, get_protocol, protocol_for
+from gs2d.protocols_datasets import (
+    DATASETS,
+    DTU_SCENES,
+    MIP_NERF_360_SCENES,
+    NERF_SYNTHETIC_SCENES,
+    TNT_SCENES,
+    SceneFacts,
+    get_dataset,
+)
+from gs2d.protocols_sources import SOURCES, source
+from gs2d.protocols_surface import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE, DtuSurface, TntSurface, VisibleSurface
 from gs2d.recipe import LossTerm
 from gs2d.recipes import get_recipe
 
@@ -82,3 +96,92 @@ def test_unknown_names_say_what_exists() -> None:
 
 def test_nerf_synthetic_masks_are_in_its_alpha_not_in_the_loss() -> None:
     assert not NERF_SYNTHETIC.use_mask_in_training
+
+
+# data sets
+
+
+def test_dtu_is_the_fifteen_scans_at_half_size() -> None:
+    assert [s.scan for s in DTU_SCENES.scenes] == [24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122]
+    assert {(s.name[:4], s.protocol, s.downscale) for s in DTU_SCENES.scenes} == {("scan", "dtu", 2)}
+    assert DTU_SCENES.evaluator == "dtu"
+
+
+def test_tanks_and_temples_is_six_scenes_with_their_tau_and_fusion() -> None:
+    """tau in m, voxel in units of the capture: the two large scenes are fused coarser and farther."""
+    got = {s.name: (s.tau, get_protocol(s.protocol).fusion.voxel, s.downscale) for s in TNT_SCENES.scenes}
+    assert got == {
+        "Barn": (0.01, 0.004, 2),
+        "Caterpillar": (0.005, 0.004, 2),
+        "Ignatius": (0.003, 0.004, 2),
+        "Truck": (0.005, 0.004, 2),
+        "Meetingroom": (0.01, 0.006, 2),
+        "Courthouse": (0.025, 0.006, 2),
+    }
+    assert get_protocol(TNT_SCENES.scene("courthouse").protocol).fusion.depth_limit == 4.5
+
+
+def test_nerf_synthetic_is_eight_scenes_at_full_size_and_360_has_its_image_folders() -> None:
+    assert len(NERF_SYNTHETIC_SCENES.scenes) == 8
+    assert {s.downscale for s in NERF_SYNTHETIC_SCENES.scenes} == {1}
+    folders = {s.name: (s.images, s.downscale) for s in MIP_NERF_360_SCENES.scenes}
+    assert folders["garden"] == folders["bicycle"] == ("images_4", 4)
+    assert folders["kitchen"] == folders["room"] == ("images_2", 2)
+    assert len(folders) == 9
+
+
+def test_every_scene_names_a_protocol_that_exists() -> None:
+    for dataset in DATASETS.values():
+        assert get_dataset(dataset.name) is dataset
+        for scene in dataset.scenes:
+            assert scene.protocol in PROTOCOLS
+            assert (scene.tau is not None) == (dataset is TNT_SCENES)
+
+
+def test_the_three_stages_of_tanks_and_temples_are_in_units_of_tau() -> None:
+    assert [(s.voxel, s.threshold) for s in TNT_SURFACE.stages] == [(1.0, 80.0), (0.5, 20.0), (None, 2.0)]
+    assert (TNT_SURFACE.score_voxel, TNT_SURFACE.max_points) == (0.5, 4_000_000)
+    assert (DTU_SURFACE.density, DTU_SURFACE.max_distance, DTU_SURFACE.dilation) == (0.2, 20, 24)
+    assert (VISIBLE_SURFACE.samples, VISIBLE_SURFACE.fractions) == (200_000, (0.0025, 0.005, 0.01))
+
+
+# sources
+
+
+def names(value: Any, where: str = "") -> list[str]:
+    """Fields of a dataclass, those of its parts with a dot."""
+    out = []
+    for field in fields(value):
+        inner = getattr(value, field.name, None)
+        if is_dataclass(inner):
+            out += names(inner, f"{where}{field.name}.")
+        else:
+            out.append(where + field.name)
+    return out
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_every_number_of_a_protocol_has_a_source(name: str) -> None:
+    assert sorted(SOURCES[name]) == sorted(names(PROTOCOLS[name]))
+    assert all(text.strip() for text in SOURCES[name].values())
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("surface: tnt", TntSurface),
+        ("surface: dtu", DtuSurface),
+        ("surface: visible", VisibleSurface),
+        ("scenes", SceneFacts),
+    ],
+)
+def test_every_number_of_an_evaluator_and_of_a_scene_has_a_source(name: str, kind: type) -> None:
+    assert sorted(SOURCES[name]) == sorted(field.name for field in fields(kind))
+
+
+def test_sources_that_do_not_exist_say_which_do() -> None:
+    assert source("dtu", "fusion.voxel") == "2DGS scripts/dtu_eval.py"
+    with pytest.raises(ProtocolError, match="no protocol 'x'; there is dtu"):
+        source("x", "near")
+    with pytest.raises(ProtocolError, match="no field 'far' in protocol dtu"):
+        source("dtu", "far")
