@@ -141,7 +141,7 @@ def opened(dry: bool) -> Iterator[Bench]:
 
     with tempfile.TemporaryDirectory() as folder:
         emulator = Emulator(Path(folder))
-        backend = Backend("cuda", cuda.rasterize, cuda.splat_errors)
+        backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize)
         before = launch.launcher_for, backends._LOADERS["cuda"]
         launch.launcher_for = lambda device: emulator
         backends._LOADERS["cuda"] = lambda: backend

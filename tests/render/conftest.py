@@ -62,17 +62,17 @@ def _available(name: str) -> Backend:
 
 
 def _emulated(launcher: Launcher) -> Backend:
-    def rasterize(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
-        return cuda.rasterize_with(launcher, s, c, r, p)
+    def rasterize(
+        s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None, rows: Tensor | None = None
+    ) -> RenderOutput:
+        return cuda.rasterize_with(launcher, s, c, r, p, rows)
 
     def splat_errors(
         s: Splats, c: Camera, image: Tensor, r: RasterSettings, mask: Tensor | None = None, occlusion: bool = False
     ) -> Tensor:
-        if occlusion:
-            pytest.skip("splat errors with occlusion have no CUDA kernel")
-        return cuda.splat_errors_with(launcher, s, c, image, r, mask)
+        return cuda.splat_errors_with(launcher, s, c, image, r, mask, occlusion)
 
-    return Backend("cuda", rasterize, splat_errors)
+    return Backend("cuda", rasterize, splat_errors, rasterize_rows=rasterize)
 
 
 def _from_host(backend: Backend) -> Backend:
@@ -82,8 +82,14 @@ def _from_host(backend: Backend) -> Backend:
     def there(tensor: Tensor | None) -> Tensor | None:
         return None if tensor is None else tensor.to(device)
 
-    def rasterize(s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None) -> RenderOutput:
-        output = backend.rasterize(Splats(**{k: t.to(device) for k, t in s.items()}), c, r, there(p))
+    def rasterize(
+        s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None, rows: Tensor | None = None
+    ) -> RenderOutput:
+        moved = Splats(**{k: t.to(device) for k, t in s.items()})
+        if rows is None or backend.rasterize_rows is None:
+            output = backend.rasterize(moved, c, r, there(p))
+        else:
+            output = backend.rasterize_rows(moved, c, r, there(p), there(rows))
         return RenderOutput(**{k: t.cpu() for k, t in vars(output).items()})
 
     def splat_errors(
@@ -91,4 +97,4 @@ def _from_host(backend: Backend) -> Backend:
     ) -> Tensor:
         return backend.splat_errors(s.to(device), c, image.to(device), r, there(mask), occlusion).cpu()
 
-    return Backend(backend.name, rasterize, splat_errors)
+    return Backend(backend.name, rasterize, splat_errors, rasterize_rows=backend.rasterize_rows and rasterize)

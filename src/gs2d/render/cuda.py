@@ -161,7 +161,9 @@ def rasterize(
     gradient_rows: Tensor | None = None,
 ) -> RenderOutput:
     """:func:`rasterize_with` on the device on which the splats lie, on torch's current stream there."""
-    return rasterize_with(launch.launcher_for(splats.device), splats, camera, settings, screen_probe, gradient_rows)
+    launcher = launch.launcher_for(splats.device)
+    distortion = settings.with_distortion
+    return rasterize_with(launcher, splats, camera, settings, screen_probe, gradient_rows, distortion=distortion)
 
 
 def splat_errors_with(

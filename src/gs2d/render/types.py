@@ -33,6 +33,8 @@ class RasterSettings:
     lowpass_depth : str
         Depth of a pair where the low-pass filter wins: "center" (the splat centre's), or "plane" (the ray-plane depth
         of the current official code; reference backend only).
+    with_distortion : bool
+        False = nobody looks at that image: a backend may leave it out (NaN) where that saves work.
     """
 
     near: float = 0.2
@@ -45,6 +47,7 @@ class RasterSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = 3
     lowpass_depth: str = "center"
+    with_distortion: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol as Interface
 
 import numpy as np
@@ -71,7 +71,8 @@ class WholeViews:
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
         """The rasterizer's constants at an iteration (1-based)."""
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
-        return raster_settings(self.protocol, self.scene.extent, degree)
+        wanted = any(term.kind == "distortion" for term in stage.losses)
+        return replace(raster_settings(self.protocol, self.scene.extent, degree), with_distortion=wanted)
 
     def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
         """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
