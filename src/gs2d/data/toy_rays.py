@@ -16,6 +16,7 @@ from gs2d.camera import Camera
 
 _PAIRS_PER_CHUNK = 60_000  # a step of one chunk stays in the cache of a core
 _CLOSEST = 1e-3  # wu, hits nearer than this to the camera are ignored
+_MARGIN = 1e-6  # samples around the box of a triangle, for rounding
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
@@ -60,13 +61,15 @@ def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samp
         Of size [height * samples, width * samples].
     """
     width, height = camera.width * samples, camera.height * samples
-    corners = (vertices @ camera.rotation.T + camera.T_cam_world[:3, 3])[faces]  # [F, 3, 3] in camera axes
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    edges = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)  # [F, 3, 3]
+    local = vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]  # [P, 3] in camera axes
+    low, high = _sample_boxes(local, faces, camera, samples, width, height)
+    met = np.flatnonzero((high[:, 0] > low[:, 0]) & (high[:, 1] > low[:, 1]))  # the others may have no ray: most of
+    low, high = low[met], high[met]  # the faces of a fine mesh
+    a, b, c = (local[faces[met, k]] for k in range(3))
+    edges = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)  # [F, 3, 3]
     volume = np.einsum("fi,fi->f", a, edges[:, 0])
     directions_x = ((np.arange(width) + 0.5) / samples - camera.cx) / camera.fx
     directions_y = ((np.arange(height) + 0.5) / samples - camera.cy) / camera.fy
-    low, high = _sample_boxes(corners, camera, samples, width, height)
 
     nearest = np.full(width * height, _NO_HIT, dtype=np.uint64)
     for pair_face, pair_x, pair_y in _pairs(low, high):
@@ -83,24 +86,33 @@ def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samp
         )
         ray = (pair_y[inside] * width + pair_x[inside])[hit]
         np.minimum.at(nearest, ray, key)
-    return _hits(nearest, edges, directions_x, directions_y)
+    hits = _hits(nearest, edges, directions_x, directions_y)
+    numbers = np.append(met, -1).astype(np.int32)  # -1 where nothing was hit
+    return Hits(numbers[hits.face], hits.depth, hits.weights)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products [n, 3], column by column."""
+    x, y, z = (a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1)))
+    return np.stack([x, y, z], axis=1)
 
 
 def _sample_boxes(
-    corners: np.ndarray, camera: Camera, samples: int, width: int, height: int
+    local: np.ndarray, faces: np.ndarray, camera: Camera, samples: int, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """First and last-but-one sample (x, y) that each triangle may cover, [F, 2] each (``high`` exclusive)."""
-    z = corners[:, :, 2]
-    in_front = z.min(axis=1) > _CLOSEST
-    safe = np.where(in_front[:, None], z, 1.0)
-    focal = np.array([camera.fx, camera.fy])
-    center = np.array([camera.cx, camera.cy])
-    pixels = (corners[:, :, :2] / safe[:, :, None] * focal + center) * samples - 0.5  # [F, 3, 2]
-    size = np.array([width, height])
-    low = np.clip(np.floor(pixels.min(axis=1)), 0, size).astype(np.int64)
-    high = np.clip(np.ceil(pixels.max(axis=1)) + 1, 0, size).astype(np.int64)
-    crossing = ~in_front & (z.max(axis=1) > _CLOSEST)
-    behind = z.max(axis=1) <= _CLOSEST
+    ahead = local[:, 2] > _CLOSEST
+    safe = np.where(ahead, local[:, 2], 1.0)
+    size, focal, center = (width, height), (camera.fx, camera.fy), (camera.cx, camera.cy)
+    low, high = np.empty((len(faces), 2), np.int64), np.empty((len(faces), 2), np.int64)
+    for axis in range(2):
+        pixels = (local[:, axis] / safe * focal[axis] + center[axis]) * samples - 0.5  # [P]
+        a, b, c = (pixels[faces[:, k]] for k in range(3))
+        least, most = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+        low[:, axis] = np.clip(np.ceil(least - _MARGIN), 0, size[axis])
+        high[:, axis] = np.clip(np.floor(most + _MARGIN) + 1, 0, size[axis])
+    corners_ahead = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
+    crossing, behind = (corners_ahead > 0) & (corners_ahead < 3), corners_ahead == 0
     low[crossing], high[crossing] = 0, size
     high[behind] = low[behind]
     return low, high
