@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.paper_rows import Cell, Results, Row, Verdict
 from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, shown, verdict_text
-from gs2d.recipes import get_recipe
+from gs2d.recipes import RECIPES, get_recipe
 from gs2d.report_html import drawing, escape, facts, missing, page, picture, table
 
 PICTURE_WIDTH = 300
@@ -25,6 +26,7 @@ FIGURE_TITLES = {
 }
 SHOWN = {"color": "Colour", "normal": "Normals", "error": "Error"}
 STYLE = """<style>
+td:first-child .paper { max-width: 24rem; white-space: normal; }
 td .paper, td .pm { display: block; color: var(--soft); font-size: .74rem; font-weight: 400; }
 tr.quoted td { color: var(--soft); } tr.quoted td:first-child { font-style: italic; }
 td.claim { text-align: left; white-space: normal; min-width: 16rem; }
@@ -77,7 +79,10 @@ def lead(verdicts: Sequence[Verdict], about: dict[str, Any]) -> str:
     if not known:
         text = "None of the paper&#8217;s orders can be checked yet."
     else:
-        text = f"<b>{hold} of {len(known)}</b> of the paper&#8217;s orders that could be checked hold."
+        figure = f"{hold} of {len(known)}"
+        text = (
+            f"<b>{figure}</b>" if hold == len(known) else figure
+        ) + " of the paper&#8217;s orders that could be checked hold."
     if len(known) < len(verdicts):
         text += f" {len(verdicts) - len(known)} could not be checked."
     scale = about["options"]["schedule_scale"]
@@ -96,7 +101,8 @@ def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> s
     rows = []
     for row in results.rows:
         mean, spread = results.mean(row, data_set), results.spread(row, data_set)
-        note = f'<span class="paper">{escape(row.note)}</span>' if row.note else ""
+        words = "; ".join(filter(None, (row.note, about_row(row))))
+        note = f'<span class="paper">{escape(words)}</span>' if words else ""
         cells = [f"<td>{escape(row.name)}{note}</td>"]
         for metric in columns:
             cells.append(_cell(row, metric, data_set, mean[metric], spread[metric], row.name in best[metric]))
@@ -111,6 +117,11 @@ def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> s
     )
     note = "In small print the paper's figure. MB: float32 parameters. s: training alone, shared stages included."
     return built + f'<p class="soft">{escape(scenes + note)}</p>'
+
+
+def about_row(row: Row) -> str:
+    """What is trained for a row, in words."""
+    return "" if row.recipe is None else RECIPES[row.recipe].about.partition(": ")[2] or RECIPES[row.recipe].about
 
 
 def _cell(row: Row, metric: str, data_set: str, mean: float | None, spread: float | None, best: bool) -> str:
@@ -258,12 +269,22 @@ def runs_table(results: Results) -> str:
                     str(cell.seed),
                     *(_run_figure(cell, name) for name in ("psnr", "ssim", "lpips", "fscore", "chamfer")),
                     f"{cell.details['splats']:,}" if "splats" in cell.details else "-",
+                    at_the_clone(cell),
                     shown("bytes", cell.figures["bytes"]),
                     shown("seconds", cell.figures["seconds"]),
                 ]
             )
     heads = ["row", "scene", "seed", *(METRICS[m] for m in ("psnr", "ssim", "lpips", "fscore", "chamfer"))]
-    return table([*heads, "splats", "MB", "s"], rows)
+    return table([*heads, "splats", "PSNR at the clone", "MB", "s"], rows)
+
+
+def at_the_clone(cell: Cell) -> str:
+    """PSNR just before the clone, just after it, and at the end."""
+    stages = cell.details.get("stages", [])
+    for before, after in itertools.pairwise(stages):
+        if "psnr_after_clone" in after:
+            return " → ".join(shown("psnr", v) for v in (before["psnr"], after["psnr_after_clone"], after["psnr"]))
+    return "-"
 
 
 def _run_figure(cell: Cell, metric: str) -> str:
