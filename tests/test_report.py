@@ -361,3 +361,11 @@ def test_figures_of_metrics_json_are_in_the_page_word_for_word(run: Path, page: 
     metrics = json.loads((run / "metrics.json").read_text())
     shown = text_of(page)
     assert json.dumps(metrics["surface"], indent=2).splitlines()[1].strip() in shown
+
+
+def test_the_other_conventions_of_the_image_metrics_are_named_beside_the_table() -> None:
+    scored = {**scores(27.35), "psnr_float": 27.361, "ssim_float": 0.91234, "lpips": 0.1, "lpips_signed": 0.15678}
+    text = text_of(stage_table(record(stages=({**stage_entry(2), "test": scored},))))
+    assert "From floats, unrounded, the last stage has 27.36 dB and 0.9123 (test views)." in text
+    assert "fed with [-1, 1], as its authors do, it is 0.1568" in text
+    assert "From floats" not in text_of(stage_table(record()))  # an older run

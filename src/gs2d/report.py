@@ -219,7 +219,7 @@ def stage_table(record: RunRecord) -> str:
             figure(_scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
         ]
     words = "PSNR and SSIM: means over the views, of pictures rounded to 8 bits. Higher is better, the best is green."
-    legend = f'<p class="soft">{words}</p>' if shown else ""
+    legend = f'<p class="soft">{words}{_other_conventions(record)}</p>' if shown else ""
     notes = [legend, _reasons(record.stages, splits), _clone_note(record)]
     return table(columns, rows) + "".join(notes)
 
@@ -273,6 +273,18 @@ def _clone_note(record: RunRecord) -> str:
                 f"from {earlier:.2f} to {after:.2f} dB."
             )
     return "".join(f'<p class="soft">{escape(line)}</p>' for line in lines)
+
+
+def _other_conventions(record: RunRecord) -> str:
+    """The last stage's figures by the other conventions: from floats, and LPIPS fed with [-1, 1]."""
+    scores = record.stages[-1].get(record.split) or {}
+    psnr, ssim, signed = (scores.get(name) for name in ("psnr_float", "ssim_float", "lpips_signed"))
+    text = ""
+    if isinstance(psnr, int | float) and isinstance(ssim, int | float):
+        text += f" From floats, unrounded, the last stage has {psnr:.2f} dB and {ssim:.4f} ({record.split} views)."
+    if isinstance(signed, int | float):
+        text += f" LPIPS is fed with pictures in [0, 1]; fed with [-1, 1], as its authors do, it is {signed:.4f}."
+    return text
 
 
 # -- training ----------------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import gs2d
-from cli_runs import TINY, one_line
+from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
 from gs2d.recipes import RECIPES
 from tiny import write_ball_mesh
@@ -192,5 +193,14 @@ def test_evaluate_shows_what_is_missing_and_scores_the_surface(
     assert run(["evaluate", str(copy), "--ground-truth", str(tmp_path / "truth.ply"), "--thresholds", "0.05"]) == 0
     text = capsys.readouterr().out
     assert "no LPIPS weights" in text
+    assert "8 bit" in text
+    assert "floats" in text
     assert "F-score" in text
     assert "Chamfer distance" in text
+
+
+def test_a_name_that_the_terminal_cannot_show_is_shown_as_its_numbers(trained: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(trained, tmp_path / "r\u00fcn"))
+    done = spawn(["info", str(copy)], env={**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
+    assert done.returncode == 0
+    assert f"{tmp_path}/r\\xfcn/mesh.ply" in done.stdout

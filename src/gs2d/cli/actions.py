@@ -134,8 +134,8 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
     )
     result = evaluate_run(command.run, options, console.on_event, threads=command.threads)
     console.close()
-    rows = [[split, *_scores(result.get(split))] for split in ("train", "test")]
-    console.table("", ["views", "PSNR dB", "SSIM", "LPIPS"], rows)
+    rows = [row for split in ("train", "test") for row in _both_scores(split, result.get(split))]
+    console.table("", ["views", "pictures", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
     for split in ("train", "test"):
         reason = (result.get(split) or {}).get("lpips_reason") or result.get(f"{split}_reason")
         if reason:
@@ -266,9 +266,13 @@ def show_run(path: Path, metrics: dict[str, Any], console: Console, definition: 
     console.result({"run": str(path), **metrics, **extra})
 
 
-def _scores(metrics: dict[str, Any] | None) -> list[str]:
+def _both_scores(split: str, metrics: dict[str, Any] | None) -> list[list[str]]:
+    """Two rows: from 8-bit pictures, as the official evaluation takes them, and from floats."""
     scores = metrics or {}
-    return [figure(scores.get("psnr"), 2), figure(scores.get("ssim"), 4), figure(scores.get("lpips"), 4)]
+    rounded = [figure(scores.get("psnr"), 2), figure(scores.get("ssim"), 4)]
+    floats = [figure(scores.get("psnr_float"), 2), figure(scores.get("ssim_float"), 4)]
+    lpips = [figure(scores.get(name), 4) for name in ("lpips", "lpips_signed")]
+    return [[split, "8 bit", *rounded, *lpips], ["", "floats", *floats, "", ""]]
 
 
 def _surface_table(surface: dict[str, Any] | None, console: Console) -> None:

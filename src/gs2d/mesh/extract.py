@@ -129,7 +129,7 @@ def extract_unbounded(
     min_weight : float
         See ``marching_cubes``.
     far_views : float
-        The same outside the innermost level, at most a quarter of the views.
+        The same outside the innermost level, at most half as many as there are views.
     min_faces, keep, max_bytes, threads, folder
         As for ``extract``.
 
@@ -161,7 +161,7 @@ def extract_unbounded(
             noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
             nest = nest.with_truncation(widen_truncation(inner, noise).truncation, noise)
         volumes = fuse_nested(spool, nest, max_bytes=max_bytes, threads=threads)
-    far_weight = min(far_views, volumes[0].frames / 4)
+    far_weight = min(far_views, volumes[0].frames / 2)
     whole = nested_marching_cubes(volumes, nest, min_weight=min_weight, far_weight=far_weight)
     limits = replace(nest.levels[0], lower=nest.levels[-1].lower, upper=nest.levels[-1].upper)
     return _extraction(whole, limits, volumes, min_faces=min_faces, keep=keep)

@@ -1,0 +1,115 @@
+"""LPIPS against the package's own code, as torchmetrics carries it, with the published heads and with random weights.
+
+torchmetrics holds a copy of ``lpips.py`` and ``pretrained_networks.py`` of the lpips package, and its files of heads
+(version 0.1). Its only change that matters here: features are divided by sqrt(|f|^2 + 1e-8), not by |f| + 1e-10.
+"""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import pytest
+import torch
+from test_images import head_state, vgg_state
+from torch import Tensor, nn
+
+from gs2d.errors import DataError
+from gs2d.evaluate.images import image_metrics
+from gs2d.evaluate.lpips import load_lpips
+
+package = pytest.importorskip("torchmetrics.functional.image.lpips")
+HEADS = Path(inspect.getfile(package)).parent / "lpips_models"
+# torchvision's VGG-16, configuration D: channels, M = max pooling
+LAYOUT = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512, "M")
+
+
+def features(state: dict[str, Tensor]) -> nn.Sequential:
+    """``torchvision.models.vgg16().features`` with given weights (torchvision itself is not needed)."""
+    layers: list[nn.Module] = []
+    width = 3
+    for entry in LAYOUT:
+        if entry == "M":
+            layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
+        else:
+            layers += [nn.Conv2d(width, int(entry), kernel_size=3, padding=1), nn.ReLU(inplace=True)]
+            width = int(entry)
+    network = nn.Sequential(*layers)
+    network.load_state_dict({key.removeprefix("features."): value for key, value in state.items()})
+    return network
+
+
+@pytest.fixture(scope="module")
+def vgg_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file as torchvision distributes it: the classifier's keys follow those of the features."""
+    path = tmp_path_factory.mktemp("vgg") / "vgg16-397923af.pth"
+    torch.save(vgg_state() | {f"classifier.{i}.bias": torch.zeros(4) for i in (0, 3, 6)}, path)
+    return path
+
+
+def oracle(monkeypatch: pytest.MonkeyPatch, heads: Path) -> nn.Module:
+    """The package's network over the same VGG."""
+    monkeypatch.setattr(package, "_get_tv_model_features", lambda net, pretrained: features(vgg_state()))
+    network: nn.Module = package._LPIPS(pretrained=True, net="vgg", model_path=str(heads))
+    return network
+
+
+def pair(seed: int) -> tuple[Tensor, Tensor]:
+    """Two images [40, 51, 3] in [0, 1]: smooth, and the same with noise."""
+    g = torch.Generator().manual_seed(seed)
+    rows, columns = torch.meshgrid(torch.linspace(0, 3, 40), torch.linspace(0, 4, 51), indexing="ij")
+    image = 0.5 + 0.4 * torch.stack([torch.sin(rows), torch.cos(columns), torch.sin(rows * columns)], dim=-1)
+    return image, (image + 0.1 * torch.randn(image.shape, generator=g)).clamp(0, 1)
+
+
+@pytest.mark.parametrize("published", [True, False], ids=["published heads", "random heads"])
+def test_lpips_is_that_of_the_package_for_the_same_weights_in_both_conventions(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, vgg_file: Path, published: bool
+) -> None:
+    heads = HEADS / "vgg.pth"
+    if not published:
+        heads = tmp_path / "vgg.pth"
+        torch.save(head_state(), heads)
+    theirs, ours = oracle(monkeypatch, heads), load_lpips([vgg_file, heads])
+    for seed in range(2):
+        image, target = pair(seed)
+        a, b = (x.permute(2, 0, 1)[None] for x in (image, target))
+        with torch.no_grad():
+            signed, unit = theirs(a, b, normalize=True).item(), theirs(a, b, normalize=False).item()
+        assert ours(image, target, convention="-1..1").item() == pytest.approx(signed, rel=2e-5)
+        assert ours(image, target, convention="0..1").item() == pytest.approx(unit, rel=2e-5)
+        assert abs(signed - unit) > 0.01 * signed  # two numbers: each must be named
+
+
+def test_the_published_heads_load_as_distributed(vgg_file: Path) -> None:
+    network = load_lpips([vgg_file, HEADS / "vgg.pth"])
+    heads = [network.weights[f"lin{b}.model.1.weight"] for b in range(5)]
+    assert [tuple(head.shape) for head in heads] == [(1, width, 1, 1) for width in (64, 128, 256, 512, 512)]
+    assert all(bool((head >= 0).all()) for head in heads)  # so that a distance is never negative
+
+
+@pytest.mark.parametrize(("name", "head"), [("alex", 1), ("squeeze", 3)])
+def test_heads_of_another_network_are_refused_in_one_line(vgg_file: Path, name: str, head: int) -> None:
+    """Channels: VGG 64 128 256 512 512, AlexNet 64 192 384 256 256, SqueezeNet 64 128 256 384 384 512 512."""
+    with pytest.raises(
+        DataError, match=rf"LPIPS weight lin{head}\.model\.1\.weight must be .*; pass --lpips"
+    ) as caught:
+        load_lpips([vgg_file, HEADS / f"{name}.pth"])
+    assert "\n" not in str(caught.value)
+
+
+def test_heads_alone_name_the_missing_network_and_a_network_alone_the_missing_heads(vgg_file: Path) -> None:
+    with pytest.raises(DataError, match=r"lack features\.0\.weight .*vgg16-397923af\.pth"):
+        load_lpips(HEADS / "vgg.pth")
+    with pytest.raises(DataError, match=r"lack lin0\.model\.1\.weight .*weights/v0\.1/vgg\.pth"):
+        load_lpips(vgg_file)
+
+
+def test_both_lpips_figures_are_of_the_8_bit_image_and_named(vgg_file: Path) -> None:
+    """A change below half a level of 255 vanishes in the 8-bit image, so that LPIPS does not see it."""
+    network = load_lpips([vgg_file, HEADS / "vgg.pth"])
+    target = torch.full((24, 24, 3), 100 / 255)
+    row = image_metrics(target + 0.4 / 255, target, backend_name="reference", lpips=network).to_json()
+    assert row["lpips"] == row["lpips_signed"] == 0.0
+    assert row["psnr"] is None  # equal after quantisation
+    assert row["psnr_float"] is not None
