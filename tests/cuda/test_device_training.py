@@ -44,7 +44,7 @@ pytestmark = pytest.mark.timeout(170)
 def emulated(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Backend:
     """The cuda backend with the emulator in the place of the GPU."""
     monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
-    return Backend("cuda", cuda.rasterize, cuda.splat_errors, device="cpu")
+    return Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize)
 
 
 @pytest.fixture(scope="module")

@@ -30,8 +30,12 @@ BROKEN = Facts(
 )
 MENDING = (
     ({}, "torch 2.15.0+cpu is built without CUDA", "CUDA build of torch"),
-    ({"torch_cuda": (13, 0)}, "cuda.bindings is not here (No module named 'cuda')", "pip install cuda-bindings"),
-    ({"bindings_error": ""}, "NVRTC is not here (libnvrtc not found)", "pip install nvidia-cuda-nvrtc"),
+    (
+        {"torch_cuda": (13, 0)},
+        "cuda.bindings is not here (No module named 'cuda')",
+        'pip install "cuda-bindings==13.*" "nvidia-cuda-nvrtc==13.*"',
+    ),
+    ({"bindings_error": ""}, "NVRTC is not here (libnvrtc not found)", '"nvidia-cuda-nvrtc==13.*"'),
     ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is here (libcuda not found)", "install NVIDIA's driver"),
     ({"driver_error": "", "driver": (12, 4)}, "driver supports CUDA 12.4, but torch is of CUDA 13.0", "update"),
     ({"torch_cuda": (12, 8)}, "driver supports CUDA 12.4, but NVRTC is of CUDA 13.0", "update"),
@@ -49,6 +53,12 @@ def test_each_missing_piece_is_named_in_order_with_its_remedy() -> None:
         assert reason in lacking.reason
         assert remedy in lacking.remedy
     assert missing(replace(facts, architecture_error="")) is None
+
+
+def test_bindings_and_compiler_are_of_the_cuda_version_of_torch() -> None:
+    lacking = missing(replace(WORKS, torch_cuda=(12, 8), bindings_error="none"))
+    assert lacking is not None
+    assert 'pip install "cuda-bindings==12.*" nvidia-cuda-nvrtc-cu12 ' in lacking.remedy
 
 
 def test_a_newer_minor_version_than_the_drivers_is_no_obstacle() -> None:

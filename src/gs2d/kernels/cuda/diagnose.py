@@ -13,7 +13,7 @@ import torch
 
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
-from gs2d.kernels.cuda.driver import BINDINGS_REMEDY, DRIVER_REMEDY, OLD_DRIVER, driver_version, load_driver
+from gs2d.kernels.cuda.driver import DRIVER_REMEDY, OLD_DRIVER, driver_version, load_driver
 
 __all__ = ["Facts", "Missing", "describe", "gather", "missing"]
 
@@ -74,9 +74,11 @@ def missing(facts: Facts) -> Missing | None:
             f"install a CUDA build of torch (on Linux plain `pip install torch` brings one), {ANYWAY}",
         )
     if facts.bindings_error:
-        return Missing(f"the Python package cuda.bindings is not here ({facts.bindings_error})", BINDINGS_REMEDY)
+        return Missing(
+            f"the Python package cuda.bindings is not here ({facts.bindings_error})", _install(facts.torch_cuda[0])
+        )
     if facts.nvrtc_error:
-        return Missing(f"the CUDA compiler NVRTC is not here ({facts.nvrtc_error})", nvrtc.REMEDY)
+        return Missing(f"the CUDA compiler NVRTC is not here ({facts.nvrtc_error})", _install(facts.torch_cuda[0]))
     if facts.driver_error or facts.driver is None:
         return Missing(f"no NVIDIA driver is here ({facts.driver_error})", DRIVER_REMEDY)
     for name, needs in (("torch", facts.torch_cuda), ("NVRTC", facts.nvrtc)):
@@ -92,6 +94,12 @@ def missing(facts: Facts) -> Missing | None:
         reason, _, remedy = facts.architecture_error.partition("; ")
         return Missing(f"{facts.devices[0][0]}: {reason}", remedy)
     return None
+
+
+def _install(major: int) -> str:
+    """How to get bindings and compiler of the CUDA version of torch: a mixture does not find its libraries."""
+    compiler = f'"nvidia-cuda-nvrtc=={major}.*"' if major >= 13 else f"nvidia-cuda-nvrtc-cu{major}"
+    return f'pip install "cuda-bindings=={major}.*" {compiler} (torch\'s CUDA wheels bring the compiler), {ANYWAY}'
 
 
 def describe(facts: Facts) -> str:
