@@ -282,6 +282,7 @@ def _surface_table(surface: dict[str, Any] | None, console: Console) -> None:
         [f"{row['threshold']:.4g}", *(figure(row[name], 4) for name in ("precision", "recall", "f_score"))]
         for row in surface.get("thresholds") or []
     ]
-    console.table("", ["surface within", "precision", "recall", "F-score"], rows)
+    if rows:
+        console.table("", ["surface within", "precision", "recall", "F-score"], rows)
     if surface.get("chamfer") is not None:
         console.say(f"Chamfer distance {surface['chamfer']:.5g} {surface.get('unit', 'world units')}")
