@@ -5,6 +5,10 @@ from __future__ import annotations
 import base64
 import csv
 import json
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -149,7 +153,9 @@ def test_the_figures_of_a_run_count_shared_stages_and_the_protocols_views(tmp_pa
     scores = {"psnr": 30.0, "ssim": 0.9, "lpips": None, "lpips_reason": "no weights"}
     last = {"name": "refine", "iterations": 1, "seconds": 2.0, "splats": 8, "bytes": 10, "test": scores}
     stages = [{**surface, "reused_from": "a cache"}, {**last, "train": {**scores, "psnr": 40.0}}]
-    (tmp_path / "run.json").write_text("{}")
+    place = {"name": "a", "path": ".", "format": "blender", "train": 1, "test": 1}
+    definition = {"format": 1, "recipe": {"name": "2dgs"}, "scene": place, "backend": {"name": "cpu"}}
+    (tmp_path / "run.json").write_text(json.dumps(definition))
     rows = [{"threshold": t, "precision": 1, "recall": 1, "f_score": t} for t in (0.1, 0.2, 0.3)]
     metrics = {"stages": stages, "surface": {"chamfer": 0.5, "thresholds": rows}}
     (tmp_path / "metrics.json").write_text(json.dumps(metrics))
@@ -326,6 +332,27 @@ def test_what_is_done_is_not_done_again(
     assert said.err.splitlines()[-1].startswith(
         "error: 4 of the runs failed, the table is written without them: broken-2dgs"
     )
+
+
+@pytest.mark.slow
+def test_a_command_killed_at_any_moment_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    write_capture(tmp_path / "data" / "ball", train=3, test=1, size=20)
+    words = ["paper", "modules", "--data", str(tmp_path / "data"), "--threads", "1", *TINY, "--quiet", "--out"]
+    killed, undisturbed = tmp_path / "killed", tmp_path / "undisturbed"
+    records = killed / "jobs"
+    with subprocess.Popen([sys.executable, "-m", "gs2d", *words, str(killed)]) as process:
+        while process.poll() is None and not (records / "ball-2dgs-r-module-ii-s0.claim").exists():
+            time.sleep(0.01)
+        time.sleep(0.3)  # somewhere in the second job
+        process.send_signal(signal.SIGKILL)
+    assert json.loads((records / "ball-2dgs-s0.json").read_text())["state"] == "done"
+    assert not (records / "ball-2dgs-r-s0.json").exists()
+    assert run([*words, str(killed)]) == run([*words, str(undisturbed)]) == 0
+    for name in ("ball-2dgs-s0", "ball-2dgs-r-module-ii-s0", "ball-2dgs-r-module-iii-s0", "ball-2dgs-r-s0"):
+        found = [(out / "runs" / name / "splats.ply").read_bytes() for out in (killed, undisturbed)]
+        assert found[0] == found[1]
+    tables = [json.loads((out / "table.json").read_text()) for out in (killed, undisturbed)]
+    assert [row["mean"]["psnr"] for row in tables[0]] == [row["mean"]["psnr"] for row in tables[1]]
 
 
 def test_a_folder_made_with_other_options_is_refused(finished: tuple[Path, list[str]]) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from gs2d.errors import Gs2dError
 from gs2d.images import image_size
+from gs2d.io.run import machine, versions
 from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, PaperTable
 from gs2d.pipeline.paper_rows import NOT_YET, Results
 from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes
@@ -31,6 +32,14 @@ def deviations_of(
         found.append("F-score on NeRF-Synthetic is by this project's own protocol: the paper states none")
     count, names = len(options.seeds), ", ".join(map(str, options.seeds))
     found.append(f"{count} seed{'s' if count > 1 else ''} ({names}); the paper does not say how many")
+    host, installed = machine(), versions()
+    backends = ", ".join(
+        sorted({cell.details["backend"] for row in results.rows for cell in row.cells if cell.details})
+    )
+    found.append(
+        f"machine: {host['processor']}, {host['cores']} cores, backend {backends or 'none yet'} (paper: RTX 4090); "
+        f"gs2d {installed['2dgs-r']}, torch {installed['torch']}, Python {installed['python']}"
+    )
     return found
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import Gs2dError
-from gs2d.io.run import is_run, open_run
+from gs2d.io.run import open_run
 from gs2d.paper_tables import DTU, LOWER_IS_BETTER, METRICS, Order, PaperTable
 
 FIGURES = (*METRICS, "bytes", "seconds")
@@ -139,7 +139,8 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
         why = record.get("reason") or NOT_YET[record["state"] == "running"]
         return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, str(why)), **place)
     try:
-        metrics = open_run(run).metrics() if is_run(run) else {"stages": []}
+        folder = open_run(run)
+        metrics, backend = folder.metrics(), _backend(folder.definition())
     except Gs2dError as error:
         return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, str(error)), **place)
     if not metrics["stages"]:
@@ -159,12 +160,18 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
     for name in (n for n in ("fscore", "chamfer") if figures[n] is None):
         reasons[name] = notes.get("surface") or (metrics.get("surface") or {}).get("reason") or "no ground truth"
     details = {
+        "backend": backend,
         "splats": last["splats"],
         "views": test_on,
         "surface": metrics.get("surface"),
         "stages": [{"name": s["name"], "seconds": s["seconds"], **_scores(s, test_on)} for s in metrics["stages"]],
     }
     return Cell(figures=figures, reasons=reasons, details=details, **place)
+
+
+def _backend(definition: dict[str, Any]) -> str:
+    """The backend that trained a run, by its name."""
+    return str((definition.get("backend") or {}).get("name", "unknown"))
 
 
 def _scores(stage: dict[str, Any], test_on: str) -> dict[str, Any]:
