@@ -200,6 +200,9 @@ def _drop(*path: Any) -> Any:
         (lambda m: (m.pop("fl_x"), m.pop("fl_y")), 'must have a focal length, "fl_x" or "camera_angle_x"'),
         (lambda m: m.update(fl_x="35"), "fl_x must be a finite number, got '35'"),
         (lambda m: m.update(fl_x=-35.0), "positive size and focal length"),
+        (lambda m: m.update(fl_x=10**400), "fl_x must be a finite number, got '1000"),
+        (lambda m: m.update(fl_x=1e12), r"a focal length of 0.01 to 100000 times .* got 1e.12, 36 px for 40x30"),
+        (lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, 10**400), "beyond all floats"),
         (lambda m: m["frames"][1]["transform_matrix"][0].__setitem__(3, math.nan), "f_01.png.*finite"),
         (lambda m: m["frames"][1]["transform_matrix"].pop(), None),
         (lambda m: m["frames"][1].update(transform_matrix=[[1, 2], [3]]), "must be a 4x4 matrix"),
@@ -221,6 +224,15 @@ def test_a_wrong_json_is_one_line_that_names_frame_and_key(tmp_path: Path, chang
     with pytest.raises(DataError, match=message) as caught:
         load_scene(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_photograph_of_another_folder_keeps_its_whole_path_as_its_name(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    write_picture(tmp_path / "elsewhere" / "x.png")
+    there = tmp_path / "elsewhere" / "x.png"
+    edit(tmp_path / "capture" / "transforms.json", lambda m: m["frames"][1].update(file_path=str(there)))
+    names = {view.name for view in load_scene(tmp_path / "capture").views}
+    assert there.as_posix().lstrip("/") in names
 
 
 def test_a_file_that_is_not_json_is_an_error_with_the_line(tmp_path: Path) -> None:

@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from ball_runs import Stop, options
+from gs2d.data import View
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.ply import read_mesh, read_splats, write_mesh
 from gs2d.io.run import RunFolder, open_run
 from gs2d.pipeline.events import Event, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.pictures import file_name
 from gs2d.pipeline.train import train
 from gs2d.triangles import Mesh
-from tiny import write_ball_mesh
+from tiny import ball_cameras, write_ball_mesh
 
 
 def test_meshing_again_keeps_to_the_box_and_the_voxel(undisturbed: RunFolder, tmp_path: Path) -> None:
@@ -120,9 +122,17 @@ def test_rendering_writes_one_png_for_each_view(undisturbed: RunFolder, tmp_path
     assert sorted(p.name for p in (tmp_path / "orbit").iterdir()) == ["0000.png", "0001.png", "0002.png"]
 
 
-def test_an_orbit_looks_at_the_focus_from_a_constant_height() -> None:
-    from tiny import ball_cameras
+def test_views_with_long_names_have_short_files_that_differ() -> None:
+    def name_of(name: str) -> str:
+        return file_name(View.from_arrays(name, ball_cameras(1, 2)[0], np.zeros((2, 2, 3), np.uint8)))
 
+    names = [name_of(f"test/{'é' * 200}{end}.png") for end in "ab"]
+    assert all(len(f".{name}.high_error.png.1234567.12345678.tmp".encode()) <= 255 for name in names)
+    assert names[0] != names[1]
+    assert name_of("test/r_0.png") == "test__r_0"
+
+
+def test_an_orbit_looks_at_the_focus_from_a_constant_height() -> None:
     circle = orbit_cameras(ball_cameras(12), 8)
     centers = np.array([camera.center for camera in circle])
     for camera in circle:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 
@@ -21,6 +22,10 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     # Before torch loads: its OpenMP threads would spin at every barrier, which costs 3x where the cores are shared.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from gs2d.cli.app import leave
+
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # None if it is closed
+            stream.reconfigure(errors="backslashreplace")  # a terminal that cannot show a name shows its numbers
 
     code = run(sys.argv[1:] if argv is None else argv)
     ignore()  # the result is known; Python only has to shut down

@@ -24,6 +24,8 @@ from gs2d.images import area_downscale, image_size, mask_downscale, read_image, 
 # An image may differ from its camera's size by a factor; each axis may then be off by rounding.
 _ASPECT_TOLERANCE = 0.01
 
+_LENSES = (0.01, 1e5)  # focal length / side: fields of view from 178.9 degrees down to 2 arc seconds
+
 LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
 
@@ -137,6 +139,8 @@ def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np
         M = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DataError(f"{where} must be a 4x4 matrix of numbers, got {str(matrix)[:60]}") from error
+    except OverflowError as error:
+        raise DataError(f"{where} must be finite, got a number beyond all floats; remove this frame") from error
     if M.shape not in ((4, 4), (3, 4)):
         raise DataError(f"{where} must be a 4x4 matrix, got shape {list(M.shape)}")
     if not np.isfinite(M).all():
@@ -235,6 +239,11 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
 
 def _view(frame: Frame, factor: int, cache: ImageCache, lens_maps: LensMaps) -> View:
     k = frame.intrinsics
+    if not all(_LENSES[0] <= f / side <= _LENSES[1] for f, side in ((k.fx, k.width), (k.fy, k.height))):
+        raise DataError(
+            f"view {frame.name}: a focal length of {_LENSES[0]:g} to {_LENSES[1]:g} times the image's side expected, "
+            f"got {k.fx:.4g}, {k.fy:.4g} px for {k.width}x{k.height} px; is it in pixels?"
+        )
     try:
         camera = Camera(k.width, k.height, k.fx, k.fy, k.cx, k.cy, frame.T_cam_world).downscaled(factor)
     except ShapeError as error:

@@ -18,6 +18,7 @@ from gs2d.images import image_size
 from gs2d.io.files import read_json
 from gs2d.io.ply import read_points
 
+_LARGEST = 1e300  # JSON has whole numbers of any size
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE"}
@@ -107,7 +108,8 @@ def _read_frames(
             _required(entry, "transform_matrix", where), f"{where} ({name}): transform_matrix", opengl=True
         )
         intrinsics = frame_intrinsics({**meta, **entry}, image, f"{where} ({name})")
-        frames.append(Frame(image.relative_to(root).as_posix(), image, intrinsics, pose, split, mask=mask))
+        inside = image.relative_to(root) if image.is_relative_to(root) else Path(*image.parts[1:])  # of another folder
+        frames.append(Frame(inside.as_posix(), image, intrinsics, pose, split, mask=mask))
     notes = [f"{missing_masks} masks named in {path.name} do not exist"] if missing_masks else []
     return frames, skipped, notes
 
@@ -148,8 +150,8 @@ def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intri
         value = entry.get(key)
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise DataError(f"{where}: {key} must be a finite number, got {value!r}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
+            raise DataError(f"{where}: {key} must be a finite number, got {str(value)[:40]!r}")
         return float(value)
 
     w, h = number("w"), number("h")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from gs2d.sh import rgb_to_sh0
 from gs2d.splats import Splats
 
 INDEX = "index.json"
+LONGEST_NAME = 180  # bytes; file systems take 255, and a picture's kind and a temporary suffix come after it
 IMAGES = ("color", "normal", "depth", "error", "high_error")
 
 
@@ -36,8 +38,12 @@ def choose_views(scene: Scene, count: int) -> list[tuple[str, View]]:
 
 
 def file_name(view: View) -> str:
-    """A view's name as the start of a file name."""
-    return Path(view.name.replace("/", "__")).stem
+    """A view's name as the start of a file name; a long one is cut, and a hash of the whole tells it from others."""
+    name = Path(view.name.replace("/", "__")).stem
+    whole = name.encode()
+    if len(whole) <= LONGEST_NAME:
+        return name
+    return whole[:LONGEST_NAME].decode(errors="ignore") + "-" + hashlib.sha256(whole).hexdigest()[:8]
 
 
 def draw_stage(
