@@ -13,6 +13,7 @@ from typing import IO, Any
 
 from gs2d.errors import DiskError
 
+_ESCAPED = "backslashreplace"  # a file name that is not UTF-8 is written as \udcff, which JSON reads back
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another folder",
     errno.EDQUOT: "free some of your quota or choose another folder",
@@ -77,7 +78,7 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
         raise disk_error(target, error) from error
     try:
         buffer = io.BufferedWriter(raw, 1 << 20)
-        file: IO[Any] = io.TextIOWrapper(buffer, encoding="utf-8", newline="\n") if mode == "w" else buffer
+        file: IO[Any] = io.TextIOWrapper(buffer, "utf-8", _ESCAPED, newline="\n") if mode == "w" else buffer
         try:
             yield file
             file.flush()

@@ -176,3 +176,10 @@ def test_a_missing_json_is_one_line_and_a_byte_order_mark_is_no_error(tmp_path: 
         read_json(tmp_path / "gone.json")
     (tmp_path / "bom.json").write_bytes(b"\xef\xbb\xbf[1]")
     assert read_json(tmp_path / "bom.json") == [1]
+
+
+def test_a_file_name_that_is_no_utf_8_survives_json(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9")  # Latin-1
+    write_json(tmp_path / "x.json", {"path": name})
+    assert read_json(tmp_path / "x.json") == {"path": name}
+    assert os.fsencode(read_json(tmp_path / "x.json")["path"]) == b"caf\xe9"
