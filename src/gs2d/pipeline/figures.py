@@ -151,7 +151,8 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
         when = f"after {job.recipe.stages[index - 1].name}"
     else:
         splats, when = finished_splats(run), "final splats"
-    total = torch.zeros(len(splats), dtype=torch.float64)
+    splats = splats.to(job.backend.device)
+    total = torch.zeros(len(splats), dtype=torch.float64, device=splats.device)
     views = job.scene.train
     for view in counted(views, "errors of each splat", len(views), on_event):
         image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
@@ -165,8 +166,8 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
             mask=None if mask is None else torch.from_numpy(mask).to(splats.device),
             occlusion=action.occlusion,
         )
-        total += errors.cpu()
-    group = torch.zeros(len(splats), dtype=torch.bool)
+        total += errors
+    group = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
     group[worst(total, action.top_percent)] = True
     return Ranking(splats, total, group, when)
 

@@ -19,7 +19,7 @@ from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.restart import Start, put_in_cache
-from gs2d.pipeline.scoring import PeakMemory, score_views, split_metrics
+from gs2d.pipeline.scoring import PeakGpuMemory, PeakMemory, score_views, split_metrics
 from gs2d.recipe import CloneInPlace, Stage
 from gs2d.splats import Splats
 from gs2d.train import events as train_events
@@ -42,7 +42,7 @@ class Recorder:
             :: max(1, len(job.scene.test or job.scene.train) // PROBE_VIEWS)
         ]
         self._probes = self._probes[:PROBE_VIEWS]
-        self._memory = PeakMemory()
+        self._memory, self._gpu_memory = PeakMemory(), PeakGpuMemory(job.backend)
         self._stage_clock = 0.0  # perf_counter() at which the stage would have begun without breaks
         self._seconds, self._peak = start.seconds, start.peak_memory
         self._at_entry = dict(start.at_entry)
@@ -81,6 +81,7 @@ class Recorder:
         elif isinstance(event, train_events.StageEntering):
             self._seconds, self._peak, self._at_entry, self._saved_iteration = 0.0, 0, {}, 0
             self._memory.reset()
+            self._gpu_memory.reset()
             self._start_clock()
             self._log("stage_entering", event)
         elif isinstance(event, train_events.StageStarted):
@@ -201,6 +202,8 @@ class Recorder:
             "bytes": state.splats.nbytes,
             "peak_memory_bytes": self._peak,
         }
+        if self._gpu_memory.read():
+            entry["peak_gpu_memory_bytes"] = self._gpu_memory.read()  # before scoring adds to it
         for split, views in (("train", self._job.scene.train), ("test", self._job.scene.test)):
             scores = self._score(state.splats, views, f"scoring {split} views", self._on_event)
             entry |= split_metrics(scores, split)

@@ -58,6 +58,22 @@ def split_metrics(scores: dict[str, ImageMetrics], split: str) -> dict[str, Any]
     return {split: mean_metrics(list(scores.values())).to_json()}
 
 
+class PeakGpuMemory:
+    """Peak of torch's memory on the current GPU since :meth:`reset`; 0 where the backend uses none."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._used = backend.device == "cuda"
+
+    def reset(self) -> None:
+        """Start again from what is allocated now."""
+        if self._used:
+            torch.cuda.reset_peak_memory_stats()
+
+    def read(self) -> int:
+        """Bytes."""
+        return int(torch.cuda.max_memory_allocated()) if self._used else 0
+
+
 class PeakMemory:
     """Peak resident memory of this process since :meth:`reset` (Linux), or since it started (elsewhere)."""
 
