@@ -39,6 +39,7 @@ GS2D_HD double abs(double a) { return __builtin_fabs(a); }
 GS2D_HD double exp(double a) { return __builtin_exp(a); }
 GS2D_HD double exp2(double a) { return __builtin_exp2(a); }
 GS2D_HD double log2(double a) { return __builtin_log2(a); }
+GS2D_HD double ceil(double a) { return __builtin_ceil(a); }
 #endif
 
 // select(m, a, b) is a where m holds, else b; keep(m, a) is a or 0. min(a, b) is b when a is NaN.

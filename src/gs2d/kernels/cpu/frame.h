@@ -10,6 +10,7 @@
 
 #include "core/blend.h"
 #include "core/project.h"
+#include "core/tile.h"
 #include "cpu/simd.h"
 
 namespace gs2d {
@@ -83,9 +84,7 @@ struct CullRecord {
     real cx, cy, disc2;  // disc2 < 0: unbounded, covers everything
 };
 
-struct TileRect {
-    uint16_t x0, y0, x1, y1;  // tiles, half open; empty for culled splats
-};
+using TileRect = TileRectangle;
 
 constexpr uint32_t ALL_BLOCKS = BLOCKS == 32 ? 0xffffffffu : (1u << (BLOCKS % 32)) - 1u;
 

@@ -11,15 +11,12 @@
 namespace gs2d {
 namespace {
 
-constexpr int RADIUS = 5, TAPS = 2 * RADIUS + 1;
-// exp(-k^2 / 4.5), k = 0..5, divided by the sum over k = -5..5
-constexpr double WINDOW[RADIUS + 1] = {0.2660117248617943,   0.21300553771125366,   0.1093606895097,
-                                       0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
+constexpr int RADIUS = SSIM_RADIUS, TAPS = SSIM_TAPS;
 
 // The window over 11 values `at(k)`, k = -5..5.
 template <class F> GS2D_HD V window(F at) {
-    V sum = V(real(WINDOW[0])) * at(0);
-    for (int k = 1; k <= RADIUS; ++k) sum = fma(V(real(WINDOW[k])), at(-k) + at(k), sum);
+    V sum = V(real(SSIM_WINDOW[0])) * at(0);
+    for (int k = 1; k <= RADIUS; ++k) sum = fma(V(real(SSIM_WINDOW[k])), at(-k) + at(k), sum);
     return sum;
 }
 

@@ -19,11 +19,7 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     g.parameters = load_parameters(s, i, lanes);
     g.frame = frame_of(g.parameters, f.camera);
     g.record = project(g.parameters, g.frame, f.camera);
-    const auto& p = g.parameters;
-    // A sum of absolute values is finite only if every term is. (gcc 12 folds 0 * x to 0 with -fno-signed-zeros.)
-    const V size = abs(p.mean.x) + abs(p.mean.y) + abs(p.mean.z) + abs(p.logit) + abs(p.qw) + abs(p.qx) + abs(p.qy) +
-                   abs(p.qz) + abs(p.log_su) + abs(p.log_sv) + exp(p.log_su) + exp(p.log_sv) + g.frame.inverse_norm;
-    g.alive = is_finite(size) & (g.record.zc > V(real(f.view.near))) & first(lanes);
+    g.alive = is_finite(parameter_size(g.parameters, g.frame)) & (g.record.zc > V(real(f.view.near))) & first(lanes);
     if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
     return g;
 }
@@ -39,34 +35,6 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     g.alive = g.alive & is_finite(size);
     const Vec3<V> c = sh_color(sh, basis, degree);
     g.record.red = max(c.x, V(0)), g.record.green = max(c.y, V(0)), g.record.blue = max(c.z, V(0));
-}
-
-inline int tile_floor(real px, int tiles) {  // first tile that reaches px; px may be anything but NaN
-    const real t = px * real(1.0 / TILE);
-    return t <= 0 ? 0 : t >= real(tiles) ? tiles : static_cast<int>(t);
-}
-
-// Tiles whose pixel centres the widened box can reach, and the radius of rule 14.
-inline TileRect rect_of(const Frame& f, real x_min, real y_min, real x_max, real y_max, bool unbounded) {
-    if (unbounded) return {0, 0, uint16_t(f.tiles_x), uint16_t(f.tiles_y)};
-    const real margin = real(0.05);
-    const real x0 = x_min - margin, y0 = y_min - margin, x1 = x_max + margin, y1 = y_max + margin;
-    if (!(x1 >= real(0.5) && y1 >= real(0.5) && x0 <= real(f.view.width) - real(0.5) && y0 <= real(f.view.height) - real(0.5)))
-        return {0, 0, 0, 0};
-    const int tx0 = tile_floor(x0 - real(0.5), f.tiles_x), ty0 = tile_floor(y0 - real(0.5), f.tiles_y);
-    const int tx1 = tile_floor(x1 - real(0.5), f.tiles_x), ty1 = tile_floor(y1 - real(0.5), f.tiles_y);
-    return {uint16_t(tx0), uint16_t(ty0), uint16_t(tx1 < f.tiles_x ? tx1 + 1 : f.tiles_x),
-            uint16_t(ty1 < f.tiles_y ? ty1 + 1 : f.tiles_y)};
-}
-
-inline real clipped_radius(const View& v, real x_min, real y_min, real x_max, real y_max, bool crosses) {
-    const real w = real(v.width), h = real(v.height);
-    if (crosses) return (w > h ? w : h) / 2;
-    const real x0 = x_min > 0 ? x_min : real(0), x1 = x_max < w ? x_max : w;
-    const real y0 = y_min > 0 ? y_min : real(0), y1 = y_max < h ? y_max : h;
-    const real half = real(0.5);
-    if (!(__builtin_ceil(x0 - half) + half <= x1 && __builtin_ceil(y0 - half) + half <= y1)) return 0;
-    return (x1 - x0 > y1 - y0 ? x1 - x0 : y1 - y0) / 2;
 }
 
 }  // namespace
@@ -104,8 +72,9 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const uint32_t unbounded = bits(o.unbounded), crosses = bits(o.crosses);
             for (int l = 0; l < lanes; ++l) {
                 if (!(alive >> l & 1)) continue;
-                f.rects[i + l] = rect_of(f, box[0][l], box[1][l], box[2][l], box[3][l], unbounded >> l & 1);
-                if (radii) radii[i + l] = clipped_radius(f.view, box[0][l], box[1][l], box[2][l], box[3][l], crosses >> l & 1);
+                const PixelBox<real> o_l = {box[0][l], box[1][l], box[2][l], box[3][l]};
+                f.rects[i + l] = tile_rectangle(o_l, unbounded >> l & 1, f.view.width, f.view.height, f.tiles_x, f.tiles_y);
+                if (radii) radii[i + l] = clipped_radius(o_l, crosses >> l & 1, f.view.width, f.view.height);
             }
         }
     });

@@ -63,17 +63,6 @@ inline void load_sh(const Parameters& s, int64_t first, int lanes, int degree, V
 
 inline M is_finite(V a) { return abs(a) < V(__builtin_inff()); }  // false for NaN
 
-// SH colour + 1/2, not clamped.
-inline Vec3<V> sh_color(const V* sh, const V* basis, int degree) {
-    Vec3<V> c = {V(real(0.5)), V(real(0.5)), V(real(0.5))};
-    for (int k = 0; k < sh_count(degree); ++k) {
-        c.x = fma(basis[k], sh[3 * k], c.x);
-        c.y = fma(basis[k], sh[3 * k + 1], c.y);
-        c.z = fma(basis[k], sh[3 * k + 2], c.z);
-    }
-    return c;
-}
-
 inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
     if (p) memset(p + first * stride, 0, size_t(lanes * stride) * sizeof(real));
 }

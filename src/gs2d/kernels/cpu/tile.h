@@ -93,24 +93,16 @@ struct BlockBoxes {
     }
 };
 
-// Bit b: the splat's ellipse or low-pass disc reaches a pixel centre of block b, or nearly so. The least value of a
-// convex quadratic over a box that does not hold its minimum is on a side that faces the minimum: two candidates.
+// Bit b: the splat's ellipse or low-pass disc reaches a pixel centre of block b, or nearly so.
 inline uint32_t blocks_touched(const CullRecord& s, const BlockBoxes& boxes, real tile_x, real tile_y) {
     if (s.disc2 < 0) return ALL_BLOCKS;
-    const V ex = V(s.ex - tile_x), ey = V(s.ey - tile_y), a = V(s.a), b = V(s.b), c = V(s.c), one = V(1);
-    const V cx = V(s.cx - tile_x), cy = V(s.cy - tile_y), disc2 = V(s.disc2);
-    const V slope_y = V(-s.b / s.c), slope_x = V(-s.b / s.a);
+    const BoxTest<V> test = {V(s.ex - tile_x), V(s.ey - tile_y), V(s.a), V(s.b), V(s.c),
+                             V(s.cx - tile_x), V(s.cy - tile_y), V(s.disc2), V(-s.b / s.c), V(-s.b / s.a)};
     uint32_t mask = 0;
     for (int i = 0; i < BLOCKS / LANES; ++i) {
         const V x0 = boxes.x0[i], y0 = boxes.y0[i];
         const V x1 = x0 + V(real(BLOCK_W - 1)), y1 = y0 + V(real(BLOCK_H - 1));
-        const V px = min(max(ex, x0), x1) - ex, py = min(max(ey, y0), y1) - ey;  // nearest in x, in y
-        const V qy = min(max(fma(slope_y, px, ey), y0), y1) - ey;                // best y on the side x = px
-        const V qx = min(max(fma(slope_x, py, ex), x0), x1) - ex;
-        const V f1 = fma(a * px, px, fma(c * qy, qy, V(2) * b * px * qy));
-        const V f2 = fma(a * qx, qx, fma(c * py, py, V(2) * b * qx * py));
-        const V dx = min(max(cx, x0), x1) - cx, dy = min(max(cy, y0), y1) - cy;
-        mask |= bits((f1 <= one) | (f2 <= one) | (fma(dx, dx, dy * dy) <= disc2)) << (i * LANES % 32);
+        mask |= bits(reaches(test, x0, y0, x1, y1)) << (i * LANES % 32);
     }
     return mask;
 }

@@ -33,6 +33,24 @@ __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
 
 __device__ __forceinline__ bool is_finite(float a) { return abs(a) <= 3.402823466e38f; }  // false for NaN
 
+// A splat against the sub-blocks of a tile: cull record ex, ey, a, b, c, cx, cy, disc2 (negative: unbounded).
+struct Culling {
+    BoxTest<float> test;
+    bool unbounded;
+    // Relative to the tile's first pixel, so that large coordinates do not cost digits.
+    __device__ __forceinline__ Culling(const float* cull, int left, int top) {
+        const float4* from = reinterpret_cast<const float4*>(cull);
+        const float4 lo = from[0], hi = from[1];
+        const float x = float(left), y = float(top), a = lo.z, b = lo.w, c = hi.x;
+        test = {lo.x - x, lo.y - y, a, b, c, hi.y - x, hi.z - y, hi.w, -b / c, -b / a};
+        unbounded = hi.w < 0.f;
+    }
+    __device__ __forceinline__ bool reaches_block(int block) const {  // columns (block & 1) * 8, rows (block >> 1) * 4
+        const float x = float((block & 1) * 8) + 0.5f, y = float((block >> 1) * 4) + 0.5f;
+        return unbounded || reaches(test, x, y, x + 7.f, y + 3.f);
+    }
+};
+
 // A record or any other row of 16 floats on a 64-byte boundary, four at a time.
 __device__ __forceinline__ Record<float> record_of(const float4& a, const float4& b, const float4& c, const float4& d) {
     return {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w, d.x, d.y, d.z, d.w};

@@ -53,20 +53,13 @@ template <class Key> __device__ __forceinline__ void emit(const EmitArguments& a
     const int tile_x = x0 + j % columns, tile_y = y0 + j / columns;
     const int left = tile_x * TILE_PX, top = tile_y * TILE_PX;
 
-    float cull[8];
-    const float4* from = reinterpret_cast<const float4*>(a.cull + 8 * splat);
-    const float4 lo = from[0], hi = from[1];
-    // Relative to the tile, so that large coordinates do not cost digits.
-    cull[0] = lo.x - float(left), cull[1] = lo.y - float(top), cull[2] = lo.z, cull[3] = lo.w;
-    cull[4] = hi.x, cull[5] = hi.y - float(left), cull[6] = hi.z - float(top), cull[7] = hi.w;
-    const BoxTest<float> test = box_test(cull);
+    const Culling culling(a.cull + 8 * splat, left, top);
     uint mask = 0;
 #pragma unroll
     for (int b = 0; b < 8; ++b) {
         const int bx = (b & 1) * 8, by = (b >> 1) * 4;
         const bool inside = left + bx < a.width && top + by < a.height;
-        const float x = float(bx) + 0.5f, y = float(by) + 0.5f;
-        const bool touched = !a.exact || reaches(test, x, y, x + 7.f, y + 3.f);
+        const bool touched = !a.exact || culling.reaches_block(b);
         mask |= uint(inside && touched) << b;
     }
     static_cast<Key*>(a.keys)[i] = Key(mask ? tile_y * a.tiles_x + tile_x : a.tiles_x * a.tiles_y);

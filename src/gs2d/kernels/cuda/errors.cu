@@ -1,5 +1,5 @@
 // Splat errors (rule 17): one warp per splat, over the pixels of its rectangle of tiles, in a fixed order.
-#include "cuda/common.h"
+#include "cuda/reduce.h"
 
 namespace gs2d {
 
@@ -31,14 +31,10 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors(ErrorArguments a)
         const int x0 = rect[0], y0 = rect[1], columns = rect[2] - x0;
         for (int t = 0; t < tiles; ++t) {
             const int left = (x0 + t % columns) * TILE_PX, top = (y0 + t / columns) * TILE_PX;
-            const float fx = float(left), fy = float(top);
-            const float cull[8] = {a.cull[8 * splat] - fx,     a.cull[8 * splat + 1] - fy, a.cull[8 * splat + 2], a.cull[8 * splat + 3],
-                                   a.cull[8 * splat + 4], a.cull[8 * splat + 5] - fx, a.cull[8 * splat + 6] - fy, a.cull[8 * splat + 7]};
-            const BoxTest<float> test = box_test(cull);
+            const Culling culling(a.cull + 8 * splat, left, top);
             for (int b = 0; b < 8; ++b) {
                 const int bx = (b & 1) * 8, by = (b >> 1) * 4;
-                const float cx = float(bx) + 0.5f, cy = float(by) + 0.5f;
-                if (!reaches(test, cx, cy, cx + 7.f, cy + 3.f)) continue;
+                if (!culling.reaches_block(b)) continue;
                 const int x = left + bx + (lane & 7), y = top + by + (lane >> 3);
                 if (x >= v.width || y >= v.height) continue;
                 const int64 at = int64(y) * v.width + x;
@@ -50,8 +46,7 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors(ErrorArguments a)
             }
         }
     }
-#pragma unroll
-    for (int step = 16; step > 0; step >>= 1) total = total + __shfl_xor_sync(FULL_MASK, total, step);
+    total = sum_over_warp(total);
     if (lane == 0) a.errors[splat] = total;
 }
 

@@ -8,7 +8,7 @@ struct ProjectArguments {
     int64 count, sh_rest;  // N; coefficients stored in shN per splat
     const float *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
     float* records;    // [N, 16]
-    float* cull;       // [N, 8], see box_test
+    float* cull;       // [N, 8], see Culling in common.h
     int* depth_keys;   // [N]; the bits of z_c, which sort as integers; those of infinity where culled
     ushort* rects;     // [N, 4]: x0, y0, x1, y1 in tiles
     int* tile_counts;  // [N]: tiles in the rectangle
@@ -30,10 +30,7 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     const SplatParameters<float> p = load_parameters(a, i);
     const Frame3<float> frame = frame_of(p, v.camera);
     Record<float> r = project(p, frame, v.camera);
-    // A sum of absolute values is finite only if every term is.
-    const float size = abs(p.mean.x) + abs(p.mean.y) + abs(p.mean.z) + abs(p.logit) + abs(p.qw) + abs(p.qx) + abs(p.qy) +
-                       abs(p.qz) + abs(p.log_su) + abs(p.log_sv) + exp(p.log_su) + exp(p.log_sv) + frame.inverse_norm;
-    if (!is_finite(size) || !(r.zc > v.near)) return;
+    if (!is_finite(parameter_size(p, frame)) || !(r.zc > v.near)) return;
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
     float sh_size;
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
@@ -43,8 +40,9 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
 
     const float k2 = a.errors ? v.error_k2 : max(float(2 * LN2) * (r.log2_opacity - v.log2_alpha_min), 0.f);
     const Footprint<float> o = footprint(frame, r, k2, v.lowpass_px, v.camera);
-    const TileRectangle rect = tile_rectangle(o, v.width, v.height, v.tiles_x, v.tiles_y);
-    a.radii[i] = clipped_radius(o, v.width, v.height);
+    const PixelBox<float> box = {o.x_min, o.y_min, o.x_max, o.y_max};
+    const TileRectangle rect = tile_rectangle(box, o.unbounded, v.width, v.height, v.tiles_x, v.tiles_y);
+    a.radii[i] = clipped_radius(box, o.crosses, v.width, v.height);
     const int tiles = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
     if (tiles == 0) return;
     float4* to = reinterpret_cast<float4*>(a.records + RECORD * i);
