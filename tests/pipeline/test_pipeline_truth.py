@@ -1,0 +1,67 @@
+"""``gs2d evaluate`` with the ground truth that lies beside the capture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from gs2d.errors import DataError, RunError
+from gs2d.evaluate.surface import evaluate_surface
+from gs2d.io.run import RunFolder, open_run
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.jobs import evaluate_run, mesh_run
+from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from tiny import write_ball_mesh
+
+
+@pytest.fixture
+def beside(undisturbed: RunFolder, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """A copy of the run whose capture has a true mesh beside its photographs; and that capture."""
+    monkeypatch.setattr("gs2d.pipeline.truth.evaluate_surface", partial(evaluate_surface, samples=2000))
+    run, folder = tmp_path / "run", tmp_path / "ball"
+    shutil.copytree(undisturbed.path, run)
+    shutil.copytree(capture, folder)
+    write_ball_mesh(folder / "mesh_gt.ply")
+    write_ball_mesh(run / "mesh.ply")
+    definition = json.loads((run / "run.json").read_text())
+    definition["scene"]["path"] = str(folder)
+    (run / "run.json").write_text(json.dumps(definition))
+    return run, folder
+
+
+def test_a_true_mesh_beside_the_capture_is_used_and_meshing_again_forgets_its_score(beside: tuple[Path, Path]) -> None:
+    run, folder = beside
+    heard: list[Event] = []
+    surface = evaluate_run(run, EvaluateOptions(), heard.append)["surface"]
+    assert f"ground truth: {folder / 'mesh_gt.ply'}" in [e.text for e in heard if isinstance(e, Notice)]
+    assert surface["evaluator"] == "visible-surface"
+    assert surface["f_score"] == surface["thresholds"][1]["f_score"] > 0.99  # the same surface
+    assert surface["self_check"] == {"ok": True, "messages": []}
+    assert open_run(run).metrics()["surface"] == json.loads(json.dumps(surface))
+    for name in surface["files"].values():
+        assert (run / name).is_file()
+    mesh_run(run, MeshOptions(voxel=0.2, truncation=0.6))
+    assert open_run(run).metrics()["surface"] is None
+    assert not (run / "surface").exists()
+
+
+def test_without_a_mesh_a_truth_that_was_asked_for_is_an_error_and_one_that_was_found_is_told(
+    beside: tuple[Path, Path],
+) -> None:
+    run, folder = beside
+    (run / "mesh.ply").unlink()
+    with pytest.raises(RunError, match="has no mesh.ply; make it with `gs2d mesh"):
+        evaluate_run(run, EvaluateOptions(ground_truth=folder / "mesh_gt.ply"))
+    heard: list[Event] = []
+    evaluate_run(run, EvaluateOptions(), heard.append)
+    assert any("the surface is not scored: no mesh.ply" in e.text for e in heard if isinstance(e, Notice))
+
+
+def test_a_folder_without_a_ground_truth_is_refused(beside: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="must hold the official ground truth of a scene of DTU or Tanks and Temples"):
+        evaluate_run(beside[0], EvaluateOptions(ground_truth=tmp_path / "empty"))
