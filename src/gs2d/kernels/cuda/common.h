@@ -47,7 +47,7 @@ struct Culling {
     }
     __device__ __forceinline__ bool reaches_block(int block) const {  // columns (block & 1) * 8, rows (block >> 1) * 4
         const float x = float((block & 1) * 8) + 0.5f, y = float((block >> 1) * 4) + 0.5f;
-        return unbounded || reaches(test, x, y, x + 7.f, y + 3.f);
+        return unbounded | reaches(test, x, y, x + 7.f, y + 3.f);
     }
 };
 
