@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -28,20 +29,23 @@ def run_on_slurm(
     Parameters
     ----------
     parameters : mapping
-        For the executor's ``update_parameters``: ``slurm_partition``, ``timeout_min``, ``gpus_per_node`` ...
+        For ``AutoExecutor.update_parameters``: ``slurm_partition``, ``timeout_min``, ``gpus_per_node`` ...
     executor : object, optional
-        What submits, with the interface of ``submitit.Executor``; default: Slurm.
+        What submits, with the interface of ``submitit.AutoExecutor``; default: one for Slurm.
 
     Raises
     ------
     BackendError
-        submitit is not installed, or Slurm not there.
+        submitit is not installed, Slurm is not there, or a parameter is none of submitit's.
     RunError
         All Slurm jobs ended and runs are left.
     """
     if executor is None:
         executor = _slurm_executor(sweep)
-    executor.update_parameters(**parameters)
+    try:
+        executor.update_parameters(**parameters)
+    except (NameError, TypeError, ValueError) as error:
+        raise BackendError(f"--slurm {dict(parameters)} is not what submitit takes: {error}") from error
     submitted = [executor.submit(work, sweep) for _ in range(min(slots, len(sweep.jobs)))]
     on_event(Notice("submitted as " + ", ".join(str(job.job_id) for job in submitted)))
 
@@ -69,7 +73,8 @@ def _slurm_executor(sweep: Sweep) -> Any:
         raise BackendError(
             "--slurm needs submitit, which is not installed; pip install '2dgs-r[slurm]', or leave --slurm out"
         ) from error
-    try:
-        return submitit.SlurmExecutor(folder=sweep.folder / "slurm")
-    except RuntimeError as error:
-        raise BackendError(f"--slurm needs Slurm's commands on this machine: {error}; or leave --slurm out") from error
+    if shutil.which("sbatch") is None:
+        raise BackendError(
+            "--slurm needs Slurm's command sbatch on this machine, which is not there; or leave --slurm out"
+        )
+    return submitit.AutoExecutor(folder=sweep.folder / "slurm", cluster="slurm")
