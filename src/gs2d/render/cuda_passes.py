@@ -32,6 +32,7 @@ from gs2d.kernels.cuda.arguments import (
     View,
 )
 from gs2d.kernels.cuda.launch import Launcher
+from gs2d.render.cuda_budget import PairBudget
 from gs2d.render.types import RasterSettings
 
 __all__ = ["IMAGES", "PARAMETERS", "Frame", "Wanted", "backward", "errors", "forward", "view_of"]
@@ -41,6 +42,7 @@ THREADS = 128
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MOST_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MOST_CANDIDATES = 1 << 31
+MOST_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 
@@ -174,7 +176,13 @@ def _project(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, er
 
 
 def forward(
-    launcher: Launcher, view: View, parameters: Sequence[Tensor], *, exact: bool = True, distortion: bool = True
+    launcher: Launcher,
+    view: View,
+    parameters: Sequence[Tensor],
+    *,
+    exact: bool = True,
+    distortion: bool = True,
+    budget: PairBudget | None = None,
 ) -> Frame:
     """Render one view; ``exact=False`` turns off culling inside tiles (tests).
 
@@ -187,7 +195,7 @@ def forward(
         return torch.empty(shape, dtype=torch.float32, device=device)
 
     projected = _project(launcher, view, parameters, errors=False)
-    lists = _bin(launcher, view, projected, exact)
+    lists = _bin(launcher, view, projected, exact, budget)
     words = (len(lists.entries) >> 5) + len(lists.tiles) + 1
     seen = torch.zeros(words, 8, dtype=torch.int32, device=device)
     H, W = int(view.height), int(view.width)
@@ -215,13 +223,15 @@ def forward(
     )
 
 
-def _bin(launcher: Launcher, view: View, projected: _Projected, exact: bool) -> _Lists:
+def _bin(
+    launcher: Launcher, view: View, projected: _Projected, exact: bool, budget: PairBudget | None = None
+) -> _Lists:
     """A stable sort by depth, emission of candidates, a stable sort by tile."""
     device = projected.records.device
     tiles = int(view.tiles_x) * int(view.tiles_y)
     order = torch.sort(projected.depth_keys, stable=True).indices
     ends = torch.cumsum(projected.tile_counts[order], 0, dtype=torch.int64)
-    candidates = int(ends[-1]) if len(ends) else 0  # the one host synchronisation of an iteration
+    candidates = _room(ends, tiles, budget) if len(ends) else 0
     if candidates >= MOST_CANDIDATES:
         raise BackendError(
             f"{candidates} pairs of splat and tile, expected fewer than 2^31: use fewer splats or pixels"
@@ -246,6 +256,19 @@ def _bin(launcher: Launcher, view: View, projected: _Projected, exact: bool) -> 
         launcher.launch(f"find_ranges_{bits}", _blocks(candidates), THREADS, find)
     heavy_first = torch.argsort(ranges[:-1, 1] - ranges[:-1, 0], descending=True, stable=True).to(torch.int32)
     return _Lists(entries, ranges, heavy_first, order, ends, permutation)
+
+
+def _room(ends: Tensor, tiles: int, budget: PairBudget | None) -> int:
+    """How many candidates to make room for: their number, for which the host waits, or what the budget allows."""
+    room = None if budget is None else budget.room(tiles)
+    if room is None:
+        room = int(ends[-1])  # the one host synchronisation
+        if budget is not None:
+            budget.learn(tiles, room)
+    else:
+        assert budget is not None
+        budget.ask(tiles, room, ends[-1])
+    return room
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,6 +358,11 @@ class _Sums:
     """Where the blending's gradients are added up: rows of the splats, or a slot for each (entry, warp)."""
 
     def __init__(self, frame: Frame, deterministic: bool, *, columns: int) -> None:
+        if deterministic and len(frame.permutation) >= MOST_SLOTTED:
+            raise BackendError(
+                f"{len(frame.permutation)} pairs of splat and tile, expected fewer than 2^30 for deterministic gradients: "
+                "use fewer splats or pixels, or torch.use_deterministic_algorithms(False)"
+            )
         self.frame = frame
         self.slots = frame.permutation if deterministic else None  # [M] int64
         rows = len(frame.records) if self.slots is None else 4 * len(self.slots)
