@@ -204,3 +204,11 @@ def test_a_name_that_the_terminal_cannot_show_is_shown_as_its_numbers(trained: P
     done = spawn(["info", str(copy)], env={**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
     assert done.returncode == 0
     assert f"{tmp_path}/r\\xfcn/mesh.ply" in done.stdout
+
+
+def test_a_terminal_without_boxes_gets_the_same_one_line() -> None:
+    done = spawn(["train", "here", "--lol"], env={**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
+    assert done.returncode == 2
+    assert "---- " not in done.stderr
+    assert " | " not in done.stderr
+    assert "--lol" in one_line(done.stderr)

@@ -178,13 +178,21 @@ def test_ctrl_c_before_the_first_checkpoint_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory"),
+        RuntimeError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+    ],
+)
 def test_out_of_memory_names_the_remedy(
-    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from gs2d.pipeline import jobs
 
     def hungry(_path: Path) -> Path:
-        raise MemoryError
+        raise error
 
     monkeypatch.setattr(jobs, "report_run", hungry)
     assert run(["report", str(trained)]) == 2

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from ball_runs import SMALL, Stop, comparable, options, spawn
-from gs2d.errors import RunError
+from gs2d.errors import DiskError, RunError
 from gs2d.io.run import RunFolder, open_run
 from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
 from gs2d.pipeline.prepare import prepare
@@ -121,6 +121,27 @@ def test_a_cache_gives_the_same_bytes_without_training_the_shared_stages(
     assert shared.file("renders/surface").is_dir()
     assert not any(isinstance(event, Step) and event.detail.startswith("surface") for event in heard)
     assert len(list(cache.glob("*.pt"))) == 3
+
+
+def test_a_cache_that_cannot_be_is_said_before_anything_trains(capture: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    heard: list[Event] = []
+    with pytest.raises(DiskError, match="file"):
+        train(options(capture, tmp_path / "run", cache=tmp_path / "file"), heard.append)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert not any(isinstance(event, Step) and "loss" in event.detail for event in heard)
+
+
+def test_a_run_that_fails_at_once_leaves_no_empty_cache(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_args: Any) -> None:
+        raise Stop
+
+    monkeypatch.setattr("gs2d.pipeline.train.choose_start", failing)
+    with pytest.raises(Stop):
+        train(options(capture, tmp_path / "run", cache=tmp_path / "deep" / "cache"))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: Path, tmp_path: Path) -> None:

@@ -42,6 +42,8 @@ _MENDABLE = {
 _HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info))
 _COMMANDS = {command.__name__.lower() for command in COMMANDS}
 _MARKUP = re.compile(r"\[/?bold\]")  # tyro shows its own markup in one of its messages
+_NO_MEMORY = re.compile("can't allocate memory|out of memory")  # how torch says it, on the CPU and on a GPU
+_ASCII_BOX = re.compile(r"(?<!\S)(?:[-+]{3,}|\|)(?!\S)")  # the same frame where the terminal has no other
 _BOX = str.maketrans(dict.fromkeys("╭╮╰╯│─", " "))
 
 
@@ -140,7 +142,7 @@ def _one_line(box: str, argv: Sequence[str]) -> str:
             if line.startswith(stop):
                 body = body[:i]
                 break
-    words = " ".join(_MARKUP.sub("", " ".join(body)).split()) or "the arguments do not parse"
+    words = " ".join(_ASCII_BOX.sub("", _MARKUP.sub("", " ".join(body))).split()) or "the arguments do not parse"
     topic = argv[0] if argv[0] in _COMMANDS else ""
     return f"{words}; see `gs2d {topic + ' ' if topic else ''}--help`".replace(" (required)", "")
 
@@ -158,7 +160,7 @@ def _report(error: Exception, debug: bool) -> int:
         return _fail(str(error))
     if isinstance(error, OSError) and error.errno in _MENDABLE:
         return _fail(f"{error.strerror}: {error.filename or 'no file named'}; mend that and run the command again")
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
         return _fail("out of memory; use a larger --downscale, or fewer splats (--set surface.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
     hint = "" if debug else "; run again with --debug and report it with the traceback"

@@ -9,7 +9,7 @@ import torch
 
 from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.io.ply import write_splats
-from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run
+from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
 from gs2d.pipeline.events import OnEvent, Phase, ignore
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
@@ -47,6 +47,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     job = prepare(options, on_event)
     run = claim_run(options.out, **claim)  # type: ignore[arg-type]
     with run.locked(), undone_if_worthless(run):
+        if options.cache is not None:  # now, not when the first stage has been trained
+            run.made += make_folder(options.cache)
         if is_run(run.path):
             check_same_run(run, job)
             if run.file(SPLATS).exists() and not run.checkpoints():
