@@ -226,15 +226,21 @@ def test_auto_follows_the_format_of_everything_else(tmp_path: Path) -> None:
     assert protocol_of(tmp_path / "garden", "colmap").name == "generic"
     courthouse = tmp_path / "Courthouse"
     small_colmap(courthouse)
+    assert protocol_of(courthouse, "colmap").name == "generic"  # anyone's, until something of the data set is there
+    (courthouse / "Courthouse_COLMAP_SfM.log").write_text("")
     assert protocol_of(courthouse, "colmap").name == "tnt-large"
     assert protocol_of(courthouse, "nerfstudio").name == "generic"
 
 
 def test_somebody_s_own_folder_is_of_no_data_set(tmp_path: Path) -> None:
     small_colmap(tmp_path / "truck_stop")
+    small_colmap(tmp_path / "old_truck")
+    (tmp_path / "old_truck/Truck_COLMAP_SfM.log").write_text("")
+    small_colmap(tmp_path / "my_garden")
+    (tmp_path / "my_garden/poses_bounds.npy").write_text("")
     small_colmap(tmp_path / "garden")  # the name alone is not enough
     small_blender(tmp_path / "scan24")
-    for name in ("truck_stop", "garden", "scan24"):
+    for name in ("truck_stop", "old_truck", "my_garden", "garden", "scan24"):
         assert recognise(tmp_path / name) is None, name
 
 

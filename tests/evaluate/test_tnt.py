@@ -168,6 +168,14 @@ def test_few_cameras_that_agree_are_told(elsewhere: tuple[TntScene, TntScore]) -
     assert not got.alignment.ok
 
 
+def test_a_log_of_something_else_is_a_data_error_that_names_it(elsewhere: tuple[TntScene, TntScore]) -> None:
+    scene = elsewhere[0]
+    log = scene.log.copy()
+    log[:, :3, 3] = np.random.default_rng(0).uniform(-50, 50, (60, 3))
+    with pytest.raises(DataError, match="Truck_COLMAP_SfM.log does not fit the capture's cameras: .* same order"):
+        score(scene, trajectory=log)
+
+
 def test_a_scan_outside_its_crop_volume_is_a_data_error() -> None:
     mesh, truth, centers = plane_scene(0.0)
     with pytest.raises(DataError, match="inside the crop volume was expected, got none"):

@@ -130,10 +130,14 @@ def find_scenes(
 
 
 def recognise(root: Path) -> tuple[DataSet, SceneFacts] | None:
-    """The data set and scene that a capture's folder is, by its name and its files; None for anyone else's."""
+    """The data set and scene that a capture's folder is, by its name and its files; None for anyone else's.
+
+    A COLMAP capture needs more than a name, for many have a garden or a truck: Tanks and Temples the camera log beside
+    the photographs or an official file, Mip-NeRF 360 its ``poses_bounds.npy``.
+    """
     for dataset in DATASETS.values():
         for facts in dataset.scenes:
-            if _is_scene(dataset, facts, root):
+            if _is_scene(dataset, facts, root) and (dataset.name not in _BY_NAME or _is_proven(dataset, facts, root)):
                 return dataset, facts
     scan = re.search(r"scan_?(\d+)$", root.name.lower())
     if scan and has_dtu_cameras(root):  # one of the scans that are not in the tables
@@ -263,6 +267,15 @@ def _is_scene(dataset: DataSet, facts: SceneFacts, root: Path) -> bool:
     if not (root / "sparse").is_dir() and not (root / "images").is_dir():
         return False
     return dataset is not MIP_NERF_360_SCENES or (root / "poses_bounds.npy").is_file() or (root / facts.images).is_dir()
+
+
+def _is_proven(dataset: DataSet, facts: SceneFacts, root: Path) -> bool:
+    """Whether a folder of the right name is that scene of a data set of COLMAP models."""
+    if root.name.lower() != facts.name.lower():
+        return False
+    if dataset is TNT_SCENES:
+        return published_log(root, facts.name).is_file() or bool(find_truth(dataset, facts, root)[0])
+    return (root / "poses_bounds.npy").is_file()
 
 
 def _capture_source(dataset: DataSet) -> str:

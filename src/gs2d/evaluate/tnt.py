@@ -180,9 +180,12 @@ def _camera_fit(
     """From the capture to the scan by camera centres; what is odd about the frames."""
     ours, entries = match_cameras(names, len(truth.trajectory), f"{truth.scene}_COLMAP_SfM.log")
     targets = apply(truth.T_truth_log, truth.trajectory[entries, :3, 3])
-    fit = ransac_similarity(
-        centers[ours], targets, threshold=protocol.camera_threshold, sample=protocol.camera_sample, seed=seed
-    )
+    try:
+        fit = ransac_similarity(
+            centers[ours], targets, threshold=protocol.camera_threshold, sample=protocol.camera_sample, seed=seed
+        )
+    except DataError as error:
+        raise DataError(f"{truth.scene}_COLMAP_SfM.log does not fit the capture's cameras: {error}") from error
     notes = []
     if published is not None and len(published) == len(names):
         order = np.array(sorted(range(len(names)), key=lambda i: names[i]))
