@@ -2,10 +2,11 @@
 
 ::
 
-    python -m benchmarks.fuse [--views 60] [--size 400] [--resolution 512] [--threads 2] [--json FILE]
+    python -m benchmarks.fuse [--views 60] [--size 400] [--resolution 512] [--threads 2] [--unbounded] [--json FILE]
 
 The scene is a sphere of radius 0.9 with coloured waves, seen from all round: as much surface as ``rendered_bottle``.
-On a shared machine the processor seconds are the ones to compare.
+With ``--unbounded`` the same frames go into a nest of levels; the innermost has half the side of the sphere, and the
+voxel of the bounded run. On a shared machine the processor seconds are the ones to compare.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ from benchmarks.timing import machine
 from gs2d.camera import Camera, look_at
 from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.fuse import fuse
+from gs2d.mesh.fuse import Volume, fuse
 from gs2d.mesh.limits import derive_limits, sample_depths, widen_truncation
+from gs2d.mesh.nest import derive_nest
+from gs2d.mesh.nested import fuse_nested, nested_marching_cubes
 from gs2d.mesh.surface import keep_components, marching_cubes
 
 RADIUS = 0.9
@@ -40,6 +43,7 @@ class Result:
     size: int
     resolution: int
     threads: int
+    levels: int
     seconds: dict[str, float]
     cpu_seconds: dict[str, float]
     blocks: int
@@ -72,7 +76,7 @@ def orbit(count: int, size: int) -> list[Camera]:
     return [look_at(eye, np.zeros(3), up, width=size, height=size, fx=1.4 * size) for eye in eyes]
 
 
-def run(views: int, size: int, resolution: int, threads: int) -> Result:
+def run(views: int, size: int, resolution: int, threads: int, *, unbounded: bool = False) -> Result:
     """Fuse once, step by step."""
     wall: dict[str, float] = {}
     cpu: dict[str, float] = {}
@@ -90,8 +94,15 @@ def run(views: int, size: int, resolution: int, threads: int) -> Result:
     limits = timed("limits", lambda: derive_limits(samples, cameras, resolution=resolution))
     noise = timed("noise", lambda: depth_noise(maps, samples, limits))
     limits = widen_truncation(limits, noise)
-    volume = timed("fuse", lambda: fuse(maps, limits, threads=threads))
-    mesh = timed("marching cubes", lambda: marching_cubes(volume))
+    volumes: Sequence[Volume]
+    if unbounded:
+        core = np.array([[-RADIUS] * 3, [RADIUS] * 3]) / 2
+        nest = derive_nest(samples, cameras, bbox=core, voxel=limits.voxel, truncation=limits.truncation)
+        volumes = timed("fuse", lambda: fuse_nested(maps, nest, threads=threads))
+        mesh = timed("marching cubes", lambda: nested_marching_cubes(volumes, nest, far_weight=1.0))
+    else:
+        volumes = [timed("fuse", lambda: fuse(maps, limits, threads=threads))]
+        mesh = timed("marching cubes", lambda: marching_cubes(volumes[0]))
     mesh = timed("components", lambda: keep_components(mesh))
     error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() / limits.voxel
     return Result(
@@ -99,10 +110,11 @@ def run(views: int, size: int, resolution: int, threads: int) -> Result:
         size=size,
         resolution=resolution,
         threads=threads,
+        levels=len(volumes),
         seconds=wall,
         cpu_seconds=cpu,
-        blocks=len(volume.keys),
-        volume_mib=round(volume.nbytes / 2**20, 1),
+        blocks=sum(len(volume.keys) for volume in volumes),
+        volume_mib=round(sum(volume.nbytes for volume in volumes) / 2**20, 1),
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
         worst_radius_error_voxels=round(float(error), 3),
@@ -116,9 +128,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", type=int, default=400)
     parser.add_argument("--resolution", type=int, default=512)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--unbounded", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    result = run(options.views, options.size, options.resolution, options.threads)
+    result = run(options.views, options.size, options.resolution, options.threads, unbounded=options.unbounded)
     document = {"machine": machine(), "result": asdict(result)}
     print(json.dumps(document, indent=1))
     if options.json is not None:
