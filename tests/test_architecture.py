@@ -66,6 +66,7 @@ RENDER = {
     "cpu": 2,
     "cuda": 2,
     "cuda_passes": 1,
+    "cuda_budget": 0,
     "reference_errors": 2,
     "reference": 1,
     "projection_reference": 0,

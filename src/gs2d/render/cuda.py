@@ -18,6 +18,7 @@ from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
 from gs2d.kernels.cuda.launch import Launcher
+from gs2d.render.cuda_budget import PairBudget
 from gs2d.render.cuda_passes import IMAGES, PARAMETERS, Frame, Wanted, backward, errors, forward
 from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -50,6 +51,7 @@ class _Options:
     distortion: bool
     deterministic: bool
     learns: Tensor | None
+    budget: PairBudget | None
 
 
 SAVED = tuple(field.name for field in fields(Frame) if field.name not in ("view", "images"))
@@ -62,7 +64,8 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx: Any, options: _Options, probe: Tensor | None, *parameters: Tensor) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         launcher, view = options.launcher, options.view
-        frame = forward(launcher, view, tensors, exact=options.exact_masks, distortion=options.distortion)
+        choices = {"exact": options.exact_masks, "distortion": options.distortion}
+        frame = forward(launcher, view, tensors, **choices, budget=options.budget)
         if any(ctx.needs_input_grad):
             # The images returned to the user may be changed in place: save_for_backward would notice, a plain
             # attribute would not. The rest is nobody else's.
@@ -107,6 +110,7 @@ def rasterize_with(
     distortion: bool = True,
     exact_masks: bool = True,
     deterministic: bool | None = None,
+    budget: PairBudget | None = None,
 ) -> RenderOutput:
     """Render one view with the CUDA kernels; the contract is in :mod:`gs2d.render.api`.
 
@@ -132,6 +136,8 @@ def rasterize_with(
     deterministic : bool, optional
         The same gradients bit for bit from run to run, for 320 bytes a pair of splat and tile and one more pass.
         None: as torch.use_deterministic_algorithms says.
+    budget : PairBudget, optional
+        Instead of waiting for the number of pairs of splat and tile; the caller looks whether it was enough.
 
     Raises
     ------
@@ -148,7 +154,7 @@ def rasterize_with(
         gradient_rows = gradient_rows.clone()  # whatever happens to it before the backward pass
     if deterministic is None:
         deterministic = torch.are_deterministic_algorithms_enabled()
-    options = _Options(launcher, _view(camera, settings), exact_masks, distortion, deterministic, gradient_rows)
+    options = _Options(launcher, _view(camera, settings), exact_masks, distortion, deterministic, gradient_rows, budget)
     *images, radii = _Rasterize.apply(options, screen_probe, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
 
@@ -159,11 +165,13 @@ def rasterize(
     settings: RasterSettings,
     screen_probe: Tensor | None = None,
     gradient_rows: Tensor | None = None,
+    *,
+    budget: PairBudget | None = None,
 ) -> RenderOutput:
     """:func:`rasterize_with` on the device on which the splats lie, on torch's current stream there."""
     launcher = launch.launcher_for(splats.device)
-    distortion = settings.with_distortion
-    return rasterize_with(launcher, splats, camera, settings, screen_probe, gradient_rows, distortion=distortion)
+    given = (splats, camera, settings, screen_probe, gradient_rows)
+    return rasterize_with(launcher, *given, distortion=settings.with_distortion, budget=budget)
 
 
 def splat_errors_with(

@@ -7,6 +7,8 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,8 +17,10 @@ from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RunError
 from gs2d.protocols import Protocol
 from gs2d.recipe import CloneInPlace, RankByError, Recipe, Stage, validate
+from gs2d.render import cuda
 from gs2d.render.api import splat_errors
 from gs2d.render.backend import Backend, get_backend
+from gs2d.render.cuda_budget import PairBudget
 from gs2d.render.types import RasterSettings
 from gs2d.splats import Splats
 from gs2d.train import events
@@ -89,7 +93,9 @@ class Trainer:
         self.state.move_to(self.backend.device)
         self._targets = self._make_targets(target_bytes)
         self._adam_step = fused_adam_step if self.backend.name == "cuda" else adam_step
-        self._whole = WholeViews(scene, self.recipe, protocol, self.backend, self._targets)
+        self._budget = PairBudget()  # used by the cuda backend alone
+        self._last: tuple[int, int] | None = None  # iteration and view that settle() may have to do again
+        self._whole = WholeViews(scene, self.recipe, protocol, self._with_budget(self.backend), self._targets)
         self._stage2_cache_bytes = stage2_cache_bytes
         self._evaluator: Evaluator | None = None  # of the stage under way, from its first iteration here
 
@@ -123,7 +129,7 @@ class Trainer:
         """Run the entry actions of a stage and prepare its first iteration."""
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
-        self._evaluator = None
+        self._evaluator = self._last = None
         while self._pending:
             self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
@@ -139,32 +145,74 @@ class Trainer:
     def step(self) -> None:
         """One iteration of the stage that was entered.
 
+        On a GPU it may be one that changes nothing, because there was no room for all pairs of splat and tile: it is
+        then done again at the start of the next one. After a Progress event everything is settled.
+
         Raises
         ------
         DivergedError
             NaN or infinity in the loss, a gradient or a parameter; names the iteration, the stage and the attribute. On
             a GPU, whose host does not wait for it, at the next Progress event, before anything could be saved.
         """
+        self._settle()
         state = self.state
         stage, iteration = self.recipe.stages[state.stage], state.step + 1
         index = state.next_view(len(self.scene.train))
         if self._evaluator is None:
             self._evaluator = choose_evaluator(self._whole, state, stage, self._stage2_cache_bytes)
-        result = self._evaluator.evaluate(state, stage, iteration, index)
-        rates = rates_at(stage.rates, iteration, self.scene.extent)
-        happened = self._densify(stage, iteration, result)
-        rebuilt = any(isinstance(event, events.Densified) for event in happened)
-        if not rebuilt:
-            limited = any(isinstance(event, events.OpacityLimited) for event in happened)
-            skip = ("opacity_logits",) if limited else ()
-            self._adam_step(state, stage, result.gradients, rates, skip=skip, rows=result.rows)
+        reports = iteration % self._progress_every == 0 or iteration == stage.iterations
+        self._budget.exact = reports or self._densifies_or_limits(stage, iteration)  # those wait for the device anyway
+        result, happened = self._learn(stage, iteration, index)
+        self._last = (iteration, index)
         state.step = iteration
         for event in happened:
             self._on_event(event)
-        if iteration % self._progress_every == 0 or iteration == stage.iterations:
+        if reports:
             losses = check_losses(stage, iteration, result.losses)
             self._check_parameters(stage, tuple(stage.train))  # on a CPU gradients are checked each time
+            rates = rates_at(stage.rates, iteration, self.scene.extent)
             self._on_event(self._progress(stage, iteration, losses, rates))
+
+    def _learn(self, stage: Stage, iteration: int, index: int) -> tuple[Evaluated, list[events.Event]]:
+        """Gradients of a view, statistics and densification, Adam; on the device nothing if the image was cut short."""
+        assert self._evaluator is not None
+        result = self._evaluator.evaluate(self.state, stage, iteration, index)
+        cancel = self._budget.overflow
+        happened = self._densify(stage, iteration, result, cancel)
+        if not any(isinstance(event, events.Densified) for event in happened):
+            limited = any(isinstance(event, events.OpacityLimited) for event in happened)
+            options = {"skip": ("opacity_logits",) if limited else (), "rows": result.rows}
+            if cancel is not None:
+                options["cancel"] = cancel
+            rates = rates_at(stage.rates, iteration, self.scene.extent)
+            self._adam_step(self.state, stage, result.gradients, rates, **options)  # type: ignore[arg-type]
+        return result, happened
+
+    def _settle(self) -> None:
+        """Do the last iteration again if there was no room for its pairs."""
+        if self._last is None or not self._budget.cut_short():
+            return
+        stage = self.recipe.stages[self.state.stage]
+        for name, parameter in self.state.splats.items():
+            if name in stage.train and parameter.numel() > 0:
+                self.state.moments[name].steps -= 1  # counted on the host
+        self._budget.exact = True
+        self._learn(stage, *self._last)
+
+    def _densifies_or_limits(self, stage: Stage, iteration: int) -> bool:
+        """Whether splats come and go, or opacities are limited, at the end of an iteration."""
+        densify = stage.densify
+        if densify is None or iteration >= densify.stop:
+            return False
+        capped = densify.cap_every > 0 and iteration % densify.cap_every == 0
+        return densify.densifies(iteration) or densify.resets(iteration, white=self.protocol.white) or capped
+
+    def _with_budget(self, backend: Backend) -> Backend:
+        """The backend for training iterations, which need not wait for the number of pairs."""
+        if backend.rasterize is not cuda.rasterize:
+            return backend
+        budgeted = partial(cuda.rasterize, budget=self._budget)
+        return replace(backend, rasterize=budgeted, rasterize_rows=budgeted)
 
     def _make_targets(self, limit_bytes: int | None) -> TargetSource:
         """The photographs, where the splats are."""
@@ -220,7 +268,7 @@ class Trainer:
             )
         return state
 
-    def _densify(self, stage: Stage, iteration: int, result: Evaluated) -> list[events.Event]:
+    def _densify(self, stage: Stage, iteration: int, result: Evaluated, cancel: Tensor | None) -> list[events.Event]:
         """Statistics, densification and opacity resets of one iteration."""
         state, densify, white = self.state, stage.densify, self.protocol.white
         happened: list[events.Event] = []
@@ -229,7 +277,7 @@ class Trainer:
         assert state.statistics is not None
         assert result.signal is not None
         assert result.radii is not None
-        accumulate(state.statistics, result.signal, result.radii)
+        accumulate(state.statistics, result.signal, result.radii if cancel is None else result.radii * (1 - cancel))
         if densify.densifies(iteration):
             try:
                 counts = densify_and_prune(state, densify, iteration=iteration, extent=self.scene.extent, white=white)

@@ -9,7 +9,7 @@ namespace gs2d {
 
 struct EmitArguments {
     int width, height, tiles_x, tiles_y;
-    int64 candidates;    // ends[visible - 1]
+    int64 candidates;    // ends[visible - 1], or the room for them: then what has none is left out
     int64 visible;
     const int64* order;  // [visible]: splats by depth
     const int64* ends;   // [visible]: running sum of tile_counts in that order
@@ -45,6 +45,10 @@ __device__ __forceinline__ int64 owner_of(const int64* ends, int64 visible, int6
 template <class Key> __device__ __forceinline__ void emit(const EmitArguments& a) {
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.candidates) return;
+    if (i >= a.ends[a.visible - 1]) {  // room that is not needed
+        static_cast<Key*>(a.keys)[i] = Key(a.tiles_x * a.tiles_y), a.payloads[i] = 0u;
+        return;
+    }
     const int64 place = owner_of(a.ends, a.visible, i), splat = a.order[place];
     const int from_last = int(a.ends[place] - 1 - i);
     const ushort* rect = a.rects + 4 * splat;

@@ -1,0 +1,83 @@
+"""Room for the pairs of a view without asking the device for their number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["PairBudget", "room_for"]
+
+SLACK = 1.25  # room, in the largest number seen
+STEP = 1 << 16  # room is a multiple of it, so that torch's allocator sees few sizes
+
+
+class PairBudget:
+    """How much room the renderings of a training run make for pairs of splat and tile.
+
+    The first rendering of a size waits for the number of pairs. Later ones take SLACK times the largest number so far
+    and wait for nothing; if that is too little, the pairs farthest away are left out, which ``overflow`` says on the
+    device at once, and ``cut_short`` on the host afterwards. So an update that reads ``overflow`` does nothing, and
+    the caller renders that view again with ``exact`` set.
+
+    Attributes
+    ----------
+    exact : bool
+        The next renderings wait for the number.
+    overflow : Tensor [] int32 or None
+        On the device: whether the last rendering lacks pairs. None where it was exact.
+    """
+
+    def __init__(self) -> None:
+        self.exact = False
+        self.overflow: Tensor | None = None
+        self._largest: dict[int, int] = {}  # by the number of tiles
+        self._asked: tuple[int, int] | None = None  # tiles and room of the last rendering, if its number is not known
+        self._host: Tensor | None = None
+        self._event: Any = None
+
+    def room(self, tiles: int) -> int | None:
+        """Pairs to make room for in an image of so many tiles; None = wait for the number, and ``learn`` it."""
+        largest = self._largest.get(tiles)
+        if self.exact or largest is None:
+            return None
+        return -(-int(SLACK * largest) // STEP) * STEP
+
+    def learn(self, tiles: int, pairs: int) -> None:
+        """The number of pairs of an exact rendering."""
+        self._largest[tiles] = max(pairs, self._largest.get(tiles, 0))
+        self.overflow = self._asked = None
+
+    def ask(self, tiles: int, room: int, pairs: Tensor) -> None:
+        """The number of pairs [] int64 of a rendering with ``room``, to be looked at later."""
+        self.overflow = (pairs > room).to(torch.int32)
+        self._asked = (tiles, room)
+        if self._host is None:
+            self._host = torch.empty((), dtype=torch.int64, pin_memory=pairs.is_cuda)
+            self._event = torch.cuda.Event() if pairs.is_cuda else None
+        self._host.copy_(pairs, non_blocking=True)
+        if self._event is not None:
+            self._event.record(torch.cuda.current_stream(pairs.device))
+
+    def cut_short(self) -> bool:
+        """Whether the last rendering lacked pairs; waits until its number is known, not until it is done."""
+        if self._asked is None or self._host is None:
+            return False
+        if self._event is not None:
+            self._event.synchronize()
+        (tiles, room), pairs = self._asked, int(self._host.numpy())
+        self.learn(tiles, pairs)
+        return pairs > room
+
+
+def room_for(pairs: Tensor, tiles: int, budget: PairBudget | None) -> int:
+    """Room for the pairs of a rendering: their number [] int64, for which the host waits, or what the budget allows."""
+    room = None if budget is None else budget.room(tiles)
+    if room is None:
+        room = int(pairs)  # the one wait of a rendering
+        if budget is not None:
+            budget.learn(tiles, room)
+    elif budget is not None:
+        budget.ask(tiles, room, pairs)
+    return room
