@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gs2d.camera import Camera
 from gs2d.errors import ShapeError
+from gs2d.kernels.cuda.arguments import SlotArguments, fill
 from gs2d.render import cuda, cuda_passes, reference
 from gs2d.splats import ATTRIBUTES, Splats
 
@@ -270,3 +271,16 @@ def test_the_largest_errors_of_the_approximate_instructions_stay_within_the_tole
     for name, values in errors.items():
         assert np.median(values) < 1e-5, (name, values)
         assert max(values) < 2e-3, (name, values)
+
+
+def test_slots_are_added_up_by_splat_and_none_is_read_beyond_those_there_are(emulator: Emulator) -> None:
+    """Splats 2, 0, 1 in depth order with 1, 0 and 4 pairs; only 3 pairs had room: 12 slots."""
+    slots, extra_slots = torch.randn(12, 16), torch.randn(12, 4)
+    order, ends = torch.tensor([2, 0, 1]), torch.tensor([1, 1, 5])
+    gradients, extras = torch.full((3, 16), torch.nan), torch.full((3, 4), torch.nan)
+    arguments = SlotArguments(count=3, candidates=3)
+    fill(arguments, order=order, ends=ends, slots=slots, extra_slots=extra_slots, gradients=gradients, extras=extras)
+    emulator.launch("sum_slots", 1, 128, arguments)
+    for found, given in ((gradients, slots), (extras, extra_slots)):
+        expected = torch.stack([torch.zeros(given.shape[1]), given[4:].sum(0), given[:4].sum(0)])
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)

@@ -32,7 +32,7 @@ from gs2d.kernels.cuda.arguments import (
     View,
 )
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_budget import PairBudget
+from gs2d.render.cuda_budget import PairBudget, room_for
 from gs2d.render.types import RasterSettings
 
 __all__ = ["IMAGES", "PARAMETERS", "Frame", "Wanted", "backward", "errors", "forward", "view_of"]
@@ -231,7 +231,7 @@ def _bin(
     tiles = int(view.tiles_x) * int(view.tiles_y)
     order = torch.sort(projected.depth_keys, stable=True).indices
     ends = torch.cumsum(projected.tile_counts[order], 0, dtype=torch.int64)
-    candidates = _room(ends, tiles, budget) if len(ends) else 0
+    candidates = room_for(ends[-1], tiles, budget) if len(ends) else 0
     if candidates >= MOST_CANDIDATES:
         raise BackendError(
             f"{candidates} pairs of splat and tile, expected fewer than 2^31: use fewer splats or pixels"
@@ -256,19 +256,6 @@ def _bin(
         launcher.launch(f"find_ranges_{bits}", _blocks(candidates), THREADS, find)
     heavy_first = torch.argsort(ranges[:-1, 1] - ranges[:-1, 0], descending=True, stable=True).to(torch.int32)
     return _Lists(entries, ranges, heavy_first, order, ends, permutation)
-
-
-def _room(ends: Tensor, tiles: int, budget: PairBudget | None) -> int:
-    """How many candidates to make room for: their number, for which the host waits, or what the budget allows."""
-    room = None if budget is None else budget.room(tiles)
-    if room is None:
-        room = int(ends[-1])  # the one host synchronisation
-        if budget is not None:
-            budget.learn(tiles, room)
-    else:
-        assert budget is not None
-        budget.ask(tiles, room, ends[-1])
-    return room
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,8 +347,8 @@ class _Sums:
     def __init__(self, frame: Frame, deterministic: bool, *, columns: int) -> None:
         if deterministic and len(frame.permutation) >= MOST_SLOTTED:
             raise BackendError(
-                f"{len(frame.permutation)} pairs of splat and tile, expected fewer than 2^30 for deterministic gradients: "
-                "use fewer splats or pixels, or torch.use_deterministic_algorithms(False)"
+                f"{len(frame.permutation)} pairs of splat and tile, expected fewer than 2^30 for deterministic "
+                "gradients: use fewer splats or pixels, or torch.use_deterministic_algorithms(False)"
             )
         self.frame = frame
         self.slots = frame.permutation if deterministic else None  # [M] int64
@@ -376,7 +363,7 @@ class _Sums:
         count = len(self.frame.records)
         extras = self.extras.new_empty(count, 4)
         gradients = None if self.gradients is None else self.gradients.new_empty(count, self.gradients.shape[1])
-        slots = SlotArguments(count=count)
+        slots = SlotArguments(count=count, candidates=len(self.slots))
         _fill(slots, {"order": self.frame.order, "ends": self.frame.ends})
         _fill(slots, {"slots": self.gradients, "extra_slots": self.extras, "gradients": gradients, "extras": extras})
         launcher.launch("sum_slots", _blocks(32 * count), THREADS, slots)

@@ -116,7 +116,7 @@ class SlotArguments(ctypes.Structure):
     """Of slots.cu."""
 
     _fields_ = (
-        ("count", ctypes.c_int64),
+        *_all(ctypes.c_int64, "count", "candidates"),
         *_pointers("order", "ends", "slots", "extra_slots", "gradients", "extras"),
     )
 

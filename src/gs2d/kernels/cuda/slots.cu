@@ -6,6 +6,7 @@ namespace gs2d {
 
 struct SlotArguments {
     int64 count;
+    int64 candidates;    // that there are slots for: pairs beyond were left out for want of room
     const int64* order;  // [N]: splats by depth
     const int64* ends;   // [N]: running sum of candidates in that order; four slots each, one for each warp of a tile
     const float *slots, *extra_slots;  // [4 * candidates, 16] or null, [4 * candidates, 4]
@@ -17,7 +18,8 @@ extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     const int64 place = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
     const int lane = threadIdx.x & 31;
     if (place >= a.count) return;  // the whole warp
-    const int64 splat = a.order[place], first = place > 0 ? 4 * a.ends[place - 1] : 0, last = 4 * a.ends[place];
+    const int64 splat = a.order[place], end = a.ends[place] < a.candidates ? a.ends[place] : a.candidates;
+    const int64 first = place > 0 ? 4 * a.ends[place - 1] : 0, last = 4 * end;
     float sum = 0.f, extra = 0.f;
     for (int64 row = first + (lane >> 4); a.slots && row < last; row += 2) sum = sum + a.slots[16 * row + (lane & 15)];
     for (int64 row = first + (lane >> 2); row < last; row += 8) extra = extra + a.extra_slots[4 * row + (lane & 3)];
