@@ -201,6 +201,8 @@ def test_clouds_are_green_up_to_tau_red_far_off_and_grey_beyond_reach(tmp_path: 
     assert (image == GOOD).all(axis=2).any()
     lower = image[320:]
     assert not (lower == FAR).all(axis=2).any()  # the truth has no wrong point
+    floating = ScoredClouds(np.array([[1e4, 0, 0]]), np.array([np.inf]), points[:4], distances[:4], 1.0)
+    assert (picture(floating)[320:] == GOOD).all(axis=2).sum() > 2 * 4  # the truth is not shrunk to one dot
     assert picture(ScoredClouds(points[:0], distances[:0], points[:0], distances[:0], 1.0)).shape == (640, 960, 3)
 
 

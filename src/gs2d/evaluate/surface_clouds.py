@@ -14,6 +14,7 @@ from gs2d.io.ply_format import write_ply
 GOOD, NEAR, FAR, OUT = (40, 150, 80), (235, 200, 60), (200, 40, 40), (150, 150, 160)
 PRECISION, RECALL, PICTURE = "precision.ply", "recall.ply", "surface.png"
 _SIDE = 320  # px of one panel
+_FEW = 50_000  # points
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +67,14 @@ def write_clouds(folder: Path, clouds: ScoredClouds) -> dict[str, str]:
 
 
 def picture(clouds: ScoredClouds) -> np.ndarray:
-    """Both clouds seen along x, y and z, uint8 [2 side, 3 side, 3]: above the reconstruction, below the truth."""
-    both = np.concatenate([clouds.mesh, clouds.truth])
-    low = both.min(axis=0) if len(both) else np.zeros(3)
-    size = float((both.max(axis=0) - low).max()) if len(both) else 1.0
+    """Both clouds seen along x, y and z, uint8 [2 side, 3 side, 3]: above the reconstruction, below the truth.
+
+    The frame is the truth's, a little widened: what floats far away must not shrink the rest to a dot.
+    """
+    inside = clouds.truth if len(clouds.truth) else clouds.mesh
+    low, high = (inside.min(axis=0), inside.max(axis=0)) if len(inside) else (np.zeros(3), np.ones(3))
+    size = 1.1 * max(float((high - low).max()), 1e-12)
+    low = (low + high - size) / 2
     rows = []
     for points, distances in ((clouds.mesh, clouds.mesh_distances), (clouds.truth, clouds.truth_distances)):
         colors = distance_colors(distances, clouds.tau)
@@ -85,12 +90,14 @@ def picture(clouds: ScoredClouds) -> np.ndarray:
 
 
 def _panel(points: np.ndarray, colors: np.ndarray, axis: int, low: np.ndarray, size: float) -> np.ndarray:
-    """Points as pixels, seen along an axis; where several fall on one pixel, their mean colour."""
+    """Points as pixels (few points: as 2x2), seen along an axis; where several fall on one pixel, their mean colour."""
     across, up = [i for i in range(3) if i != axis]
-    scale = (_SIDE - 21) / max(size, 1e-12)
-    column = 10 + np.floor((points[:, across] - low[across]) * scale).astype(np.int64)
-    row = _SIDE - 11 - np.floor((points[:, up] - low[up]) * scale).astype(np.int64)
-    at = row * _SIDE + column
+    column, row = (np.floor((points[:, i] - low[i]) / size * _SIDE).astype(np.int64) for i in (across, up))
+    dots = [(0, 0), (1, 0), (0, 1), (1, 1)] if len(points) < _FEW else [(0, 0)]
+    column, row = (np.concatenate([values + dot[i] for dot in dots]) for i, values in enumerate((column, row)))
+    colors = np.tile(colors, (len(dots), 1))
+    shown = (column >= 0) & (column < _SIDE) & (row >= 0) & (row < _SIDE)
+    at, colors = ((_SIDE - 1 - row) * _SIDE + column)[shown], colors[shown]
     count = np.bincount(at, minlength=_SIDE * _SIDE)
     panel = np.full((_SIDE * _SIDE, 3), 255.0)
     hit = count > 0
