@@ -360,3 +360,16 @@ def test_a_folder_made_with_other_options_is_refused(finished: tuple[Path, list[
     options = PaperOptions(table="modules", data=Path(words[3]), out=out, schedule_scale=0.1)
     with pytest.raises(RunError, match="made with schedule_scale = 0.0005, now 0.1"):
         paper(options)
+
+
+def test_quoted_rows_are_shown_where_the_paper_has_figures_of_them() -> None:
+    table = PAPER_TABLES["benchmark"]
+    rows = tuple(
+        Row(row.name, row.recipe, dict(row.paper), "", (make_cell(data_set=DTU, psnr=30.0),) if row.recipe else ())
+        for row in table.rows
+    )
+    text = to_markdown(table, Results(rows), (), (), ())
+    assert "| NeuS | (0.84) | (31.97) | (0.840) | - | - | - |" in text
+    assert "SVRaster" not in text  # the paper has no figures of it on DTU
+    assert "| 2DGS-R | - (0.74) | **30.00** (35.69) |" in text
+    assert r"NeuS & \footnotesize(0.84) & \footnotesize(31.97)" in to_latex(table, Results(rows))

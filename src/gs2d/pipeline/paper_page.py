@@ -15,7 +15,7 @@ from gs2d.io.run import RENDERS
 from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.paper_rows import Cell, Results, Row, Verdict
-from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, shown, verdict_text
+from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, rows_for, shown, verdict_text
 from gs2d.recipes import RECIPES, get_recipe
 from gs2d.report_html import drawing, escape, facts, missing, page, picture, table
 
@@ -58,8 +58,7 @@ def write_page(
     body += [f"<h1>{escape(paper_table.title)}</h1>", lead(verdicts, about)]
     for data_set in results.data_sets:
         body += [f"<h2>{escape(data_set)}</h2>", figures_table(paper_table, results, data_set)]
-    if any(data_set not in paper_table.columns for data_set in results.data_sets):
-        body += ["<h2>The paper&#8217;s figures</h2>", papers_table(paper_table)]
+    body += papers_tables(paper_table, results)
     body += ["<h2>Do the paper&#8217;s orders hold?</h2>", orders_table(verdicts)]
     body += ["<h2>How this differs from the paper</h2>", _list(deviations)]
     body += ["<h2>Side by side</h2>", *side_by_side(results)]
@@ -98,8 +97,8 @@ def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> s
     columns = columns_of(paper_table, results, data_set)
     best = {metric: best_rows(metric, results, data_set) for metric in columns}
     heads = [TITLES[m] + ("" if m in ("bytes", "seconds") else " ↓" if m in LOWER_IS_BETTER else " ↑") for m in columns]
-    rows = []
-    for row in results.rows:
+    rows, listed = [], rows_for(results, data_set)
+    for row in listed:
         mean, spread = results.mean(row, data_set), results.spread(row, data_set)
         words = "; ".join(filter(None, (row.note, about_row(row))))
         note = f'<span class="paper">{escape(words)}</span>' if words else ""
@@ -108,14 +107,17 @@ def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> s
             cells.append(_cell(row, metric, data_set, mean[metric], spread[metric], row.name in best[metric]))
         rows.append(cells)
     built = table(["", *heads], rows)
-    for row in results.rows:
+    for row in listed:
         if row.recipe is None:  # quoted rows are grey
             built = built.replace(f"<tr><td>{escape(row.name)}<", f'<tr class="quoted"><td>{escape(row.name)}<')
     counted = sorted({scene for scene, _ in results.counted("psnr", data_set)})
     scenes = (
         f"Means over {len(counted)} scene{'s' if len(counted) != 1 else ''}: {', '.join(counted)}. " if counted else ""
     )
-    note = "In small print the paper's figure. MB: float32 parameters. s: training alone, shared stages included."
+    note = (
+        "In small print, and in grey rows, the paper's figures. "
+        "MB: float32 parameters. s: training alone, shared stages included."
+    )
     return built + f'<p class="soft">{escape(scenes + note)}</p>'
 
 
@@ -125,10 +127,12 @@ def about_row(row: Row) -> str:
 
 
 def _cell(row: Row, metric: str, data_set: str, mean: float | None, spread: float | None, best: bool) -> str:
+    figure = row.paper.get(data_set, {}).get(metric)
+    if row.recipe is None:
+        return "<td>-</td>" if figure is None else f"<td>{printed(metric, data_set, figure)}</td>"
     text = shown(metric, mean)
     if spread is not None and metric not in ("bytes", "seconds"):
         text += f' <span class="pm">± {shown(metric, spread)}</span>'
-    figure = row.paper.get(data_set, {}).get(metric)
     if figure is not None:
         text += f'<span class="paper">paper {printed(metric, data_set, figure)}</span>'
     return f'<td class="best">{text}</td>' if best else f"<td>{text}</td>"
@@ -242,19 +246,19 @@ def _drawing(path: Path) -> str:
     return picture(read_image(path), title, alt=title, width=1400)
 
 
-def papers_table(paper_table: PaperTable) -> str:
-    """The paper's figures alone, for rows that were trained on other scenes."""
-    heads = [f"{TITLES[m]}, {d}" for d, metrics in paper_table.columns.items() for m in metrics]
-    rows = [
-        [escape(row.name)]
-        + [
-            printed(m, d, row.paper[d][m]) if m in row.paper.get(d, {}) else "-"
-            for d, metrics in paper_table.columns.items()
-            for m in metrics
+def papers_tables(paper_table: PaperTable, results: Results) -> list[str]:
+    """The paper's figures of the data sets that were not trained here."""
+    sections = []
+    for data_set, metrics in paper_table.columns.items():
+        if data_set in results.data_sets:
+            continue
+        rows = [
+            [escape(row.name), *(printed(m, data_set, known[m]) if m in known else "-" for m in metrics)]
+            for row in paper_table.rows
+            if (known := row.paper.get(data_set))
         ]
-        for row in paper_table.rows
-    ]
-    return table(["", *heads], rows)
+        sections += [f"<h3>{escape(data_set)}</h3>", table(["", *(TITLES[m] for m in metrics)], rows)]
+    return ["<h2>What the paper has on other data sets</h2>", *sections] if sections else []
 
 
 def runs_table(results: Results) -> str:

@@ -36,6 +36,11 @@ def columns_of(table: PaperTable, results: Results, data_set: str) -> list[str]:
     return [*order, "bytes", "seconds"]
 
 
+def rows_for(results: Results, *data_sets: str) -> list[Row]:
+    """The rows that have something to show for a data set: trained ones, and quoted ones with a figure."""
+    return [row for row in results.rows if row.recipe is not None or any(row.paper.get(d) for d in data_sets)]
+
+
 def measured(metric: str, results: Results, row: Row, data_set: str) -> str:
     """Mean, with the spread over seeds where there are several."""
     mean, spread = results.mean(row, data_set)[metric], results.spread(row, data_set)[metric]
@@ -83,13 +88,14 @@ def to_markdown(
             TITLES[m] + ("" if m in ("bytes", "seconds") else " ↓" if m in LOWER_IS_BETTER else " ↑") for m in columns
         ]
         lines += [f"## {data_set}", "", "| | " + " | ".join(arrows) + " |", "|---" * (len(columns) + 1) + "|"]
-        for row in results.rows:
+        for row in rows_for(results, data_set):
             paper = row.paper.get(data_set, {})
             cells = []
             for metric in columns:
-                text = measured(metric, results, row, data_set)
+                text = measured(metric, results, row, data_set) if row.recipe is not None else ""
                 text = f"**{text}**" if row.name in best_rows(metric, results, data_set) else text
-                cells.append(text + (f" ({printed(metric, data_set, paper[metric])})" if metric in paper else ""))
+                quoted = f"({printed(metric, data_set, paper[metric])})" if metric in paper else ""
+                cells.append(f"{text} {quoted}".strip() or "-")
             lines.append(f"| {row.name} | " + " | ".join(cells) + " |")
         lines.append("")
     lines += ["## Do the paper's orders hold?", ""]
@@ -147,7 +153,7 @@ def to_latex(table: PaperTable, results: Results) -> str:
     ]
     lines += ["    & " + " & ".join(head) + r" \\", "    " + " ".join(rules), "    & " + " & ".join(arrows) + r" \\"]
     lines.append("    \\midrule")
-    for row in results.rows:
+    for row in rows_for(results, *groups):
         ours, papers = [], []
         for data_set, columns in groups.items():
             for metric in columns:
@@ -156,6 +162,8 @@ def to_latex(table: PaperTable, results: Results) -> str:
                 ours.append(f"\\textbf{{{text}}}" if bold else text)
                 figure = row.paper.get(data_set, {}).get(metric)
                 papers.append("" if figure is None else f"\\footnotesize({printed(metric, data_set, figure)})")
+        if row.recipe is None:
+            ours, papers = [figure or "-" for figure in papers], []
         lines.append(f"    {row.name.translate(_TEX)} & " + " & ".join(ours) + r" \\")
         if any(papers):
             lines.append("     & " + " & ".join(papers) + r" \\")
