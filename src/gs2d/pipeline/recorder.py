@@ -11,7 +11,6 @@ from dataclasses import asdict
 from typing import Any
 
 from gs2d.errors import DivergedError
-from gs2d.evaluate.images import mean_metrics
 from gs2d.io.run import RunFolder, load_tensors
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
@@ -19,7 +18,7 @@ from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.restart import Start, put_in_cache
-from gs2d.pipeline.scoring import PeakGpuMemory, PeakMemory, score_views, split_metrics
+from gs2d.pipeline.scoring import PeakGpuMemory, PeakMemory, mean_psnr, score_views, split_metrics
 from gs2d.recipe import CloneInPlace, Stage
 from gs2d.splats import Splats
 from gs2d.train import events as train_events
@@ -148,9 +147,9 @@ class Recorder:
     def _probe_psnr(self, splats: Splats) -> float | None:
         """Mean PSNR over a few fixed views (test views where there are any)."""
         self._stop_clock()
-        scores = self._score(splats, self._probes, "", lambda _event: None)
+        psnr = mean_psnr(splats, self._probes, self._settings, self._job.backend)
         self._start_clock()
-        return mean_metrics(list(scores.values())).psnr_float.value if scores else None
+        return psnr
 
     # -- checkpoints ---------------------------------------------------------------------------------------------------
     def _payload(self, index: int) -> dict[str, Any]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from gs2d.data import View
-from gs2d.evaluate.images import ImageMetrics, image_metrics, mean_metrics
+from gs2d.evaluate.images import ImageMetrics, image_metrics, mean_metrics, psnr_float
 from gs2d.evaluate.lpips import Lpips
 from gs2d.pipeline.events import OnEvent, Phase, Step
 from gs2d.render.api import rasterize
@@ -34,21 +35,39 @@ def score_views(
     """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere."""
     on_event(Phase(name, len(views)))
     scores: dict[str, ImageMetrics] = {}
-    settings = replace(settings, sh_degree=splats.sh_degree)
-    with torch.no_grad():
-        for done, view in enumerate(views, start=1):
-            image = rasterize(splats, view.camera, settings, backend=backend).color
-            target = torch.from_numpy(view.target(settings.background)).to(image)
-            mask = view.mask()
-            scores[view.name] = image_metrics(
-                image,
-                target,
-                None if mask is None else torch.from_numpy(mask).to(image.device),
-                backend_name=backend.name,
-                lpips=lpips,
-            )
-            on_event(Step(done))
+    for done, drawn in enumerate(_drawn(splats, views, settings, backend), start=1):
+        scores[drawn.name] = image_metrics(
+            drawn.image, drawn.target, drawn.mask, backend_name=backend.name, lpips=lpips
+        )
+        on_event(Step(done))
     return scores
+
+
+def mean_psnr(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> float | None:
+    """Mean ``psnr_float`` of the views that have one, as by :func:`score_views`, without the other metrics."""
+    values = [psnr_float(d.image, d.target, d.mask) for d in _drawn(splats, views, settings, backend)]
+    finite = [value for value in values if math.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """A view of the splats and its photograph."""
+
+    name: str
+    image: torch.Tensor  # [H, W, 3]
+    target: torch.Tensor  # [H, W, 3]
+    mask: torch.Tensor | None  # [H, W] bool
+
+
+def _drawn(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> Iterator[_Drawn]:
+    settings = replace(settings, sh_degree=splats.sh_degree)
+    for view in views:
+        with torch.no_grad():
+            image = rasterize(splats, view.camera, settings, backend=backend).color
+        target = torch.from_numpy(view.target(settings.background)).to(image)
+        mask = view.mask()
+        yield _Drawn(view.name, image, target, None if mask is None else torch.from_numpy(mask).to(image.device))
 
 
 def split_metrics(scores: dict[str, ImageMetrics], split: str) -> dict[str, Any]:

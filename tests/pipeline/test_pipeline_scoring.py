@@ -1,0 +1,46 @@
+"""Scores of splats over views: the quick mean PSNR of the training curve is that of the full scores."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.camera import look_at
+from gs2d.data.scene import View
+from gs2d.pipeline.scoring import mean_psnr, score_views
+from gs2d.render.backend import get_backend
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+
+def test_the_mean_psnr_of_the_curve_is_that_of_the_full_scores_masks_and_equal_images_included() -> None:
+    g = torch.Generator().manual_seed(0)
+    splats = Splats(
+        means=0.3 * torch.randn(6, 3, generator=g),
+        quats=torch.randn(6, 4, generator=g),
+        log_scales=torch.full((6, 2), -1.5),
+        opacity_logits=torch.zeros(6),
+        sh0=torch.randn(6, 1, 3, generator=g),
+        shN=torch.zeros(6, 0, 3),
+    )
+    backend, settings = get_backend("reference"), RasterSettings(sh_degree=0)
+    camera = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=12, height=12, fx=14.0)
+    away = look_at(
+        np.array([0.0, 0.0, -3.0]), np.array([0, 0, -9.0]), np.array([0, -1.0, 0]), width=12, height=12, fx=14.0
+    )
+    noise = np.random.default_rng(0).integers(0, 256, (12, 12, 3), dtype=np.uint8)
+    half = np.arange(12)[:, None].repeat(12, axis=1) < 6
+    views = [
+        View.from_arrays("noise", camera, noise),
+        View.from_arrays("half", camera, noise, mask=half),
+        View.from_arrays("nothing counts", camera, noise, mask=np.zeros((12, 12), bool)),
+        View.from_arrays("equal: infinite", away, np.zeros((12, 12, 3), np.uint8)),
+    ]
+    scores = score_views(splats, views, settings, backend, name="", on_event=lambda event: None)
+    values = [scores[name].psnr_float.value for name in ("noise", "half")]
+    assert [scores[view.name].psnr_float.value for view in views[2:]] == [None, None]
+    assert values[0] != values[1]
+    assert mean_psnr(splats, views, settings, backend) == pytest.approx(sum(v for v in values if v) / 2, abs=0)
+    assert mean_psnr(splats, views[2:], settings, backend) is None
+    assert mean_psnr(splats, [], settings, backend) is None
