@@ -62,9 +62,7 @@ def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samp
     """
     width, height = camera.width * samples, camera.height * samples
     local = vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]  # [P, 3] in camera axes
-    low, high = _sample_boxes(local, faces, camera, samples, width, height)
-    met = np.flatnonzero((high[:, 0] > low[:, 0]) & (high[:, 1] > low[:, 1]))  # the others may have no ray: most of
-    low, high = low[met], high[met]  # the faces of a fine mesh
+    met, low, high = _sample_boxes(local, faces, camera, samples, width, height)
     a, b, c = (local[faces[met, k]] for k in range(3))
     edges = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)  # [F, 3, 3]
     volume = np.einsum("fi,fi->f", a, edges[:, 0])
@@ -99,23 +97,35 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _sample_boxes(
     local: np.ndarray, faces: np.ndarray, camera: Camera, samples: int, width: int, height: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """First and last-but-one sample (x, y) that each triangle may cover, [F, 2] each (``high`` exclusive)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The triangles [n] that may cover a sample, the first (x, y) [n, 2] of each and the end of its box (exclusive).
+
+    Most faces of a fine mesh lie between two columns or two rows of samples. Bounds are rounded once a vertex.
+    """
     ahead = local[:, 2] > _CLOSEST
     safe = np.where(ahead, local[:, 2], 1.0)
     size, focal, center = (width, height), (camera.fx, camera.fy), (camera.cx, camera.cy)
-    low, high = np.empty((len(faces), 2), np.int64), np.empty((len(faces), 2), np.int64)
+    met, crossing = np.arange(len(faces)), np.zeros(0, np.int64)
+    if not ahead.all():
+        corners = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
+        met, crossing = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
+    bounds: list[np.ndarray] = []
     for axis in range(2):
         pixels = (local[:, axis] / safe * focal[axis] + center[axis]) * samples - 0.5  # [P]
-        a, b, c = (pixels[faces[:, k]] for k in range(3))
-        least, most = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-        low[:, axis] = np.clip(np.ceil(least - _MARGIN), 0, size[axis])
-        high[:, axis] = np.clip(np.floor(most + _MARGIN) + 1, 0, size[axis])
-    corners_ahead = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
-    crossing, behind = (corners_ahead > 0) & (corners_ahead < 3), corners_ahead == 0
-    low[crossing], high[crossing] = 0, size
-    high[behind] = low[behind]
-    return low, high
+        first = np.clip(np.ceil(pixels - _MARGIN), 0, size[axis]).astype(np.int32)
+        end = np.clip(np.floor(pixels + _MARGIN) + 1, 0, size[axis]).astype(np.int32)
+        a, b, c = (faces[met, k] for k in range(3))
+        low = np.minimum(np.minimum(first[a], first[b]), first[c])
+        high = np.maximum(np.maximum(end[a], end[b]), end[c])
+        some = high > low
+        met, bounds = met[some], [*(bound[some] for bound in bounds), low[some], high[some]]
+    whole = np.concatenate([met, crossing])  # faces that cross the camera plane: the whole image
+    order = np.argsort(whole, kind="stable")
+    x0, x1, y0, y1 = (
+        np.concatenate([bound, np.full(len(crossing), all_of_it)])[order]
+        for bound, all_of_it in zip(bounds, (0, width, 0, height), strict=True)
+    )
+    return whole[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
 
 
 def _pairs(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
