@@ -73,7 +73,7 @@ def relative_error(found: Tensor, expected: Tensor) -> float:
 def test_gradients_of_colours_alone_agree_with_the_reference(emulator: Emulator, clear_cases: list[Case]) -> None:
     launcher = Recording(emulator)
     errors = []
-    for case in clear_cases:
+    for case in clear_cases[:8]:
         cotangents = color_cotangent(case)
         found = gradients(launcher, case, cotangents, trained=COLORS)
         scene = requiring_grad(double(case.splats))
@@ -84,7 +84,7 @@ def test_gradients_of_colours_alone_agree_with_the_reference(emulator: Emulator,
                 errors.append(relative_error(found[name], expected))
     assert {"blend_vjp_learning", "project_colors_vjp"} <= set(launcher.names)
     assert not any(name.startswith(("blend_vjp_color", "project_splats_vjp")) for name in launcher.names)
-    assert len(errors) >= 16
+    assert len(errors) >= 10
     assert np.median(errors) < 1e-5
     assert max(errors) < 2e-3
 
@@ -257,7 +257,7 @@ def test_the_largest_errors_of_the_approximate_instructions_stay_within_the_tole
     same = {name: built for name, built in emulator._built.items() if not name.startswith("blend")}
     launcher = Emulator(tmp_path, approximate=True, _built=same)  # only the blending has such instructions
     errors: dict[str, list[float]] = {name: [] for name in ("color", *ATTRIBUTES)}
-    for case in clear_cases[:6]:
+    for case in clear_cases[:4]:
         exact, rough = (cuda.rasterize_with(e, case.splats, case.camera, SETTINGS) for e in (emulator, launcher))
         errors["color"].append(float((exact.color - rough.color).abs().max()))
         cotangents = random_cotangents(np.random.default_rng(case.seed), case.camera)
