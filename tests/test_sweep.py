@@ -24,7 +24,7 @@ from gs2d.pipeline.events import OnEvent, StageDone
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.sweep import MAX_DEATHS, StageClaims, Sweep, SweepJob, stage_keys, work
 from gs2d.pipeline.sweep_claims import is_stale, take_claim
-from gs2d.pipeline.sweep_slots import run_sweep
+from gs2d.pipeline.sweep_slots import revive, run_sweep
 from gs2d.pipeline.sweep_slurm import run_on_slurm
 
 
@@ -234,6 +234,25 @@ def test_a_sweep_goes_on_after_sigkill_without_doing_anything_twice(
 def test_slots_must_be_a_number_of_processes(tmp_path: Path) -> None:
     with pytest.raises(BackendError, match="--slots must be a whole number >= 1, got 0"):
         run_sweep(make_sweep(tmp_path, {}), lambda _event: None, slots=0)
+
+
+def test_slots_that_die_for_no_job_are_not_started_for_ever(tmp_path: Path) -> None:
+    class Dead:
+        exitcode = 9
+
+        def is_alive(self) -> bool:
+            return False
+
+        def join(self) -> None: ...
+
+    sweep, deaths, started = make_sweep(tmp_path, {"a": ("1",)}), list[int](), []
+    processes: list[Any] = [Dead()]
+    start: Any = lambda index: started.append(index) or Dead()  # noqa: E731
+    for _ in range(MAX_DEATHS):  # as often as the job may kill its process
+        revive(sweep, processes, start, deaths)
+    with pytest.raises(RunError, match="4 processes of --slots died .the last with exit code 9."):
+        revive(sweep, processes, start, deaths)
+    assert started == [0] * MAX_DEATHS
 
 
 @pytest.mark.slow

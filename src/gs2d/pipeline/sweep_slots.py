@@ -10,9 +10,9 @@ from dataclasses import replace
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from gs2d.errors import BackendError
+from gs2d.errors import BackendError, RunError
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
-from gs2d.pipeline.sweep import POLL_SECONDS, Sweep, SweepJob, work
+from gs2d.pipeline.sweep import MAX_DEATHS, POLL_SECONDS, Sweep, SweepJob, work
 
 
 def run_sweep(
@@ -104,9 +104,9 @@ def _local(sweep: Sweep, on_event: OnEvent, slots: int, gpus: int, after_job: Ca
         process.start()
         return process
 
-    processes = [start(index) for index in range(slots)]
+    processes, deaths = [start(index) for index in range(slots)], list[int]()
     try:
-        watch(sweep, on_event, after_job, lambda: _revive(sweep, processes, start))
+        watch(sweep, on_event, after_job, lambda: revive(sweep, processes, start, deaths))
     finally:
         for process in processes:
             if process.is_alive():
@@ -115,12 +115,25 @@ def _local(sweep: Sweep, on_event: OnEvent, slots: int, gpus: int, after_job: Ca
             process.join(timeout=10)
 
 
-def _revive(sweep: Sweep, processes: list[BaseProcess], start: Callable[[int], BaseProcess]) -> None:
+def revive(sweep: Sweep, processes: list[BaseProcess], start: Callable[[int], BaseProcess], deaths: list[int]) -> None:
+    """Start dead slots again while there is work; ``deaths`` collects their exit codes.
+
+    Raises
+    ------
+    RunError
+        They die more often than jobs can explain: something is wrong with the machine, not with a job.
+    """
     if not sweep.unsettled():
         return
     for index, process in enumerate(processes):
         if not process.is_alive():
             process.join()
+            deaths.append(process.exitcode or 0)
+            if len(deaths) > MAX_DEATHS * len(sweep.jobs):
+                raise RunError(
+                    f"{len(deaths)} processes of --slots died (the last with exit code {deaths[-1]}); "
+                    "try --slots 1, which shows why"
+                )
             processes[index] = start(index)
 
 
