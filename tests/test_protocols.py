@@ -24,6 +24,15 @@ from gs2d.recipe import LossTerm
 from gs2d.recipes import get_recipe
 
 
+def test_the_depth_that_is_fused_is_that_of_the_losses_unless_the_protocol_names_another() -> None:
+    """NeRF-Synthetic trains on mean depth, as the official script does, and fuses median depth."""
+    assert {name: p.fused_depth for name, p in PROTOCOLS.items() if p.fused_depth != p.depth} == {
+        "nerf-synthetic": "median"
+    }
+    assert DTU.fused_depth == "median"
+    assert GENERIC.fused_depth == "mean"
+
+
 def test_depth_is_median_on_dtu_and_tnt_and_mean_elsewhere() -> None:
     assert {name: p.depth for name, p in PROTOCOLS.items()} == {
         "dtu": "median",

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gs2d.cli import main
-from gs2d.errors import ProtocolError
+from gs2d.errors import ProtocolError, RunError
+from gs2d.io.files import write_json
 from gs2d.io.ply import read_mesh
+from gs2d.io.run import RunFolder
 from gs2d.pipeline.jobs import mesh_run
 from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.prepare import check_same_run, reload_job
 from gs2d.pipeline.train import train
 from tiny import RADIUS, write_capture
 
@@ -62,3 +66,21 @@ def test_memory_is_bounded_by_an_option_of_the_command(
     assert not out.exists()
     with pytest.raises(ProtocolError, match="--max-gib must be a positive number of GiB"):
         mesh_run(run, MeshOptions(max_gib=0.0), out=out)
+
+
+def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_resumes(
+    run: Path, tmp_path: Path
+) -> None:
+    assert mesh_run(run, MeshOptions(voxel=0.05), out=tmp_path / "a.ply", threads=1)["depth"] == "median"
+    assert mesh_run(run, MeshOptions(voxel=0.05, depth="mean"), out=tmp_path / "b.ply", threads=1)["depth"] == "mean"
+    folder = RunFolder(run)
+    job = reload_job(folder, lambda _event: None)
+    definition = json.loads((run / "run.json").read_text())
+    del definition["protocol"]["fusion"]["depth"]
+    old = RunFolder(tmp_path)
+    write_json(tmp_path / "run.json", definition)
+    check_same_run(old, job)
+    other = replace(job.protocol, fusion=replace(job.protocol.fusion, depth="mean"))
+    assert replace(job, protocol=other).stage_key(0) == job.stage_key(0)  # shares its stages
+    with pytest.raises(RunError, match="protocol"):
+        check_same_run(old, replace(job, protocol=replace(job.protocol, near=0.3)))

@@ -84,7 +84,7 @@ class Job:
         recipe = to_json(self.recipe)
         facts = {
             "scene": self.pictures_digest,
-            "protocol": asdict(self.protocol),
+            "protocol": _training_facts(asdict(self.protocol)),
             "raster": asdict(self.settings),
             "seed": self.recipe.seed,
             "backend": backend_facts(self.backend.name),
@@ -266,6 +266,8 @@ def check_same_run(run: RunFolder, job: Job) -> None:
     before, after = run.definition(), json.loads(json.dumps(job.definition()))
     for name, value in after.items():
         old = before.get(name)
+        if name == "protocol" and isinstance(old, dict):
+            old, value = _training_facts(old), _training_facts(value)
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]
@@ -274,9 +276,14 @@ def check_same_run(run: RunFolder, job: Job) -> None:
             where = _difference(old, value)
         if old != value:
             raise RunError(
-                f"{run.path} was made with another {name}{where}; "
-                "resume with the same options, or choose another --out"
+                f"{run.path} was made with another {name}{where}; resume with the same options, or choose another --out"
             )
+
+
+def _training_facts(protocol: dict[str, Any]) -> dict[str, Any]:
+    """A protocol without the kind of depth that is fused, which decides no byte of training."""
+    fusion = {name: value for name, value in protocol.get("fusion", {}).items() if name != "depth"}
+    return {**protocol, "fusion": fusion}
 
 
 def _difference(old: Any, new: Any, where: str = "") -> str:

@@ -44,7 +44,7 @@ def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_e
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     check_mesh_options(options)
-    depth = options.depth or job.protocol.depth
+    depth = options.depth or job.protocol.fused_depth
     result = _extract(job, splats, options, depth, on_event)
     write_mesh(out, result.mesh)
     if result.limits.cut_fraction > MOSTLY_CUT:
