@@ -74,17 +74,18 @@ __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 r
 }
 
 // What the inner loop needs of a pixel's upstream gradient, in shared memory: each thread reads what it wrote itself.
-struct Upstream {
-    float4 color[HALVES][128];   // red, green, blue, alpha
-    float4 normal[HALVES][128];  // and depth
+template <bool GEO> struct Upstream {
+    float4 color[HALVES][128];               // red, green, blue, alpha
+    float4 normal[HALVES][GEO ? 128 : 1];    // and depth
     __device__ __forceinline__ void put(int h, const PixelGradient<float>& g) {
-        color[h][threadIdx.x] = {g.red, g.green, g.blue, g.alpha}, normal[h][threadIdx.x] = {g.nx, g.ny, g.nz, g.depth};
+        color[h][threadIdx.x] = {g.red, g.green, g.blue, g.alpha};
+        if constexpr (GEO) normal[h][threadIdx.x] = {g.nx, g.ny, g.nz, g.depth};
     }
-    template <bool GEO> __device__ __forceinline__ void get(int h, PixelGradient<float>& g) const {
+    __device__ __forceinline__ void get(int h, PixelGradient<float>& g) const {
         const float4 c = color[h][threadIdx.x];
         g.red = c.x, g.green = c.y, g.blue = c.z, g.alpha = c.w;
         if constexpr (!GEO) return;
-        const float4 n = normal[h][threadIdx.x];
+        const float4 n = normal[h][GEO ? threadIdx.x : 0];
         g.nx = n.x, g.ny = n.y, g.nz = n.z, g.depth = n.w;
     }
 };
@@ -95,7 +96,7 @@ struct Staged {  // of a warp: 32 splats
 };
 
 template <bool GEO, bool DIST, bool ABS>
-__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream& upstream) {
+__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream<GEO>& upstream) {
     const Place at = place_of(a.view, a.tiles);
     const BlendLimits<float> limits = limits_of(a.view);
     PixelGradient<float> g[HALVES];  // in registers only what is not in `upstream`
@@ -138,7 +139,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                 if (!(hits[h] & bit)) continue;
                 const float dy = y + float(4 * h) - s.cy;
                 const Hit<float> hit = intersect(s, dx, dy, limits);
-                upstream.get<GEO>(h, g[h]);
+                upstream.get(h, g[h]);
                 composite_vjp<GEO, DIST, ABS, true>(s, inverse_zc, dx, dy, hit, limits, g[h], T[h], S[h], sums);
             }
             if (!(learning & bit)) continue;  // the same for all lanes
@@ -152,37 +153,37 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
 // GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is wanted.
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
     __shared__ Staged staged[4];
-    __shared__ Upstream upstream;
+    __shared__ Upstream<false> upstream;
     blend_vjp<false, false, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color_abs(BlendVjpArguments a) {
     __shared__ Staged staged[4];
-    __shared__ Upstream upstream;
+    __shared__ Upstream<false> upstream;
     blend_vjp<false, false, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_geometry(BlendVjpArguments a) {
     __shared__ Staged staged[4];
-    __shared__ Upstream upstream;
+    __shared__ Upstream<true> upstream;
     blend_vjp<true, false, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_geometry_abs(BlendVjpArguments a) {
     __shared__ Staged staged[4];
-    __shared__ Upstream upstream;
+    __shared__ Upstream<true> upstream;
     blend_vjp<true, false, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion(BlendVjpArguments a) {
     __shared__ Staged staged[4];
-    __shared__ Upstream upstream;
+    __shared__ Upstream<true> upstream;
     blend_vjp<true, true, false>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion_abs(BlendVjpArguments a) {
     __shared__ Staged staged[4];
-    __shared__ Upstream upstream;
+    __shared__ Upstream<true> upstream;
     blend_vjp<true, true, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
