@@ -28,7 +28,6 @@ _COMMON = {
     "fusion.truncation": f"{_OURS}: from the depth maps",
     "fusion.depth_limit": f"{_OURS}: from the depth maps",
     "fusion.clusters": f"{_CODE}: render.py keeps 50",
-    "fusion.depth": f"{_CODE}: render.py fuses the depth of the losses (depth_ratio)",
     "fusion.depth": f"{_CODE}: render.py fuses the depth that was trained",
     "metrics.from_8bit": f"{_CODE}: metrics.py reads PNG files",
     "metrics.lpips_unit_range": f"{_CODE}: LPIPS of images in [0, 1]",
@@ -64,7 +63,6 @@ _OWN: dict[str, dict[str, str]] = {
         "test_every": "the data set's own split",
         "use_mask_in_training": f"{_CODE}: pictures are composited on the background instead",
         "fusion.clusters": f"{_CODE}: render.py keeps 50; some objects come in pieces",
-        "fusion.depth": f"{_OURS}: median, which is nearer the truth where it was measured",
         "fusion.depth": f"{_OURS}: median depth is nearer the truth",
     },
     "mip-nerf-360": {
