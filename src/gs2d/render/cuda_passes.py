@@ -154,6 +154,9 @@ class _Projected:
     radii: Tensor  # [N] float32
 
 
+PROJECTED = tuple(field.name for field in fields(_Projected))
+
+
 def _project(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, errors: bool) -> _Projected:
     """Records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
     count, device = parameters[0].shape[0], parameters[0].device
@@ -162,10 +165,8 @@ def _project(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, er
     shapes = {"records": (count, 16), "cull": (count, 8), "rects": (count, 4)}
     types = {"rects": torch.int16, "depth_keys": torch.int32, "tile_counts": torch.int32}
     arrays = {
-        field.name: torch.empty(
-            shapes.get(field.name, (count,)), dtype=types.get(field.name, torch.float32), device=device
-        )
-        for field in fields(_Projected)
+        name: torch.empty(shapes.get(name, (count,)), dtype=types.get(name, torch.float32), device=device)
+        for name in PROJECTED
     }
     if count > 0:
         project = ProjectArguments(view=view, count=count, sh_rest=parameters[5].shape[1], errors=int(errors))
