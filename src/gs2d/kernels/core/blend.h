@@ -50,25 +50,39 @@ template <class V> struct Pixel {
     mask_t<V> live;
 };
 
-// Composites one splat, given what `intersect` found; returns where a live pixel saw it (also where that pixel stops).
-template <class V>
-GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
-    const auto seen = (raw_alpha > V(0)) & p.live;
-    const V alpha = keep(seen, min(raw_alpha, k.alpha_max));
+// One splat at the pixel, given what `intersect` found: its weight, and all of the state that it changes but the images
+// of `accumulate`. Early: a live pixel may have T > 1/2 or nothing in front; otherwise its first and median pairs are past.
+template <bool Early, class V>
+GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
+    const V alpha = keep(p.live, min(raw_alpha, k.alpha_max));
     const V after = fnma(alpha, p.T, p.T);
-    p.live = p.live & (after >= k.transmittance_min);  // T of a live pixel never is below: only `seen` can stop it
+    p.live = p.live & (after >= k.transmittance_min);  // T of a live pixel never is below: only a seen splat can stop it
     const V w = keep(p.live, alpha * p.T);
-    p.inverse_depth0 = select(p.alpha <= V(0), inverse_depth, p.inverse_depth0);
+    if constexpr (Early) {
+        p.inverse_depth0 = select(p.alpha <= V(0), inverse_depth, p.inverse_depth0);
+        p.median = select((w > V(0)) & (p.T > V(0.5)), depth, p.median);
+    }
     const V q = inverse_depth - p.inverse_depth0, wq = w * q;
     p.distortion = fma(wq, fma(q, p.alpha, V(-2) * p.M1), fma(w, p.M2, p.distortion));
     p.M1 = p.M1 + wq;
     p.M2 = fma(wq, q, p.M2);
-    p.median = select((w > V(0)) & (p.T > V(0.5)), depth, p.median);
     p.T = select(p.live, after, p.T);
     p.alpha = p.alpha + w;
+    return w;
+}
+
+// The images that only sum up weights.
+template <class V> GS2D_HD void accumulate(const Record<V>& s, V w, V depth, Pixel<V>& p) {
     p.red = fma(w, s.red, p.red), p.green = fma(w, s.green, p.green), p.blue = fma(w, s.blue, p.blue);
     p.nx = fma(w, s.nx, p.nx), p.ny = fma(w, s.ny, p.ny), p.nz = fma(w, s.nz, p.nz);
     p.depth = fma(w, depth, p.depth);
+}
+
+// Both; returns where a live pixel saw the splat (also where that pixel stops).
+template <class V>
+GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
+    const auto seen = (raw_alpha > V(0)) & p.live;
+    accumulate(s, composite_weight<true>(raw_alpha, depth, inverse_depth, k, p), depth, p);
     return seen;
 }
 

@@ -44,27 +44,47 @@ inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
 // on the pixel's state, and so many of them overlap; the state stays in registers while it is used.
 constexpr int BATCH = 8;
 
+// What the intersections leave: one row per splat.
+struct Batch {
+    alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
+};
+
+template <bool Early>
+inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b, Batch& batch, const BlendLimits<V>& limits, Pixel<V>& p) {
+    const auto weigh = [&](int i) {
+        const V alpha = load(batch.alpha[i]);
+        w.seen[list[i]] |= uint32_t(any_positive(alpha, p.live)) << b;
+        return composite_weight<Early>(alpha, load(batch.depth[i]), load(batch.inverse_depth[i]), limits, p);
+    };
+    const auto add = [&](int i, V weight) { accumulate(broadcast(w.records[list[i]]), weight, load(batch.depth[i]), p); };
+    if constexpr (REGISTERS >= 32) {
+        for (int i = 0; i < count; ++i) add(i, weigh(i));
+    } else {  // the state of a pixel does not fit: first one half of it, then the other
+        for (int i = 0; i < count; ++i) store(batch.alpha[i], weigh(i));
+        for (int i = 0; i < count; ++i) add(i, load(batch.alpha[i]));
+    }
+}
+
 void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const BlendLimits<V>& limits) {
     const int count = indices_with_bit(w.touched, n, b, w.list);
     if (count == 0) return;
     const V x = lane_x(0) + V(tile_x + real(block_x(b))), y = lane_y(0) + V(tile_y + real(block_y(b)));
     Pixel<V> p = load_pixel(w.state, b);
     for (int j = 0; j < count; j += BATCH) {
-        alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
+        Batch batch;
         const int m = count - j < BATCH ? count - j : BATCH;
         for (int i = 0; i < m; ++i) {
             const uint32_t e = w.list[j + i];
             const Record<V> s = broadcast(w.records[e]);
             const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
-            store(alpha[i], h.alpha);
-            store(depth[i], s.zc * h.rq);
-            store(inverse_depth[i], V(w.inverse_zc[e]) * h.Q);
+            store(batch.alpha[i], h.alpha);
+            store(batch.depth[i], s.zc * h.rq);
+            store(batch.inverse_depth[i], V(w.inverse_zc[e]) * h.Q);
         }
-        for (int i = 0; i < m; ++i) {
-            const uint32_t e = w.list[j + i];
-            const M seen = composite(broadcast(w.records[e]), load(alpha[i]), load(depth[i]), load(inverse_depth[i]), limits, p);
-            w.seen[e] |= uint32_t(any(seen)) << b;
-        }
+        if (any(p.live & ((p.alpha <= V(0)) | (p.T > V(real(0.5))))))
+            composite_batch<true>(w, w.list + j, m, b, batch, limits, p);
+        else
+            composite_batch<false>(w, w.list + j, m, b, batch, limits, p);
         if (!any(p.live)) break;
     }
     store_pixel(w.state, b, p);

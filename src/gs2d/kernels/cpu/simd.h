@@ -14,7 +14,9 @@
 //   fma(a,b,c), fnma(a,b,c)   a*b+c, c-a*b            min, max, abs, sqrt, round  min(a,b) is b where a is NaN
 //   exp2, exp, log2           a few ulp               select(m, a, b)             m ? a : b
 //   keep(m, a)                m ? a : 0               any(m), all(m), bits(m), mask_of(bits), first(n)
+//   any_positive(a, m)        any(m & (a > 0)), where no lane of a is below 0, -0 or NaN
 //   iota()                    0, 1, 2, ...            sum(v)                      fixed order
+//   REGISTERS                 how many vectors the processor holds
 //   transpose(v)              in place, LANES vectors
 //   transpose_reduce<K>(v, p) p[k] = sum(v[k]), K = 16 or 4, fixed order
 #pragma once
@@ -49,7 +51,7 @@ GS2D_HD V& operator+=(V& a, V b) { return a = a + b; }
 GS2D_HD V& operator-=(V& a, V b) { return a = a - b; }
 GS2D_HD V& operator*=(V& a, V b) { return a = a * b; }
 
-#if !(defined(__AVX512F__) && !defined(GS2D_DOUBLE))
+#if !defined(GS2D_OWN_INDICES)
 // Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
 GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     int count = 0;

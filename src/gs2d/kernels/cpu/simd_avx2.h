@@ -6,7 +6,7 @@
 namespace gs2d {
 
 using real = float;
-constexpr int LANES = 8;
+constexpr int LANES = 8, REGISTERS = 16;
 
 struct M {
     __m256 m;
@@ -50,6 +50,7 @@ GS2D_HD M and_not(M a, M b) { return {_mm256_andnot_ps(b.m, a.m)}; }  // a & ~b
 GS2D_HD M operator~(M a) { return {_mm256_xor_ps(a.m, _mm256_castsi256_ps(_mm256_set1_epi32(-1)))}; }
 GS2D_HD uint32_t bits(M m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.m)); }
 GS2D_HD bool any(M m) { return bits(m) != 0; }
+GS2D_HD bool any_positive(V a, M m) { return !_mm256_testz_si256(_mm256_castps_si256(a.v), _mm256_castps_si256(m.m)); }
 GS2D_HD bool all(M m) { return bits(m) == 0xffu; }
 GS2D_HD M mask_of(uint32_t b) {
     const __m256i bit = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
@@ -88,6 +89,34 @@ GS2D_HD void transpose(V* v) {
         v[j] = _mm256_permute2f128_ps(r[j], r[4 + j], 0x20);
         v[4 + j] = _mm256_permute2f128_ps(r[j], r[4 + j], 0x31);
     }
+}
+
+#define GS2D_OWN_INDICES
+// For each 8-bit mask the numbers of its bits, one after the other.
+struct BitNumbers {
+    uint8_t of[256][8] = {};
+    constexpr BitNumbers() {
+        for (int mask = 0; mask < 256; ++mask)
+            for (int bit = 0, n = 0; bit < 8; ++bit)
+                if (mask >> bit & 1) of[mask][n++] = static_cast<uint8_t>(bit);
+    }
+};
+constexpr BitNumbers BIT_NUMBERS;
+
+// Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
+    const __m128i shift = _mm_cvtsi32_si128(31 - bit);
+    __m256i index = _mm256_setzero_si256();
+    int count = 0;
+    for (int i = 0; i < n; i += 8, index = _mm256_add_epi32(index, _mm256_set1_epi32(8))) {
+        const __m256i m = _mm256_sll_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(masks + i)), shift);
+        uint32_t k = static_cast<uint32_t>(_mm256_movemask_ps(_mm256_castsi256_ps(m)));
+        if (n - i < 8) k &= (1u << (n - i)) - 1u;
+        const __m256i bits = _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(BIT_NUMBERS.of[k])));
+        _mm256_storeu_si256(reinterpret_cast<__m256i*>(out + count), _mm256_add_epi32(index, bits));
+        count += __builtin_popcount(k);
+    }
+    return count;
 }
 
 template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {

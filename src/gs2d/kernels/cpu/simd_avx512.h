@@ -6,7 +6,7 @@
 namespace gs2d {
 
 using real = float;
-constexpr int LANES = 16;
+constexpr int LANES = 16, REGISTERS = 32;
 
 struct M {
     __mmask16 k;
@@ -45,6 +45,10 @@ GS2D_HD M operator|(M a, M b) { return {_kor_mask16(a.k, b.k)}; }
 GS2D_HD M operator~(M a) { return {_knot_mask16(a.k)}; }
 GS2D_HD M and_not(M a, M b) { return {_kandn_mask16(b.k, a.k)}; }  // a & ~b
 GS2D_HD bool any(M m) { return !_kortestz_mask16_u8(m.k, m.k); }
+GS2D_HD bool any_positive(V a, M m) {
+    const __m512i i = _mm512_castps_si512(a.v);
+    return any({_mm512_mask_test_epi32_mask(m.k, i, i)});
+}
 GS2D_HD bool all(M m) { return _kortestc_mask16_u8(m.k, m.k); }
 GS2D_HD uint32_t bits(M m) { return _cvtmask16_u32(m.k); }
 GS2D_HD M mask_of(uint32_t b) { return {static_cast<__mmask16>(b)}; }
@@ -80,6 +84,7 @@ GS2D_HD void transpose(V* v) {
     }
 }
 
+#define GS2D_OWN_INDICES
 // Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
 GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16);

@@ -10,7 +10,7 @@ using lane_int = int64_t;
 using real = float;
 using lane_int = int32_t;
 #endif
-constexpr int LANES = 8;
+constexpr int LANES = 8, REGISTERS = 16;
 
 typedef real vreal __attribute__((vector_size(LANES * sizeof(real))));
 typedef lane_int vint __attribute__((vector_size(LANES * sizeof(real))));
@@ -87,6 +87,7 @@ GS2D_HD bool any(M m) {
     for (int i = 0; i < LANES; ++i) a |= m.m[i];
     return a != 0;
 }
+GS2D_HD bool any_positive(V a, M m) { return any((a > V(0)) & m); }
 GS2D_HD bool all(M m) { return !any(~m); }
 GS2D_HD M mask_of(uint32_t b) {
     vint m{};
