@@ -152,3 +152,11 @@ def test_a_weight_of_zero_leaves_the_term_out() -> None:
 def test_an_unknown_name_suggests_a_near_one() -> None:
     with pytest.raises(RecipeError, match="2dgs-r-k10"):
         get_recipe("2dgs-r-k100")
+
+
+def test_silhouettes_are_kept_wherever_opacity_or_geometry_learns() -> None:
+    surface, appearance, refine = get_recipe("2dgs-r-silhouette").stages
+    plain = get_recipe("2dgs-r").stages
+    assert weights(surface) == weights(plain[0]) | {"silhouette": (0.1, 0)}
+    assert appearance == plain[1]  # colours alone: alpha cannot change, and views can be cached
+    assert weights(refine) == weights(plain[2]) | {"silhouette": (0.1, 0)}

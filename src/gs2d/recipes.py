@@ -118,6 +118,19 @@ def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: St
     return Recipe(name, (surface(), stage_2 or appearance(), stage_3 or refine()))
 
 
+def with_silhouette(recipe: Recipe, weight: float = 0.1, *, name: str) -> Recipe:
+    """The recipe with a silhouette loss wherever opacity or geometry is trained; photographs need an alpha channel.
+
+    Not in the paper. Colour cannot see splats that have the background's colour, and the official normal consistency
+    rewards their coverage: they grow without bound (docs/results.md).
+    """
+    stages = (
+        replace(stage, losses=(*stage.losses, LossTerm("silhouette", weight))) if set(stage.train) - set(SH) else stage
+        for stage in recipe.stages
+    )
+    return replace(recipe, name=name, stages=tuple(stages))
+
+
 def _normal_consistency(weight: float, start: int) -> tuple[LossTerm, ...]:
     return (LossTerm("normal_consistency", weight, start),) if weight > 0 else ()
 
@@ -193,6 +206,12 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
     add("2dgs-r-rerank", "Variant: E_i is ranked again after stage 2", rerank)
     visible = replace(appearance(), on_enter=(RankByError(occlusion=True),))
     add("2dgs-r-occlusion", "Variant: E_i counts visible pixels only", partial(two_dgs_r, stage_2=visible))
+    for base, build in {"2dgs": two_dgs, "2dgs-60k": two_dgs_60k, "2dgs-r": two_dgs_r}.items():
+        add(
+            f"{base}-silhouette",
+            f"{base} that also keeps empty what the photographs' alpha channel says is empty",
+            partial(with_silhouette, build()),
+        )
 
 
 RECIPES: Mapping[str, NamedRecipe] = MappingProxyType(_registry())
