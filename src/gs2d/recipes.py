@@ -206,7 +206,8 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
     add("2dgs-r-rerank", "Variant: E_i is ranked again after stage 2", rerank)
     visible = replace(appearance(), on_enter=(RankByError(occlusion=True),))
     add("2dgs-r-occlusion", "Variant: E_i counts visible pixels only", partial(two_dgs_r, stage_2=visible))
-    for base, build in {"2dgs": two_dgs, "2dgs-60k": two_dgs_60k, "2dgs-r": two_dgs_r}.items():
+    bases: dict[str, Callable[..., Recipe]] = {"2dgs": two_dgs, "2dgs-60k": two_dgs_60k, "2dgs-r": two_dgs_r}
+    for base, build in bases.items():
         add(
             f"{base}-silhouette",
             f"{base} that also keeps empty what the photographs' alpha channel says is empty",
