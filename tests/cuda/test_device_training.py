@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from emulate import Emulator
-from render_scenes import front_camera
+from render_scenes import front_camera, splat, stack
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -31,8 +31,9 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.protocols import GENERIC
 from gs2d.recipe import Recipe
-from gs2d.render import cuda, cuda_budget
+from gs2d.render import cuda, cuda_budget, cuda_passes
 from gs2d.render.backend import Backend, get_backend
+from gs2d.render.types import RasterSettings
 from gs2d.train import events, loop, views
 from gs2d.train.loop import Trainer
 from gs2d.train.targets import DeviceTargets, Targets
@@ -203,6 +204,34 @@ def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     assert any(outcomes) == (slack < 1)
     assert train_toys.same(kept.splats, trainer.splats)
     assert {k: m.steps for k, m in kept.state.moments.items()} == {k: m.steps for k, m in trainer.state.moments.items()}
+
+
+def test_room_that_is_not_needed_holds_nothing_and_too_little_room_is_said(
+    emulator: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last splat by depth is culled: nothing of it may be read for the pairs that do not exist."""
+    monkeypatch.setattr(cuda_budget, "STEP", 1)
+    camera = front_camera(40, 20)
+    scene = stack(splat((0.1, 0.0, 2.0)), splat((0.0, 0.1, 3.0), (2.0, 1.0)), splat((0.0, 0.0, -1.0)))
+    view = cuda_passes.view_of(camera, RasterSettings(sh_degree=0))
+    parameters = [tensor for _, tensor in scene.items()]
+    budget = cuda_budget.PairBudget()
+    exact = cuda_passes.forward(emulator, view, parameters, budget=budget)
+    assert budget.overflow is None
+    assert not budget.cut_short()
+    pairs = len(exact.entries)
+    assert pairs > 6
+    for slack, short in ((3.0, False), (0.5, True)):
+        monkeypatch.setattr(cuda_budget, "SLACK", slack)
+        frame = cuda_passes.forward(emulator, view, parameters, budget=budget)
+        assert len(frame.entries) == int(slack * pairs)
+        assert bool(budget.overflow) == short
+        assert budget.cut_short() == short
+        assert not budget.cut_short()  # settled
+        same = [torch.equal(frame.images[name], exact.images[name]) for name in ("color", "alpha", "depth_median")]
+        assert all(same) != short
+        if not short:
+            assert torch.equal(frame.ranges[:-1], exact.ranges[:-1])
 
 
 def picture_scene() -> tuple[View, ...]:
