@@ -85,7 +85,9 @@ def psnr_float(image: Tensor, target: Tensor, mask: Tensor | None = None) -> flo
         ``inf`` for equal images, ``nan`` when no pixel is valid.
     """
     check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
-    squared = (image.clamp(0, 1).double() - target.double()).square()  # [H, W, 3]
+    squared = image.detach().clamp(0, 1).double()  # [H, W, 3]
+    squared -= target.detach()
+    squared.square_()  # in place: a 4K image of doubles is 200 MB
     if mask is not None:
         check_shapes({"target": (target, "H W 3"), "mask": (mask, "H W")})
         squared = squared[mask]
