@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -19,114 +17,14 @@ import pytest
 
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.pipeline import sweep as sweep_module
-from gs2d.pipeline import sweep_claims
 from gs2d.pipeline.events import OnEvent, StageDone
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.sweep import MAX_DEATHS, StageClaims, Sweep, SweepJob, stage_keys, work
-from gs2d.pipeline.sweep_claims import is_stale, take_claim
+from gs2d.pipeline.sweep import MAX_DEATHS, Sweep, SweepJob, work
 from gs2d.pipeline.sweep_slots import revive, run_sweep
 from gs2d.pipeline.sweep_slurm import run_on_slurm
-
-
-def make_sweep(folder: Path, keys: dict[str, tuple[str, ...]]) -> Sweep:
-    """Jobs by name with the keys of their stages."""
-    jobs = tuple(
-        SweepJob(name=name, train=TrainOptions(scene=folder, out=folder / "runs" / name), stage_keys=stages)
-        for name, stages in keys.items()
-    )
-    return Sweep(folder=folder, jobs=jobs, cache=folder / "cache")
-
-
-def dead_pid() -> int:
-    """The number of a process that has ended."""
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
-
-
-def write_claim(path: Path, **facts: Any) -> None:
-    path.write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "began": None, **facts}))
-
-
-# -- claims ------------------------------------------------------------------------------------------------------
-def test_a_claim_is_held_by_one_and_free_again_after_release(tmp_path: Path) -> None:
-    first = take_claim(tmp_path / "job.claim")
-    assert first is not None
-    assert take_claim(tmp_path / "job.claim") is None
-    assert not is_stale(tmp_path / "job.claim")
-    first.release()
-    assert take_claim(tmp_path / "job.claim") is not None
-
-
-@pytest.mark.parametrize("facts", [{"pid": None}, {"began": "12345"}], ids=["dead process", "number in use again"])
-def test_a_claim_of_a_process_that_is_gone_is_taken_over(tmp_path: Path, facts: dict[str, Any]) -> None:
-    path = tmp_path / "job.claim"
-    write_claim(path, **({"pid": dead_pid(), "began": "1"} if facts.get("pid", 0) is None else facts))
-    assert is_stale(path)
-    mine = take_claim(path)
-    assert mine is not None
-    assert json.loads(path.read_text())["pid"] == os.getpid()
-
-
-def test_of_many_that_see_a_dead_claim_one_gets_it(tmp_path: Path) -> None:
-    path = tmp_path / "job.claim"
-    for _ in range(5):
-        write_claim(path, pid=dead_pid(), began="1")
-        with ThreadPoolExecutor(8) as pool:
-            got = [claim for claim in pool.map(lambda _i: take_claim(path), range(8)) if claim is not None]
-        assert len(got) == 1
-        got[0].release()
-
-
-def test_a_claim_of_another_machine_is_stale_when_it_is_not_touched(tmp_path: Path) -> None:
-    path = tmp_path / "job.claim"
-    write_claim(path, host="elsewhere")
-    assert not is_stale(path)
-    old = time.time() - sweep_claims.FOREIGN_SECONDS - 1
-    os.utime(path, (old, old))
-    assert is_stale(path)
-
-
-def test_a_claim_that_was_never_written_is_stale_after_a_while(tmp_path: Path) -> None:
-    path = tmp_path / "job.claim"
-    path.touch()  # killed between making the file and writing into it
-    assert not is_stale(path)
-    old = time.time() - sweep_claims.UNWRITTEN_SECONDS - 1
-    os.utime(path, (old, old))
-    assert is_stale(path)
-
-
-def test_who_was_taken_over_does_not_release_the_new_holder(tmp_path: Path) -> None:
-    path = tmp_path / "job.claim"
-    first = take_claim(path)
-    assert first is not None
-    path.unlink()
-    second = take_claim(path)
-    first.release()
-    assert second is not None
-    assert path.exists()
+from sweep_jobs import dead_pid, make_sweep, write_claim
 
 
 # -- shared stages -------------------------------------------------------------------------------------------------
-def test_keys_are_equal_as_far_as_the_stages_are() -> None:
-    a, b = stage_keys(["lego", 0], ["surface", "x"]), stage_keys(["lego", 0], ["surface", "y"])
-    assert a[0] == b[0]
-    assert a[1] != b[1]
-    assert stage_keys(["lego", 1], ["surface"])[0] != a[0]
-
-
-def test_a_stage_under_training_is_waited_for_and_free_when_it_is_finished(tmp_path: Path) -> None:
-    first, second = StageClaims(tmp_path, ("s", "a")), StageClaims(tmp_path, ("s", "b"))
-    assert first.take()
-    assert not second.take()
-    assert not (tmp_path / "b.claim").exists()  # who cannot have all holds none
-    first.finished(1)
-    assert second.take()
-    second.release()
-    first.release()
-    assert not list(tmp_path.glob("*.claim"))
-
-
 def test_two_workers_train_a_shared_stage_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log: list[str] = []
     both_began = threading.Event()
@@ -196,12 +94,73 @@ def test_a_job_whose_process_dies_again_and_again_counts_as_failed(
     assert f"died {MAX_DEATHS} times" in sweep.failures()["a"]
 
 
+def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_its_run_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    def train(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
+        done.append(job.name)
+        job.train.out.mkdir(parents=True, exist_ok=True)
+        (job.train.out / "splats.ply").touch()
+        return {}
+
+    def sweep_that_wants(*wanted: str) -> Sweep:
+        sweep = make_sweep(tmp_path, {"a": ("1",)})
+        return replace(sweep, jobs=(replace(sweep.jobs[0], wanted=wanted),))
+
+    monkeypatch.setattr(sweep_module, "train_and_evaluate", train)
+    work(sweep_that_wants("surface: x"))
+    work(sweep_that_wants("surface: x"))
+    work(sweep_that_wants())  # less is wanted: what is there stays
+    assert len(done) == 1
+    work(sweep_that_wants("surface: x", "lpips: y"))
+    assert len(done) == 2
+    (tmp_path / "runs" / "a" / "splats.ply").unlink()
+    work(sweep_that_wants("surface: x"))
+    assert len(done) == 3
+
+
+def test_a_job_that_was_trained_and_could_not_be_scored_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
+        if job.name == "trained":
+            job.train.out.mkdir(parents=True)
+            (job.train.out / "splats.ply").touch()
+        raise DataError("the log does not fit")
+
+    monkeypatch.setattr(sweep_module, "train_and_evaluate", train)
+    sweep = make_sweep(tmp_path, {"trained": ("1",), "not": ("2",)})
+    work(sweep)
+    assert [sweep.record(job)["trained"] for job in sweep.jobs] == [True, False]
+    assert set(sweep.failures()) == {"trained", "not"}
+
+
+def test_who_waits_for_another_machine_says_for_whom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = make_sweep(tmp_path, {"a": ("1",)})
+    (tmp_path / "jobs").mkdir()
+    claim = sweep.claim_file(sweep.jobs[0])
+    write_claim(claim, host="elsewhere", pid=7)
+    heard: list[str] = []
+
+    def listen(event: object) -> None:
+        heard.append(getattr(event, "text", ""))
+        claim.unlink(missing_ok=True)  # it is done there
+
+    monkeypatch.setattr(sweep_module, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(sweep_module, "train_and_evaluate", lambda *_: {})
+    work(sweep, listen)
+    assert heard[0].startswith("waiting for a (process 7 on elsewhere); should that machine be gone, ")
+    assert heard[1] == "job 1 of 1: a"
+
+
 KILLED = """
 import sys, time
 from pathlib import Path
 from gs2d.pipeline import sweep as module
 sys.path.insert(0, sys.argv[2])
-from test_sweep import make_sweep
+from sweep_jobs import make_sweep
 def train(job, on_event):
     if job.name == "b":
         print("at b", flush=True)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from gs2d.io.run import machine, make_folder, versions
 from gs2d.paper_tables import PAPER_TABLES, PaperTable
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.paper_commands import commands_of, paper_command
 from gs2d.pipeline.paper_deviations import deviations_of
 from gs2d.pipeline.paper_page import write_page
 from gs2d.pipeline.paper_rows import Results, Row, Verdict, judge, read_cell
@@ -185,8 +185,8 @@ def make_plan(options: PaperOptions) -> Plan:
 
 def canonical_recipe(name: str) -> str:
     """The first named recipe that trains the same: "2dgs-r" for "2dgs-r-k1"."""
-    stages = get_recipe(name).stages
-    return next(other for other in RECIPES if get_recipe(other).stages == stages)
+    recipe = replace(get_recipe(name), name="")
+    return next(other for other in RECIPES if replace(get_recipe(other), name="") == recipe)
 
 
 def _recipe(name: str, options: PaperOptions) -> Recipe:
@@ -234,7 +234,16 @@ def _job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, se
         train=train,
         evaluate=evaluate,
         stage_keys=stage_keys((*map(repr, facts), recipe.init_points, recipe.sh_degree), to_json(recipe)["stages"]),
+        wanted=tuple(_wanted(scene, options)),
     )
+
+
+def _wanted(scene: FoundScene, options: PaperOptions) -> Iterator[str]:
+    """What is scored: a run that was scored without it is scored again."""
+    if scene.scored:
+        yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
+    if options.lpips_weights is not None:
+        yield f"lpips: {options.lpips_weights.resolve()}"
 
 
 def check_folder(plan: Plan) -> None:
@@ -249,7 +258,9 @@ def check_folder(plan: Plan) -> None:
         raise RunError(f"--out must be a folder, {plan.options.out} is a file")
     if not path.exists():
         return
-    before, after = read_json(path)["options"], json.loads(json.dumps(_defining(plan.options)))
+    before, after = read_json(path).get("options"), json.loads(json.dumps(_defining(plan.options)))
+    if not isinstance(before, dict):
+        raise RunError(f"{path} must be one that gs2d paper wrote, got another file; choose another --out")
     for name, value in after.items():
         if before.get(name) != value:
             raise RunError(
@@ -350,46 +361,3 @@ def _scene_facts(scene: FoundScene) -> dict[str, Any]:
     truth = "found beside it" if scene.scored and scene.truth is None else scene.truth and str(scene.truth)
     facts = {"path": str(scene.path), "format": scene.format, "downscale": scene.downscale, "ground_truth": truth}
     return {**facts, "missing": list(scene.missing), "protocol": asdict(scene.protocol)}
-
-
-def paper_command(options: PaperOptions) -> str:
-    """The command that makes this table."""
-    words = ["gs2d", "paper", options.table, "--data", str(options.data), "--out", str(options.out)]
-    words += ["--scenes", *options.scenes] if options.scenes else []
-    if options.schedule_scale != 1.0:
-        words += ["--schedule-scale", str(options.schedule_scale)]
-    if options.downscale is not None:
-        words += ["--downscale", str(options.downscale)]
-    words += ["--seeds", ",".join(map(str, options.seeds))] if options.seeds != (0,) else []
-    for name in ("protocol", "backend"):
-        if getattr(options, name) != "auto":
-            words += [f"--{name}", getattr(options, name)]
-    for name in ("cache", "truth", "lpips_weights"):
-        if getattr(options, name) is not None:
-            words += [f"--{name.replace('_', '-')}", str(getattr(options, name))]
-    for text in options.overrides:
-        words += ["--set", text]
-    return shlex.join(words)
-
-
-def commands_of(job: SweepJob) -> list[str]:
-    """The `gs2d train` and `gs2d evaluate` lines that do what a job does."""
-    plain, train = TrainOptions(scene=job.train.scene, out=job.train.out), job.train
-    words = ["gs2d", "train", str(train.scene), "--out", str(train.out), "--recipe", str(train.recipe)]
-    for name in ("protocol", "format", "backend", "schedule_scale", "downscale", "seed", "threads", "cache"):
-        if getattr(train, name) != getattr(plain, name):
-            words += [f"--{name.replace('_', '-')}", str(getattr(train, name))]
-    for text in train.overrides:
-        words += ["--set", text]
-    lines = [shlex.join(words)]
-    if job.evaluate is not None:
-        score = ["gs2d", "evaluate", str(train.out)]
-        if job.evaluate.ground_truth is not None:
-            score += ["--ground-truth", str(job.evaluate.ground_truth)]
-        if job.evaluate.lpips_weights is not None:
-            score += ["--lpips-weights", str(job.evaluate.lpips_weights)]
-        lines.append(shlex.join(score))
-    return lines
-
-
-__all__ = ["PaperOptions", "PaperResult", "make_plan", "paper", "replace", "tabulate"]

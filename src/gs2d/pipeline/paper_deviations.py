@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING
 from gs2d.errors import Gs2dError
 from gs2d.images import image_size
 from gs2d.io.run import machine, versions
-from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, PaperTable
+from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
 from gs2d.pipeline.paper_rows import NOT_YET, Results
 from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes
+from gs2d.recipes import get_recipe
 
 if TYPE_CHECKING:
     from gs2d.pipeline.paper import PaperOptions
 
 NERF_SYNTHETIC_SIZE = (800, 800)  # px
+EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by data set
 
 
 def deviations_of(
@@ -27,9 +29,13 @@ def deviations_of(
         found.append(f"the schedule is {options.schedule_scale:g} of the paper's (30k + 10k + 20k iterations)")
     found += _scenes(options, scenes, table)
     found += [f"changed in the recipes: {text}" for text in options.overrides]
+    found += _methods(table)
     found += _missing_figures(results)
     if any(scene.data_set == NERF_SYNTHETIC and scene.scored for scene in scenes):
         found.append("F-score on NeRF-Synthetic is by this project's own protocol: the paper states none")
+    found += dict.fromkeys(_surfaces(results))
+    if options.slots is not None and options.slots > 1:
+        found.append(f"{options.slots} runs shared the machine: their seconds are longer than those of one alone")
     count, names = len(options.seeds), ", ".join(map(str, options.seeds))
     found.append(f"{count} seed{'s' if count > 1 else ''} ({names}); the paper does not say how many")
     host, installed = machine(), versions()
@@ -41,6 +47,38 @@ def deviations_of(
         f"gs2d {installed['2dgs-r']}, torch {installed['torch']}, Python {installed['python']}"
     )
     return found
+
+
+def _methods(table: PaperTable) -> Iterator[str]:
+    """What the paper leaves open in the recipes of a table."""
+    recipes = {row.recipe: get_recipe(row.recipe) for row in table.trained if row.recipe is not None}
+    if any(len(recipe.stages) > 2 for recipe in recipes.values()):
+        yield (
+            "the paper does not say which pixels count in E_i, with what opacity clones begin, nor the rates and "
+            "Adam's moments of stages 2 and 3: docs/decisions.md has the readings that were trained"
+        )
+    if "2dgs-r-absgs-a" in recipes:
+        yield (
+            "the paper prints no thresholds of AbsGS-A: those here are gs2d's own (docs/guides/paper.md); AbsGS-D has "
+            "those of AbsGS's released code, and both densify in stage 3 in place of the clone"
+        )
+
+
+def _surfaces(results: Results) -> Iterator[str]:
+    """Surfaces that were not scored as the paper's were, and scores that their own check does not believe."""
+    for row in results.rows:
+        for cell in row.cells:
+            surface = cell.details.get("surface") or {}
+            official = EVALUATORS.get(cell.data_set)
+            if official is not None and surface.get("evaluator", official) != official:
+                yield (
+                    f"{cell.scene}: its surface is scored by this project's visible-surface protocol, not by that of "
+                    f"{cell.data_set}; do not compare it with the paper's"
+                )
+            check = surface.get("self_check") or {"ok": True}
+            if not check["ok"]:
+                why = "; ".join(check.get("messages", ())) or surface.get("reason") or "no reason given"
+                yield f"{row.name}, {cell.scene}, seed {cell.seed}: do not believe its surface score: {why}"
 
 
 def _scenes(options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:

@@ -86,30 +86,39 @@ class Results:
         return set.intersection(*filter(None, have)) if any(have) else set()
 
     def mean(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
-        """Mean of each figure over scenes and seeds; None where there is none."""
+        """Mean over scenes of the mean over seeds of each figure; None where there is none."""
         found: dict[str, float | None] = {}
         for name in FIGURES:
             values = self._values(row, name, data_set)
-            found[name] = statistics.fmean([v for group in values.values() for v in group]) if values else None
+            means = [statistics.fmean(by_seed.values()) for by_seed in values.values()]
+            found[name] = statistics.fmean(means) if means else None
         return found
 
     def spread(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
-        """Standard deviation over seeds of the mean over scenes; None with fewer than two seeds."""
+        """Standard deviation over seeds of the mean over scenes; None with fewer than two seeds that have them all."""
         found: dict[str, float | None] = {}
         for name in FIGURES:
-            means = [statistics.fmean(group) for group in self._values(row, name, data_set).values()]
+            means = by_seed(self._values(row, name, data_set))
             found[name] = statistics.stdev(means) if len(means) > 1 else None
         return found
 
-    def _values(self, row: Row, name: str, data_set: str | None) -> dict[int, list[float]]:
-        """Seed -> values of the counted scenes."""
+    def _values(self, row: Row, name: str, data_set: str | None) -> dict[str, dict[int, float]]:
+        """Scene -> seed -> value, of those that count; nothing where the data sets measure in different units."""
         counted = self.counted(name, data_set)
-        found: dict[int, list[float]] = {}
+        found: dict[str, dict[int, float]] = {}
+        if self._units_differ(name, data_set):
+            return found
         for cell in row.of(data_set):
             value = cell.figures[name]
             if value is not None and (cell.scene, cell.seed) in counted:
-                found.setdefault(cell.seed, []).append(value)
+                found.setdefault(cell.scene, {})[cell.seed] = value
         return found
+
+    def _units_differ(self, name: str, data_set: str | None) -> bool:
+        """Distances of several data sets: mm, m and world units have no mean."""
+        if name != "chamfer" or data_set is not None:
+            return False
+        return len({c.data_set for row in self.rows for c in row.cells if c.figures[name] is not None}) > 1
 
     def reasons(self, row: Row) -> dict[str, str]:
         """Why a figure has no mean."""
@@ -118,9 +127,23 @@ class Results:
             return dict.fromkeys(FIGURES, why)
         means, found = self.mean(row), {}
         for name in (n for n in FIGURES if means[n] is None):
-            cell = next(c for c in row.cells if c.figures[name] is None)
-            found[name] = f"{cell.scene}, seed {cell.seed}: {cell.reasons.get(name, 'not measured')}"
+            cell = next((c for c in row.cells if c.figures[name] is None), None)
+            if self._units_differ(name, None):
+                found[name] = "the data sets measure in different units: each has its own mean"
+            elif cell is None:
+                found[name] = "no scene and seed that every row has"
+            else:
+                found[name] = f"{cell.scene}, seed {cell.seed}: {cell.reasons.get(name, 'not measured')}"
         return found
+
+
+def by_seed(values: dict[str, dict[int, float]]) -> list[float]:
+    """Means over scenes (scene -> seed -> value) at each seed that all of the scenes have, in order of the seeds.
+
+    A seed that lacks a scene would be compared with others over other scenes.
+    """
+    seeds = set.intersection(*(set(of_scene) for of_scene in values.values())) if values else set()
+    return [statistics.fmean([of_scene[seed] for of_scene in values.values()]) for seed in sorted(seeds)]
 
 
 def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, record: dict[str, Any]) -> Cell:
@@ -135,7 +158,8 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
     """
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
     place: dict[str, Any] = {"scene": scene, "data_set": data_set, "seed": seed, "run": run}
-    if record["state"] != "done":
+    failed = record["state"] == "failed"
+    if record["state"] != "done" and not (failed and record.get("trained")):  # trained: only its surface is lost
         why = record.get("reason") or NOT_YET[record["state"] == "running"]
         return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, str(why)), **place)
     try:
@@ -156,7 +180,7 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
     figures["seconds"] = round(sum(stage["seconds"] for stage in metrics["stages"]), 3)  # shared stages count too
     surface = surface_figures(metrics.get("surface"), data_set)
     figures.update(surface)
-    notes = record.get("notes") or {}
+    notes = {"surface": record["reason"]} if failed else record.get("notes") or {}
     for name in (n for n in ("fscore", "chamfer") if figures[n] is None):
         reasons[name] = notes.get("surface") or (metrics.get("surface") or {}).get("reason") or "no ground truth"
     details = {
@@ -256,7 +280,7 @@ def judge_order(order: Order, rows: Sequence[Row], data_set: str) -> Verdict:
             return Verdict(*facts, "unknown", (), f"no {METRICS[metric]} of {name}: {why}")
     steps = tuple(_step(by_name[a], by_name[b], metric, data_set, order) for a, b in _pairs(order))
     if not all(step.seeds for step in steps):
-        return Verdict(*facts, "unknown", (), "no scene and seed that both rows have")
+        return Verdict(*facts, "unknown", (), "no seed at which both rows have all of their scenes")
     if all(step.seeds_with_sign == step.seeds for step in steps):
         holds = "yes"
     elif any(step.seeds_with_sign == 0 for step in steps):
@@ -278,12 +302,12 @@ def _pairs(order: Order) -> list[tuple[str, str]]:
 def _step(lower: Row, upper: Row, metric: str, data_set: str, order: Order) -> Step:
     sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
     values = {row.name: {(c.scene, c.seed): c.figures[metric] for c in row.of(data_set)} for row in (lower, upper)}
-    by_seed: dict[int, list[float]] = {}
+    found: dict[str, dict[int, float]] = {}
     for (scene, seed), high in values[upper.name].items():
         low = values[lower.name].get((scene, seed))
         if high is not None and low is not None:
-            by_seed.setdefault(seed, []).append(sign * (high - low))
-    differences = [statistics.fmean(group) for group in by_seed.values()]
+            found.setdefault(scene, {})[seed] = sign * (high - low)
+    differences = by_seed(found)
     within = order.within or 0.0
     if order.kind == "flat":
         right = [abs(d) <= within for d in differences]

@@ -131,7 +131,7 @@ def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None)
     if known is not None and protocol.name not in {scene.protocol for scene in known[0].scenes}:
         known = None  # a capture that only happens to have the name of a scene, or is treated as something else
     if known is None:
-        data_set = DTU if protocol.name == "dtu" else f"other ({protocol.name})"
+        data_set = f"other ({protocol.name})"
         truth = _plain_truth(name, path, truths)
         return FoundScene(name, path, kind, protocol, protocol.downscale, data_set, name, truth, truth is not None, ())
     dataset, facts = known

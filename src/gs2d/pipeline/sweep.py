@@ -21,7 +21,7 @@ from gs2d.io.files import read_json, write_json
 from gs2d.io.run import SPLATS, RunFolder, make_folder, now
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, StageDone, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
-from gs2d.pipeline.sweep_claims import Claim, take_claim
+from gs2d.pipeline.sweep_claims import FOREIGN_SECONDS, Claim, holder, take_claim
 
 MAX_DEATHS = 3  # so often may the process of a job die before the job counts as failed
 POLL_SECONDS = 0.5
@@ -41,12 +41,15 @@ class SweepJob:
         What is scored beyond what training scores.
     stage_keys : tuple of str
         One for each stage; jobs with equal keys train the same stage.
+    wanted : tuple of str
+        What is scored, and with what: a finished job is scored again when it was scored with less.
     """
 
     name: str
     train: TrainOptions
     evaluate: EvaluateOptions | None = None
     stage_keys: tuple[str, ...] = ()
+    wanted: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,14 +80,18 @@ class Sweep:
         return self.folder / "jobs" / f"{job.name}.claim"
 
     def record(self, job: SweepJob) -> dict[str, Any]:
-        """What became of a job: ``state`` (new, running, done, failed), ``reason``, ``deaths``."""
+        """What became of a job: ``state`` (new, running, done, failed), ``reason``, ``trained``, ``deaths``."""
         path = self.record_file(job)
         return dict(read_json(path)) if path.exists() else {"state": "new"}
 
     def settled(self, job: SweepJob) -> bool:
         """Whether nothing is left to do for a job in this command."""
         record = self.record(job)
-        return record["state"] == "done" or (record["state"] == "failed" and record["time"] >= self.started)
+        if record["state"] == "done":
+            gone = record.get("trained", False) and not is_trained(job)
+            scored = set(job.wanted) <= set(record.get("wanted", job.wanted))
+            return not gone and (scored or record["time"] >= self.started)
+        return record["state"] == "failed" and record["time"] >= self.started
 
     def unsettled(self) -> list[SweepJob]:
         """Jobs that are not settled, in order."""
@@ -94,6 +101,11 @@ class Sweep:
         """Reason by job, of those that failed."""
         records = {job.name: self.record(job) for job in self.jobs}
         return {name: record["reason"] for name, record in records.items() if record["state"] == "failed"}
+
+
+def is_trained(job: SweepJob) -> bool:
+    """Whether the run of a job has its splats."""
+    return RunFolder(job.train.out).file(SPLATS).exists()
 
 
 def stage_keys(facts: Sequence[Any], stages: Sequence[Any]) -> tuple[str, ...]:
@@ -172,6 +184,7 @@ def work(
         Whether to stay until the jobs of other processes are settled too (and take them over if those die).
     """
     make_folder(sweep.folder / "jobs")
+    said = ""
     while True:
         left = sweep.unsettled()
         if not left:
@@ -180,6 +193,10 @@ def work(
         if taken is None:
             if not wait:
                 return
+            others = _waiting_for(sweep, left)
+            if others and others != said:
+                on_event(Notice(others))
+                said = others
             time.sleep(POLL_SECONDS)
             continue
         job, claim, stages = taken
@@ -206,6 +223,18 @@ def _take_one(sweep: Sweep, jobs: Sequence[SweepJob]) -> tuple[SweepJob, Claim, 
     return None
 
 
+def _waiting_for(sweep: Sweep, jobs: Sequence[SweepJob]) -> str:
+    """Who has what is left: a claim of a machine that died looks like a hang to whoever waits for it."""
+    held = {job.name: found for job in jobs if (found := holder(sweep.claim_file(job)))}
+    names = [f"{name} (process {found.get('pid')} on {found.get('host')})" for name, found in held.items()]
+    if not names:
+        return ""
+    return (
+        f"waiting for {', '.join(names)}; should that machine be gone, its work is taken over after "
+        f"{FOREIGN_SECONDS / 60:.0f} minutes"
+    )
+
+
 def _do(sweep: Sweep, job: SweepJob, claim: Claim, stages: StageClaims, on_event: OnEvent) -> None:
     """One job; what goes wrong is written down, and the sweep goes on."""
     path, record = sweep.record_file(job), sweep.record(job)
@@ -230,11 +259,14 @@ def _do(sweep: Sweep, job: SweepJob, claim: Claim, stages: StageClaims, on_event
     except Exception as error:
         mended = isinstance(error, Gs2dError)
         reason = " ".join(str(error).split()) if mended else f"{type(error).__name__}: {error}"
-        failed = {"state": "failed", "reason": reason or type(error).__name__, "time": time.time(), "at": now()}
+        failed: dict[str, Any] = {"state": "failed", "reason": reason or type(error).__name__}
+        failed |= {"time": time.time(), "at": now()}
+        failed["trained"] = is_trained(job)  # then its pictures were scored, and those scores stand
         write_json(path, failed if mended else {**failed, "traceback": traceback.format_exc()})
         on_event(Notice(f"{job.name} failed: {reason}"))
         return
-    write_json(path, {"state": "done", "notes": notes, "time": time.time(), "at": now()})
+    facts = {"notes": notes, "wanted": list(job.wanted), "trained": is_trained(job)}
+    write_json(path, {"state": "done", **facts, "time": time.time(), "at": now()})
 
 
 def train_and_evaluate(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
@@ -252,9 +284,12 @@ def train_and_evaluate(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
     try:
         train(job.train, on_event)
     except ProtocolError as error:
-        if not run.file(SPLATS).exists():
+        if not is_trained(job):
             raise
-        return {"surface": str(error)}  # trained and scored, but its splats give no mesh
+        if job.evaluate is not None and job.evaluate.lpips_weights is not None:
+            images = EvaluateOptions(lpips_weights=job.evaluate.lpips_weights)
+            evaluate_run(run.path, images, on_event, threads=job.train.threads)
+        return {"surface": str(error)}  # trained, but its splats give no mesh
     if job.evaluate is not None:
         evaluate_run(run.path, job.evaluate, on_event, threads=job.train.threads)
     return {}

@@ -1,0 +1,105 @@
+"""Rows of a paper table where runs are missing, failed, or measured by other means than the paper's."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gs2d.errors import RunError
+from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
+from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan
+from gs2d.pipeline.paper_deviations import deviations_of
+from gs2d.pipeline.paper_rows import FIGURES, Cell, Results, Row, judge_order, read_cell
+from tiny import write_ball_mesh, write_capture
+
+
+def make_cell(scene: str, seed: int = 0, data_set: str = TNT, **figures: float | None) -> Cell:
+    known = {**dict.fromkeys(FIGURES), **figures}
+    return Cell(scene, data_set, seed, known, {n: "because" for n, v in known.items() if v is None}, Path("run"))
+
+
+def make_row(name: str, *cells: Cell) -> Row:
+    return Row(name, "2dgs", {}, "", cells)
+
+
+# Scene a (30 dB) at both seeds, scene b (20 dB) at seed 0 only: the seeds differ by 0.2 dB, not by (30.2 - 25) dB.
+UNEVEN = (make_cell("a", 0, psnr=30.0), make_cell("b", 0, psnr=20.0), make_cell("a", 1, psnr=30.2))
+
+
+def test_a_seed_that_lacks_a_scene_is_no_spread_and_does_not_weigh_the_mean() -> None:
+    row = make_row("row", *UNEVEN)
+    results = Results((row,))
+    assert results.spread(row)["psnr"] is None
+    assert results.mean(row)["psnr"] == pytest.approx((30.1 + 20.0) / 2)  # not (30 + 20 + 30.2) / 3
+
+
+def test_an_order_is_judged_at_the_seeds_that_have_every_scene() -> None:
+    high = [replace(c, figures={**c.figures, "psnr": (c.figures["psnr"] or 0) + 1}) for c in UNEVEN[:2]]
+    worse = replace(UNEVEN[2], figures={**UNEVEN[2].figures, "psnr": 0.0})  # seed 1, without scene b
+    rows = (make_row("low", *UNEVEN), make_row("high", *high, worse))
+    verdict = judge_order(Order("claim", "psnr", ("low", "high")), rows, TNT)
+    assert (verdict.holds, verdict.steps[0].seeds, verdict.steps[0].difference) == ("yes", 1, 1.0)
+
+
+def test_distances_in_different_units_have_no_common_mean() -> None:
+    row = make_row("row", make_cell("scan24", data_set=DTU, chamfer=0.8), make_cell("lego", data_set="x", chamfer=0.01))
+    results = Results((row,))
+    assert results.mean(row)["chamfer"] is None
+    assert results.reasons(row)["chamfer"] == "the data sets measure in different units: each has its own mean"
+    assert results.mean(row, DTU)["chamfer"] == 0.8
+
+
+def test_rows_that_have_no_run_in_common_say_so() -> None:
+    full = make_row("full", make_cell("a", psnr=1.0), make_cell("b", psnr=2.0))
+    first = make_row("first", make_cell("a", psnr=1.0), make_cell("b"))
+    second = make_row("second", make_cell("a"), make_cell("b", psnr=2.0))
+    results = Results((full, first, second))
+    assert results.mean(full)["psnr"] is None
+    assert results.reasons(full)["psnr"] == "no scene and seed that every row has"
+
+
+def test_a_run_whose_surface_could_not_be_scored_keeps_its_pictures_scores(tmp_path: Path) -> None:
+    place = {"name": "a", "path": ".", "format": "blender", "train": 1, "test": 1}
+    definition = {"format": 1, "recipe": {"name": "2dgs"}, "scene": place, "backend": {"name": "cpu"}}
+    (tmp_path / "run.json").write_text(json.dumps(definition))
+    stage = {"name": "surface", "iterations": 3, "seconds": 5.0, "splats": 7, "bytes": 9, "test": {"psnr": 30.0}}
+    (tmp_path / "metrics.json").write_text(json.dumps({"stages": [stage], "surface": None}))
+    record = {"state": "failed", "reason": "the log does not fit", "trained": True}
+    options: Any = {"scene": "a", "data_set": TNT, "seed": 0, "test_on": "test"}
+    cell = read_cell(tmp_path, record=record, **options)
+    assert (cell.figures["psnr"], cell.figures["fscore"]) == (30.0, None)
+    assert cell.reasons["fscore"] == "the log does not fit"
+    assert read_cell(tmp_path, record={**record, "trained": False}, **options).figures["psnr"] is None
+
+
+def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
+    check = {"ok": False, "messages": ["only 40% of the cameras agree"]}
+    details = {"backend": "cpu", "surface": {"evaluator": "visible-surface", "self_check": check}}
+    cell = replace(make_cell("Barn", psnr=1.0, bytes=1.0, fscore=0.1), details=details)
+    options = PaperOptions(table="absgs", data=Path("data"), out=Path("out"), slots=2)
+    table = PAPER_TABLES["absgs"]
+    lines = deviations_of(options, (), table, Results((make_row("row", cell),)))
+    assert "row, Barn, seed 0: do not believe its surface score: only 40% of the cameras agree" in lines
+    assert any("Barn: its surface is scored by this project's visible-surface protocol" in line for line in lines)
+    assert any("the paper prints no thresholds of AbsGS-A" in line for line in lines)
+    assert any("2 runs shared the machine" in line for line in lines)
+    plain = deviations_of(options, (), PAPER_TABLES["regularisation"], Results((make_row("row", cell),)))
+    assert not any("E_i" in line or "AbsGS" in line for line in plain)  # one stage: nothing was left open
+
+
+def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_path: Path) -> None:
+    write_capture(tmp_path / "ball", train=2, test=1, size=8)
+    options = PaperOptions(table="modules", data=tmp_path / "ball", out=tmp_path / "out")
+    assert make_plan(options).sweep.jobs[0].wanted == ()
+    write_ball_mesh(tmp_path / "ball" / "mesh_gt.ply", rings=4)
+    plan = make_plan(replace(options, lpips_weights=tmp_path / "vgg.pth"))
+    truth, weights = (tmp_path / "ball" / "mesh_gt.ply").resolve(), (tmp_path / "vgg.pth").resolve()
+    assert plan.sweep.jobs[0].wanted == (f"surface: {truth}", f"lpips: {weights}")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "about.json").write_text("{}")
+    with pytest.raises(RunError, match="must be one that gs2d paper wrote, got another file"):
+        check_folder(plan)
