@@ -25,11 +25,12 @@ from benchmarks.timing import machine
 from gs2d.camera import Camera, look_at
 from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.fuse import Volume, fuse
+from gs2d.mesh.fuse import fuse
 from gs2d.mesh.limits import derive_limits, sample_depths, widen_truncation
 from gs2d.mesh.nest import derive_nest
 from gs2d.mesh.nested import fuse_nested, nested_marching_cubes
 from gs2d.mesh.surface import keep_components, marching_cubes
+from gs2d.mesh.volume import Volume
 
 RADIUS = 0.9
 T = TypeVar("T")

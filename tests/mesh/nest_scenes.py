@@ -9,9 +9,9 @@ from surface_shapes import rays, sphere_depth
 
 from gs2d.camera import look_at
 from gs2d.mesh.frames import Frame
-from gs2d.mesh.fuse import BLOCK, VOXELS, Volume
 from gs2d.mesh.limits import FusionLimits
 from gs2d.mesh.nest import Nest
+from gs2d.mesh.volume import BLOCK, VOXELS, Volume
 
 GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it
 

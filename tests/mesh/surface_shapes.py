@@ -8,8 +8,8 @@ import numpy as np
 
 from gs2d.camera import Camera, look_at
 from gs2d.mesh.frames import Frame
-from gs2d.mesh.fuse import BLOCK, VOXELS, Volume
 from gs2d.mesh.limits import FusionLimits
+from gs2d.mesh.volume import BLOCK, VOXELS, Volume
 from gs2d.triangles import Mesh
 
 

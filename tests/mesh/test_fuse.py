@@ -23,9 +23,11 @@ from gs2d.camera import Camera, look_at
 from gs2d.errors import DiskError, ProtocolError, ShapeError
 from gs2d.mesh.extract import extract
 from gs2d.mesh.frames import DepthMap, Frame, Spool, depth_map
-from gs2d.mesh.fuse import BLOCK, FULL_WEIGHT_BEHIND, block_bytes, block_grid, fuse, touched_blocks
+from gs2d.mesh.fuse import fuse, touched_blocks
+from gs2d.mesh.integrate import FULL_WEIGHT_BEHIND
 from gs2d.mesh.limits import derive_limits, sample_depths
 from gs2d.mesh.surface import components, marching_cubes
+from gs2d.mesh.volume import BLOCK, block_bytes, block_grid
 
 LIMITS = limits(1.3, 0.03)
 
@@ -173,7 +175,7 @@ def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: 
     frames = maps([Frame(c, box_depth(c, np.array([-0.9, -0.5, -0.2]), np.array([0.3, 0.8, 0.9]))) for c in cameras])
     fast = fuse(frames, LIMITS, threads=1)
     monkeypatch.setattr(
-        "gs2d.mesh.fuse.block_visibility",
+        "gs2d.mesh.integrate.block_visibility",
         lambda view, centers, radius, truncation: np.flatnonzero(
             centers @ view.projection[2, :3] + view.projection[2, 3] > 1.01 * radius
         ),

@@ -7,8 +7,8 @@ import pytest
 from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
 
 from gs2d.mesh.cases import CORNERS, EDGES, case_table
-from gs2d.mesh.fuse import BLOCK, Volume
 from gs2d.mesh.surface import components, keep_components, marching_cubes, select_faces
+from gs2d.mesh.volume import BLOCK, Volume
 from gs2d.triangles import Mesh
 
 

@@ -13,11 +13,11 @@ from gs2d.camera import look_at
 from gs2d.errors import ProtocolError
 from gs2d.mesh.extract import Extraction, extract, extract_unbounded
 from gs2d.mesh.frames import Frame, depth_map
-from gs2d.mesh.fuse import BLOCK, VOXELS, block_bytes
 from gs2d.mesh.limits import sample_depths
 from gs2d.mesh.nest import STEP, derive_nest, known_depth
 from gs2d.mesh.nested import fuse_nested, nested_marching_cubes
 from gs2d.mesh.surface import components
+from gs2d.mesh.volume import BLOCK, VOXELS, block_bytes
 
 
 # -- joins -------------------------------------------------------------------------------------------------------------

@@ -10,11 +10,12 @@ import numpy as np
 
 from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.frames import Frame, Spool
-from gs2d.mesh.fuse import Volume, fuse
+from gs2d.mesh.fuse import fuse
 from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths, widen_truncation
 from gs2d.mesh.nest import derive_nest
 from gs2d.mesh.nested import FAR_VIEWS, fuse_nested, nested_marching_cubes
 from gs2d.mesh.surface import components, keep_components, marching_cubes
+from gs2d.mesh.volume import Volume
 from gs2d.triangles import Mesh
 
 
@@ -47,6 +48,7 @@ def extract(
     keep: int | None = None,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
+    backend: str = "auto",
     folder: str | os.PathLike[str] | None = None,
 ) -> Extraction:
     """Fuse frames into a mesh.
@@ -66,6 +68,8 @@ def extract(
     max_bytes : int
         Bound on the volume.
     threads : int, optional
+    backend : str
+        What fuses, see ``fuse``.
     folder : path, optional
         Where the temporary file goes.
 
@@ -77,6 +81,8 @@ def extract(
         If a frame's maps are not of its camera's size.
     DiskError
         If the temporary file cannot be written.
+    BackendError
+        If the backend is unknown or cannot run here.
     """
     if limits is not None and any(v is not None for v in (bbox, voxel, truncation, depth_limit, points)):
         raise TypeError("give limits, or the numbers to derive them from, not both")
@@ -96,7 +102,7 @@ def extract(
             )
             if truncation is None:
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
-        volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads)
+        volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
     whole = marching_cubes(volume, min_weight=min_weight)
     return _extraction(whole, limits, [volume], min_faces=min_faces, keep=keep)
 
@@ -115,6 +121,7 @@ def extract_unbounded(
     keep: int | None = None,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
+    backend: str = "auto",
     folder: str | os.PathLike[str] | None = None,
 ) -> Extraction:
     """Fuse frames of a scene without bounds into a mesh, in voxels that grow with the distance from its centre.
@@ -130,7 +137,7 @@ def extract_unbounded(
         See ``marching_cubes``.
     far_views : float
         The same outside the innermost level, at most half as many as there are views.
-    min_faces, keep, max_bytes, threads, folder
+    min_faces, keep, max_bytes, threads, backend, folder
         As for ``extract``.
 
     Returns
@@ -140,7 +147,7 @@ def extract_unbounded(
 
     Raises
     ------
-    ProtocolError, ShapeError, DiskError
+    ProtocolError, ShapeError, DiskError, BackendError
         As ``extract``.
     """
     with Spool(folder) as spool:
@@ -160,7 +167,7 @@ def extract_unbounded(
             # far depths contradict each other more, but their levels have wider bands
             noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
             nest = nest.with_truncation(widen_truncation(inner, noise).truncation, noise)
-        volumes = fuse_nested(spool, nest, max_bytes=max_bytes, threads=threads)
+        volumes = fuse_nested(spool, nest, max_bytes=max_bytes, threads=threads, backend=backend)
     far_weight = min(far_views, volumes[0].frames / 2)
     whole = nested_marching_cubes(volumes, nest, min_weight=min_weight, far_weight=far_weight)
     limits = replace(nest.levels[0], lower=nest.levels[-1].lower, upper=nest.levels[-1].upper)

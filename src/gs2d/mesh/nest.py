@@ -14,7 +14,6 @@ import numpy as np
 
 from gs2d.camera import Camera
 from gs2d.errors import ProtocolError
-from gs2d.mesh.fuse import BLOCK
 from gs2d.mesh.limits import (
     BOX_PERCENTILES,
     DEPTH_PERCENTILE,
@@ -25,6 +24,7 @@ from gs2d.mesh.limits import (
     check_positive,
     checked_box,
 )
+from gs2d.mesh.volume import BLOCK
 
 STEP = 4 * BLOCK  # voxels along a side are a multiple: the middle half of a level is made of whole blocks
 MAX_LEVELS = 24

@@ -9,9 +9,7 @@ is as closed as within a level. (Dual marching cubes on an octree: Schaefer and 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,18 +17,25 @@ import numpy as np
 from gs2d.errors import ProtocolError
 from gs2d.mesh.cases import CORNERS, EDGES, case_table
 from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.fuse import BLOCK, VOXELS, Budget, Volume, integrate, touched_blocks, unknown_volume
+from gs2d.mesh.fuse import touched_blocks
+from gs2d.mesh.integrate import integrator
 from gs2d.mesh.limits import backproject
 from gs2d.mesh.nest import STEP, Nest
 from gs2d.mesh.sampling import prepare
 from gs2d.mesh.surface import cell_surface, crossing, mixed_colors
+from gs2d.mesh.volume import BLOCK, VOXELS, Budget, Volume, unknown_volume
 from gs2d.triangles import Mesh
 
 FAR_VIEWS = 5.0  # weight from which a voxel outside the innermost level is known: so many views seldom agree on a sky
 
 
 def fuse_nested(
-    frames: Iterable[DepthMap], nest: Nest, *, max_bytes: int = 4 << 30, threads: int | None = None
+    frames: Iterable[DepthMap],
+    nest: Nest,
+    *,
+    max_bytes: int = 4 << 30,
+    threads: int | None = None,
+    backend: str = "auto",
 ) -> tuple[Volume, ...]:
     """Fuse depth maps into every level of a nest.
 
@@ -43,6 +48,8 @@ def fuse_nested(
         The volumes together will not grow beyond this.
     threads : int, optional
         Default: as many as the machine has. The result does not depend on it.
+    backend : str
+        As for ``fuse``.
 
     Returns
     -------
@@ -51,7 +58,7 @@ def fuse_nested(
 
     Raises
     ------
-    ProtocolError
+    ProtocolError, BackendError
         As for ``fuse``.
     """
     if iter(frames) is frames:
@@ -71,12 +78,9 @@ def fuse_nested(
         unknown_volume(limits, nest.dims, found, colored=colored, frames=count)
         for limits, found in zip(nest.levels, keys, strict=True)
     )
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+    with integrator(volumes, backend, threads) as add:
         for item in frames:
-            view = prepare(item, nest.levels[0], truncation=_truncations(item, nest))
-            for volume in volumes:
-                if len(volume.keys):
-                    integrate(volume, view, pool)
+            add(prepare(item, nest.levels[0], truncation=_truncations(item, nest)))
     return volumes
 
 

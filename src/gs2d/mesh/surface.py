@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gs2d.mesh.cases import CORNERS, EDGES, case_table
-from gs2d.mesh.fuse import BLOCK, VOXELS, Volume
+from gs2d.mesh.volume import BLOCK, VOXELS, Volume
 from gs2d.triangles import Mesh
 
 _CHUNK = 512  # blocks at a time

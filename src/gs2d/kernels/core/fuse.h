@@ -1,0 +1,70 @@
+// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; mesh/fuse.py and
+// mesh/sampling.py have the same in numpy, operation for operation: single precision gives the same bits, so nothing
+// here is a fused multiply-add).
+#pragma once
+
+#include "core/base.h"
+
+namespace gs2d {
+
+constexpr int FUSE_VOXELS = 512;             // of a block of 8^3, z fastest
+constexpr double FUSE_WEIGHT_SLOPE = 4.0;    // 1 / (1 - FULL_WEIGHT_BEHIND): the weight is 1 down to 3/4 of the truncation
+constexpr double FUSE_NO_WEIGHT = 1e-20;     // a sum of weights below this is taken as this
+
+// One view over some blocks of a volume, for kernels/fusion.py. R is the type of the arrays.
+template <class R> struct FuseArguments {
+    long long blocks;      // that the view may change
+    const long long* rows; // [blocks] of the volume
+    const R* bases;        // [blocks, 3] (x z, y z, z) of each block's first voxel: px times wu, and wu
+    const R* offsets;      // [3, 512] of a voxel from its block's first
+    long long width, height;
+    const R *depth, *slope_x, *slope_y;  // [height, width] wu, wu/px; the depth is hugely negative where unseen
+    const R *pixel_weight, *pixel_color; // [height, width], [height, width, 3]; or null
+    R truncation;                        // wu
+    R *tsdf, *weight, *color, *color_weight;  // [M, 512], [M, 512, 3]; the colours null where there are none
+};
+
+GS2D_HD float whole(float a) { return float(int(a)); }  // floor, of what is not negative
+GS2D_HD double whole(double a) { return double(int(a)); }
+
+// The pixel that a voxel is seen through, and the place from its centre, px. Outside of the image it is the border's.
+template <class V> struct FusePixel {
+    V column, row, x, y;
+};
+
+template <class V> GS2D_HD FusePixel<V> fuse_pixel(V xz, V yz, V z, V last_column, V last_row) {
+    const V x = min(max(xz / z, V(0.f)), last_column), y = min(max(yz / z, V(0.f)), last_row);
+    const V column = whole(x), row = whole(y);
+    return {column, row, (x - column) - V(0.5f), (y - row) - V(0.5f)};
+}
+
+// How far the surface lies behind the voxel, in truncations: the depth of the plane through the pixel, less the voxel's.
+template <class V> GS2D_HD V fuse_distance(const FusePixel<V>& p, V depth, V slope_x, V slope_y, V z, V truncation) {
+    return (((depth + p.x * slope_x) + p.y * slope_y) - z) / truncation;
+}
+
+// 1 down to 3/4 of the truncation behind the surface, from there falling to 0 at the truncation.
+template <class V> GS2D_HD V fuse_weight(V distance) {
+    return min(max((distance + V(1.f)) * V(float(FUSE_WEIGHT_SLOPE)), V(0.f)), V(1.f));
+}
+
+// A running mean: the sum of weights, and how far the mean moves towards the new value.
+template <class V> struct FuseStep {
+    V total, share;
+};
+
+template <class V> GS2D_HD FuseStep<V> fuse_step(V old_weight, V weight) {
+    const V total = old_weight + weight;
+    return {total, weight / max(total, V(float(FUSE_NO_WEIGHT)))};
+}
+
+template <class V> GS2D_HD V fuse_mean(V old, V value, V share) { return old + (value - old) * share; }
+
+template <class V> GS2D_HD V fuse_clear(V distance) { return min(distance, V(1.f)); }  // free space is 1
+
+// Of a colour: the nearer the surface, the more; 0 before the band.
+template <class V> GS2D_HD V fuse_color_weight(V distance, V weight) {
+    return keep(distance < V(1.f), weight * (V(1.f) - abs(distance)));
+}
+
+}  // namespace gs2d

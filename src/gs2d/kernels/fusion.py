@@ -1,0 +1,74 @@
+"""Adding one depth map to a volume, natively and on a GPU: the formulas are in ``kernels/core/fuse.h``.
+
+Shapes and types are those of ``mesh/fuse.py``, which is the only caller and has the same in numpy.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gs2d.errors import ShapeError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gs2d.kernels.cuda.launch import Launcher
+    from gs2d.kernels.library import Library
+
+__all__ = ["FuseArguments", "arguments_of", "fuse_on_cpu", "fuse_on_gpu"]
+
+VOXELS = 512  # of a block
+THREADS = 128  # of a CUDA block, fuse.cu
+
+
+class FuseArguments(ctypes.Structure):
+    """``FuseArguments`` of core/fuse.h, with float32 arrays."""
+
+    _fields_ = (
+        ("blocks", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("rows", "bases", "offsets")),
+        *((name, ctypes.c_int64) for name in ("width", "height")),
+        *((name, ctypes.c_void_p) for name in ("depth", "slope_x", "slope_y", "pixel_weight", "pixel_color")),
+        ("truncation", ctypes.c_float),
+        *((name, ctypes.c_void_p) for name in ("tsdf", "weight", "color", "color_weight")),
+    )
+
+
+def arguments_of(
+    size: tuple[int, int], truncation: float, arrays: dict[str, np.ndarray | None] | dict[str, Tensor | None]
+) -> FuseArguments:
+    """Arguments for a depth map of ``size`` (height, width); ``arrays`` are named as the fields, and must outlive them.
+
+    Raises
+    ------
+    ShapeError
+        Arrays that are not contiguous, or not float32 (``rows``: int64).
+    """
+    rows = arrays["rows"]
+    assert rows is not None
+    arguments = FuseArguments(blocks=len(rows), height=size[0], width=size[1], truncation=truncation)
+    for name, array in arrays.items():
+        if array is None:
+            continue
+        wanted = "int64" if name == "rows" else "float32"
+        if isinstance(array, np.ndarray):
+            contiguous, address = array.flags.c_contiguous, array.ctypes.data
+        else:
+            contiguous, address = array.is_contiguous(), array.data_ptr()
+        if not contiguous or str(array.dtype).removeprefix("torch.") != wanted:
+            raise ShapeError(f"{name} must be contiguous {wanted} for the fusion kernels, got {array.dtype}")
+        setattr(arguments, name, address)
+    return arguments
+
+
+def fuse_on_cpu(library: Library, arguments: FuseArguments) -> None:
+    """Add the view, on the threads that the library was told to use."""
+    library.function("gs2d_fuse", None, [ctypes.c_void_p])(ctypes.byref(arguments))
+
+
+def fuse_on_gpu(launcher: Launcher, arguments: FuseArguments) -> None:
+    """Add the view: one launch on the current stream."""
+    launcher.launch("fuse_voxels", arguments.blocks * (VOXELS // THREADS), THREADS, arguments)

@@ -1,0 +1,136 @@
+"""Adding views natively: numpy is the reference, and single precision leaves no room between the two."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from surface_shapes import limits, orbit, sphere_depth
+
+from gs2d.camera import Camera
+from gs2d.errors import BackendError, ShapeError
+from gs2d.kernels.fusion import arguments_of
+from gs2d.kernels.library import available_variants, load
+from gs2d.mesh.frames import DepthMap, Frame, depth_map
+from gs2d.mesh.fuse import fuse
+from gs2d.mesh.integrate import add_natively, fusion_backend, integrator
+from gs2d.mesh.limits import sample_depths
+from gs2d.mesh.nest import derive_nest
+from gs2d.mesh.nested import fuse_nested
+from gs2d.mesh.sampling import prepare
+from gs2d.mesh.volume import Volume, block_grid, unknown_volume
+
+ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")
+LIMITS = limits(1.3, 0.05)
+VARIANTS = [*available_variants()] or [pytest.param("none", marks=pytest.mark.skip("the native library is not built"))]
+native = pytest.mark.skipif(not available_variants(), reason="the native library is not built")
+
+
+def views(count: int = 6) -> list[DepthMap]:
+    """A sphere with noise and holes, near enough to be cut by the images; weights and colours in some of the views."""
+    rng = np.random.default_rng(3)
+    found = []
+    for k, camera in enumerate(orbit(count, 2.2, size=64, focal=80.0)):
+        depth = sphere_depth(camera, 1.0) + 0.01 * rng.standard_normal((64, 64))
+        valid = rng.random((64, 64)) > 0.05
+        weights = valid * rng.random((64, 64)) if k % 2 else valid
+        color = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8) if k % 3 else None
+        found.append(depth_map(Frame(camera, depth, color, weights)))
+    return found
+
+
+def assert_same(found: Volume, expected: Volume) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+    assert (expected.weight > 0).any()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_native_field_is_that_of_numpy_in_every_bit(
+    variant: str, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GS2D_CPU_VARIANT", variant)
+    frames = views()
+    expected = fuse(frames, LIMITS, threads=1, backend="reference")
+    assert expected.color_weight is not None
+    assert (expected.color_weight > 0).any()
+    assert_same(fuse(frames, LIMITS, threads=threads, backend="cpu"), expected)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_without_colours_too(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GS2D_CPU_VARIANT", variant)
+    frames = [replace(view, color=None) for view in views(3)]
+    found = fuse(frames, LIMITS, threads=1, backend="cpu")
+    assert found.color is None
+    np.testing.assert_array_equal(found.tsdf, fuse(frames, LIMITS, threads=1, backend="reference").tsdf)
+
+
+@native
+def test_every_level_of_a_nest_is_that_of_numpy() -> None:
+    frames = views()
+    nest = derive_nest([sample_depths(view) for view in frames], [view.camera for view in frames], resolution=32)
+    found = fuse_nested(frames, nest, threads=2, backend="cpu")
+    expected = fuse_nested(frames, nest, threads=1, backend="reference")
+    assert sum(len(volume.keys) > 0 for volume in expected) > 1
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.tsdf, other.tsdf)
+        np.testing.assert_array_equal(one.weight, other.weight)
+
+
+def wall(depth: float) -> tuple[Volume, DepthMap, Camera]:
+    """One block of 8^3 voxels of 0.25 from (-1, -1, 1) on, before a camera at the origin that sees a wall."""
+    camera = Camera(64, 64, 16.0, 16.0, 32.0, 32.0, np.eye(4))
+    lim = replace(LIMITS, lower=(-1.0, -1.0, 1.0), upper=(0.5, 0.5, 2.5), voxel=0.25, truncation=1.0, depth_limit=9.0)
+    color = np.full((64, 64, 3), 200, np.uint8)
+    volume = unknown_volume(lim, block_grid(lim), np.zeros(1, np.int64), colored=True, frames=1)
+    return volume, depth_map(Frame(camera, np.full((64, 64), depth), color)), camera
+
+
+@pytest.mark.parametrize("backend", ["reference", pytest.param("cpu", marks=native)])
+def test_a_voxel_moves_as_worked_by_hand(backend: str) -> None:
+    """Voxels at z = 1, 1.25, ... 2.75, a truncation of 1, walls at 1.5 and then at 1.75.
+
+    First wall: distances 0.5, 0.25, 0, -0.25, -0.5, -0.75, -1, -1.25: weight 1 to -0.75, then 0. Second: 0.75, 0.5,
+    0.25, 0, -0.25, -0.5, -0.75, -1: their means, and at z = 2.5 the second alone. The colour of the voxel at z = 1 has
+    the weight (1 - 0.5) + (1 - 0.75).
+    """
+    volume, first, camera = wall(1.5)
+    second = depth_map(Frame(camera, np.full((64, 64), 1.75), np.full((64, 64, 3), 100, np.uint8)))
+    with integrator([volume], backend, 1) as add:
+        for item in (first, second):
+            add(prepare(item, volume.limits))
+    z = volume.tsdf[0].reshape(8, 8, 8)[4, 4]
+    np.testing.assert_allclose(z, [0.625, 0.375, 0.125, -0.125, -0.375, -0.625, -0.75, 0.0], atol=1e-6)
+    np.testing.assert_allclose(volume.weight[0].reshape(8, 8, 8)[4, 4], [2, 2, 2, 2, 2, 2, 1, 0], atol=1e-6)
+    assert volume.color is not None
+    assert volume.color_weight is not None
+    assert volume.color_weight[0].reshape(8, 8, 8)[4, 4, 0] == pytest.approx(0.75)
+    # 200 with weight 0.5, 100 with weight 0.25
+    assert volume.color[0].reshape(8, 8, 8, 3)[4, 4, 0, 1] == pytest.approx(500 / 3, rel=1e-5)
+
+
+def test_the_backend_that_is_asked_for_is_the_one_that_runs() -> None:
+    assert fusion_backend("auto") == ("cpu" if available_variants() else "reference")
+    assert fusion_backend("reference") == "reference"
+    with pytest.raises(BackendError, match="auto, cpu, cuda, reference, got 'gpu'"):
+        fusion_backend("gpu")
+
+
+def test_without_the_native_library_auto_is_numpy_and_cpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gs2d.kernels.library.available_variants", lambda: ())
+    assert fusion_backend("auto") == "reference"
+    with pytest.raises(BackendError, match="native CPU library"):
+        fuse(views(1), LIMITS, backend="cpu")
+
+
+@native
+def test_an_array_of_another_type_is_refused_before_native_code_reads_it() -> None:
+    volume, item, _ = wall(1.5)
+    view = replace(prepare(item, volume.limits), depth=np.zeros(66 * 66))
+    with pytest.raises(ShapeError, match="depth must be contiguous float32"), add_natively([volume], load(), 1) as add:
+        add(view)
+    with pytest.raises(ShapeError, match="rows"):
+        arguments_of((1, 1), 1.0, {"rows": np.zeros(1, np.int32)})
