@@ -10,6 +10,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,12 +206,32 @@ def test_surface_figures_are_shown_or_their_absence_explained() -> None:
     assert "The surface was not scored: no camera saw it." in surface_scores(None, "no camera saw it")
 
 
+def test_the_picture_of_a_score_and_the_doubts_about_it_are_in_the_report(tmp_path: Path) -> None:
+    (tmp_path / "surface").mkdir()
+    Image.new("RGB", (960, 640), (40, 150, 80)).save(tmp_path / "surface" / "surface.png")
+    surface: dict[str, Any] = {"chamfer": 0.8, "evaluator": "tnt", "files": {"picture": "surface/surface.png"}}
+    sound = surface_scores(
+        {**surface, "self_check": {"ok": True, "messages": ["aligned by its cameras"]}}, None, tmp_path
+    )
+    assert sound.count("data:image/jpeg") == 1
+    assert "green where the other one is near" in sound
+    assert "Do not believe" not in sound
+    assert "aligned by its cameras" in sound
+    wrong = {"ok": False, "messages": ["only 40% of the cameras agree"]}
+    text = surface_scores({**surface, "self_check": wrong}, None, tmp_path / "elsewhere")
+    assert "Do not believe these figures, their own check failed: only 40% of the cameras agree" in text
+    assert "data:image/jpeg" not in text
+
+
 def test_every_figure_of_a_surface_score_is_explained_in_the_report() -> None:
     from dataclasses import fields
 
     from gs2d.evaluate.surface import SurfaceScore
 
-    known = {field.name for field in fields(SurfaceScore)} - {"scores", "clouds"}  # tables and point clouds, not figures
+    known = {field.name for field in fields(SurfaceScore)} - {
+        "scores",
+        "clouds",
+    }  # tables and point clouds, not figures
     assert known <= set(report_surface._MEANINGS)
 
 

@@ -112,7 +112,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
         "<h2>Results</h2>",
         stage_table(record),
         "<h2>Surface</h2>",
-        surface_scores(record.surface, record.surface_reason),
+        surface_scores(record.surface, record.surface_reason, record.path),
         mesh_section(record.path / MESH, cameras),
         "<h2>Every stage beside the photographs</h2>",
         view_sections(renders, expected_stages=[stage["name"] for stage in record.stages]),

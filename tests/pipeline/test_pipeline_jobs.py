@@ -18,7 +18,7 @@ from gs2d.io.run import RunFolder, open_run
 from gs2d.pipeline.events import Event, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
-from gs2d.pipeline.pictures import file_name
+from gs2d.pipeline.pictures import file_name, file_names
 from gs2d.pipeline.train import train
 from gs2d.triangles import Mesh
 from tiny import ball_cameras, write_ball_mesh
@@ -130,6 +130,16 @@ def test_views_with_long_names_have_short_files_that_differ() -> None:
     assert all(len(f".{name}.high_error.png.1234567.12345678.tmp".encode()) <= 255 for name in names)
     assert names[0] != names[1]
     assert name_of("test/r_0.png") == "test__r_0"
+
+
+def test_views_whose_names_differ_in_the_ending_or_the_case_only_have_files_of_their_own() -> None:
+    wanted = ["x.png", "x.jpg", "a/b.png", "a__b.png", "Y.png", "y.png", "z.png"]
+    views = [View.from_arrays(name, ball_cameras(1, 2)[0], np.zeros((2, 2, 3), np.uint8)) for name in wanted]
+    names = file_names(views)
+    assert len({name.lower() for name in names}) == len(wanted)
+    assert names[-1] == "z"  # nobody else's
+    assert names[0].startswith("x-")
+    assert file_names(views) == names
 
 
 def test_an_orbit_looks_at_the_focus_from_a_constant_height() -> None:

@@ -18,7 +18,7 @@ from gs2d.io.ply import read_mesh, read_splats, write_splats
 from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, SURFACE, RunFolder, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
-from gs2d.pipeline.pictures import file_name, render_view, shown_cameras
+from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.scoring import score_views, split_metrics
 from gs2d.pipeline.surface import extract_mesh
@@ -100,7 +100,8 @@ def render_run(
         cameras = orbit_cameras([view.camera for view in job.scene.train], orbit)
         views = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, image)) for i, camera in enumerate(cameras)]
     else:
-        views = [(file_name(view), view) for view in (job.scene.test if split == "test" else job.scene.train)]
+        chosen = job.scene.test if split == "test" else job.scene.train
+        views = list(zip(file_names(chosen), chosen, strict=True))
     if not views:
         raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
     folder = out or run.file(RENDERS) / ("orbit" if orbit else split)

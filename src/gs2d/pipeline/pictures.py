@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +44,21 @@ def file_name(view: View) -> str:
     whole = name.encode()
     if len(whole) <= LONGEST_NAME:
         return name
-    return whole[:LONGEST_NAME].decode(errors="ignore") + "-" + hashlib.sha256(whole).hexdigest()[:8]
+    return whole[:LONGEST_NAME].decode(errors="ignore") + "-" + _short_hash(name)
+
+
+def file_names(views: Sequence[View]) -> list[str]:
+    """``file_name`` of each view; those that would share a file (x.png and x.jpg, a/b and a__b) differ by a hash."""
+    names = [file_name(view) for view in views]
+    count = Counter(name.casefold() for name in names)  # not every file system knows upper from lower case
+    return [
+        name if count[name.casefold()] == 1 else f"{name}-{_short_hash(view.name)}"
+        for name, view in zip(names, views, strict=True)
+    ]
+
+
+def _short_hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def draw_stage(
@@ -67,7 +82,8 @@ def draw_stage(
     index: dict[str, Any] = read_json(index_file) if index_file.exists() else {"views": [], "stages": []}
     limits = {entry["name"]: entry["depth_limits"] for entry in index["views"]}
     views = []
-    for split, view in shown:
+    files = file_names([view for _, view in shown])
+    for (split, view), file in zip(shown, files, strict=True):
         output = render_view(splats, view, job.settings, job.backend)
         depth = output.depth(job.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
@@ -83,9 +99,9 @@ def draw_stage(
             share = share_of_group(splats, group, view, job.settings, job.backend)
             pictures["high_error"] = highlight_picture(color, share)
         for what, picture in pictures.items():
-            write_image(folder / stage / f"{file_name(view)}.{what}.png", picture)
-        write_image(folder / "photos" / f"{file_name(view)}.png", photo)
-        shown_as = {"name": view.name, "file": file_name(view), "split": split, "depth_limits": near_far}
+            write_image(folder / stage / f"{file}.{what}.png", picture)
+        write_image(folder / "photos" / f"{file}.png", photo)
+        shown_as = {"name": view.name, "file": file, "split": split, "depth_limits": near_far}
         views.append({**shown_as, "camera": camera_json(view.camera)})
     stages = [*(name for name in index["stages"] if name != stage), stage]
     write_json(index_file, {"views": views, "stages": stages, "images": list(IMAGES)})

@@ -183,7 +183,7 @@ def _score_visible(
         on_event(Notice(message))
     return {
         "evaluator": "visible-surface",
-        "unit": "world units",
+        "unit": "world units" if np.array_equal(job.scene.T_metric_scene, np.eye(4)) else "mm",  # the scale_mat of DTU
         "ground_truth": str(truth.path),
         **{name: first[name] for name in ("threshold", "precision", "recall", "f_score")},
         **facts,
