@@ -42,6 +42,15 @@ def test_every_kernel_compiles_without_spills_or_stack(name: str, arch: str) -> 
 
 
 @needs_nvrtc
+def test_ptx_for_devices_to_come_is_a_text_that_ends_with_zero() -> None:
+    """The driver reads it as a C string."""
+    code = compile_source("cuda/project.cu", "compute_120").code
+    assert b".target sm_120" in code
+    assert b".entry project_splats" in code
+    assert code.index(b"\0") == len(code) - 1
+
+
+@needs_nvrtc
 def test_the_spill_gate_sees_spills(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nvrtc_compile, "sources", lambda: {"cuda/greedy.cu": GREEDY})
     usage = compile_source("cuda/greedy.cu", "sm_90").usage()["greedy"]

@@ -113,23 +113,43 @@ def test_missing_bindings_are_told_from_a_missing_compiler(monkeypatch: pytest.M
     assert facts.nvrtc_error
 
 
+class Compiler:
+    """NVRTC, as far as the choice of an architecture asks it."""
+
+    known: tuple[int, ...] = (75, 80, 86, 87, 90, 100, 103, 110, 120)
+
+    class nvrtcResult:
+        NVRTC_SUCCESS = 0
+
+    @classmethod
+    def nvrtcGetSupportedArchs(cls) -> tuple[int, list[int]]:
+        return 0, list(cls.known)
+
+
 def test_a_device_newer_than_the_compiler_takes_the_newest_code_of_its_major_version(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class Compiler:
-        class nvrtcResult:
-            NVRTC_SUCCESS = 0
-
-        @staticmethod
-        def nvrtcGetSupportedArchs() -> tuple[int, list[int]]:
-            return 0, [75, 80, 86, 90, 100, 103, 120]
-
-    monkeypatch.setattr(nvrtc, "_nvrtc", Compiler)
+    monkeypatch.setattr(nvrtc, "_nvrtc", lambda: Compiler)
     assert nvrtc.architecture_for((9, 0)) == "sm_90"
-    assert nvrtc.architecture_for((8, 9)) == "sm_86"
     assert nvrtc.architecture_for((12, 1)) == "sm_120"
     assert nvrtc.architecture_for((7, 5)) == "sm_75"
     with pytest.raises(BackendError, match=r"7\.5 or more \(Turing, 2018\), got 7\.0"):
         nvrtc.architecture_for((7, 0))
-    with pytest.raises(BackendError, match=r"up to sm_120, the GPU has compute capability 13\.0"):
-        nvrtc.architecture_for((13, 0))
+
+
+def test_code_for_a_processor_with_a_cpu_on_its_chip_is_for_that_one_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NVRTC 12.8 knows 10.0 and 10.1 (Thor): a B300 (10.3) runs the code of the former, not of the latter."""
+    monkeypatch.setattr(nvrtc, "_nvrtc", lambda: Compiler)
+    monkeypatch.setattr(Compiler, "known", (75, 80, 86, 87, 90, 100, 101, 120))
+    assert nvrtc.architecture_for((10, 3)) == "sm_100"
+    assert nvrtc.architecture_for((10, 1)) == "sm_101"
+    assert nvrtc.architecture_for((8, 9)) == "sm_86"
+    assert nvrtc.architecture_for((8, 7)) == "sm_87"
+
+
+def test_a_device_of_an_unknown_major_version_gets_ptx_of_the_newest_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nvrtc, "_nvrtc", lambda: Compiler)
+    assert nvrtc.architecture_for((13, 0)) == "compute_120"
+    monkeypatch.setattr(Compiler, "known", (90, 100))
+    with pytest.raises(BackendError, match=r"from sm_90, the GPU has compute capability 8\.0"):
+        nvrtc.architecture_for((8, 0))

@@ -42,6 +42,8 @@ OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v", "--device-as-def
 REMEDY = "pip install nvidia-cuda-nvrtc cuda-bindings (torch's CUDA wheels bring both), or use --backend cpu"
 DIGEST_BYTES = 32
 LEAST_CAPABILITY = (7, 5)
+# GPUs in one chip with a CPU (Xavier, Orin, Thor): their code runs on no other GPU of the same major version.
+INTEGRATED = frozenset({72, 87, 88, 101, 110})
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
 
 
@@ -67,7 +69,7 @@ class KernelUsage:
 
 @dataclass(frozen=True)
 class Cubin:
-    """Machine code for one architecture, and the compiler's log ("" where it came from the cache)."""
+    """Machine code for one architecture (PTX for ``compute_XX``), and the compiler's log ("" where it was cached)."""
 
     code: bytes
     log: str
@@ -147,12 +149,13 @@ def nvrtc_version() -> tuple[int, int]:
 def architecture_for(capability: tuple[int, int]) -> str:
     """What to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
 
-    A device newer than the compiler runs code for an older one of the same major version.
+    A device newer than the compiler runs code for an older one of the same major version. Of a major version that the
+    compiler does not know it gets ``"compute_120"``, PTX of the newest known one, which the driver translates.
 
     Raises
     ------
     BackendError
-        The device is too old, or newer than anything that NVRTC knows.
+        The device is too old, or between what NVRTC knows.
     """
     if capability < LEAST_CAPABILITY:
         raise BackendError(
@@ -163,14 +166,16 @@ def architecture_for(capability: tuple[int, int]) -> str:
     status, known = nvrtc.nvrtcGetSupportedArchs()
     _check(nvrtc, status, "nvrtcGetSupportedArchs")
     wanted = 10 * capability[0] + capability[1]
-    fitting = [arch for arch in known if arch <= wanted and arch // 10 == wanted // 10]
-    if not fitting:
+    older = [arch for arch in known if arch <= wanted and (arch == wanted or arch not in INTEGRATED)]
+    fitting = [arch for arch in older if arch // 10 == wanted // 10]
+    if fitting:
+        return f"sm_{max(fitting)}"
+    if not older:
         raise BackendError(
-            f"the CUDA compiler knows architectures up to sm_{max(known)}, the GPU has compute capability "
-            f"{capability[0]}.{capability[1]}; install the NVRTC of the driver's CUDA version: pip install -U "
-            "nvidia-cuda-nvrtc"
+            f"the CUDA compiler knows architectures from sm_{min(known)}, the GPU has compute capability "
+            f"{capability[0]}.{capability[1]}; install the NVRTC of torch's CUDA version"
         )
-    return f"sm_{max(fitting)}"
+    return f"compute_{max(older)}"
 
 
 def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
@@ -181,7 +186,7 @@ def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cu
     name : str
         One of :func:`source_names`.
     arch : str
-        ``"sm_90"`` and the like.
+        ``"sm_90"`` and the like, or ``"compute_90"`` for PTX.
     options : sequence of str
         NVRTC options besides the architecture.
 
@@ -231,7 +236,7 @@ def compile_text(
         if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
             first = next((line for line in log.splitlines() if "error" in line), status.name)
             raise BackendError(f"the CUDA compiler refused {name} for {arch}: {first.strip()}")
-        return Cubin(_bytes(nvrtc, program, "CUBIN"), log)
+        return Cubin(_bytes(nvrtc, program, "PTX" if arch.startswith("compute_") else "CUBIN"), log)
     finally:
         nvrtc.nvrtcDestroyProgram(program)
 

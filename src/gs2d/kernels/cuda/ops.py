@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -197,8 +198,7 @@ def _normal_arguments(
     arguments = NormalArguments(height=camera.height, width=camera.width, per_splat=int(per_splat))
     for name in ("fx", "fy", "cx", "cy"):
         setattr(arguments, name, float(getattr(camera, name)))
-    rows = torch.as_tensor(camera.rotation, dtype=torch.float64, device="cpu")
-    arguments.rotation[:] = rows.flatten().tolist()
+    arguments.rotation[:] = np.asarray(camera.rotation).ravel().tolist()
     fill(arguments, normal=normal, depth=depth, alpha=alpha, mask=mask, **more)
     return arguments
 
