@@ -1,0 +1,44 @@
+"""Cameras, rendered images and depths for the tests of the losses."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.camera import Camera, look_at
+from gs2d.render.types import RenderOutput
+
+
+def make_camera(width: int, height: int) -> Camera:
+    """A camera with nothing symmetric about it."""
+    T = look_at(
+        np.array([1.0, -2.0, 0.7]), np.zeros(3), np.array([0.1, 0.2, 1.0]), width=width, height=height, fx=1.0
+    ).T_cam_world
+    return Camera(width, height, 0.9 * width, 1.1 * width, 0.4 * width, 0.55 * height, T)
+
+
+def make_output(height: int, width: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> RenderOutput:
+    """Random images that could come from a rasterizer, all requiring gradients."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64).to(dtype)
+
+    return RenderOutput(
+        color=rand(height, width, 3).requires_grad_(),
+        alpha=rand(height, width).requires_grad_(),
+        normal=(rand(height, width, 3) - 0.5).requires_grad_(),
+        depth_mean=(1 + rand(height, width)).requires_grad_(),
+        depth_median=(1 + rand(height, width)).requires_grad_(),
+        distortion=rand(height, width).requires_grad_(),
+        radii=torch.zeros(0),
+    )
+
+
+def plane_depth(camera: Camera, normal_world: np.ndarray, offset: float) -> Tensor:
+    """Exact z-depth [H, W] of the plane {X: normal . X = offset}."""
+    i, j = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(i - camera.cx) / camera.fx, (j - camera.cy) / camera.fy, np.ones_like(i)], axis=-1)
+    rays_world = rays @ camera.rotation  # z = 1 along each ray
+    return torch.from_numpy((offset - normal_world @ camera.center) / (rays_world @ normal_world))

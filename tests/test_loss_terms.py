@@ -1,0 +1,247 @@
+"""The losses of a recipe: masks, gradients, terms, both implementations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d import losses_reference as reference
+from gs2d.camera import Camera
+from gs2d.errors import BackendError, RecipeError, ShapeError
+from gs2d.kernels.library import load
+from gs2d.losses import FUSED_LOSSES, LOSSES, compute_losses, target_maps
+from gs2d.recipe import LossTerm
+from gs2d.render.types import RenderOutput
+from loss_images import make_camera, make_output
+
+
+@pytest.fixture
+def native() -> None:
+    """Skip where the native library is not built."""
+    try:
+        load()
+    except BackendError as error:
+        pytest.skip(str(error))
+
+
+OFFICIAL = (
+    LossTerm("l1", 0.8),
+    LossTerm("ssim", 0.2),
+    LossTerm("normal_consistency", 0.05, start=7000),
+    LossTerm("distortion", 100.0, start=3000),
+)
+
+
+def one_loss(
+    kind: str,
+    output: RenderOutput,
+    target: Tensor,
+    mask: Tensor | None,
+    camera: Camera,
+    *,
+    depth: str = "mean",
+    backend: str = "reference",
+) -> Tensor:
+    """A loss of weight 1; the silhouette that is asked for is the first channel of the target."""
+    losses = compute_losses(
+        output,
+        target,
+        mask,
+        camera,
+        [LossTerm(kind, 1.0)],
+        iteration=1,
+        depth_kind=depth,
+        backend_name=backend,
+        silhouette=target[..., 0],
+    )
+    return losses[kind]
+
+
+@pytest.mark.parametrize("kind", list(LOSSES))
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_what_was_rendered_at_an_ignored_pixel_has_no_influence(
+    kind: str, backend: str, request: pytest.FixtureRequest
+) -> None:
+    if backend == "cpu":
+        request.getfixturevalue("native")
+    height, width = 14, 17
+    camera, target = make_camera(width, height), torch.rand(height, width, 3)
+    mask = torch.rand(height, width, generator=torch.Generator().manual_seed(5)) < 0.8
+    values, gradients = [], []
+    for junk in (0.0, 7.0, float("nan")):
+        clean = make_output(height, width, dtype=torch.float32)
+        leaves = {
+            name: torch.where(
+                mask if image.dim() == 2 else mask[..., None], image.detach(), torch.full_like(image.detach(), junk)
+            ).requires_grad_()
+            for name, image in vars(clean).items()
+            if name != "radii"
+        }
+        output = RenderOutput(**leaves, radii=clean.radii)
+        loss = one_loss(kind, output, target, mask, camera, backend=backend)
+        values.append(loss.item())
+        found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+        gradients.append([g for g in found if g is not None])
+    assert values[0] == values[1] == values[2]
+    assert gradients[0]
+    for first, *others in zip(*gradients, strict=True):
+        assert first.abs().sum() > 0
+        assert (first[~mask] == 0).all()
+        for other in others:
+            assert torch.equal(first, other)
+
+
+@pytest.mark.parametrize("kind", list(LOSSES))
+def test_an_all_true_mask_changes_nothing(kind: str) -> None:
+    output, camera, target = make_output(12, 13), make_camera(13, 12), torch.rand(12, 13, 3, dtype=torch.float64)
+    plain, masked = (
+        one_loss(kind, output, target, mask, camera, depth="median")
+        for mask in (None, torch.ones(12, 13, dtype=torch.bool))
+    )
+    torch.testing.assert_close(plain, masked)
+
+
+@pytest.mark.parametrize("kind", list(LOSSES))
+def test_a_view_without_valid_pixels_has_loss_zero_except_for_the_constant_of_ssim(kind: str) -> None:
+    output, camera = make_output(5, 6), make_camera(6, 5)
+    mask, target = torch.zeros(5, 6, dtype=torch.bool), torch.rand(5, 6, 3, dtype=torch.float64)
+    assert one_loss(kind, output, target, mask, camera).item() == (1.0 if kind == "ssim" else 0.0)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("kind", list(LOSSES))
+def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked: bool) -> None:
+    height, width = 6, 7
+    output, camera = make_output(height, width, seed=1), make_camera(width, height)
+    g = torch.Generator().manual_seed(2)
+    target = torch.rand(height, width, 3, generator=g, dtype=torch.float64)
+    mask = torch.rand(height, width, generator=g) < 0.85 if masked else None
+    images = {name: image for name, image in vars(output).items() if name != "radii"}
+    if kind == "normal_consistency":  # alpha is detached there, which finite differences cannot know
+        images["alpha"] = images["alpha"].detach()
+
+    def loss(*values: Tensor) -> Tensor:
+        rendered = RenderOutput(**dict(zip(images, values, strict=True)), radii=output.radii)
+        return one_loss(kind, rendered, target, mask, camera)
+
+    assert torch.autograd.gradcheck(loss, tuple(images.values()), atol=1e-7)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_the_official_total_is_the_sum_of_the_weighted_terms_that_have_started(
+    backend: str, request: pytest.FixtureRequest
+) -> None:
+    if backend == "cpu":
+        request.getfixturevalue("native")
+    output, camera = make_output(12, 15, dtype=torch.float32), make_camera(15, 12)
+    target = torch.rand(12, 15, 3)
+
+    def losses(iteration: int) -> dict[str, float]:
+        values = compute_losses(
+            output, target, None, camera, OFFICIAL, iteration=iteration, depth_kind="mean", backend_name=backend
+        )
+        return {kind: value.item() for kind, value in values.items()}
+
+    assert list(losses(3000)) == ["l1", "ssim"]  # "active when iteration > start"
+    assert list(losses(3001)) == ["l1", "ssim", "distortion"]
+    everything = losses(7001)
+    assert everything["l1"] == pytest.approx(0.8 * (output.color - target).abs().mean().item(), rel=1e-5)
+    assert everything["ssim"] == pytest.approx(0.2 * (1 - reference.ssim(output.color, target).item()), rel=1e-5)
+    assert everything["distortion"] == pytest.approx(100 * output.distortion.mean().item(), rel=1e-5)
+    nc = reference.normal_consistency(output.normal, output.depth_mean, output.alpha, camera)
+    assert everything["normal_consistency"] == pytest.approx(0.05 * nc.item(), rel=1e-5)
+
+
+def test_a_term_that_names_its_depth_overrides_the_protocol() -> None:
+    output, camera, target = make_output(8, 9), make_camera(9, 8), torch.zeros(8, 9, 3, dtype=torch.float64)
+
+    def value(term: LossTerm, depth_kind: str) -> float:
+        args = (output, target, None, camera, [term])
+        losses = compute_losses(*args, iteration=1, depth_kind=depth_kind, backend_name="reference")
+        return losses["normal_consistency"].item()
+
+    plain = LossTerm("normal_consistency", 1.0)
+    assert value(plain, "mean") != value(plain, "median")
+    assert value(LossTerm("normal_consistency", 1.0, depth="median"), "mean") == value(plain, "median")
+
+
+def test_terms_of_one_kind_add_up() -> None:
+    output, camera, target = make_output(8, 9), make_camera(9, 8), torch.zeros(8, 9, 3, dtype=torch.float64)
+    args = (output, target, None, camera)
+    one, two = (
+        compute_losses(*args, [LossTerm("l1", 0.5)] * n, iteration=1, depth_kind="mean", backend_name="reference")
+        for n in (1, 2)
+    )
+    assert two["l1"].item() == pytest.approx(2 * one["l1"].item())
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"backend_name": "auto"}, BackendError, "cpu"),
+        ({"terms": [LossTerm("l2", 1.0)]}, RecipeError, "l2"),
+        ({"terms": [LossTerm("distortion", None)]}, RecipeError, "no weight"),
+        ({"target": torch.zeros(8, 8, 3)}, ShapeError, "target"),
+        ({"mask": torch.ones(9, 8, dtype=torch.bool)}, ShapeError, "mask"),
+        ({"camera": make_camera(8, 9)}, ShapeError, "camera is 8x9"),
+    ],
+)
+def test_a_wrong_argument_is_refused_in_one_line(change: dict[str, object], error: type[Exception], words: str) -> None:
+    arguments: dict[str, object] = {
+        "output": make_output(8, 9),
+        "target": torch.zeros(8, 9, 3, dtype=torch.float64),
+        "mask": None,
+        "camera": make_camera(9, 8),
+        "terms": [LossTerm("l1", 1.0)],
+        "iteration": 1,
+        "depth_kind": "mean",
+        "backend_name": "reference",
+    }
+    call: Callable[..., object] = compute_losses
+    with pytest.raises(error, match=words) as caught:
+        call(**(arguments | change))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_cache_of_another_target_is_refused(native: None) -> None:
+    output, camera = make_output(8, 9, dtype=torch.float32), make_camera(9, 8)
+    target, other = torch.rand(8, 9, 3), torch.rand(8, 9, 3)
+
+    def ssim(of: Tensor | None) -> float:
+        terms = [LossTerm("ssim", 1.0)]
+        losses = compute_losses(
+            output,
+            target,
+            None,
+            camera,
+            terms,
+            iteration=1,
+            depth_kind="mean",
+            backend_name="cpu",
+            target_cache=maps[of],
+        )
+        return losses["ssim"].item()
+
+    maps = {target: target_maps(target), other: target_maps(other), None: None}
+    assert ssim(target) == ssim(None)
+    with pytest.raises(ShapeError, match="another target"):
+        ssim(other)
+    target.mul_(0.5)
+    with pytest.raises(ShapeError, match="changed in place"):
+        ssim(target)
+
+
+def test_both_implementations_know_the_same_kinds() -> None:
+    assert list(LOSSES) == list(FUSED_LOSSES)
+
+
+def test_a_silhouette_term_without_an_alpha_channel_says_so() -> None:
+    output, camera = make_output(5, 6), make_camera(6, 5)
+    term = [LossTerm("silhouette", 0.1)]
+    with pytest.raises(RecipeError, match="alpha channel, got one without"):
+        compute_losses(
+            output, torch.rand(5, 6, 3), None, camera, term, iteration=1, depth_kind="mean", backend_name="reference"
+        )
