@@ -237,6 +237,21 @@ def test_room_that_is_not_needed_holds_nothing_and_too_little_room_is_said(
             assert torch.equal(frame.ranges[:-1], exact.ranges[:-1])
 
 
+def test_room_follows_the_number_of_pairs_up_at_once_and_down_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Room is sorted whether it is used or not: large splats of a start must not cost for the rest of a run."""
+    monkeypatch.setattr(cuda_budget, "STEP", 1)
+    budget = cuda_budget.PairBudget()
+    budget.learn(7, 1_000_000)
+    assert budget.room(7) == 1_250_000
+    budget.learn(7, 100_000)
+    assert budget.room(7) == 1_248_779  # 1.25 * 1e6 * 1023 / 1024, rounded down to whole pairs
+    for _ in range(10_000):
+        budget.learn(7, 100_000)
+    assert budget.room(7) == 125_000
+    budget.learn(7, cuda_budget.MOST_PAIRS)
+    assert budget.room(7) == cuda_budget.MOST_PAIRS  # 1.25 times as many would not fit in an index
+
+
 def picture_scene() -> tuple[View, ...]:
     """Four views of 6 x 4 px: opaque, with alpha, with a mask, opaque."""
     rng = np.random.default_rng(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Protocol
 
 from torch import Tensor
@@ -106,6 +107,7 @@ def _cpu() -> Backend:
     return Backend("cpu", cpu.rasterize, cpu.splat_errors, rasterize_rows=cpu.rasterize)
 
 
+@cache  # a machine that can run it is asked once, not at each rendering; an error is not kept
 def _cuda() -> Backend:
     from gs2d.kernels.cuda.diagnose import gather, missing
     from gs2d.render import cuda

@@ -7,19 +7,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["PairBudget", "room_for"]
+__all__ = ["MOST_PAIRS", "PairBudget", "room_for"]
 
 SLACK = 1.25  # room, in the largest number seen
 STEP = 1 << 16  # room is a multiple of it, so that torch's allocator sees few sizes
+FORGET = 1 / 1024  # share of the largest number that goes with each rendering: room that is not used is sorted too
+MOST_PAIRS = (1 << 31) - 1
 
 
 class PairBudget:
     """How much room the renderings of a training run make for pairs of splat and tile.
 
-    The first rendering of a size waits for the number of pairs. Later ones take SLACK times the largest number so far
-    and wait for nothing; if that is too little, the pairs farthest away are left out, which ``overflow`` says on the
-    device at once, and ``cut_short`` on the host afterwards. So an update that reads ``overflow`` does nothing, and
-    the caller renders that view again with ``exact`` set.
+    The first rendering of a size waits for the number of pairs. Later ones take SLACK times the largest number so far,
+    which is slowly forgotten, and wait for nothing; if that is too little, the pairs farthest away are left out, which
+    ``overflow`` says on the device at once, and ``cut_short`` on the host afterwards. So an update that reads
+    ``overflow`` does nothing, and the caller renders that view again with ``exact`` set.
 
     Attributes
     ----------
@@ -32,7 +34,7 @@ class PairBudget:
     def __init__(self) -> None:
         self.exact = False
         self.overflow: Tensor | None = None
-        self._largest: dict[int, int] = {}  # by the number of tiles
+        self._largest: dict[int, float] = {}  # by the number of tiles
         self._asked: tuple[int, int] | None = None  # tiles and room of the last rendering, if its number is not known
         self._host: Tensor | None = None
         self._event: Any = None
@@ -42,11 +44,11 @@ class PairBudget:
         largest = self._largest.get(tiles)
         if self.exact or largest is None:
             return None
-        return -(-int(SLACK * largest) // STEP) * STEP
+        return min(-(-int(SLACK * largest) // STEP) * STEP, MOST_PAIRS)
 
     def learn(self, tiles: int, pairs: int) -> None:
-        """The number of pairs of an exact rendering."""
-        self._largest[tiles] = max(pairs, self._largest.get(tiles, 0))
+        """The number of pairs of a rendering, once it is known."""
+        self._largest[tiles] = max(pairs, self._largest.get(tiles, 0) * (1 - FORGET))
         self.overflow = self._asked = None
 
     def ask(self, tiles: int, room: int, pairs: Tensor) -> None:

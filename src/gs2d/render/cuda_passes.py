@@ -32,7 +32,7 @@ from gs2d.kernels.cuda.arguments import (
     View,
 )
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_budget import PairBudget, room_for
+from gs2d.render.cuda_budget import MOST_PAIRS, PairBudget, room_for
 from gs2d.render.types import RasterSettings
 
 __all__ = ["IMAGES", "PARAMETERS", "Frame", "Wanted", "backward", "errors", "forward", "view_of"]
@@ -41,7 +41,6 @@ TILE = 16
 THREADS = 128
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MOST_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
-MOST_CANDIDATES = 1 << 31
 MOST_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
@@ -233,7 +232,7 @@ def _bin(
     order = torch.sort(projected.depth_keys, stable=True).indices
     ends = torch.cumsum(projected.tile_counts[order], 0, dtype=torch.int64)
     candidates = room_for(ends[-1], tiles, budget) if len(ends) else 0
-    if candidates >= MOST_CANDIDATES:
+    if candidates > MOST_PAIRS:
         raise BackendError(
             f"{candidates} pairs of splat and tile, expected fewer than 2^31: use fewer splats or pixels"
         )
