@@ -265,7 +265,10 @@ def picture_scene() -> tuple[View, ...]:
 
 
 def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
-    """72 bytes opaque, 96 with alpha, 96 with a mask: of 170 bytes on the device the first two use 168."""
+    """72 bytes opaque, 96 with alpha, 96 with a mask: of 170 bytes on the device the first two use 168.
+
+    Pinned, the third takes 128 + 32 bytes.
+    """
     scene_views, pinned = picture_scene(), []
 
     def pin(tensor: Tensor) -> Tensor:
@@ -274,7 +277,7 @@ def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
 
     background = (0.25, 0.5, 1.0)
     options: dict[str, Any] = {"use_masks": True, "device": torch.device("cpu")}
-    targets = DeviceTargets(scene_views, background, **options, limit_bytes=170, pinned_bytes=100, pin=pin)
+    targets = DeviceTargets(scene_views, background, **options, limit_bytes=170, pinned_bytes=160, pin=pin)
     plain = Targets(scene_views, background, use_masks=True, with_maps=False)
     for _ in range(2):
         for index in range(4):
@@ -284,6 +287,21 @@ def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
             assert target.mask is None or torch.equal(target.mask, expected.mask)  # type: ignore[arg-type]
     assert pinned == [72, 24]  # the third, image and mask; the fourth does not fit any more and is read each time
     assert sorted(targets._kept) == [0, 1, 2]
+
+
+def test_memory_that_the_system_does_not_lock_is_done_without() -> None:
+    asked = []
+
+    def refuse(tensor: Tensor) -> Tensor:
+        asked.append(tensor.nbytes)
+        raise RuntimeError("CUDA error: out of memory")
+
+    options: dict[str, Any] = {"use_masks": False, "device": torch.device("cpu"), "limit_bytes": 0, "pin": refuse}
+    targets = DeviceTargets(picture_scene(), (0.0, 0.0, 0.0), **options)
+    for index in range(4):
+        assert targets[index].image.shape == (4, 6, 3)
+    assert asked == [72]  # not asked again
+    assert targets._kept == {}
 
 
 def test_a_state_on_a_device_is_saved_in_host_memory_and_moves_whole() -> None:

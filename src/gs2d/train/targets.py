@@ -103,9 +103,10 @@ class _Picture:
     image: Tensor  # [H, W, 3 or 4] uint8
     mask: Tensor | None  # [H, W] bool
 
-    @property
-    def nbytes(self) -> int:
-        return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
+    def nbytes(self, place: str) -> int:
+        """What it takes on the device or, where torch rounds each tensor up to a power of two, in pinned memory."""
+        sizes = [self.image.nbytes, 0 if self.mask is None else self.mask.nbytes]
+        return sum(1 << (size - 1).bit_length() if place == "pinned" and size else size for size in sizes)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> _Picture:
         return _Picture(change(self.image), None if self.mask is None else change(self.mask))
@@ -114,8 +115,9 @@ class _Picture:
 class DeviceTargets:
     """Targets on a GPU: photographs wait there as bytes, 3 or 4 a pixel, and become floats when they are wanted.
 
-    The first ones that fit in ``limit_bytes`` stay on the device. The next ones, up to ``pinned_bytes``, stay in pinned
-    memory of the host, from which they are copied without waiting; any others are decoded anew each time.
+    The first ones that fit in ``limit_bytes`` stay on the device. The next ones, up to ``pinned_bytes`` or what the
+    system gives, stay in pinned memory of the host, from which they are copied without waiting; any others are decoded
+    anew each time.
 
     Parameters
     ----------
@@ -165,9 +167,16 @@ class DeviceTargets:
         mask = view.mask() if self._use_masks else None
         picture = _Picture(torch.tensor(view.image()), None if mask is None else torch.tensor(mask))
         for place in ("device", "pinned"):
-            if picture.nbytes <= self._room[place]:
-                self._room[place] -= picture.nbytes
-                change = self._pin if place == "pinned" else lambda tensor: tensor.to(self._device)
+            if picture.nbytes(place) > self._room[place]:
+                continue
+            change = self._pin if place == "pinned" else lambda tensor: tensor.to(self._device)
+            try:
                 self._kept[index] = picture.map(change)
-                return self._kept[index]
+            except RuntimeError:
+                if place == "device":
+                    raise
+                self._room[place] = 0  # the system locks no more memory: slower, but no reason to stop
+                break
+            self._room[place] -= picture.nbytes(place)
+            return self._kept[index]
         return picture
