@@ -2,11 +2,13 @@
 
 ::
 
-    python -m benchmarks.fuse [--views 60] [--size 400] [--resolution 512] [--threads 2] [--unbounded] [--json FILE]
+    python -m benchmarks.fuse [--views 60] [--size 400] [--resolution 512] [--threads 2] [--unbounded]
+                              [--backend auto] [--json FILE]
 
 The scene is a sphere of radius 0.9 with coloured waves, seen from all round: as much surface as ``rendered_bottle``.
 With ``--unbounded`` the same frames go into a nest of levels; the innermost has half the side of the sphere, and the
-voxel of the bounded run. On a shared machine the processor seconds are the ones to compare.
+voxel of the bounded run. ``--backend reference`` fuses in numpy, ``cpu`` natively, ``cuda`` on a GPU. On a shared
+machine the processor seconds are the ones to compare.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from gs2d.camera import Camera, look_at
 from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.frames import DepthMap, Frame, depth_map
 from gs2d.mesh.fuse import fuse
+from gs2d.mesh.integrate import BACKENDS, fusion_backend
 from gs2d.mesh.limits import derive_limits, sample_depths, widen_truncation
 from gs2d.mesh.nest import derive_nest
 from gs2d.mesh.nested import fuse_nested, nested_marching_cubes
@@ -44,6 +47,7 @@ class Result:
     size: int
     resolution: int
     threads: int
+    backend: str
     levels: int
     seconds: dict[str, float]
     cpu_seconds: dict[str, float]
@@ -77,7 +81,9 @@ def orbit(count: int, size: int) -> list[Camera]:
     return [look_at(eye, np.zeros(3), up, width=size, height=size, fx=1.4 * size) for eye in eyes]
 
 
-def run(views: int, size: int, resolution: int, threads: int, *, unbounded: bool = False) -> Result:
+def run(
+    views: int, size: int, resolution: int, threads: int, *, unbounded: bool = False, backend: str = "auto"
+) -> Result:
     """Fuse once, step by step."""
     wall: dict[str, float] = {}
     cpu: dict[str, float] = {}
@@ -99,10 +105,10 @@ def run(views: int, size: int, resolution: int, threads: int, *, unbounded: bool
     if unbounded:
         core = np.array([[-RADIUS] * 3, [RADIUS] * 3]) / 2
         nest = derive_nest(samples, cameras, bbox=core, voxel=limits.voxel, truncation=limits.truncation)
-        volumes = timed("fuse", lambda: fuse_nested(maps, nest, threads=threads))
+        volumes = timed("fuse", lambda: fuse_nested(maps, nest, threads=threads, backend=backend))
         mesh = timed("marching cubes", lambda: nested_marching_cubes(volumes, nest, far_weight=1.0))
     else:
-        volumes = [timed("fuse", lambda: fuse(maps, limits, threads=threads))]
+        volumes = [timed("fuse", lambda: fuse(maps, limits, threads=threads, backend=backend))]
         mesh = timed("marching cubes", lambda: marching_cubes(volumes[0]))
     mesh = timed("components", lambda: keep_components(mesh))
     error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() / limits.voxel
@@ -111,6 +117,7 @@ def run(views: int, size: int, resolution: int, threads: int, *, unbounded: bool
         size=size,
         resolution=resolution,
         threads=threads,
+        backend=fusion_backend(backend),
         levels=len(volumes),
         seconds=wall,
         cpu_seconds=cpu,
@@ -130,9 +137,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--resolution", type=int, default=512)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--unbounded", action="store_true")
+    parser.add_argument("--backend", default="auto", choices=("auto", *BACKENDS))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    result = run(options.views, options.size, options.resolution, options.threads, unbounded=options.unbounded)
+    result = run(
+        options.views,
+        options.size,
+        options.resolution,
+        options.threads,
+        unbounded=options.unbounded,
+        backend=options.backend,
+    )
     document = {"machine": machine(), "result": asdict(result)}
     print(json.dumps(document, indent=1))
     if options.json is not None:

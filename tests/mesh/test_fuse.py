@@ -185,6 +185,29 @@ def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: 
     np.testing.assert_array_equal(fast.tsdf, slow.tsdf)
 
 
+@pytest.mark.parametrize("marked", [True, False])
+def test_the_blocks_near_a_depth_map_are_those_of_a_plain_loop(marked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples every half block from -0.15 to 0.15 of each pixel's depth; each takes the two nearest blocks by axis."""
+    if not marked:
+        monkeypatch.setattr("gs2d.mesh.fuse._MOST_MARKS", 0)  # as for a grid that is too large to mark
+    camera = look_at(np.array([0.4, -2.5, 0.3]), np.zeros(3), np.array([0, 0, 1.0]), width=24, height=20, fx=40)
+    item = depth_map(Frame(camera, sphere_depth(camera, 1.0)))
+    dims = block_grid(LIMITS)
+    expected = set()
+    for row, column in zip(*np.nonzero(item.depth), strict=True):
+        for offset in np.linspace(-0.15, 0.15, 4):  # 2 * 0.15 in steps of at most 0.12, half a block of 8 * 0.03
+            local = np.array([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0])
+            point = (local * (item.depth[row, column] + offset) - camera.T_cam_world[:3, 3]) @ camera.rotation
+            lower = np.floor((point - LIMITS.lower) / 0.24 - 0.5).astype(int)
+            for corner in np.ndindex(2, 2, 2):
+                block = lower + corner
+                if (block >= 0).all() and (block < dims).all():
+                    expected.add((block[0] * dims[1] + block[1]) * dims[2] + block[2])
+    found = touched_blocks(item, LIMITS, dims)
+    assert found.tolist() == sorted(expected)
+    assert len(found) > 50
+
+
 def test_every_voxel_within_the_truncation_of_a_seen_point_has_a_block() -> None:
     camera = orbit(1, 3.0)[0]
     item = depth_map(Frame(camera, sphere_depth(camera, 1.0)))

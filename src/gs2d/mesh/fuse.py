@@ -20,6 +20,8 @@ from gs2d.mesh.limits import FusionLimits, backproject
 from gs2d.mesh.sampling import prepare
 from gs2d.mesh.volume import BLOCK, Budget, Volume, block_grid, unknown_volume
 
+_MOST_MARKS = 1 << 27  # bytes
+
 
 def fuse(
     frames: Iterable[DepthMap],
@@ -60,7 +62,7 @@ def fuse(
     colored, count = False, 0
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
-        keys = np.union1d(keys, touched_blocks(item, limits, dims))
+        keys = merged(keys, touched_blocks(item, limits, dims))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
@@ -88,23 +90,40 @@ def touched_blocks(item: DepthMap, limits: FusionLimits, dims: tuple[int, int, i
     parts = max(1, int(np.ceil(width / half)))
     shifts = (np.arange(parts) + 0.5) / parts - 0.5
     steps = int(np.ceil(2 * limits.truncation / half)) + 1
-    found: list[np.ndarray] = []
-    lower, half_dims = np.asarray(limits.lower), 2 * np.asarray(dims)
+    # The lower of the two nearest blocks along each axis, counted from a border of one block round the grid.
+    padded = (dims[0] + 2, dims[1] + 2, dims[2] + 2)
+    strides = (padded[1] * padded[2], padded[2], 1)
+    start = ((item.camera.center - limits.lower) / half)[:, None]  # in half blocks, as is all below
+    end = 2 * np.asarray(dims)[:, None]
+    lowest: list[np.ndarray] = []
     for dx in shifts:
         for dy in shifts:
+            ray = (backproject(item.camera, np.ones(len(rows)), rows + dy, columns + dx) - item.camera.center).T / half
             for offset in np.linspace(-limits.truncation, limits.truncation, steps):
-                points = backproject(item.camera, depth + offset, rows + dy, columns + dx)
-                cells = np.floor((points - lower) / half).astype(np.int64)
-                cells = cells[((cells >= 0) & (cells < half_dims)).all(axis=1)]
-                flat = (cells[:, 0] * half_dims[1] + cells[:, 1]) * half_dims[2] + cells[:, 2]
-                # neighbours in a row mostly share a cell: drop repeats before sorting
-                found.append(np.unique(flat[np.flatnonzero(np.diff(flat, prepend=-1))]))
-    flat = np.unique(np.concatenate(found))
-    cells = np.stack(np.unravel_index(flat, tuple(half_dims)), axis=1)
-    base = (cells - 1) >> 1  # the lower of the two nearest blocks along each axis
-    keys = []
-    for corner in range(8):
-        block = base + np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
-        block = block[((block >= 0) & (block < dims)).all(axis=1)]
-        keys.append((block[:, 0] * dims[1] + block[:, 1]) * dims[2] + block[:, 2])
-    return np.unique(np.concatenate(keys))
+                at = start + (depth + offset) * ray  # [3, P]
+                cells = at[:, ((at >= 0) & (at < end)).all(axis=0)].astype(np.int64)
+                x, y, z = (cells + 1) >> 1
+                flat = x * strides[0] + y * strides[1] + z
+                lowest.append(flat[np.flatnonzero(np.diff(flat, prepend=-1))])  # neighbours mostly share a block
+    first = _distinct(lowest, padded)
+    corners = [sum(strides[axis] * (c >> axis & 1) for axis in range(3)) for c in range(8)]
+    blocks = np.stack(np.unravel_index(_distinct([first + corner for corner in corners], padded), padded)) - 1
+    x, y, z = blocks[:, ((blocks >= 0) & (blocks < np.asarray(dims)[:, None])).all(axis=0)]
+    return (x * dims[1] + y) * dims[2] + z
+
+
+def _distinct(numbers: list[np.ndarray], dims: tuple[int, int, int]) -> np.ndarray:
+    """Numbers of a grid's places, sorted, each once: by marking them, or, where the grid is too large, by sorting."""
+    places = dims[0] * dims[1] * dims[2]
+    if places > _MOST_MARKS:
+        return np.unique(np.concatenate(numbers))
+    marks = np.zeros(places, bool)
+    for some in numbers:
+        marks[some] = True
+    return np.flatnonzero(marks)
+
+
+def merged(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """All of two sorted arrays of keys >= 0, sorted, each once."""
+    both = np.sort(np.concatenate([one, other]), kind="stable")  # merges what is sorted
+    return both[np.flatnonzero(np.diff(both, prepend=-1))]

@@ -17,7 +17,7 @@ import numpy as np
 from gs2d.errors import ProtocolError
 from gs2d.mesh.cases import CORNERS, EDGES, case_table
 from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.fuse import touched_blocks
+from gs2d.mesh.fuse import merged, touched_blocks
 from gs2d.mesh.integrate import integrator
 from gs2d.mesh.limits import backproject
 from gs2d.mesh.nest import STEP, Nest
@@ -69,7 +69,7 @@ def fuse_nested(
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
         for k, found in enumerate(_touched(item, nest)):
-            keys[k] = np.union1d(keys[k], found)
+            keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
     if not any(map(len, keys)):
