@@ -169,7 +169,7 @@ def make_plan(options: PaperOptions) -> Plan:
     table = PAPER_TABLES[options.table]
     scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
     names = {row.recipe: canonical_recipe(row.recipe) for row in table.trained if row.recipe is not None}
-    recipes = {name: _recipe(name, options) for name in dict.fromkeys(names.values())}
+    recipes = {name: trained_recipe(name, options) for name in dict.fromkeys(names.values())}
     _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
     cache = options.cache or options.out / "cache"
     made: dict[str, SweepJob] = {}
@@ -177,7 +177,7 @@ def make_plan(options: PaperOptions) -> Plan:
     for scene in scenes:
         for seed in options.seeds:
             for row_recipe, name in names.items():
-                job = _job(options, scene, name, recipes[name], seed, cache)
+                job = make_job(options, scene, name, recipes[name], seed, cache)
                 jobs[row_recipe, scene.name, seed] = made.setdefault(job.name, job)
     sweep = Sweep(folder=options.out, jobs=tuple(made.values()), cache=cache)
     return Plan(options, table, scenes, sweep, jobs)
@@ -189,7 +189,8 @@ def canonical_recipe(name: str) -> str:
     return next(other for other in RECIPES if replace(get_recipe(other), name="") == recipe)
 
 
-def _recipe(name: str, options: PaperOptions) -> Recipe:
+def trained_recipe(name: str, options: PaperOptions) -> Recipe:
+    """A named recipe at the schedule and with the changes of the options."""
     recipe = scale_schedule(get_recipe(name), options.schedule_scale)
     return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
 
@@ -208,7 +209,8 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
             raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
 
 
-def _job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int, cache: Path) -> SweepJob:
+def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int, cache: Path) -> SweepJob:
+    """The run of a recipe (``trained_recipe`` of the name) on a scene."""
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
         scene=scene.path,
