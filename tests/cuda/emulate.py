@@ -37,13 +37,23 @@ class EmulatedKernels:
         self._dll = ctypes.CDLL(str(library))
 
     def launch(
-        self, name: str, grid: tuple[int, int], block: int, arguments: ctypes.Structure, *, descending: bool = False
+        self,
+        name: str,
+        grid: tuple[int, int],
+        block: int,
+        arguments: ctypes.Structure,
+        *,
+        descending: bool = False,
+        seed: int = 0,
     ) -> None:
-        """Run a whole grid; RuntimeError with the emulator's words if threads do not meet at a collective."""
+        """Run a whole grid; RuntimeError with the emulator's words if threads do not meet at a collective.
+
+        With ``seed`` > 0 threads, warps and blocks run in an order of their own.
+        """
         function = self._dll[f"launch_{name}"]
         function.restype = ctypes.c_char_p
         function.argtypes = [ctypes.c_uint] * 3 + [ctypes.c_int, ctypes.c_void_p]
-        error = function(grid[0], grid[1], block, int(descending), ctypes.byref(arguments))
+        error = function(grid[0], grid[1], block, seed + 1 if seed else int(descending), ctypes.byref(arguments))
         if error is not None:
             raise RuntimeError(f"{name}: {error.decode()}")
 
@@ -61,9 +71,9 @@ def build(
     wrapper = folder / f"{name}.cpp"
     lines = [f'#include "{HERE / "emulator.h"}"', *(f'#include "{source}"' for source in sources)]
     lines.append("namespace gs2d {}\nusing namespace gs2d;")  # where our kernels live
-    signature = "(unsigned x, unsigned y, unsigned block, int descending, const void* a)"
+    signature = "(unsigned x, unsigned y, unsigned block, int order, const void* a)"
     for kernel in names:
-        body = f"return emulator::launch({kernel}, x, y, block, descending, a);"
+        body = f"return emulator::launch({kernel}, x, y, block, order, a);"
         lines.append(f'extern "C" const char* launch_{kernel}{signature} {{ {body} }}')
     wrapper.write_text("\n".join(lines) + "\n")
     library = folder / f"{name}.so"
@@ -84,6 +94,7 @@ class Emulator:
 
     folder: Path
     descending: bool = False
+    seed: int = 0
     approximate: bool = False
     _built: dict[str, EmulatedKernels] = field(default_factory=dict)
 
@@ -95,4 +106,4 @@ class Emulator:
             source = next(s for s in sorted((KERNELS / "cuda").glob("*.cu")) if name in KERNEL.findall(s.read_text()))
             built = build([source], KERNELS, self.folder, source.stem, approximate=self.approximate)
             self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
-        self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending)
+        self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending, seed=self.seed)

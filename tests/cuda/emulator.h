@@ -2,8 +2,9 @@
 //
 // Stricter than a GPU: a warp collective wants all 32 lanes of the warp at the same call with the full mask, a block
 // barrier wants every thread, and what does not come together is an error with the lines, never a hang. Shared memory is
-// filled with NaN before each block. Threads run in ascending or descending order between collectives: a missing barrier
-// changes the result of one of the two. Data races proper are not found.
+// filled with NaN before each block. Threads run in ascending or descending order between collectives, or shuffled: then
+// blocks come in any order too, and of the warps that could go on some stay behind, so that others run ahead of them as far
+// as barriers let them. A missing barrier changes the result of one of these. Races between collectives are not found.
 #pragma once
 
 #include <math.h>
@@ -130,7 +131,36 @@ inline bool complete_collectives() {
     return false;
 }
 
-inline void run_block(bool descending) {
+enum Order : int { ASCENDING, DESCENDING };  // any other number is the seed of a shuffle
+
+inline uint32_t random_state;
+inline unsigned random_below(unsigned n) {  // xorshift
+    random_state ^= random_state << 13, random_state ^= random_state >> 17, random_state ^= random_state << 5;
+    return random_state % n;
+}
+inline void shuffle(unsigned* items, unsigned n) {
+    for (unsigned i = n; i > 1; --i) {
+        const unsigned j = random_below(i), last = items[i - 1];
+        items[i - 1] = items[j], items[j] = last;
+    }
+}
+
+// The threads in the order in which they run until they meet at collectives; returns how many do.
+inline unsigned choose_threads(int order, unsigned* chosen) {
+    if (order == ASCENDING || order == DESCENDING) {
+        for (unsigned k = 0; k < threads; ++k) chosen[k] = order == DESCENDING ? threads - 1 - k : k;
+        return threads;
+    }
+    unsigned n = 0;
+    for (unsigned w = 0; w < threads; w += WARP)
+        if (random_below(2))
+            for (unsigned i = w; i < w + WARP; ++i) chosen[n++] = i;
+    shuffle(chosen, n);
+    return n;
+}
+
+inline void run_block(int order) {
+    unsigned chosen[MOST_THREADS];
     if (__start_gs2d_shared) memset(__start_gs2d_shared, 0xff, size_t(__stop_gs2d_shared - __start_gs2d_shared));
     for (unsigned i = 0; i < threads; ++i) {
         Fiber& f = fibers[i];
@@ -141,8 +171,9 @@ inline void run_block(bool descending) {
         f.runnable = true, f.done = false, f.op = Op::NONE, f.line = 0;
     }
     do {
-        for (unsigned k = 0; k < threads; ++k) {
-            current = descending ? threads - 1 - k : k;
+        const unsigned n = choose_threads(order, chosen);
+        for (unsigned k = 0; k < n; ++k) {
+            current = chosen[k];
             if (!fibers[current].runnable) continue;
             threadIdx = {current % blockDim.x, current / blockDim.x, 0};
             swapcontext(&scheduler, &fibers[current].context);
@@ -152,7 +183,7 @@ inline void run_block(bool descending) {
 
 // Null, or what went wrong (the rest of the grid is not run).
 template <class A>
-const char* launch(void (*kernel)(A), unsigned grid_x, unsigned grid_y, unsigned block_x, int descending, const void* arguments) {
+const char* launch(void (*kernel)(A), unsigned grid_x, unsigned grid_y, unsigned block_x, int order, const void* arguments) {
     static void (*the_kernel)(A);
     the_kernel = kernel;
     body = [](const void* a) { the_kernel(*static_cast<const A*>(a)); };
@@ -160,10 +191,15 @@ const char* launch(void (*kernel)(A), unsigned grid_x, unsigned grid_y, unsigned
     threads = block_x, failed = false;
     if (block_x % WARP || block_x > MOST_THREADS) return "the block must be whole warps, at most 1024 threads";
     gridDim = {grid_x, grid_y, 1}, blockDim = {block_x, 1, 1};
-    for (unsigned i = 0; i < grid_x * grid_y && !failed; ++i) {
-        blockIdx = {i % grid_x, i / grid_x, 0};
-        run_block(descending != 0);
+    const unsigned blocks = grid_x * grid_y;
+    unsigned* const turns = static_cast<unsigned*>(malloc(blocks * sizeof(unsigned)));
+    for (unsigned i = 0; i < blocks; ++i) turns[i] = i;
+    if (order != ASCENDING && order != DESCENDING) random_state = uint32_t(order), shuffle(turns, blocks);
+    for (unsigned i = 0; i < blocks && !failed; ++i) {
+        blockIdx = {turns[i] % grid_x, turns[i] / grid_x, 0};
+        run_block(order);
     }
+    free(turns);
     return failed ? message : nullptr;
 }
 

@@ -26,6 +26,13 @@ extern "C" __global__ void reverse_block_without_barrier(Ints a) {
     a.out[blockIdx.x * 64 + threadIdx.x] = values[63 - threadIdx.x];
 }
 
+extern "C" __global__ void reverse_block_behind_a_vote(Ints a) {  // of a warp, where the whole block should meet
+    __shared__ int values[64];
+    values[threadIdx.x] = a.in[blockIdx.x * 64 + threadIdx.x];
+    __any_sync(0xffffffffu, 1);
+    a.out[blockIdx.x * 64 + threadIdx.x] = values[63 - threadIdx.x];
+}
+
 extern "C" __global__ void warp_collectives(Ints a) {
     const int v = a.in[threadIdx.x];
     int sum = v;

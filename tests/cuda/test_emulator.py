@@ -24,10 +24,16 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> emulate.EmulatedKernels:
 
 
 def run(
-    kernels: emulate.EmulatedKernels, name: str, given: Tensor, out: Tensor, blocks: int = 1, descending: bool = False
+    kernels: emulate.EmulatedKernels,
+    name: str,
+    given: Tensor,
+    out: Tensor,
+    blocks: int = 1,
+    descending: bool = False,
+    seed: int = 0,
 ) -> Tensor:
     arrays = _Arrays(given.data_ptr(), out.data_ptr())
-    kernels.launch(name, (blocks, 1), len(given) // blocks, arrays, descending=descending)
+    kernels.launch(name, (blocks, 1), len(given) // blocks, arrays, descending=descending, seed=seed)
     return out
 
 
@@ -53,10 +59,23 @@ def test_a_missing_barrier_gives_wrong_results(cases: emulate.EmulatedKernels) -
     assert all(result != list(range(63, -1, -1)) for result in results)
 
 
-def test_warp_collectives_stay_within_their_warp(cases: emulate.EmulatedKernels) -> None:
+def test_warps_that_run_ahead_show_a_vote_in_the_place_of_a_barrier(cases: emulate.EmulatedKernels) -> None:
+    """Where all warps go from collective to collective together it would pass for one; with a barrier all is well."""
+    right = [*range(63, -1, -1), *range(127, 63, -1)]
+
+    def results(name: str, **order: int) -> list[int]:
+        return list(run(cases, name, ints(128), ints(128) - 9, 2, **order).tolist())  # type: ignore[arg-type]
+
+    assert [results("reverse_block_behind_a_vote", descending=d) for d in (False, True)] == [right] * 2
+    assert any(results("reverse_block_behind_a_vote", seed=seed) != right for seed in range(1, 9))
+    assert all(results("reverse_block", seed=seed) == right for seed in range(1, 9))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_warp_collectives_stay_within_their_warp(cases: emulate.EmulatedKernels, seed: int) -> None:
     given = ints(64)
     given[40] = -8
-    out = run(cases, "warp_collectives", given, torch.zeros(64, 3, dtype=torch.int32))
+    out = run(cases, "warp_collectives", given, torch.zeros(64, 3, dtype=torch.int32), seed=seed)
     first, second = out[:32], out[32:]
     odd = 0xAAAAAAAA - (1 << 32)
     assert first.tolist() == [[sum(range(32)), odd, 0]] * 32
@@ -92,6 +111,8 @@ def test_threads_that_do_not_meet_are_an_error_with_words_not_a_hang(
 ) -> None:
     with pytest.raises(RuntimeError, match=words):
         run(cases, name, ints(64), ints(64))
+    with pytest.raises(RuntimeError):
+        run(cases, name, ints(64), ints(64), seed=3)
 
 
 def test_a_source_that_does_not_compile_is_reported(tmp_path: Path) -> None:

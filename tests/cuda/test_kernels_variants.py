@@ -143,10 +143,12 @@ def test_deterministic_gradients_do_not_depend_on_order_or_culling(
     options: dict[str, Any] = {"trained": trained, "columns": columns, "deterministic": True}
     usual = gradients(emulator, case, cotangents, **options)
     downwards = gradients(replace(emulator, descending=True), case, cotangents, **options)
+    shuffled = gradients(replace(emulator, seed=1), case, cotangents, **options)
     everywhere = gradients(emulator, case, cotangents, **options, exact_masks=False)
     atomic = gradients(emulator, case, cotangents, trained=trained, columns=columns)
     for name, grad in usual.items():
         assert torch.equal(grad, downwards[name]), name
+        assert torch.equal(grad, shuffled[name]), name
         assert torch.equal(grad, everywhere[name]), name
         assert float((grad - atomic[name]).norm()) <= 1e-5 * float(grad.norm()), name
 
