@@ -12,7 +12,7 @@ import pytest
 from gs2d.errors import RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
 from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan
-from gs2d.pipeline.paper_deviations import deviations_of
+from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
 from gs2d.pipeline.paper_rows import FIGURES, Cell, Results, Row, judge_order, read_cell
 from tiny import write_ball_mesh, write_capture
 
@@ -89,6 +89,14 @@ def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
     assert any("2 runs shared the machine" in line for line in lines)
     plain = deviations_of(options, (), PAPER_TABLES["regularisation"], Results((make_row("row", cell),)))
     assert not any("E_i" in line or "AbsGS" in line for line in plain)  # one stage: nothing was left open
+
+
+def test_resets_that_a_short_schedule_has_not_are_a_deviation() -> None:
+    # Every 3000 iterations while splats are added, which is until half of stage 1: 3000, 6000, 9000, 12000 of 15000.
+    assert (opacity_resets(1.0), opacity_resets(0.3), opacity_resets(0.1)) == (4, 1, 0)
+    options = PaperOptions(table="modules", data=Path("data"), out=Path("out"), schedule_scale=0.1)
+    lines = deviations_of(options, (), PAPER_TABLES["modules"], Results(()))
+    assert "opacity is reset 0 times in stage 1, in the paper 4 times: the interval is not scaled" in lines
 
 
 def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
 from gs2d.pipeline.paper_rows import NOT_YET, Results
 from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes
 from gs2d.recipes import get_recipe
+from gs2d.schedule import scale_schedule
 
 if TYPE_CHECKING:
     from gs2d.pipeline.paper import PaperOptions
@@ -27,6 +28,11 @@ def deviations_of(
     found = []
     if options.schedule_scale != 1.0:
         found.append(f"the schedule is {options.schedule_scale:g} of the paper's (30k + 10k + 20k iterations)")
+        full, scaled = opacity_resets(1.0), opacity_resets(options.schedule_scale)
+        if full != scaled:
+            found.append(
+                f"opacity is reset {scaled} times in stage 1, in the paper {full} times: the interval is not scaled"
+            )
     found += _scenes(options, scenes, table)
     found += [f"changed in the recipes: {text}" for text in options.overrides]
     found += _methods(table)
@@ -47,6 +53,13 @@ def deviations_of(
         f"gs2d {installed['2dgs-r']}, torch {installed['torch']}, Python {installed['python']}"
     )
     return found
+
+
+def opacity_resets(scale: float) -> int:
+    """How often stage 1 resets opacity at this part of the schedule, over a black background."""
+    stage = scale_schedule(get_recipe("2dgs"), scale).stages[0]
+    assert stage.densify is not None
+    return sum(stage.densify.resets(i, white=False) for i in range(1, stage.iterations + 1))
 
 
 def _methods(table: PaperTable) -> Iterator[str]:
