@@ -1,0 +1,84 @@
+"""What nobody has written is never read: on a GPU fresh memory holds what an earlier tensor left there."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from emulate import Emulator
+from kernel_cases import SETTINGS, many_tiles
+from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "train"))  # train_toys
+
+import train_toys
+
+from gs2d.kernels.cuda import launch
+from gs2d.render import cuda
+from gs2d.render.backend import Backend
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@contextmanager
+def fresh_memory(*, poisoned: bool) -> Iterator[None]:
+    """``torch.empty`` and its kin give NaN and the largest integers, or whatever there is."""
+    before = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = poisoned
+    try:
+        yield
+    finally:
+        torch.utils.deterministic.fill_uninitialized_memory = before
+        torch.use_deterministic_algorithms(False)
+
+
+def unchanged_by_poison(work: Callable[[], list[Tensor]]) -> int:
+    """Runs it twice; how many tensors it gave."""
+    with fresh_memory(poisoned=False):
+        plain = work()
+    with fresh_memory(poisoned=True):
+        assert bool(torch.empty(3).isnan().all())
+        assert torch.zeros(2, dtype=torch.int16).new_empty(1).item() == 32767
+        found = work()
+    assert all(torch.equal(a, b) for a, b in zip(plain, found, strict=True))
+    return len(found)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_no_pass_of_the_rasterizer_reads_what_is_not_written(emulator: Emulator, deterministic: bool) -> None:
+    case = many_tiles()
+    cotangents = random_cotangents(np.random.default_rng(1), case.camera)
+    image = torch.rand(case.camera.height, case.camera.width, 3, generator=torch.Generator().manual_seed(0))
+
+    def work() -> list[Tensor]:
+        scene = requiring_grad(case.splats)
+        probe = torch.zeros(len(scene), 4, requires_grad=True)
+        output = cuda.rasterize_with(emulator, scene, case.camera, SETTINGS, probe, deterministic=deterministic)
+        contraction(output, cotangents).backward()
+        given = (emulator, case.splats, case.camera, image, SETTINGS)
+        errors = [cuda.splat_errors_with(*given, occlusion=occlusion) for occlusion in (False, True)]
+        grads = [tensor.grad for _, tensor in scene.items()] + [probe.grad]
+        images = [getattr(output, name).detach() for name in IMAGES]
+        return [*images, *(grad for grad in grads if grad is not None), *errors]
+
+    assert unchanged_by_poison(work) == len(IMAGES) + 7 + 2
+
+
+def test_nothing_in_training_reads_what_is_not_written(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Losses, Adam, densification, ranking, clones and frozen rows of three short stages."""
+    monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
+    backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize)
+    scene, recipe = train_toys.make_scene(), train_toys.short()
+
+    def work() -> list[Tensor]:
+        state = train_toys.train(scene, recipe, backend=backend)[0].state
+        return [t for _, t in state.splats.items()] + [m.square for m in state.moments.values()]
+
+    assert unchanged_by_poison(work) > 6
