@@ -21,22 +21,13 @@ from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
 from gs2d.pipeline import sweep as sweep_module
 from gs2d.pipeline.paper import PaperOptions, canonical_recipe, make_plan, paper
-from gs2d.pipeline.paper_rows import FIGURES, Cell, Results, Row, judge_order, read_cell
+from gs2d.pipeline.paper_rows import FIGURES, Results, Row, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes, missing_scenes
 from gs2d.pipeline.paper_text import measured, shown, to_csv, to_latex, to_markdown
+from paper_cells import make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 
 TINY = ["--schedule-scale", "0.0005", "--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
-
-
-def make_cell(scene: str = "a", seed: int = 0, data_set: str = TNT, **figures: float | None) -> Cell:
-    known = {**dict.fromkeys(FIGURES), **figures}
-    reasons = {name: "because" for name, value in known.items() if value is None}
-    return Cell(scene, data_set, seed, known, reasons, Path("run"))
-
-
-def make_row(name: str, *cells: Cell, paper: Mapping[str, Any] | None = None) -> Row:
-    return Row(name, "2dgs", dict(paper or {}), "", cells)
 
 
 # -- scenes --------------------------------------------------------------------------------------------------------

@@ -13,18 +13,10 @@ from gs2d.errors import RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
 from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan
 from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
-from gs2d.pipeline.paper_rows import FIGURES, Cell, Results, Row, judge_order, read_cell
+from gs2d.pipeline.paper_rows import Results, judge_order, read_cell
+from gs2d.pipeline.paper_scenes import find_scenes
+from paper_cells import make_cell, make_row
 from tiny import write_ball_mesh, write_capture
-
-
-def make_cell(scene: str, seed: int = 0, data_set: str = TNT, **figures: float | None) -> Cell:
-    known = {**dict.fromkeys(FIGURES), **figures}
-    return Cell(scene, data_set, seed, known, {n: "because" for n, v in known.items() if v is None}, Path("run"))
-
-
-def make_row(name: str, *cells: Cell) -> Row:
-    return Row(name, "2dgs", {}, "", cells)
-
 
 # Scene a (30 dB) at both seeds, scene b (20 dB) at seed 0 only: the seeds differ by 0.2 dB, not by (30.2 - 25) dB.
 UNEVEN = (make_cell("a", 0, psnr=30.0), make_cell("b", 0, psnr=20.0), make_cell("a", 1, psnr=30.2))
@@ -97,6 +89,15 @@ def test_resets_that_a_short_schedule_has_not_are_a_deviation() -> None:
     options = PaperOptions(table="modules", data=Path("data"), out=Path("out"), schedule_scale=0.1)
     lines = deviations_of(options, (), PAPER_TABLES["modules"], Results(()))
     assert "opacity is reset 0 times in stage 1, in the paper 4 times: the interval is not scaled" in lines
+
+
+def test_another_weight_of_distortion_than_the_papers_is_a_deviation(tmp_path: Path) -> None:
+    write_capture(tmp_path / "ball", train=2, test=1, size=8)
+    options = PaperOptions(table="regularisation", data=tmp_path, out=tmp_path / "out")
+    scenes = find_scenes(tmp_path)
+    line = "ball: alpha with distortion is 1000, their protocol's; the paper's 100/10 is of TnT"
+    assert line in deviations_of(options, scenes, PAPER_TABLES["regularisation"], Results(()))
+    assert line not in deviations_of(options, scenes, PAPER_TABLES["modules"], Results(()))
 
 
 def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_path: Path) -> None:

@@ -173,7 +173,7 @@ def find_truth(
     places = [folder] if folder is not None else [root, *root.parents[:above]]
     if dataset.name == "dtu":
         names = dtu_truth_files(facts.scan or 0)
-        near = [place for base in places for place in (base, *_subfolders(base))]
+        near = [place for base in places for place in (base, *subfolders(base))]
         inside = [place for base in near for place in (base, base / "MVS Data", base / "SampleSet" / "MVS Data")]
         found = {what: path for what, name in names.items() if (path := _first(inside, name)) is not None}
         if found:  # where the others are
@@ -184,7 +184,7 @@ def find_truth(
         candidates = [
             place
             for base in places
-            for place in (base, base / facts.name, *(sub / facts.name for sub in _subfolders(base)))
+            for place in (base, base / facts.name, *(sub / facts.name for sub in subfolders(base)))
         ]
         best = max(candidates, key=lambda place: _own_pieces(place, names))
         has_any = _own_pieces(best, names) > 0
@@ -296,10 +296,11 @@ def _folders(data: Path) -> Iterator[Path]:
     level = [data]
     for _ in range(DEPTH + 1):
         yield from level
-        level = [sub for folder in level for sub in _subfolders(folder)]
+        level = [sub for folder in level for sub in subfolders(folder)]
 
 
-def _subfolders(folder: Path) -> list[Path]:
+def subfolders(folder: Path) -> list[Path]:
+    """The folders in a folder that are not hidden, by name; none where it cannot be read."""
     try:
         return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
     except OSError:

@@ -36,6 +36,7 @@ def deviations_of(
     found += _scenes(options, scenes, table)
     found += [f"changed in the recipes: {text}" for text in options.overrides]
     found += _methods(table)
+    found += _weights(table, scenes)
     found += _missing_figures(results)
     if any(scene.data_set == NERF_SYNTHETIC and scene.scored for scene in scenes):
         found.append("F-score on NeRF-Synthetic is by this project's own protocol: the paper states none")
@@ -75,6 +76,15 @@ def _methods(table: PaperTable) -> Iterator[str]:
             "the paper prints no thresholds of AbsGS-A: those here are gs2d's own (docs/guides/paper.md); AbsGS-D has "
             "those of AbsGS's released code, and both densify in stage 3 in place of the clone"
         )
+
+
+def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
+    """Scenes whose protocol weighs distortion otherwise than the paper's "100/10", in tables with such rows."""
+    if not any("100/10" in row.name for row in table.rows):
+        return
+    for weight in dict.fromkeys(scene.protocol.distortion_weight for scene in scenes if scene.data_set != TNT):
+        names = ", ".join(s.name for s in scenes if s.data_set != TNT and s.protocol.distortion_weight == weight)
+        yield f"{names}: alpha with distortion is {weight:g}, their protocol's; the paper's 100/10 is of TnT"
 
 
 def _surfaces(results: Results) -> Iterator[str]:

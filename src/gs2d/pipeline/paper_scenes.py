@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.data import detect_format
-from gs2d.data.layouts import MESH_TRUTHS, SCORING, describe, find_truth, protocol_of, recognise
+from gs2d.data.layouts import DEPTH, MESH_TRUTHS, SCORING, describe, find_truth, protocol_of, recognise, subfolders
 from gs2d.errors import DataError, Gs2dError
 from gs2d.paper_tables import DTU, NERF_SYNTHETIC, TNT
 from gs2d.protocols import Protocol, get_protocol
 from gs2d.protocols_datasets import DATASETS, DataSet, SceneFacts
 
-DEPTH = 3  # folders below the data folder in which captures are looked for (TNT_GOF/TrainingSet/Barn)
 PAPER_NAMES = {"dtu": DTU, "tnt": TNT, "nerf-synthetic": NERF_SYNTHETIC, "mip-nerf-360": "Mip-NeRF 360"}
 OFFICIAL = ("dtu", "tnt")  # evaluators that need several files
 
@@ -99,20 +98,13 @@ def _captures(folder: Path, depth: int) -> dict[str, Path]:
         detect_format(folder)
     except DataError:
         found: dict[str, Path] = {}
-        for inner in _subfolders(folder) if depth else ():
+        for inner in subfolders(folder) if depth else ():
             for name, path in _captures(inner, depth - 1).items():
                 if name in found:
                     raise DataError(f"{found[name]} and {path} have the same name; give --data one of them") from None
                 found[name] = path
         return found
     return {folder.resolve().name: folder}
-
-
-def _subfolders(folder: Path) -> list[Path]:
-    try:
-        return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    except OSError:
-        return []  # not ours to read
 
 
 def _match(want: str, captures: dict[str, Path], data: Path) -> str:
