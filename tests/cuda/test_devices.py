@@ -1,0 +1,184 @@
+"""Where tensors lie when the splats are on a GPU: nothing from the host's memory reaches a kernel or is mixed in.
+
+torch's fake tensors say "cuda:0" without a GPU: they have shapes and devices but no values, refuse to be mixed with
+those of another device, and cannot be read, so a look at a value, for which the host would wait, is an error. A torch
+without CUDA needs a stand-in for the part that knows devices, which is compiled here.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+pytestmark = [
+    pytest.mark.timeout(120),
+    pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here: tests/gpu"),
+    pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here"),
+]
+
+GUARD = """
+#include <c10/core/impl/DeviceGuardImplInterface.h>
+static c10::impl::DeviceGuardImplRegistrar registrar(
+    c10::DeviceType::CUDA, new c10::impl::NoOpDeviceGuardImpl<c10::DeviceType::CUDA>());
+"""
+
+COMMON = """
+import ctypes, sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+ctypes.CDLL(sys.argv[1])
+for folder in ("train", "render", "cuda"):
+    sys.path.insert(0, sys.argv[2] + "/" + folder)
+
+from gs2d.kernels.cuda import adam, arguments, launch, ops
+from gs2d.render import cuda, cuda_budget, cuda_passes
+from gs2d.render.backend import Backend
+
+launched, pointers = set(), [0]
+
+def fill(structure, **tensors):
+    for name, tensor in tensors.items():
+        if tensor is not None:
+            assert tensor.device == torch.device("cuda:0"), (name, tensor.device)
+            assert tensor.is_contiguous(), name
+            pointers[0] += 1
+
+for module in (adam, arguments, ops):
+    module.fill = fill
+cuda_passes._fill = lambda structure, tensors: fill(structure, **tensors)
+launcher = SimpleNamespace(launch=lambda name, *rest: launched.add(name))
+
+def launcher_for(device):
+    assert device == torch.device("cuda:0"), device
+    return launcher
+
+launch.launcher_for = launcher_for
+cuda_budget.PairBudget.ask = lambda self, tiles, room, pairs: setattr(self, "overflow", (pairs > room).to(torch.int32))
+budget = cuda_budget.PairBudget()
+"""
+
+ITERATIONS = """
+import train_toys
+from gs2d.protocols import GENERIC
+from gs2d.train import loop
+from gs2d.train.initialise import initial_splats
+from gs2d.train.state import TrainState
+
+backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize, device="cuda:0")
+recipe, scene, generator = train_toys.short(), train_toys.make_scene(), torch.Generator()
+start = initial_splats(scene, sh_degree=recipe.sh_degree, random_points=50, near=0.2, generator=generator)
+loop.validate = lambda recipe: recipe  # entry actions look at values: the groups that they write are made below
+loop.Trainer._check_parameters = lambda *_: None
+torch.Tensor.backward = lambda self: None  # torch's engine wants a real device: the other test has the gradients
+
+def quiet(stage):
+    densify = stage.densify and replace(stage.densify, start=10**5, stop=10**6, reset_at=(), cap_every=0)
+    return replace(stage, densify=densify, iterations=10**4, on_enter=())
+
+recipe = replace(recipe, stages=tuple(quiet(stage) for stage in recipe.stages))
+with FakeTensorMode(allow_non_fake_inputs=True):
+    state = TrainState(start.splats, generator, queue=[0, 1] * 10)
+    trainer = loop.Trainer(scene, recipe, GENERIC, backend=backend, state=state, progress_every=10**9)
+    trainer._budget.room = lambda tiles: 1000
+    ones = torch.ones(len(start.splats), dtype=torch.bool, device="cuda:0")
+    trainer.state.groups = {g: ones for stage in recipe.stages for g in stage.train.values() if g != "all"}
+    for index, _ in enumerate(recipe.stages):
+        trainer.enter(index)
+        trainer.step()
+        trainer.step()
+    devices = {str(tensor.device) for _, tensor in trainer.splats.items()}
+assert trainer.state.moments["sh0"].steps > 1
+print(sorted(devices), sorted(launched), pointers[0])
+"""
+
+GRADIENTS = """
+import numpy as np
+from render_scenes import front_camera
+from gs2d.render.types import RasterSettings
+
+class Context:
+    needs_input_grad = ()
+    def save_for_backward(self, *tensors): self.saved_tensors = tensors
+    def mark_non_differentiable(self, *tensors): pass
+    def set_materialize_grads(self, value): pass
+
+def there_and_back(function, needs, *given):
+    ctx = Context()
+    ctx.needs_input_grad = needs
+    out = function.forward(ctx, *given)
+    out = out if isinstance(out, tuple) else (out,)
+    for gradient in function.backward(ctx, *(torch.ones_like(x) for x in out)):
+        if gradient is not None:
+            fill(None, gradient=gradient.contiguous())
+
+camera = front_camera(40, 24)
+budget.room = lambda tiles: 1000
+with FakeTensorMode():
+    def rand(*shape): return torch.rand(*shape, device="cuda:0")
+    splats = (rand(9, 3), rand(9, 4), rand(9, 2), rand(9), rand(9, 1, 3), rand(9, 15, 3))
+    view = cuda_passes.view_of(camera, RasterSettings())
+    rows = torch.ones(9, dtype=torch.bool, device="cuda:0")
+    for sure in (False, True):
+        options = cuda._Options(launcher, view, True, True, sure, rows, budget)
+        for columns in (2, 4):
+            there_and_back(cuda._Rasterize, (False, *[True] * 7), options, rand(9, columns), *splats)
+        there_and_back(cuda._Rasterize, (*[False] * 6, True, True), options, None, *splats)
+    image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
+    mean = ops.blur(image, launcher=launcher)
+    there_and_back(ops._Photometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)
+    for form in (False, True):
+        there_and_back(ops._NormalConsistency, (True, True, True), image, plane, plane, mask, camera, form, launcher)
+    there_and_back(ops._MaskedMean, (True,), plane, mask, launcher)
+    cuda_passes.errors(launcher, view, splats, image, mask)
+    print(sorted(launched), pointers[0])
+    torch.argsort = lambda x, **_: torch.arange(len(x))  # in host memory
+    try:
+        cuda_passes.forward(launcher, view, splats, budget=budget)
+    except AssertionError as error:
+        print("refused:", error)
+"""
+
+
+@pytest.fixture(scope="module")
+def guard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A library that makes torch believe that there is one CUDA device."""
+    folder, root = tmp_path_factory.mktemp("guard"), Path(torch.__file__).parent
+    if not (root / "include" / "c10").is_dir():
+        pytest.skip("this torch has no headers")
+    (folder / "guard.cpp").write_text(GUARD)
+    command = ["g++", "-std=c++20", "-O0", "-fPIC", "-shared", "-w", f"-I{root / 'include'}", str(folder / "guard.cpp")]
+    command += ["-o", str(folder / "guard.so"), f"-L{root / 'lib'}", "-lc10"]
+    subprocess.run(command, check=True, timeout=90)
+    return folder / "guard.so"
+
+
+def run(guard: Path, script: str) -> str:
+    """What the script prints; it runs in a process of its own, because the guard stays."""
+    command = [sys.executable, "-c", COMMON + script, str(guard), str(Path(__file__).resolve().parents[1])]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, env=dict(os.environ))
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def test_an_iteration_of_each_stage_stays_on_the_device(guard: Path) -> None:
+    said = run(guard, ITERATIONS)
+    assert "['cuda:0']" in said
+    for kernel in ("project_splats", "blend_forward", "photometric_forward", "normal_consistency", "adam_step"):
+        assert f"'{kernel}'" in said
+
+
+def test_gradients_and_splat_errors_stay_on_the_device_and_a_tensor_of_the_host_is_found(guard: Path) -> None:
+    said = run(guard, GRADIENTS)
+    for kernel in ("blend_vjp_distortion_abs", "blend_vjp_learning", "sum_slots", "photometric_vjp", "splat_errors"):
+        assert f"'{kernel}'" in said
+    assert "refused: ('tiles', device(type='cpu'))" in said
