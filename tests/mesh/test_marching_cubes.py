@@ -7,7 +7,7 @@ import pytest
 from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
 
 from gs2d.mesh.cases import CORNERS, EDGES, case_table
-from gs2d.mesh.surface import components, keep_components, marching_cubes, select_faces
+from gs2d.mesh.surface import _numbered, components, keep_components, marching_cubes, select_faces
 from gs2d.mesh.volume import BLOCK, Volume
 from gs2d.triangles import Mesh
 
@@ -174,3 +174,17 @@ def test_selecting_no_face_gives_an_empty_mesh() -> None:
     empty = select_faces(strips(), np.zeros(5, bool))
     assert empty.faces.shape == (0, 3)
     assert empty.vertices.shape == (0, 3)
+
+
+def test_edges_are_numbered_as_by_sorting_them() -> None:
+    """5 blocks of 1536 edges, of which the second and the fourth have none; and no edge at all."""
+    rng = np.random.default_rng(0)
+    corners = rng.integers(0, 1536, (400, 3)) + 1536 * rng.choice([0, 2, 4], (400, 3))
+    corners[0] = [0, 1535, 5 * 1536 - 1]
+    edges, faces = _numbered(corners, 5)
+    expected, numbers = np.unique(corners, return_inverse=True)
+    np.testing.assert_array_equal(edges, expected)
+    np.testing.assert_array_equal(faces, numbers.reshape(-1, 3))
+    edges, faces = _numbered(np.zeros((0, 3), np.int64), 0)
+    assert edges.shape == (0,)
+    assert faces.shape == (0, 3)

@@ -6,6 +6,8 @@ grid and are numbered by edge, so cells of neighbouring blocks share theirs exac
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -15,6 +17,7 @@ from gs2d.mesh.volume import BLOCK, VOXELS, Volume
 from gs2d.triangles import Mesh
 
 _CHUNK = 512  # blocks at a time
+_EDGES = 3 * VOXELS  # of a block: those that go up from its voxels
 _EDGE_GUARD = np.float32(1e-3)  # of an edge: vertices keep off its ends, so that no triangle is a point
 
 
@@ -26,7 +29,7 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
     volume : Volume
     min_weight : float
         A voxel is known from this weight on. A view adds 1 to voxels in front of its surface and to those behind it
-        up to ``fuse.FULL_WEIGHT_BEHIND`` of the truncation.
+        up to ``integrate.FULL_WEIGHT_BEHIND`` of the truncation.
 
     Returns
     -------
@@ -57,8 +60,28 @@ def cell_surface(volume: Volume, min_weight: float) -> tuple[np.ndarray, np.ndar
         for start in range(0, len(volume.keys), _CHUNK)
     ]
     corners = np.concatenate(triangles) if triangles else np.zeros((0, 3), np.int64)
-    edges, faces = np.unique(corners, return_inverse=True)
-    return edges, faces.reshape(-1, 3), _upper_ends(shifted, edges)
+    edges, faces = _numbered(corners, len(volume.keys))
+    return edges, faces, _upper_ends(shifted, edges)
+
+
+def _numbered(corners: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """The edges among ``corners``, sorted, each once, and where each corner's is: ``np.unique`` without sorting.
+
+    Edges are marked in a table for the blocks that have some.
+    """
+    row = corners // _EDGES
+    used = np.zeros(blocks, bool)
+    used[row] = True
+    rows = np.flatnonzero(used)
+    skipped = np.zeros(blocks, np.int64)  # edges of unused blocks before each block
+    skipped[rows] = (rows - np.arange(len(rows))) * _EDGES
+    compact = corners - skipped[row]
+    marks = np.zeros(len(rows) * _EDGES, bool)
+    marks[compact] = True
+    edges = np.flatnonzero(marks)
+    numbers = np.empty(len(marks), np.int32)
+    numbers[edges] = np.arange(len(edges), dtype=np.int32)
+    return edges + skipped[rows][edges // _EDGES], numbers[compact]
 
 
 def _neighbours(volume: Volume) -> np.ndarray:
@@ -109,14 +132,20 @@ def _chunk_triangles(volume: Volume, shifted: np.ndarray, chunk: np.ndarray, min
 
 def _edge_numbers(shifted: np.ndarray, row: np.ndarray, voxel: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Global number of cell edges: 3 * (512 * row + voxel) + axis, of the voxel at the edge's lower end."""
-    axis = np.array([a for a, _ in EDGES])[edges]
-    low = CORNERS[np.array([c for _, c in EDGES])][edges]  # [T, 3, 3]
-    at = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1)[:, None, :] + low
-    over = at >= BLOCK  # into which neighbour
-    corner = (over * np.array([1, 2, 4])).sum(axis=2)
-    at = at - BLOCK * over
-    owner = shifted[row[:, None], corner]
-    return 3 * (owner * VOXELS + (at[..., 0] * BLOCK + at[..., 1]) * BLOCK + at[..., 2]) + axis
+    neighbour, number = _cell_edges()
+    at = voxel[:, None] * len(EDGES) + edges
+    return shifted[row[:, None], neighbour[at]] * _EDGES + number[at]
+
+
+@cache
+def _cell_edges() -> tuple[np.ndarray, np.ndarray]:
+    """For each of the 12 edges of the cell at each voxel [512 * 12]: which neighbour it lies in, its number there."""
+    at = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)[:, None, :]
+    at = at + CORNERS[[corner for _, corner in EDGES]]  # [512, 12, 3] the lower end
+    over = at >= BLOCK
+    x, y, z = np.moveaxis(at - BLOCK * over, 2, 0)
+    number = 3 * ((x * BLOCK + y) * BLOCK + z) + np.array([axis for axis, _ in EDGES])
+    return (over @ np.array([1, 2, 4])).reshape(-1), number.reshape(-1)
 
 
 def _upper_ends(shifted: np.ndarray, edges: np.ndarray) -> np.ndarray:
