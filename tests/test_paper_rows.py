@@ -75,7 +75,7 @@ def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
     options = PaperOptions(table="absgs", data=Path("data"), out=Path("out"), slots=2)
     table = PAPER_TABLES["absgs"]
     lines = deviations_of(options, (), table, Results((make_row("row", cell),)))
-    assert "row, Barn, seed 0: do not believe its surface score: only 40% of the cameras agree" in lines
+    assert "Barn: do not believe the surface scores of row (seed 0): only 40% of the cameras agree" in lines
     assert any("Barn: its surface is scored by this project's visible-surface protocol" in line for line in lines)
     assert any("the paper prints no thresholds of AbsGS-A" in line for line in lines)
     assert any("2 runs shared the machine" in line for line in lines)

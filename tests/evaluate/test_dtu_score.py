@@ -48,6 +48,15 @@ def test_parallel_squares_have_their_distance_in_millimetres() -> None:
     assert score.truth_points == 81 * 81
 
 
+def test_a_mesh_outside_every_silhouette_points_at_the_masks() -> None:
+    camera = look_at(np.array([0.0, 0, 3]), np.zeros(3), np.array([0.0, 1, 0]), width=16, height=16, fx=16.0)
+    score = evaluate_dtu(flat(0.0), [Silhouette(camera, np.zeros((16, 16), bool))], T_MM, flat_truth())
+    assert (score.chamfer, score.culled, score.ok) == (None, 1.0, False)
+    assert score.messages == (
+        "every corner of the mesh lies outside some silhouette: are the masks those of these views?",
+    )
+
+
 def test_points_on_a_sphere_inside_a_sphere_are_at_the_difference_of_the_radii() -> None:
     """Radius 11 against 10 mm: 1 mm both ways; the scan has 20 000 points, about 0.25 mm apart."""
     i = np.arange(20_000) + 0.5

@@ -123,6 +123,8 @@ def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurf
         clouds = ScoredClouds(points, np.full(len(points), np.inf), above, np.full(len(above), np.inf), GREEN_WITHIN)
         why = f"nothing {whose}"
         message = f"{why}: was the mesh made from this scan, and is scale_mat the one of its cameras?"
+        if culled == 1:
+            message = "every corner of the mesh lies outside some silhouette: are the masks those of these views?"
         counts = (len(observed), len(above))
         return DtuScore(None, None, None, *counts, 1.0, 1.0, culled, False, (message,), clouds, why)
     d2s, _ = nearest(cKDTree(truth.points), observed, limit=limit, workers=workers)

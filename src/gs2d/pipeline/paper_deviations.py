@@ -89,6 +89,7 @@ def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
 
 def _surfaces(results: Results) -> Iterator[str]:
     """Surfaces that were not scored as the paper's were, and scores that their own check does not believe."""
+    doubts: dict[tuple[str, str], list[str]] = {}
     for row in results.rows:
         for cell in row.cells:
             surface = cell.details.get("surface") or {}
@@ -101,7 +102,9 @@ def _surfaces(results: Results) -> Iterator[str]:
             check = surface.get("self_check") or {"ok": True}
             if not check["ok"]:
                 why = "; ".join(check.get("messages", ())) or surface.get("reason") or "no reason given"
-                yield f"{row.name}, {cell.scene}, seed {cell.seed}: do not believe its surface score: {why}"
+                doubts.setdefault((cell.scene, why), []).append(f"{row.name} (seed {cell.seed})")
+    for (scene, why), runs in doubts.items():
+        yield f"{scene}: do not believe the surface scores of {', '.join(runs)}: {why}"
 
 
 def _scenes(options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
