@@ -2,7 +2,7 @@
 
 ::
 
-    python -m benchmarks.gpu correctness [--out FILE.json] [--dry-run]
+    python -m benchmarks.gpu correctness [--out FILE.json] [--dry-run] [--only parity memcheck ...]
     python -m benchmarks.gpu kernels     [--out FILE.json] [--dry-run] [--only 1000000 ...]
     python -m benchmarks.gpu training    [--out FILE.json] [--dry-run] --capture FOLDER ... [--schedule-scale 1.0]
                                          [--downscale 1] [--runs FOLDER]
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("command", choices=("correctness", "kernels", "training", "exercise"))
     parser.add_argument("--out", type=Path)
     parser.add_argument("--dry-run", action="store_true")
-    parser.add_argument("--only", nargs="+", default=[], help="scenes whose name contains one of these")
+    parser.add_argument("--only", nargs="+", default=[], help="parts or scenes whose name contains one of these")
     parser.add_argument("--capture", type=Path, nargs="+", default=[])
     parser.add_argument("--schedule-scale", type=float, default=1.0)
     parser.add_argument("--downscale", type=int, default=1)
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with opened(args.dry_run) as bench:
             if args.command == "exercise":
-                correctness.exercise(bench)
+                print("not run:", *correctness.exercise(bench) or ["-"])
                 return 0
             out = args.out or RESULTS / f"gpu_{args.command}.json"
             return run(args, bench, out)
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
         write(out, {**document, "results": results})
 
     if args.command == "correctness":
-        results, module = correctness.run(bench), correctness
+        results, module = correctness.run(bench, args.only, progress), correctness
     elif args.command == "kernels":
         results, module = kernels.run(bench, args.only, progress), kernels  # type: ignore[assignment]
     else:
@@ -75,9 +75,7 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
         document["clocks_after"] = clocks()
     progress(results)
     print(*module.table(results), f"written: {out}", sep="\n")
-    wrong = args.command == "correctness" and (
-        results["tests"].get("exit") != 0 or any(row.get("clean") is False for row in results["sanitizer"].values())
-    )
+    wrong = args.command == "correctness" and correctness.wrong(results)
     return int(wrong and not bench.dry)
 
 

@@ -69,6 +69,23 @@ class Bench:
         quartiles = statistics.quantiles(found, n=4)
         return rounded({"median": quartiles[1], "best": min(found), "spread": quartiles[2] - quartiles[0]})
 
+    @contextmanager
+    def replaced(self, launcher: Launcher) -> Iterator[None]:
+        """Everything that looks for the device's launcher finds this one."""
+        before = launch.launcher_for
+        launch.launcher_for = lambda device: launcher
+        try:
+            yield
+        finally:
+            launch.launcher_for = before
+
+    @contextmanager
+    def recorded(self) -> Iterator[set[str]]:
+        """The names of the kernels that are launched."""
+        launcher = RecordingLauncher(self.launcher)
+        with self.replaced(launcher):
+            yield launcher.names
+
     def peak_memory(self, work: Callable[[], object]) -> int:
         """Bytes that torch's allocator held at most during ``work``, beyond those before."""
         if self.dry:
@@ -103,6 +120,18 @@ class _Clock:
             return float(first.elapsed_time(last))
 
         return read
+
+
+@dataclass(eq=False)
+class RecordingLauncher:
+    """Notes the names of what another launcher launches."""
+
+    inner: Launcher
+    names: set[str] = field(default_factory=set)
+
+    def launch(self, name: str, blocks: int, threads: int, arguments: Any, shared_bytes: int = 0) -> None:
+        self.names.add(name)
+        self.inner.launch(name, blocks, threads, arguments, shared_bytes)
 
 
 @dataclass(eq=False)

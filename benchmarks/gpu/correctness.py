@@ -16,7 +16,9 @@ from torch import Tensor
 
 from benchmarks.gpu.bench import ROOT, Bench, attempt
 from benchmarks.gpu.probes import ceilings
-from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, source_names
+from gs2d.kernels.cuda import launch, ops
+from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
+from gs2d.kernels.fusion import arguments_of, fuse_on_gpu
 from gs2d.render import cuda, reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.types import RasterSettings
@@ -27,16 +29,27 @@ SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 
 
-def run(bench: Bench) -> dict[str, Any]:
-    """Ceilings, registers, parity, determinism, the tests marked gpu, and the sanitizer."""
-    return {
-        "ceilings": attempt("ceilings", lambda: ceilings(bench)),
-        "registers": attempt("registers", lambda: registers(bench)),
-        "parity": attempt("parity", lambda: parity(bench, 2 if bench.dry else 60)),
-        "determinism": attempt("determinism", lambda: determinism(bench)),
-        "tests": attempt("tests", lambda: gpu_tests(bench)),
-        "sanitizer": {tool: attempt(tool, lambda tool=tool: sanitize(bench, tool)) for tool in TOOLS},  # type: ignore[misc]
+def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
+    """Ceilings, registers, parity, determinism, sanitizer, the tests marked gpu; ``progress`` gets all so far after each."""
+    parts: dict[str, Any] = {
+        "ceilings": lambda: ceilings(bench),
+        "registers": lambda: registers(bench),
+        "parity": lambda: parity(bench, 2 if bench.dry else 60),
+        "determinism": lambda: determinism(bench),
+        **{tool: lambda tool=tool: sanitize(bench, tool) for tool in TOOLS},
+        "tests": lambda: gpu_tests(bench),
     }
+    found: dict[str, Any] = {}
+    for name, work in parts.items():
+        if not only or any(word in name for word in only):
+            found[name] = attempt(name, work)
+            progress(found)
+    return found
+
+
+def wrong(found: dict[str, Any]) -> bool:
+    """Whether a test failed, a tool found something, or a part could not be done."""
+    return any("failed" in part or part.get("clean") is False or part.get("exit", 0) != 0 for part in found.values())
 
 
 def registers(bench: Bench) -> dict[str, Any]:
@@ -107,24 +120,71 @@ def small_scene(bench: Bench) -> tuple[Splats, Any]:
     return splats, camera
 
 
-def exercise(bench: Bench) -> None:
-    """Every kernel once: forward, all variants of backward, splat errors, losses and Adam in three short stages."""
+def exercise(bench: Bench) -> list[str]:
+    """Every kernel at least once, at a size for a sanitizer; the names of those that were not run."""
+    with bench.recorded() as launched:
+        _render_all_ways(bench)
+        _all_losses(bench)
+        _three_stages(bench)
+        _fusion(bench)
+    bench.wait()
+    return sorted(set(kernel_sources()) - launched)
+
+
+def _render_all_ways(bench: Bench) -> None:
+    """Forward, all variants of backward, splat errors; images of more than 32767 tiles only on a GPU."""
+    splats, camera = small_scene(bench)
+    launcher = launch.launcher_for(bench.device)
+    every = ("color", "normal", "depth_median", "distortion")
+    for names in (every[:1], every[:3], every):
+        for columns in (2, 4):
+            for deterministic in (False, True):
+                leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
+                probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
+                given = (launcher, leaves, camera, SETTINGS, probe)
+                output = cuda.rasterize_with(*given, deterministic=deterministic)
+                sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
+    image = torch.rand(camera.height, camera.width, 3, device=bench.device)
+    for occlusion in (False, True):
+        splat_errors(splats, camera, image, SETTINGS, backend=bench.backend, occlusion=occlusion)
+    if not bench.dry:
+        few = splats.rows(torch.arange(20, device=bench.device))
+        cuda.rasterize_with(launcher, few, camera.resized(16, 16 * 32768), SETTINGS)
+
+
+def _all_losses(bench: Bench) -> None:
+    """L1 and SSIM with the target's mean at hand, and the mean of a map; training runs the others."""
+    launcher = launch.launcher_for(bench.device)
+    image, target = (torch.rand(45, 70, 3, device=bench.device, requires_grad=k == 0) for k in range(2))
+    l1, ssim = ops.photometric(image, target, target_mean=ops.blur(target, launcher=launcher), launcher=launcher)
+    (l1 + ssim + ops.masked_mean(image[..., 0], target[..., 0] > 0.5, launcher=launcher)).backward()
+
+
+def _three_stages(bench: Bench) -> None:
+    """Three short stages: normals, Adam, densification, ranking, clones, frozen rows."""
     sys.path.insert(0, str(ROOT / "tests" / "train"))
     import train_toys
 
-    splats, camera = small_scene(bench)
-    for names in (("color",), ("color", "normal", "depth_median"), IMAGES):
-        for columns in (2, 4):
-            leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
-            probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
-            output = cuda.rasterize_with(bench.launcher, leaves, camera, SETTINGS, probe)
-            sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
-    image = torch.rand(camera.height, camera.width, 3, device=bench.device)
-    splat_errors(splats, camera, image, SETTINGS, backend=bench.backend)
     recipe = train_toys.short()
     stages = tuple(replace(stage, iterations=min(stage.iterations, 2 if bench.dry else 4)) for stage in recipe.stages)
     train_toys.train(train_toys.make_scene(), replace(recipe, stages=stages), backend=bench.backend)
-    bench.wait()
+
+
+def _fusion(bench: Bench) -> None:
+    """A depth map into three blocks of voxels before and behind it, with colours."""
+    height, width, blocks = 24, 30, 3
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, device=bench.device)
+
+    depth = {"depth": 1 + random(height, width), "slope_x": random(height, width), "slope_y": random(height, width)}
+    pixels = {"pixel_weight": random(height, width), "pixel_color": random(height, width, 3)}
+    z = 1 + torch.arange(blocks, device=bench.device)[:, None] * 0.3
+    place = {"rows": torch.arange(blocks, device=bench.device), "bases": z * torch.tensor([[9.0, 7, 1]]).to(z)}
+    volume = {"tsdf": random(blocks, 512), "weight": random(blocks, 512)}
+    colors = {"color": random(blocks, 512, 3), "color_weight": random(blocks, 512)}
+    arrays = depth | pixels | place | {"offsets": 0.1 * random(3, 512)} | volume | colors
+    fuse_on_gpu(launch.launcher_for(bench.device), arguments_of((height, width), 0.5, arrays))
 
 
 def determinism(bench: Bench) -> dict[str, Any]:
@@ -151,8 +211,8 @@ def gpu_tests(bench: Bench) -> dict[str, Any]:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1500, check=False)
     last = done.stdout.strip().splitlines()[-1:] or [done.stderr.strip()[-200:]]
     counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed|skipped|error)", last[0])}
-    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return {"exit": done.returncode, "summary": last[0], "counts": counts, "failed": failed}
+    names = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return {"exit": done.returncode, "summary": last[0], "counts": counts, "not_passed": names}
 
 
 def sanitize(bench: Bench, tool: str) -> dict[str, Any]:
@@ -175,11 +235,12 @@ def sanitize(bench: Bench, tool: str) -> dict[str, Any]:
 
 def table(found: dict[str, Any]) -> list[str]:
     """A few lines for people."""
-    images = found["parity"].get("images", {})
+    images = found.get("parity", {}).get("images", {})
     lines = [
         f"{name}: median {row['median']:.1e}, q99.9 {row['q999']:.1e}, flipped {row['flipped']:.1e}"
         for name, row in images.items()
     ]
-    lines.append(f"tests: {found['tests'].get('summary', found['tests'])}")
-    lines += [f"{tool}: {'clean' if row.get('clean') else row}" for tool, row in found["sanitizer"].items()]
+    if "tests" in found:
+        lines.append(f"tests: {found['tests'].get('summary', found['tests'])}")
+    lines += [f"{tool}: {'clean' if found[tool].get('clean') else found[tool]}" for tool in TOOLS if tool in found]
     return lines

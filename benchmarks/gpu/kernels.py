@@ -69,14 +69,13 @@ def measure_scene(bench: Bench, scene: GpuScene, floors: dict[str, float]) -> di
     """Counts, kernels, passes, iterations and peers of one scene."""
     result: dict[str, Any] = {"counts": attempt("counts", lambda: counts(bench, scene))}
     result["kernels_ms"] = attempt("kernels", lambda: kernels(bench, scene))
-    result["floors_ms"] = {name: floor for name, floor in floors.items() if name in result["kernels_ms"]}
-    result["times_floor"] = {
-        name: round(result["kernels_ms"][name] / floor, 3) for name, floor in result["floors_ms"].items()
-    }
     result["passes"] = attempt("passes", lambda: passes(bench, scene))
     result["sorts_ms"] = attempt("sorts", lambda: sorts(bench, scene))
     targets = pictures(bench, scene)
     result["iteration"] = attempt("iteration", lambda: iterations(bench, scene, targets))
+    times = result["iteration"].get("surface_kernels_ms", {}) | result["kernels_ms"]
+    result["floors_ms"] = {name: floor for name, floor in floors.items() if name in times}
+    result["times_floor"] = {name: round(times[name] / floor, 3) for name, floor in result["floors_ms"].items()}
     for name in PEERS:
         result[name] = attempt(name, lambda name=name: peer(bench, scene, targets, name))  # type: ignore[misc]
     ours = result["iteration"].get("surface", {}).get("median")
@@ -198,7 +197,18 @@ def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor]) -> dict[str
             trainer.step()  # every photograph is taken in
         found[stage.name] = bench.times(lambda _: trainer.step(), repeats=REPEATS, warmup=WARMUP)
         found[f"{stage.name}_peak_bytes"] = bench.peak_memory(trainer.step)
+        found[f"{stage.name}_kernels_ms"] = _in_iterations(bench, trainer)
     return found
+
+
+def _in_iterations(bench: Bench, trainer: Trainer) -> dict[str, float]:
+    """Median time of each kernel of the trainer's iterations, losses and Adam too."""
+    timing = TimingLauncher(bench.launcher, bench.dry)
+    with bench.replaced(timing):
+        for _ in range(1 if bench.dry else REPEATS):
+            trainer.step()
+    bench.wait()
+    return timing.medians(skip=0 if bench.dry else WARMUP)
 
 
 def peer(bench: Bench, scene: GpuScene, targets: list[Tensor], name: str) -> dict[str, Any]:
