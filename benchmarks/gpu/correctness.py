@@ -30,7 +30,7 @@ IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion"
 
 
 def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
-    """Ceilings, registers, parity, determinism, sanitizer, the tests marked gpu; ``progress`` gets all so far after each."""
+    """Ceilings, registers, parity, determinism, sanitizer, tests; ``progress`` gets the results so far after each."""
     parts: dict[str, Any] = {
         "ceilings": lambda: ceilings(bench),
         "registers": lambda: registers(bench),
@@ -205,9 +205,11 @@ def determinism(bench: Bench) -> dict[str, Any]:
 
 def gpu_tests(bench: Bench) -> dict[str, Any]:
     """``pytest -m gpu``: how many passed, failed and were skipped."""
-    command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-x" if bench.dry else "-q"]
-    if bench.dry:
-        command += ["--collect-only", "tests/gpu"]
+    command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", *(["--collect-only"] if bench.dry else [])]
+    command += [
+        "tests/gpu",
+        *([] if bench.dry else ["tests/render"]),
+    ]  # where they are: other folders need other packages
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1500, check=False)
     last = done.stdout.strip().splitlines()[-1:] or [done.stderr.strip()[-200:]]
     counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed|skipped|error)", last[0])}
