@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
-from gs2d.errors import RunError
+from gs2d.errors import DataError, RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
-from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan
+from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan, paper
 from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
 from gs2d.pipeline.paper_rows import Results, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes
+from gs2d.protocols import MetricConventions
 from paper_cells import make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 
@@ -58,13 +59,18 @@ def test_a_run_whose_surface_could_not_be_scored_keeps_its_pictures_scores(tmp_p
     place = {"name": "a", "path": ".", "format": "blender", "train": 1, "test": 1}
     definition = {"format": 1, "recipe": {"name": "2dgs"}, "scene": place, "backend": {"name": "cpu"}}
     (tmp_path / "run.json").write_text(json.dumps(definition))
-    stage = {"name": "surface", "iterations": 3, "seconds": 5.0, "splats": 7, "bytes": 9, "test": {"psnr": 30.0}}
+    stage: dict[str, Any] = {"name": "surface", "iterations": 3, "seconds": 5.0, "splats": 7, "bytes": 9}
+    stage["test"] = {"psnr": 30.0, "psnr_float": 31.0}
     (tmp_path / "metrics.json").write_text(json.dumps({"stages": [stage], "surface": None}))
     record = {"state": "failed", "reason": "the log does not fit", "trained": True}
     options: Any = {"scene": "a", "data_set": TNT, "seed": 0, "test_on": "test"}
     cell = read_cell(tmp_path, record=record, **options)
     assert (cell.figures["psnr"], cell.figures["fscore"]) == (30.0, None)
     assert cell.reasons["fscore"] == "the log does not fit"
+    floats = MetricConventions(from_8bit=False, surface="chamfer")
+    other = read_cell(tmp_path, record=record, conventions=floats, **options)
+    assert (other.figures["psnr"], other.details["headline"]) == (31.0, "chamfer")  # what its protocol asks for
+    assert judge_order(Order("claim", "surface", ("row", "row")), (make_row("row", other),), TNT).metric == "chamfer"
     assert read_cell(tmp_path, record={**record, "trained": False}, **options).figures["psnr"] is None
 
 
@@ -109,6 +115,8 @@ def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_p
     truth, weights = (tmp_path / "ball" / "mesh_gt.ply").resolve(), (tmp_path / "vgg.pth").resolve()
     assert plan.sweep.jobs[0].wanted == (f"surface: {truth}", f"lpips: {weights}")
     (tmp_path / "out").mkdir()
+    with pytest.raises(DataError, match="LPIPS weights not found"):  # before anything is trained
+        paper(replace(options, lpips_weights=tmp_path / "vgg.pth"))
     (tmp_path / "out" / "about.json").write_text("{}")
     with pytest.raises(RunError, match="must be one that gs2d paper wrote, got another file"):
         check_folder(plan)

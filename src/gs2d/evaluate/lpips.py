@@ -49,6 +49,10 @@ class Lpips:
         """Where the weights are, and images must be."""
         return next(iter(self.weights.values())).device
 
+    def to(self, device: str | torch.device) -> Lpips:
+        """The same network on a device."""
+        return Lpips({name: weight.to(device) for name, weight in self.weights.items()})
+
     def __call__(self, image: Tensor, target: Tensor, *, convention: str = "0..1") -> Tensor:
         """Distance [] of two images [H, W, 3] with values in [0, 1].
 

@@ -36,9 +36,7 @@ def depth_buffer(mesh: Mesh, camera: Camera) -> np.ndarray:
     return buffer.reshape(camera.height, camera.width)
 
 
-def _pixel_boxes(
-    corners: np.ndarray, faces: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pixel_boxes(corners: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Faces [n] that may cover a pixel centre, the first (column, row) [n, 2] of their boxes and the sizes [n, 2]."""
     z = corners[:, 2]
     ahead = z > 1e-9

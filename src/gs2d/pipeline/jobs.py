@@ -158,6 +158,7 @@ def evaluate_run(
     truth: Truth | OfficialTruth | None = None if given is None or given.is_dir() else read_truth(given)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, job, splats = _open(path, threads, on_event)
+    lpips = None if lpips is None else lpips.to(job.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
     if truth is None and job.scene.root is not None:
         truth = choose_truth(given, job.scene.root, on_event)

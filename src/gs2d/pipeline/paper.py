@@ -134,6 +134,10 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
     plan = make_plan(options)
     check_folder(plan)
     if options.train:
+        if options.lpips_weights is not None:
+            from gs2d.evaluate.lpips import load_lpips  # loads torch
+
+            load_lpips(options.lpips_weights)  # a wrong file is said now, not after hours of training
         make_folder(options.out)
         write_json(options.out / ABOUT, about(plan, None, ()))
         run_sweep(
@@ -315,6 +319,7 @@ def _row(plan: Plan, row: Any) -> Row:
                     seed=seed,
                     test_on=scene.protocol.test_on,
                     record=plan.sweep.record(job),
+                    conventions=scene.protocol.metrics,
                 )
             )
             commands += commands_of(job)

@@ -9,7 +9,7 @@ from gs2d.errors import Gs2dError
 from gs2d.images import image_size
 from gs2d.io.run import machine, versions
 from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
-from gs2d.pipeline.paper_rows import NOT_YET, Results
+from gs2d.pipeline.paper_rows import NOT_YET, Results, surface_metric
 from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes
 from gs2d.recipes import get_recipe
 from gs2d.schedule import scale_schedule
@@ -147,7 +147,7 @@ def _missing_figures(results: Results) -> list[str]:
     if waiting:
         found.append(f"{waiting} runs are not finished yet")
     for data_set in results.data_sets:
-        for metric in ("lpips", "chamfer" if data_set == DTU else "fscore"):
+        for metric in ("lpips", surface_metric(results.rows, data_set)):
             cells = [cell for row in results.rows for cell in row.of(data_set) if cell.figures["bytes"] is not None]
             lacking = [cell for cell in cells if cell.figures[metric] is None]
             reasons = sorted({cell.reasons.get(metric, "") for cell in lacking})

@@ -12,9 +12,9 @@ from typing import Any
 from gs2d.errors import Gs2dError
 from gs2d.io.run import open_run
 from gs2d.paper_tables import DTU, LOWER_IS_BETTER, METRICS, Order, PaperTable
+from gs2d.protocols import MetricConventions
 
 FIGURES = (*METRICS, "bytes", "seconds")
-IMAGE_METRICS = ("psnr", "ssim", "lpips")
 NOT_YET = ("not trained yet", "under way or interrupted")
 
 
@@ -146,7 +146,16 @@ def by_seed(values: dict[str, dict[int, float]]) -> list[float]:
     return [statistics.fmean([of_scene[seed] for of_scene in values.values()]) for seed in sorted(seeds)]
 
 
-def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, record: dict[str, Any]) -> Cell:
+def read_cell(
+    run: Path,
+    *,
+    scene: str,
+    data_set: str,
+    seed: int,
+    test_on: str,
+    record: dict[str, Any],
+    conventions: MetricConventions = MetricConventions(),  # noqa: B008 (frozen)
+) -> Cell:
     """The figures of a run, from its ``metrics.json``; None with a reason where there are none.
 
     Parameters
@@ -155,6 +164,8 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
         "test" or "train": the views whose image metrics count.
     record : dict
         What the sweep wrote about the job.
+    conventions : MetricConventions
+        The protocol's: which of the image metrics count, and which figure of the surface is the headline.
     """
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
     place: dict[str, Any] = {"scene": scene, "data_set": data_set, "seed": seed, "run": run}
@@ -171,10 +182,10 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
         return Cell(figures=figures, reasons=dict.fromkeys(FIGURES, f"{run} has no metrics.json"), **place)
     last, reasons = metrics["stages"][-1], {}
     views = last.get(test_on)
-    for name in IMAGE_METRICS:
-        figures[name] = (views or {}).get(name)
+    for name, measured in measured_as(conventions).items():
+        figures[name] = (views or {}).get(measured)
         if figures[name] is None:
-            why = last.get(f"{test_on}_reason") if views is None else views.get(f"{name}_reason")
+            why = last.get(f"{test_on}_reason") if views is None else views.get(f"{measured}_reason")
             reasons[name] = str(why or "not measured")
     figures["bytes"] = last["bytes"]
     figures["seconds"] = round(sum(stage["seconds"] for stage in metrics["stages"]), 3)  # shared stages count too
@@ -187,10 +198,24 @@ def read_cell(run: Path, *, scene: str, data_set: str, seed: int, test_on: str, 
         "backend": backend,
         "splats": last["splats"],
         "views": test_on,
+        "headline": "chamfer" if conventions.surface == "chamfer" else "fscore",
         "surface": metrics.get("surface"),
         "stages": [{"name": s["name"], "seconds": s["seconds"], **_scores(s, test_on)} for s in metrics["stages"]],
     }
     return Cell(figures=figures, reasons=reasons, details=details, **place)
+
+
+def measured_as(conventions: MetricConventions) -> dict[str, str]:
+    """The image metrics of a table -> their names in ``metrics.json``."""
+    suffix = "" if conventions.from_8bit else "_float"
+    lpips = "lpips" if conventions.lpips_unit_range else "lpips_signed"
+    return {"psnr": f"psnr{suffix}", "ssim": f"ssim{suffix}", "lpips": lpips}
+
+
+def surface_metric(rows: Sequence[Row], data_set: str) -> str:
+    """The headline figure of a data set's surfaces: what its protocol says."""
+    named = {c.details["headline"] for row in rows for c in row.of(data_set) if "headline" in c.details}
+    return named.pop() if len(named) == 1 else "chamfer" if data_set == DTU else "fscore"
 
 
 def _backend(definition: dict[str, Any]) -> str:
@@ -270,7 +295,7 @@ def judge_order(order: Order, rows: Sequence[Row], data_set: str) -> Verdict:
     """One order on one data set."""
     metric = order.metric
     if metric == "surface":
-        metric = "chamfer" if data_set == DTU else "fscore"
+        metric = surface_metric(rows, data_set)
     by_name = {row.name: row for row in rows}
     facts = (order.text, metric, order.kind, data_set)
     for name in order.rows:
