@@ -67,7 +67,7 @@ class TrainOptions:
     start_from: Path | None = None
     cache: Path | None = None
     threads: int | None = None
-    checkpoint_every: int = 1000
+    checkpoint_every: int = 10_000
     checkpoint_seconds: float = 120.0
     stage2_cache_mb: int = 1024
     title: str | None = None

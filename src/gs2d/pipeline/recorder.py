@@ -28,6 +28,7 @@ from gs2d.train.state import TrainState
 LOG_LINES = 300  # step lines a stage
 PROBES = 30  # times a stage at which the probe views are scored for the PSNR curve
 PROBE_VIEWS = 4
+REPORTS = {"cpu": 10, "cuda": 50}  # iterations between progress events, by device: for each the host waits for a GPU
 
 
 class Recorder:
@@ -35,7 +36,7 @@ class Recorder:
 
     def __init__(self, run: RunFolder, job: Job, options: TrainOptions, start: Start, on_event: OnEvent) -> None:
         self._run, self._job, self._options, self._start, self._on_event = run, job, options, start, on_event
-        self.progress_every = max(1, min(10, options.checkpoint_every))
+        self.progress_every = max(1, min(REPORTS[job.backend.device], options.checkpoint_every))
         self._shown = choose_views(job.scene, options.shown_views)
         self._probes = (job.scene.test or job.scene.train)[
             :: max(1, len(job.scene.test or job.scene.train) // PROBE_VIEWS)
