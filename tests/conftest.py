@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from gs2d.errors import BackendError
+from gs2d.kernels.library import load
+
 
 @pytest.fixture(scope="session", autouse=True)
 def one_torch_thread() -> None:
@@ -37,3 +40,12 @@ def shared(data_root: Path) -> Callable[[str], Path]:
         return folder
 
     return find
+
+
+@pytest.fixture
+def native() -> None:
+    """Skip where the native library is not built."""
+    try:
+        load()
+    except BackendError as error:
+        pytest.skip(str(error))

@@ -11,21 +11,10 @@ from torch import Tensor
 from gs2d import losses_reference as reference
 from gs2d.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
-from gs2d.kernels.library import load
 from gs2d.losses import FUSED_LOSSES, LOSSES, compute_losses, target_maps
 from gs2d.recipe import LossTerm
 from gs2d.render.types import RenderOutput
 from loss_images import make_camera, make_output
-
-
-@pytest.fixture
-def native() -> None:
-    """Skip where the native library is not built."""
-    try:
-        load()
-    except BackendError as error:
-        pytest.skip(str(error))
-
 
 OFFICIAL = (
     LossTerm("l1", 0.8),

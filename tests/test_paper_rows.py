@@ -95,6 +95,8 @@ def test_resets_that_a_short_schedule_has_not_are_a_deviation() -> None:
     options = PaperOptions(table="modules", data=Path("data"), out=Path("out"), schedule_scale=0.1)
     lines = deviations_of(options, (), PAPER_TABLES["modules"], Results(()))
     assert "opacity is reset 0 times in stage 1, in the paper 4 times: the interval is not scaled" in lines
+    # 100 000 sqrt(0.1) = 31 622.8
+    assert "captures without points start from 31,623 random ones, not from 100,000" in lines
 
 
 def test_another_weight_of_distortion_than_the_papers_is_a_deviation(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.errors import BackendError, DataError, ShapeError
+from gs2d.errors import DataError, ShapeError
 from gs2d.evaluate.images import (
     Metric,
     image_metrics,
@@ -21,16 +21,6 @@ from gs2d.evaluate.images import (
     ssim_float,
 )
 from gs2d.evaluate.lpips import BLOCKS, WIDTHS, Lpips, load_lpips
-from gs2d.kernels.library import load
-
-
-@pytest.fixture
-def native() -> None:
-    """Skip where the native library is not built."""
-    try:
-        load()
-    except BackendError as error:
-        pytest.skip(str(error))
 
 
 def vgg_state(seed: int = 0) -> dict[str, Tensor]:

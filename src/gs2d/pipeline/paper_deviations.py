@@ -33,6 +33,9 @@ def deviations_of(
             found.append(
                 f"opacity is reset {scaled} times in stage 1, in the paper {full} times: the interval is not scaled"
             )
+        points = [scale_schedule(get_recipe("2dgs"), scale).init_points for scale in (1.0, options.schedule_scale)]
+        if points[0] != points[1]:
+            found.append(f"captures without points start from {points[1]:,} random ones, not from {points[0]:,}")
     found += _scenes(options, scenes, table)
     found += [f"changed in the recipes: {text}" for text in options.overrides]
     found += _methods(table)
