@@ -134,3 +134,10 @@ def test_an_array_of_another_type_is_refused_before_native_code_reads_it() -> No
         add(view)
     with pytest.raises(ShapeError, match="rows"):
         arguments_of((1, 1), 1.0, {"rows": np.zeros(1, np.int32)})
+
+
+@native
+def test_the_double_library_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GS2D_CPU_VARIANT", "f64")
+    with pytest.raises(BackendError, match="fused in float32, got the f64 kernels; unset GS2D_CPU_VARIANT"):
+        fuse(views(1), LIMITS, backend="cpu")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +16,15 @@ from gs2d.errors import ProtocolError, RunError
 from gs2d.io.files import write_json
 from gs2d.io.ply import read_mesh
 from gs2d.io.run import RunFolder
-from gs2d.pipeline.jobs import mesh_run
+from gs2d.kernels.library import available_variants
+from gs2d.mesh.integrate import Add, integrator
+from gs2d.mesh.volume import Volume
+from gs2d.pipeline.jobs import finished_splats, mesh_run
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import check_same_run, reload_job
+from gs2d.pipeline.surface import extract_mesh
 from gs2d.pipeline.train import train
+from gs2d.render.backend import get_backend
 from tiny import RADIUS, write_capture
 
 
@@ -84,3 +91,25 @@ def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_re
     assert replace(job, protocol=other).stage_key(0) == job.stage_key(0)  # shares its stages
     with pytest.raises(RunError, match="protocol"):
         check_same_run(old, replace(job, protocol=replace(job.protocol, near=0.3)))
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_a_run_is_fused_by_its_own_backend_and_says_so(
+    run: Path, tmp_path: Path, unbounded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def recorded(volumes: Sequence[Volume], backend: str, threads: int | None = None) -> AbstractContextManager[Add]:
+        asked.append(backend)
+        return integrator(volumes, backend, threads)
+
+    job, splats = reload_job(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
+    monkeypatch.setattr("gs2d.mesh.fuse.integrator", recorded)
+    monkeypatch.setattr("gs2d.mesh.nested.integrator", recorded)
+    for backend in ("reference", *(["cpu"] if available_variants() else [])):
+        options = MeshOptions(unbounded=unbounded, voxel=0.05)
+        result = extract_mesh(
+            replace(job, backend=get_backend(backend)), splats, options, tmp_path / "mesh.ply", lambda _event: None
+        )
+        assert result["fused_by"] == backend == asked.pop()
+    assert not asked

@@ -1,6 +1,6 @@
 """Adding one depth map to a volume, natively and on a GPU: the formulas are in ``kernels/core/fuse.h``.
 
-Shapes and types are those of ``mesh/fuse.py``, which is the only caller and has the same in numpy.
+Shapes and types are those of ``mesh/volume.py``; ``mesh/integrate.py`` is the only caller, and has the same in numpy.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gs2d.errors import ShapeError
+from gs2d.errors import BackendError, ShapeError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -65,7 +65,17 @@ def arguments_of(
 
 
 def fuse_on_cpu(library: Library, arguments: FuseArguments) -> None:
-    """Add the view, on the threads that the library was told to use."""
+    """Add the view, on the threads that the library was told to use.
+
+    Raises
+    ------
+    BackendError
+        The library's arithmetic is in float64: it cannot read the arrays.
+    """
+    if library.dtype.itemsize != 4:
+        raise BackendError(
+            f"depth maps are fused in float32, got the {library.variant} kernels; unset GS2D_CPU_VARIANT"
+        )
     library.function("gs2d_fuse", None, [ctypes.c_void_p])(ctypes.byref(arguments))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.frames import Frame, Spool
 from gs2d.mesh.fuse import fuse
+from gs2d.mesh.integrate import fusion_backend
 from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths, widen_truncation
 from gs2d.mesh.nest import derive_nest
 from gs2d.mesh.nested import FAR_VIEWS, fuse_nested, nested_marching_cubes
@@ -31,6 +32,7 @@ class Extraction:
     components: int  # before small ones went
     faces_removed: int
     levels: int = 1  # of the nest of an unbounded scene
+    backend: str = "reference"  # what fused: never "auto"
 
 
 def extract(
@@ -86,6 +88,7 @@ def extract(
     """
     if limits is not None and any(v is not None for v in (bbox, voxel, truncation, depth_limit, points)):
         raise TypeError("give limits, or the numbers to derive them from, not both")
+    backend = fusion_backend(backend)
     with Spool(folder) as spool:
         spool.extend(frames)
         if limits is None:
@@ -104,7 +107,7 @@ def extract(
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
         volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
     whole = marching_cubes(volume, min_weight=min_weight)
-    return _extraction(whole, limits, [volume], min_faces=min_faces, keep=keep)
+    return _extraction(whole, limits, [volume], min_faces=min_faces, keep=keep, backend=backend)
 
 
 def extract_unbounded(
@@ -150,6 +153,7 @@ def extract_unbounded(
     ProtocolError, ShapeError, DiskError, BackendError
         As ``extract``.
     """
+    backend = fusion_backend(backend)
     with Spool(folder) as spool:
         spool.extend(frames)
         samples = [sample_depths(item) for item in spool]
@@ -171,11 +175,11 @@ def extract_unbounded(
     far_weight = min(far_views, volumes[0].frames / 2)
     whole = nested_marching_cubes(volumes, nest, min_weight=min_weight, far_weight=far_weight)
     limits = replace(nest.levels[0], lower=nest.levels[-1].lower, upper=nest.levels[-1].upper)
-    return _extraction(whole, limits, volumes, min_faces=min_faces, keep=keep)
+    return _extraction(whole, limits, volumes, min_faces=min_faces, keep=keep, backend=backend)
 
 
 def _extraction(
-    whole: Mesh, limits: FusionLimits, volumes: Sequence[Volume], *, min_faces: int, keep: int | None
+    whole: Mesh, limits: FusionLimits, volumes: Sequence[Volume], *, min_faces: int, keep: int | None, backend: str
 ) -> Extraction:
     """Without small pieces, with the figures."""
     mesh = keep_components(whole, min_faces=min_faces, keep=keep)
@@ -188,4 +192,5 @@ def _extraction(
         components=int(components(whole).max(initial=-1)) + 1,
         faces_removed=len(whole.faces) - len(mesh.faces),
         levels=len(volumes),
+        backend=backend,
     )

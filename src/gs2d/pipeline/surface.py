@@ -57,6 +57,7 @@ def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_e
         "depth": depth,
         "unbounded": options.unbounded,
         "levels": result.levels,
+        "fused_by": result.backend,
         **limits,
         "blocks": result.blocks,
         "volume_bytes": result.volume_bytes,

@@ -1,15 +1,15 @@
-// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; mesh/fuse.py and
-// mesh/sampling.py have the same in numpy, operation for operation: single precision gives the same bits, so nothing
-// here is a fused multiply-add).
+// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; mesh/integrate.py
+// and mesh/sampling.py have the same in numpy, operation for operation: single precision gives the same bits, so
+// nothing here is a fused multiply-add).
 #pragma once
 
 #include "core/base.h"
 
 namespace gs2d {
 
-constexpr int FUSE_VOXELS = 512;             // of a block of 8^3, z fastest
-constexpr double FUSE_WEIGHT_SLOPE = 4.0;    // 1 / (1 - FULL_WEIGHT_BEHIND): the weight is 1 down to 3/4 of the truncation
-constexpr double FUSE_NO_WEIGHT = 1e-20;     // a sum of weights below this is taken as this
+constexpr int FUSE_VOXELS = 512;           // of a block of 8^3, z fastest
+constexpr double FUSE_WEIGHT_SLOPE = 4.0;  // 1 / (1 - FULL_WEIGHT_BEHIND) of mesh/integrate.py
+constexpr double FUSE_NO_WEIGHT = 1e-20;   // a sum of weights below this is taken as this
 
 // One view over some blocks of a volume, for kernels/fusion.py. R is the type of the arrays.
 template <class R> struct FuseArguments {
@@ -38,7 +38,7 @@ template <class V> GS2D_HD FusePixel<V> fuse_pixel(V xz, V yz, V z, V last_colum
     return {column, row, (x - column) - V(0.5f), (y - row) - V(0.5f)};
 }
 
-// How far the surface lies behind the voxel, in truncations: the depth of the plane through the pixel, less the voxel's.
+// How far the surface lies behind the voxel, in truncations, by the plane through the pixel.
 template <class V> GS2D_HD V fuse_distance(const FusePixel<V>& p, V depth, V slope_x, V slope_y, V z, V truncation) {
     return (((depth + p.x * slope_x) + p.y * slope_y) - z) / truncation;
 }

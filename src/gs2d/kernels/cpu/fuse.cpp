@@ -57,7 +57,8 @@ void fuse_block(const FuseArguments<real>& a, int64_t n) {
         if (!any(changed)) continue;
         const int64_t at = first + v;
         if (a.pixel_color && any(changed & (distance < V(real(1))))) {
-            const FuseStep<V> color = fuse_step<V>(load(a.color_weight + at), keep(changed, fuse_color_weight<V>(distance, weight)));
+            const V share = keep(changed, fuse_color_weight<V>(distance, weight));
+            const FuseStep<V> color = fuse_step<V>(load(a.color_weight + at), share);
             store(a.color_weight + at, color.total);
             mix_colors(a.color + 3 * at, a.pixel_color, pixel, color.share);
         }

@@ -9,8 +9,8 @@ extern "C" __global__ void __launch_bounds__(128) fuse_voxels(FuseArguments<floa
     const int64 i = int64(blockIdx.x) * 128 + threadIdx.x, n = i / FUSE_VOXELS, v = i % FUSE_VOXELS;
     if (n >= a.blocks) return;
     const float z = a.bases[3 * n + 2] + a.offsets[2 * FUSE_VOXELS + v];
-    const FusePixel<float> p = fuse_pixel(a.bases[3 * n] + a.offsets[v], a.bases[3 * n + 1] + a.offsets[FUSE_VOXELS + v],
-                                          z, float(a.width - 1), float(a.height - 1));
+    const float xz = a.bases[3 * n] + a.offsets[v], yz = a.bases[3 * n + 1] + a.offsets[FUSE_VOXELS + v];
+    const FusePixel<float> p = fuse_pixel(xz, yz, z, float(a.width - 1), float(a.height - 1));
     const int64 pixel = int64(p.row) * a.width + int64(p.column);
     const float distance = fuse_distance(p, a.depth[pixel], a.slope_x[pixel], a.slope_y[pixel], z, a.truncation);
     float weight = fuse_weight(distance);
