@@ -55,6 +55,15 @@ def test_a_claim_of_another_machine_is_stale_when_it_is_not_touched(tmp_path: Pa
     assert is_stale(path)
 
 
+def test_a_claim_of_another_container_on_this_host_is_judged_by_its_age(tmp_path: Path) -> None:
+    path = tmp_path / "job.claim"
+    write_claim(path, space="pid:[1]", pid=dead_pid(), began="1")  # its process numbers mean nothing here
+    assert not is_stale(path)
+    old = time.time() - sweep_claims.FOREIGN_SECONDS - 1
+    os.utime(path, (old, old))
+    assert is_stale(path)
+
+
 def test_a_claim_that_was_never_written_is_stale_after_a_while(tmp_path: Path) -> None:
     path = tmp_path / "job.claim"
     path.touch()  # killed between making the file and writing into it

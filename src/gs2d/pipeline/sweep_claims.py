@@ -2,7 +2,7 @@
 
 A claim is made with ``O_EXCL`` (atomic on local and network file systems) and names host, process and the time at
 which that process began, so that the claim of a killed process is recognised, even if its number is in use again.
-A claim of another machine is stale when it was not touched for ``FOREIGN_SECONDS``. Pure Python; never imports torch.
+A claim of another machine or container is stale when it was not touched for ``FOREIGN_SECONDS``. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ def is_stale(path: Path) -> bool:
         return False
     if not found:  # killed between making the file and writing into it, or about to write
         return _age(path) > UNWRITTEN_SECONDS
-    if found.get("host") == socket.gethostname():
+    here = found.get("host") == socket.gethostname() and found.get("space", _space()) == _space()
+    if here:
         return _began(int(found.get("pid", -1))) != found.get("began") or found.get("began") is None
     return _age(path) > FOREIGN_SECONDS
 
@@ -113,7 +114,15 @@ def _age(path: Path) -> float:
 
 
 def _me() -> dict[str, Any]:
-    return {"host": socket.gethostname(), "pid": os.getpid(), "began": _began(os.getpid())}
+    return {"host": socket.gethostname(), "space": _space(), "pid": os.getpid(), "began": _began(os.getpid())}
+
+
+def _space() -> str:
+    """The container, as far as process numbers go: containers that share a host's name do not see each other's."""
+    try:
+        return os.readlink("/proc/self/ns/pid")
+    except OSError:
+        return ""
 
 
 def _began(pid: int) -> str | None:
