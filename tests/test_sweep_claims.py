@@ -64,6 +64,15 @@ def test_a_claim_of_another_container_on_this_host_is_judged_by_its_age(tmp_path
     assert is_stale(path)
 
 
+def test_a_clock_that_is_ahead_takes_nothing_from_the_living(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "job.claim"
+    write_claim(path, host="elsewhere")  # touched now, by the disk's clock
+    ahead = time.time() + 2 * sweep_claims.FOREIGN_SECONDS
+    monkeypatch.setattr(sweep_claims.time, "time", lambda: ahead)
+    assert not is_stale(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["job.claim"]
+
+
 def test_a_claim_that_was_never_written_is_stale_after_a_while(tmp_path: Path) -> None:
     path = tmp_path / "job.claim"
     path.touch()  # killed between making the file and writing into it

@@ -2,7 +2,8 @@
 
 A claim is made with ``O_EXCL`` (atomic on local and network file systems) and names host, process and the time at
 which that process began, so that the claim of a killed process is recognised, even if its number is in use again.
-A claim of another machine or container is stale when it was not touched for ``FOREIGN_SECONDS``. Pure Python; never imports torch.
+A claim of another machine or container is stale when it was not touched for ``FOREIGN_SECONDS``, by the clock of the disk
+that both write to. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -98,19 +99,30 @@ def is_stale(path: Path) -> bool:
     if found is None:
         return False
     if not found:  # killed between making the file and writing into it, or about to write
-        return _age(path) > UNWRITTEN_SECONDS
+        return _is_old(path, UNWRITTEN_SECONDS)
     here = found.get("host") == socket.gethostname() and found.get("space", _space()) == _space()
     if here:
         return _began(int(found.get("pid", -1))) != found.get("began") or found.get("began") is None
-    return _age(path) > FOREIGN_SECONDS
+    return _is_old(path, FOREIGN_SECONDS)
 
 
-def _age(path: Path) -> float:
-    """Seconds since a file was touched; 0 if it is gone."""
+def _is_old(path: Path, seconds: float) -> bool:
+    """Whether a file was not touched for so long, by this machine's clock and by the disk's; False if it is gone."""
     try:
-        return time.time() - path.stat().st_mtime
+        touched = path.stat().st_mtime
+        return time.time() - touched > seconds and _clock_of(path.parent) - touched > seconds
     except OSError:
-        return 0.0
+        return False
+
+
+def _clock_of(folder: Path) -> float:
+    """What time it is where the files are: a server's clock may differ from ours."""
+    probe = folder / f".clock-{uuid.uuid4().hex}"
+    try:
+        probe.touch()
+        return probe.stat().st_mtime
+    finally:
+        probe.unlink(missing_ok=True)
 
 
 def _me() -> dict[str, Any]:
