@@ -1,0 +1,23 @@
+"""Fusion on a GPU leaves the field of numpy: no operation of it is fused or approximate there either."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_cuda_fuse import waves
+
+from gs2d.mesh.fuse import fuse
+from gs2d.mesh.limits import derive_limits, sample_depths
+from gs2d.render.backend import Backend
+
+pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
+
+
+@pytest.mark.parametrize("colored", [True, False])
+def test_the_field_is_that_of_numpy_in_every_bit(gpu: Backend, colored: bool) -> None:
+    views = waves(12, colored=colored)
+    limits = derive_limits([sample_depths(view) for view in views], [view.camera for view in views], voxel=0.03)
+    found, expected = (fuse(views, limits, threads=1, backend=name) for name in (gpu.name, "reference"))
+    assert (expected.weight > 0).any()
+    for name in ("keys", "tsdf", "weight", "color", "color_weight"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
