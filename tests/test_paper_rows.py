@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gs2d.errors import DataError, RunError
+from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
 from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan, paper
 from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
@@ -106,6 +106,13 @@ def test_another_weight_of_distortion_than_the_papers_is_a_deviation(tmp_path: P
     line = "ball: alpha with distortion is 1000, their protocol's; the paper's 100/10 is of TnT"
     assert line in deviations_of(options, scenes, PAPER_TABLES["regularisation"], Results(()))
     assert line not in deviations_of(options, scenes, PAPER_TABLES["modules"], Results(()))
+
+
+@pytest.mark.parametrize("name", ["downscale", "threads"])
+def test_zero_is_not_taken_for_the_default(name: str) -> None:
+    options = replace(PaperOptions(table="k", data=Path("data"), out=Path("out")), **{name: 0})
+    with pytest.raises(RecipeError, match=f"--{name} must be a whole number >= 1, got 0"):
+        make_plan(options)
 
 
 def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_path: Path) -> None:

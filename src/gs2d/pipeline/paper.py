@@ -170,6 +170,10 @@ def make_plan(options: PaperOptions) -> Plan:
         raise RecipeError(
             f"--seeds must be different whole numbers, got {', '.join(map(str, options.seeds)) or 'none'}"
         )
+    for name in ("downscale", "threads"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
     table = PAPER_TABLES[options.table]
     scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
     names = {row.recipe: canonical_recipe(row.recipe) for row in table.trained if row.recipe is not None}

@@ -2,8 +2,8 @@
 
 A claim is made with ``O_EXCL`` (atomic on local and network file systems) and names host, process and the time at
 which that process began, so that the claim of a killed process is recognised, even if its number is in use again.
-A claim of another machine or container is stale when it was not touched for ``FOREIGN_SECONDS``, by the clock of the disk
-that both write to. Pure Python; never imports torch.
+A claim of another machine or container is stale when it was not touched for ``FOREIGN_SECONDS`` by the disk's clock.
+Pure Python; never imports torch.
 """
 
 from __future__ import annotations
