@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gs2d.cli.paper import parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
 from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan, paper
+from gs2d.pipeline.paper_commands import paper_command
 from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
 from gs2d.pipeline.paper_rows import Results, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes
@@ -106,6 +109,14 @@ def test_another_weight_of_distortion_than_the_papers_is_a_deviation(tmp_path: P
     line = "ball: alpha with distortion is 1000, their protocol's; the paper's 100/10 is of TnT"
     assert line in deviations_of(options, scenes, PAPER_TABLES["regularisation"], Results(()))
     assert line not in deviations_of(options, scenes, PAPER_TABLES["modules"], Results(()))
+
+
+@pytest.mark.parametrize("seeds", [(0,), (1,), (7,), (0, 1, 2), (4, 2)])
+def test_the_command_on_the_page_has_the_seeds_that_were_run(seeds: tuple[int, ...]) -> None:
+    words = shlex.split(paper_command(PaperOptions(table="k", data=Path("a b"), out=Path("out"), seeds=seeds)))
+    given = words[words.index("--seeds") + 1] if "--seeds" in words else "0"
+    assert parse_seeds((given,)) == seeds
+    assert words[words.index("--data") + 1] == "a b"
 
 
 @pytest.mark.parametrize("name", ["downscale", "threads"])

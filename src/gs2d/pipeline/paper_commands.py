@@ -20,7 +20,8 @@ def paper_command(options: PaperOptions) -> str:
         words += ["--schedule-scale", str(options.schedule_scale)]
     if options.downscale is not None:
         words += ["--downscale", str(options.downscale)]
-    words += ["--seeds", ",".join(map(str, options.seeds))] if options.seeds != (0,) else []
+    if options.seeds != (0,):  # one number alone would be a count
+        words += ["--seeds", ",".join(map(str, options.seeds)) + ("," if len(options.seeds) == 1 else "")]
     for name in ("protocol", "backend"):
         if getattr(options, name) != "auto":
             words += [f"--{name}", getattr(options, name)]
