@@ -10,11 +10,14 @@ from typing import Any
 
 import pytest
 
+from gs2d.cli.actions import _train_options as train_options
+from gs2d.cli.app import parse
+from gs2d.cli.commands import Train
 from gs2d.cli.paper import parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
 from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan, paper
-from gs2d.pipeline.paper_commands import paper_command
+from gs2d.pipeline.paper_commands import commands_of, paper_command
 from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
 from gs2d.pipeline.paper_rows import Results, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes
@@ -109,6 +112,28 @@ def test_another_weight_of_distortion_than_the_papers_is_a_deviation(tmp_path: P
     line = "ball: alpha with distortion is 1000, their protocol's; the paper's 100/10 is of TnT"
     assert line in deviations_of(options, scenes, PAPER_TABLES["regularisation"], Results(()))
     assert line not in deviations_of(options, scenes, PAPER_TABLES["modules"], Results(()))
+
+
+def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None:
+    write_capture(tmp_path / "a b" / "bäll", train=2, test=1, size=8)
+    options = PaperOptions(
+        table="absgs",
+        data=tmp_path / "a b",
+        out=tmp_path / "o ut",
+        schedule_scale=0.05,
+        downscale=2,
+        seeds=(3,),
+        threads=1,
+        overrides=("surface.densify.max_splats=7",),
+    )
+    jobs = make_plan(options).sweep.jobs
+    assert len(jobs) == 5
+    for job in jobs:
+        words = shlex.split(commands_of(job)[0])
+        assert words[0] == "gs2d"
+        command = parse(words[1:])
+        assert isinstance(command, Train)
+        assert train_options(command) == replace(job.train, resume=False)
 
 
 @pytest.mark.parametrize("seeds", [(0,), (1,), (7,), (0, 1, 2), (4, 2)])

@@ -76,7 +76,7 @@ class Train(TrainingCommon):
     """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
     overrides: Overrides = ()
     """Change the recipe, e.g. --set refine.iterations=2000; may be repeated."""
-    checkpoint_every: int = 1000
+    checkpoint_every: int = 10_000
     """Iterations between checkpoints."""
     checkpoint_seconds: float = 120.0
     """Seconds between checkpoints, whichever comes first."""
