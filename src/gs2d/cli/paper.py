@@ -36,8 +36,8 @@ def show_paper(command: Paper, console: Console) -> None:
             else ""
         )
         raise RunError(
-            f"{len(result.failures)} of the runs failed, the table is written without what they lack: {name}: {reason}{more}; "
-            "mend that and run the command again"
+            f"{len(result.failures)} of the runs failed, the table is written without what they lack: "
+            f"{name}: {reason}{more}; mend that and run the command again"
         )
 
 
