@@ -16,15 +16,16 @@ from render_scenes import IMAGES, contraction, random_camera, random_cotangents,
 from torch import Tensor
 
 from gs2d.camera import Camera
-from gs2d.errors import ShapeError
+from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
-from gs2d.kernels.cuda.compile import cubin, source_names
+from gs2d.kernels.cuda.compile import compile_source, cubin, source_names
 from gs2d.render import cuda
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
 from gs2d.train import events
+from gs2d.train.targets import DeviceTargets
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
@@ -95,15 +96,51 @@ def test_errors_of_splats_are_the_same_bits_each_time(gpu: Backend) -> None:
     assert float(a.sum()) > 0
 
 
+def test_deterministic_gradients_are_the_same_bits_each_time(gpu: Backend) -> None:
+    splats, camera = scene()
+    torch.use_deterministic_algorithms(True)
+    try:
+        (_, a), (_, b) = (differentiate(splats, camera, torch.device("cuda")) for _ in range(2))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert len(a) == 7
+    assert all(torch.equal(grad, b[name]) for name, grad in a.items())
+
+
+def test_ptx_for_devices_to_come_is_translated_by_the_driver(gpu: Backend) -> None:
+    """Of a device that NVRTC does not know; here the device is known, and gives the same image to rounding."""
+    splats, camera = scene()
+    device = torch.device("cuda", torch.cuda.current_device())
+    known = launch.launcher_for(device)
+    assert isinstance(known, launch.GpuLauncher)
+    later = launch.GpuLauncher(
+        device,
+        architecture_of=lambda _: known.architecture.replace("sm_", "compute_"),
+        code_of=lambda name, arch: compile_source(name, arch).code,
+    )
+    try:
+        found = cuda.rasterize_with(later, splats.to(device), camera, SETTINGS)
+    except BackendError as error:
+        if "UNSUPPORTED_PTX" in str(error):
+            pytest.skip("the driver is older than NVRTC")
+        raise
+    expected = cuda.rasterize_with(known, splats.to(device), camera, SETTINGS)
+    assert float((found.color - expected.color).abs().median()) < 1e-6
+
+
 def test_work_is_queued_on_the_current_stream(gpu: Backend) -> None:
-    """Behind a long wait on another stream nothing is done yet when the call returns; then it is right."""
+    """What an earlier operation of the stream writes, long after it was queued, is what the kernels read."""
     splats, camera = scene()
     there = splats.to("cuda")
     expected = rasterize(there, camera, SETTINGS, backend="cuda").color
+    late = Splats(**{name: torch.zeros_like(tensor) for name, tensor in there.items()})
     torch.cuda.synchronize()
     stream = torch.cuda.Stream()
     with torch.cuda.stream(stream):
-        results = [rasterize(there, camera, SETTINGS, backend="cuda").color for _ in range(8)]
+        torch.cuda._sleep(200_000_000)  # clock cycles
+        for name, tensor in there.items():
+            getattr(late, name).copy_(tensor)
+        results = [rasterize(late, camera, SETTINGS, backend="cuda").color for _ in range(8)]
     stream.synchronize()
     assert all(torch.equal(result, expected) for result in results)
     with torch.cuda.stream(stream):
@@ -184,6 +221,38 @@ def test_three_stages_train_on_the_gpu_like_on_the_cpu(gpu: Backend) -> None:
     assert abs(len(trainer.splats) - len(plain.splats)) <= 2
     saved = trainer.state.state_dict()
     assert saved["splats"]["means"].device.type == "cpu"
+
+
+def test_what_was_trained_on_the_gpu_goes_on_on_the_cpu_and_back(gpu: Backend) -> None:
+    from gs2d.protocols import GENERIC
+    from gs2d.train.loop import Trainer
+    from gs2d.train.state import TrainState
+
+    toy, recipe = train_toys.make_scene(), train_toys.short()
+    state, devices = None, []
+    for backend in (gpu, get_backend("reference"), gpu):
+        trainer = Trainer(toy, recipe, GENERIC, backend=backend, state=state, progress_every=1)
+        if state is None:
+            trainer.enter(0)
+        trainer.step()
+        devices.append(trainer.splats.device.type)
+        state = TrainState.from_state_dict(trainer.state.state_dict())
+    assert devices == ["cuda", "cpu", "cuda"]
+    assert state is not None
+    assert state.step == 3
+
+
+def test_photographs_in_pinned_memory_are_those_on_the_device(gpu: Backend) -> None:
+    views, device = train_toys.make_scene().train, torch.device("cuda", torch.cuda.current_device())
+    kept, pinned = (
+        DeviceTargets(views, (0.2, 0.5, 0.9), use_masks=True, device=device, limit_bytes=n) for n in (1 << 30, 0)
+    )
+    for _ in range(2):
+        for index in range(len(views)):
+            assert torch.equal(kept[index].image, pinned[index].image)
+    assert all(picture.image.is_pinned() for picture in pinned._kept.values())
+    assert all(picture.image.is_cuda for picture in kept._kept.values())
+    assert len(pinned._kept) == len(kept._kept) == len(views)
 
 
 def test_peak_memory_is_bounded_by_what_is_documented(gpu: Backend) -> None:
