@@ -65,4 +65,5 @@ def mean_changes(snapshot: Snapshot, splats: Splats, *, iterations: int, extent:
 def _covariances(splats: Splats) -> Tensor:
     """Sigma [N, 3, 3] wu^2, in double: its changes are small."""
     axes = quats_to_matrices(splats.quats.double())[:, :, :2] * splats.scales.double()[:, None]
-    return axes @ axes.transpose(1, 2)
+    # No matrix product: on a GPU torch refuses it where deterministic algorithms are asked for.
+    return (axes[:, :, None] * axes[:, None]).sum(dim=3)
