@@ -86,9 +86,7 @@ class Camera:
         if factor < 1 or width < 1 or height < 1:
             raise ShapeError(f"downscale must leave at least one pixel of {self.width}x{self.height}, got {factor}")
         f = float(factor)
-        return replace(
-            self, width=width, height=height, fx=self.fx / f, fy=self.fy / f, cx=self.cx / f, cy=self.cy / f
-        )
+        return replace(self, width=width, height=height, fx=self.fx / f, fy=self.fy / f, cx=self.cx / f, cy=self.cy / f)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points.

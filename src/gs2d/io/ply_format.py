@@ -233,9 +233,7 @@ class _BinaryReader:
         properties: dict[str, np.ndarray | PlyList] = {}
         for p in element.properties:
             size = np.dtype(p.dtype).itemsize
-            raw = b"".join(
-                self.data[s : s + n * size] for s, n in zip(starts[p.name], counts[p.name], strict=True)
-            )
+            raw = b"".join(self.data[s : s + n * size] for s, n in zip(starts[p.name], counts[p.name], strict=True))
             values = _native(np.frombuffer(raw, self.order + p.dtype))
             properties[p.name] = values if p.count_dtype is None else PlyList(np.array(counts[p.name]), values)
         return PlyElement(element.count, properties)
