@@ -27,6 +27,7 @@ FLAGS = (
     "-Wall",
     "-Wno-unknown-pragmas",
 )
+ADDRESSES = ("-fsanitize=address", "-fno-omit-frame-pointer", "-g")  # needs the run-time library in the process
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
 
 
@@ -59,11 +60,17 @@ class EmulatedKernels:
 
 
 def build(
-    sources: Sequence[Path], include: Path, folder: Path, name: str, *, approximate: bool = False
+    sources: Sequence[Path],
+    include: Path,
+    folder: Path,
+    name: str,
+    *,
+    approximate: bool = False,
+    addresses: bool = False,
 ) -> EmulatedKernels:
     """Compile; the compiler gets two minutes. ``folder`` receives a wrapper and the library. Skips without g++.
 
-    ``approximate``: with the largest errors of the GPU's approximate instructions.
+    ``approximate``: with the largest errors of the approximate instructions. ``addresses``: with AddressSanitizer.
     """
     if shutil.which("g++") is None:
         pytest.skip("no g++ here, which runs the CUDA kernels on the CPU; install one")
@@ -78,6 +85,7 @@ def build(
     wrapper.write_text("\n".join(lines) + "\n")
     library = folder / f"{name}.so"
     chosen = ["-DEMULATE_APPROXIMATIONS"] if approximate else []
+    chosen += ADDRESSES if addresses else []
     command = ["g++", *FLAGS, *chosen, f"-I{include}", str(wrapper), "-o", str(library)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     if done.returncode != 0:
@@ -96,6 +104,7 @@ class Emulator:
     descending: bool = False
     seed: int = 0
     approximate: bool = False
+    addresses: bool = False
     _built: dict[str, EmulatedKernels] = field(default_factory=dict)
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
@@ -104,6 +113,7 @@ class Emulator:
             return
         if name not in self._built:
             source = next(s for s in sorted((KERNELS / "cuda").glob("*.cu")) if name in KERNEL.findall(s.read_text()))
-            built = build([source], KERNELS, self.folder, source.stem, approximate=self.approximate)
+            options = {"approximate": self.approximate, "addresses": self.addresses}
+            built = build([source], KERNELS, self.folder, source.stem, **options)
             self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
         self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending, seed=self.seed)
