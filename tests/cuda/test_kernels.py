@@ -137,7 +137,7 @@ def test_the_order_of_threads_warps_and_blocks_does_not_change_images(emulator: 
     usual = render(emulator, case.splats, case.camera, SETTINGS)
     cotangents = random_cotangents(np.random.default_rng(1), case.camera)
     a = gradients(emulator, case.splats, case.camera, cotangents, 4)
-    for other in (replace(emulator, descending=True), replace(emulator, seed=1), replace(emulator, seed=2)):
+    for other in (replace(emulator, descending=True), replace(emulator, seed=1)):
         images = render(other, case.splats, case.camera, SETTINGS)
         for name in (*IMAGES, "radii"):
             assert torch.equal(getattr(usual, name), getattr(images, name)), name
