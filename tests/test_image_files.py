@@ -16,6 +16,7 @@ from gs2d.images import (
     composite,
     image_size,
     mask_downscale,
+    natural_key,
     read_image,
     read_mask,
     to_uint8,
@@ -141,3 +142,9 @@ def test_a_mask_pixel_counts_if_enough_of_its_block_does() -> None:
     mask = np.array([[1, 1, 1, 0], [1, 1, 0, 1], [0, 0, 1, 0], [1, 0, 1, 0]], bool)
     np.testing.assert_array_equal(mask_downscale(mask, 2, need=1.0), [[True, False], [False, False]])
     np.testing.assert_array_equal(mask_downscale(mask, 2, need=0.5), [[True, True], [False, True]])
+
+
+def test_names_are_in_the_order_in_which_people_count() -> None:
+    names = ["r_10.png", "r_2.png", "a.png", "r_2b.png", "r_002.png", "3.png", "12.png"]
+    counted = ["3.png", "12.png", "a.png", "r_002.png", "r_2.png", "r_2b.png", "r_10.png"]
+    assert sorted(names, key=natural_key) == counted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 import zlib
 from collections.abc import Sequence
@@ -15,6 +16,17 @@ from gs2d.disk import atomic_write
 from gs2d.errors import DataError, ShapeError
 
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sorts names as people count: ``frame_2`` before ``frame_10``. Names padded with zeros keep the order of text.
+
+    For pairing files with something else by their place. The views of a scene are sorted as text, as the official
+    loaders have them, so that every 8th is the same view.
+    """
+    parts: list[str | int] = list(re.split("([0-9]+)", name))  # text, number, text ...: neighbours are of one kind
+    parts[1::2] = [int(part) for part in parts[1::2]]
+    return parts, name
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:

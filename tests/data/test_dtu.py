@@ -78,6 +78,19 @@ def test_numbered_images_keep_their_camera_when_one_is_missing(tmp_path: Path) -
     assert scene.skipped == ("view 2: no photograph",)
 
 
+def test_photographs_numbered_without_zeros_keep_their_cameras(tmp_path: Path) -> None:
+    """As text 10.png is the third of twelve, and would get the camera of view 2."""
+    cameras = small_dtu(tmp_path, count=12, digits=1)
+    for path in (tmp_path / "image").iterdir():
+        path.rename(path.with_name(f"{int(path.stem)}.png"))
+    for view in load_scene(tmp_path).train:
+        index = int(Path(view.name).stem)
+        np.testing.assert_allclose(view.camera.T_cam_world, cameras[index].T_cam_world, atol=1e-9)
+        np.testing.assert_array_equal(view.object_mask()[10, 5:], np.arange(35) < 15 + index)
+    for index, silhouette in enumerate(dtu_silhouettes(tmp_path)):
+        assert silhouette.path.stem == str(index)
+
+
 def test_wrong_archives_are_errors(tmp_path: Path) -> None:
     small_dtu(tmp_path)
     path = tmp_path / "cameras_sphere.npz"

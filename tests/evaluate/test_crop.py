@@ -113,3 +113,20 @@ def test_photographs_are_matched_with_the_log_by_order_or_by_number() -> None:
         match_cameras(names, 2)
     with pytest.raises(DataError, match="have no numbers"):
         match_cameras(["a.jpg", "b.jpg", "c.jpg"], 5)
+
+
+def test_photographs_named_without_leading_zeros_are_matched_as_people_count() -> None:
+    """As text frame_10 comes before frame_2, and every camera but the first would be another photograph's."""
+    names = [f"frame_{n}.jpg" for n in (1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9)]
+    ours, entries = match_cameras(names, 11)
+    assert [names[i] for i in ours] == [f"frame_{n}.jpg" for n in range(1, 12)]
+    assert entries.tolist() == list(range(11))
+    ours, entries = match_cameras(names, 20)
+    assert [names[i] for i in ours] == [f"frame_{n}.jpg" for n in range(1, 12)]
+    assert entries.tolist() == list(range(11))
+
+
+def test_a_photograph_with_the_number_zero_is_the_first() -> None:
+    ours, entries = match_cameras(["0.jpg", "2.jpg", "12.jpg"], 13)
+    assert ours.tolist() == [0, 1, 2]
+    assert entries.tolist() == [0, 2, 12]

@@ -158,6 +158,20 @@ def test_a_published_log_in_another_frame_than_the_cameras_is_told(in_place: tup
     assert score(scene, published=beside).alignment.messages == ()
 
 
+def test_photographs_named_without_leading_zeros_have_the_same_score(in_place: tuple[TntScene, TntScore]) -> None:
+    """And a published log may be in the order of text, frame_1, frame_10, frame_11 ..., as the official converter's."""
+    scene = in_place[0]
+    names = [f"frame_{i + 1}.jpg" for i in range(60)]
+    own = scene.log.copy()
+    own[:, :3, 3] = scene.centers
+    as_text = own[sorted(range(60), key=lambda i: names[i])]
+    for published in (own, as_text):
+        got = evaluate_tnt(
+            Mesh(scene.vertices, scene.faces), names, scene.centers, truth_of(scene), TAU, published=published
+        )
+        assert (got.f_score, got.alignment.messages) == (in_place[1].f_score, ())
+
+
 def test_few_cameras_that_agree_are_told(elsewhere: tuple[TntScene, TntScore]) -> None:
     scene = elsewhere[0]
     log = scene.log.copy()

@@ -17,7 +17,7 @@ from gs2d.data.colmap_model import ColmapCamera, ColmapImage, find_model, read_c
 from gs2d.data.lens import Intrinsics, colmap_intrinsics
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError
-from gs2d.images import image_size
+from gs2d.images import image_size, natural_key
 
 CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz")
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
@@ -26,8 +26,9 @@ _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 def read_dtu(root: Path) -> Capture:
     """Read a DTU scan.
 
-    View i is the i-th file in sorted order. P_i = world_mat_i @ scale_mat_i maps the unit-sphere frame, which is the
-    scene's frame, to pixels whose centres are whole numbers; ours are at + 0.5, so 0.5 is added to cx and cy.
+    View i is the i-th file in the order of their names (2.png before 10.png). P_i = world_mat_i @ scale_mat_i maps the
+    unit-sphere frame, which is the scene's frame, to pixels whose centres are whole numbers; ours are at + 0.5, so 0.5
+    is added to cx and cy.
     T_metric_scene = scale_mat_0 maps the scene to millimetres. Masks (``mask/NNN.png``) are silhouettes
     (``View.object_mask``), as is an alpha channel: the background is trained. All views train.
     Where ``sparse/0`` has cameras that stand where these do, its points are used, and its intrinsics if they are of the
@@ -145,7 +146,7 @@ def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.n
     if not paths:
         raise DataError(f"{root} must hold {' or '.join(CAMERA_FILES)}, got neither")
     if len(paths) > 1 and model is not None:
-        names = [Path(name).stem for name in sorted(model.images)]
+        names = [Path(name).stem for name in sorted(model.images, key=natural_key)]
         for path in paths:
             world, scale = _read_matrices(path)
             centers = {
@@ -188,7 +189,8 @@ def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndar
 def _files(root: Path, names: Sequence[str]) -> list[Path]:
     for name in names:
         if (root / name).is_dir():
-            return sorted(p for p in (root / name).iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
+            found = [p for p in (root / name).iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES]
+            return sorted(found, key=lambda path: natural_key(path.name))
     return []
 
 

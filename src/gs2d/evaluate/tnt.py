@@ -23,6 +23,7 @@ from gs2d.evaluate.align import RobustFit, apply, ransac_similarity, rotation_de
 from gs2d.evaluate.icp import IcpResult, icp, nearest, uniform_downsample, voxel_downsample
 from gs2d.evaluate.surface_clouds import ScoredClouds
 from gs2d.evaluate.tnt_files import TntTruth, match_cameras
+from gs2d.images import natural_key
 from gs2d.protocols_surface import TNT_SURFACE, IcpStage, TntSurface
 from gs2d.triangles import Mesh
 
@@ -188,15 +189,19 @@ def _camera_fit(
         raise DataError(f"{truth.scene}_COLMAP_SfM.log does not fit the capture's cameras: {error}") from error
     notes = []
     if published is not None and len(published) == len(names):
-        order = np.array(sorted(range(len(names)), key=lambda i: names[i]))
-        gap = np.linalg.norm(published[:, :3, 3] - centers[order], axis=1)
-        spread = float(np.linalg.norm(np.ptp(centers, axis=0)))
-        if np.median(gap) > 0.01 * spread:
+        gap, spread = _frame_gap(names, centers, published), float(np.linalg.norm(np.ptp(centers, axis=0)))
+        if gap > 0.01 * spread:
             notes.append(
                 f"{truth.scene}_COLMAP_SfM.log beside the photographs is in another frame than their cameras (median "
-                f"distance {np.median(gap) / spread:.0%} of their spread): the cameras were used instead"
+                f"distance {gap / spread:.0%} of their spread): the cameras were used instead"
             )
     return fit, notes
+
+
+def _frame_gap(names: Sequence[str], centers: np.ndarray, published: np.ndarray) -> float:
+    """Median distance of cameras from those of a log, in the order of text (as logs are written) or of numbers."""
+    orders = [sorted(range(len(names)), key=key) for key in (lambda i: names[i], lambda i: natural_key(names[i]))]
+    return min(float(np.median(np.linalg.norm(published[:, :3, 3] - centers[order], axis=1))) for order in orders)
 
 
 def _stage(

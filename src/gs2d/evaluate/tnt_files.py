@@ -11,6 +11,7 @@ import numpy as np
 
 from gs2d.errors import DataError
 from gs2d.evaluate.crop import CropVolume, read_crop
+from gs2d.images import natural_key
 from gs2d.io.ply import read_points
 
 
@@ -101,25 +102,27 @@ def _number_rows(path: Path) -> list[list[float]]:
 def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> tuple[np.ndarray, np.ndarray]:
     """Which of the named photographs belong to which of ``count`` entries of a log: indices [m], [m].
 
-    As many as entries: in order of their names. Else by the number in the name, the first photograph being 1
-    (``000001.jpg``) as Tanks and Temples counts.
+    As many as entries: in order of their names (``frame_2`` before ``frame_10``). Else by the number in the name, the
+    first photograph being 1 (``000001.jpg``) as Tanks and Temples counts, or 0 if there is a number 0.
 
     Raises
     ------
     DataError
         Neither is possible.
     """
-    order = np.array(sorted(range(len(names)), key=lambda i: names[i]), np.int64)
+    order = np.array(sorted(range(len(names)), key=lambda i: natural_key(names[i])), np.int64)
     if len(names) == count:
         return order, np.arange(count)
     numbers = [re.search(r"(\d+)\D*$", Path(names[i]).stem) for i in order]
     if not all(numbers):
         raise DataError(f"{where} has {count} cameras, the capture {len(names)}, and their names have no numbers")
-    entries = np.array([int(number.group(1)) - 1 for number in numbers if number], np.int64)
+    counted = np.array([int(number.group(1)) for number in numbers if number], np.int64)
+    first = min(1, int(counted.min()))
+    entries = counted - first
     inside = (entries >= 0) & (entries < count)
     if inside.sum() < 3 or len(np.unique(entries)) < len(entries):
         raise DataError(
-            f"{where} has {count} cameras, the capture {len(names)}, numbered {entries.min() + 1} to "
-            f"{entries.max() + 1}; take the log of the same photographs"
+            f"{where} has {count} cameras, the capture {len(names)}, numbered {counted.min()} to "
+            f"{counted.max()}; take the log of the same photographs"
         )
     return order[inside], entries[inside]
