@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -230,6 +231,37 @@ def test_tables_show_the_measured_figures_with_the_papers_in_brackets() -> None:
     assert tex.count("{") == tex.count("}")
 
 
+def test_the_papers_figures_stand_beside_what_was_trained_on_other_data() -> None:
+    table = PAPER_TABLES["benchmark"]
+    rows = tuple(
+        Row(row.name, row.recipe, dict(row.paper), "", (make_cell(data_set="other", psnr=30.0),) if row.recipe else ())
+        for row in table.rows
+    )
+    text, tex = to_markdown(table, Results(rows), (), (), ()), to_latex(table, Results(rows))
+    titles = [line for line in text.splitlines() if line.startswith("## ")]
+    papers = [f"## The paper's figures on {d}" for d in ("TnT", "NeRF-Synthetic", "DTU")]
+    assert titles[:4] == ["## other", *papers]
+    assert "| SVRaster | (0.40) | (23.04) | - | (0.144) |" in text
+    assert text.count("| 2DGS (60k) |") == 1  # the control is not in the paper
+    assert r"    SVRaster & \footnotesize(0.40) & \footnotesize(23.04) & - & \footnotesize(0.144) \\" in tex
+    assert tex.count(r"\begin{tabular}{lcccc}") == 3
+    # every line of a table has as many cells as its head
+    for part in tex.split(r"\begin{tabular}")[1:]:
+        width = part.partition("}")[0].count("c")
+        lines = [line for line in part.splitlines() if line.endswith(r"\\")]
+        assert lines
+        assert {line.count("&") for line in lines} == {width}
+
+
+def test_what_latex_would_read_as_its_own_is_escaped() -> None:
+    table = replace(PAPER_TABLES["k"], title=r"50 % of #1_a & {b} < $c^2$ ~ \d")
+    caption = next(line for line in to_latex(table, Results(())).splitlines() if "caption" in line)
+    assert caption.startswith(
+        r"  \caption{50 \% of \#1\_a \& \{b\} \textless{} \$c\textasciicircum{}2\$ "
+        r"\textasciitilde{} \textbackslash{}d."
+    )
+
+
 def test_figures_have_the_digits_that_fit_them() -> None:
     assert [shown("chamfer", 0.00392), shown("chamfer", 0.774), shown("bytes", 5.5e6)] == ["0.00392", "0.774", "5.50"]
     assert [shown("seconds", 0.84), shown("seconds", 612.4), shown("psnr", None)] == ["0.8", "612", "-"]
@@ -361,6 +393,7 @@ def test_quoted_rows_are_shown_where_the_paper_has_figures_of_them() -> None:
     )
     text = to_markdown(table, Results(rows), (), (), ())
     assert "| NeuS | (0.84) | (31.97) | (0.840) | - | - | - |" in text
-    assert "SVRaster" not in text  # the paper has no figures of it on DTU
+    trained = text.partition("## The paper's figures on")[0]
+    assert "SVRaster" not in trained  # the paper has no figures of it on DTU
     assert "| 2DGS-R | - (0.74) | **30.00** (35.69) |" in text
     assert r"NeuS & \footnotesize(0.84) & \footnotesize(31.97)" in to_latex(table, Results(rows))

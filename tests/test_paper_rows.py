@@ -15,11 +15,11 @@ from gs2d.cli.app import parse
 from gs2d.cli.commands import Train
 from gs2d.cli.paper import parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
+from gs2d.paper_tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Order
 from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan, paper
 from gs2d.pipeline.paper_commands import commands_of, paper_command
 from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
-from gs2d.pipeline.paper_rows import Results, judge_order, read_cell
+from gs2d.pipeline.paper_rows import Cell, Results, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes
 from gs2d.protocols import MetricConventions
 from paper_cells import make_cell, make_row
@@ -27,6 +27,7 @@ from tiny import write_ball_mesh, write_capture
 
 # Scene a (30 dB) at both seeds, scene b (20 dB) at seed 0 only: the seeds differ by 0.2 dB, not by (30.2 - 25) dB.
 UNEVEN = (make_cell("a", 0, psnr=30.0), make_cell("b", 0, psnr=20.0), make_cell("a", 1, psnr=30.2))
+TWO = {"lego": 31.0, "ship": 29.0}  # dB
 
 
 def test_a_seed_that_lacks_a_scene_is_no_spread_and_does_not_weigh_the_mean() -> None:
@@ -48,8 +49,39 @@ def test_distances_in_different_units_have_no_common_mean() -> None:
     row = make_row("row", make_cell("scan24", data_set=DTU, chamfer=0.8), make_cell("lego", data_set="x", chamfer=0.01))
     results = Results((row,))
     assert results.mean(row)["chamfer"] is None
-    assert results.reasons(row)["chamfer"] == "the data sets measure in different units: each has its own mean"
+    assert results.reasons(row)["chamfer"] == (
+        "measured in different ways, which have no common mean: "
+        "protocol visible-surface, units of DTU; protocol visible-surface, units of lego"
+    )
     assert results.mean(row, DTU)["chamfer"] == 0.8
+    other = make_row("row", make_cell("fox", data_set="x", chamfer=2.0), make_cell("cup", data_set="x", chamfer=0.01))
+    assert Results((other,)).mean(other, "x")["chamfer"] is None  # each capture's unit is its own
+
+
+def test_training_views_are_not_averaged_with_test_views() -> None:
+    """DTU is measured on training views, 35 dB; lego and ship on test views, 31 and 29: their mean is 30, not 31.67."""
+
+    def seen(scene: str, data_set: str, views: str, **figures: float) -> Cell:
+        return replace(make_cell(scene, data_set=data_set, **figures), details={"views": views})
+
+    scan = seen("scan24", DTU, "train", psnr=35.0, bytes=6.0)
+    row = make_row("row", scan, *(seen(n, NERF_SYNTHETIC, "test", psnr=v, bytes=6.0) for n, v in TWO.items()))
+    results = Results((row,))
+    assert results.mean(row)["psnr"] == 30.0
+    assert results.scenes("psnr") == ["lego", "ship"]
+    assert results.scenes("bytes") == ["scan24", "lego", "ship"]
+    assert results.mean(row, DTU)["psnr"] == 35.0
+    assert results.scenes("psnr", DTU) == ["scan24"]
+
+
+def test_f_scores_of_different_protocols_have_no_common_mean() -> None:
+    surfaces = {"Barn": "tnt", "lego": "visible-surface"}
+    cells = [replace(make_cell(n, fscore=0.5), details={"surface": {"evaluator": e}}) for n, e in surfaces.items()]
+    row = make_row("row", *cells)
+    results = Results((row,))
+    assert results.mean(row)["fscore"] is None
+    assert results.scenes("fscore") == []
+    assert results.reasons(row)["fscore"].endswith("no common mean: protocol tnt; protocol visible-surface")
 
 
 def test_rows_that_have_no_run_in_common_say_so() -> None:

@@ -19,7 +19,7 @@ from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.paper_commands import commands_of, paper_command
 from gs2d.pipeline.paper_deviations import deviations_of
 from gs2d.pipeline.paper_page import write_page
-from gs2d.pipeline.paper_rows import Results, Row, Verdict, judge, read_cell
+from gs2d.pipeline.paper_rows import FIGURES, Results, Row, Verdict, judge, read_cell
 from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
 from gs2d.pipeline.paper_text import to_csv, to_latex, to_markdown
 from gs2d.pipeline.sweep import Sweep, SweepJob, stage_keys
@@ -337,6 +337,7 @@ def row_json(row: Row, results: Results, deviations: Sequence[str]) -> dict[str,
         "name": row.name,
         "recipe": row.recipe,
         "mean": results.mean(row),
+        "mean_over": {name: results.scenes(name) if row.cells else [] for name in FIGURES},
         "spread": results.spread(row),
         "reasons": results.reasons(row),
         "data_sets": {d: {"mean": results.mean(row, d), "spread": results.spread(row, d)} for d in results.data_sets},

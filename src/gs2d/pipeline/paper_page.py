@@ -15,7 +15,7 @@ from gs2d.io.run import RENDERS
 from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.paper_rows import Cell, Results, Row, Verdict
-from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, rows_for, shown, verdict_text
+from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, rows_for, shown, untrained, verdict_text
 from gs2d.recipes import RECIPES, get_recipe
 from gs2d.report_html import drawing, escape, facts, missing, page, picture, table
 
@@ -110,7 +110,7 @@ def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> s
     for row in listed:
         if row.recipe is None:  # quoted rows are grey
             built = built.replace(f"<tr><td>{escape(row.name)}<", f'<tr class="quoted"><td>{escape(row.name)}<')
-    counted = sorted({scene for scene, _ in results.counted("psnr", data_set)})
+    counted = results.scenes("psnr", data_set)
     scenes = (
         f"Means over {len(counted)} scene{'s' if len(counted) != 1 else ''}: {', '.join(counted)}. " if counted else ""
     )
@@ -249,9 +249,7 @@ def _drawing(path: Path) -> str:
 def papers_tables(paper_table: PaperTable, results: Results) -> list[str]:
     """The paper's figures of the data sets that were not trained here."""
     sections = []
-    for data_set, metrics in paper_table.columns.items():
-        if data_set in results.data_sets:
-            continue
+    for data_set, metrics in untrained(paper_table, results).items():
         rows = [
             [escape(row.name), *(printed(m, data_set, known[m]) if m in known else "-" for m in metrics)]
             for row in paper_table.rows

@@ -11,10 +11,12 @@ from typing import Any
 
 from gs2d.errors import Gs2dError
 from gs2d.io.run import open_run
-from gs2d.paper_tables import DTU, LOWER_IS_BETTER, METRICS, Order, PaperTable
+from gs2d.paper_tables import DTU, LOWER_IS_BETTER, METRICS, NERF_SYNTHETIC, TNT, Order, PaperTable
 from gs2d.protocols import MetricConventions
 
 FIGURES = (*METRICS, "bytes", "seconds")
+IMAGES = ("psnr", "ssim", "lpips")
+DATA_SETS = (DTU, NERF_SYNTHETIC, TNT)
 NOT_YET = ("not trained yet", "under way or interrupted")
 
 
@@ -70,7 +72,8 @@ class Results:
     """The rows of a table.
 
     Means are over the runs (scene, seed) that *every* trained row has: a mean over other scenes than those of the row
-    above would be compared with it all the same. Rows of which nothing is there yet do not count for this.
+    above would be compared with it all the same. Rows of which nothing is there yet do not count for this. Figures that
+    were measured otherwise have no common mean (:func:`measured_on`); of images, test views count where there are any.
     """
 
     rows: tuple[Row, ...]
@@ -81,9 +84,30 @@ class Results:
         return tuple(dict.fromkeys(cell.data_set for row in self.rows for cell in row.cells))
 
     def counted(self, metric: str, data_set: str | None = None) -> set[tuple[str, int]]:
-        """The (scene, seed) that means of a metric are taken over."""
-        have = [{(c.scene, c.seed) for c in r.of(data_set) if c.figures[metric] is not None} for r in self.rows]
+        """The (scene, seed) that means of a metric are taken over; none where there is no common mean."""
+        kinds = self._kinds(metric, data_set)
+        one = "test views" if "test views" in kinds else next(iter(kinds), "")
+        if len(kinds) > 1 and metric not in IMAGES:
+            return set()
+        have = [
+            {
+                (c.scene, c.seed)
+                for c in r.of(data_set)
+                if c.figures[metric] is not None and measured_on(c, metric) == one
+            }
+            for r in self.rows
+        ]
         return set.intersection(*filter(None, have)) if any(have) else set()
+
+    def _kinds(self, metric: str, data_set: str | None) -> set[str]:
+        """On what, and how, a metric was measured."""
+        cells = (c for r in self.rows for c in r.of(data_set) if c.figures[metric] is not None)
+        return {measured_on(cell, metric) for cell in cells}
+
+    def scenes(self, metric: str, data_set: str | None = None) -> list[str]:
+        """The scenes that means of a metric are taken over."""
+        counted = {scene for scene, _ in self.counted(metric, data_set)}
+        return [s for s in dict.fromkeys(c.scene for r in self.rows for c in r.of(data_set)) if s in counted]
 
     def mean(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
         """Mean over scenes of the mean over seeds of each figure; None where there is none."""
@@ -103,22 +127,14 @@ class Results:
         return found
 
     def _values(self, row: Row, name: str, data_set: str | None) -> dict[str, dict[int, float]]:
-        """Scene -> seed -> value, of those that count; nothing where the data sets measure in different units."""
+        """Scene -> seed -> value, of those that count."""
         counted = self.counted(name, data_set)
         found: dict[str, dict[int, float]] = {}
-        if self._units_differ(name, data_set):
-            return found
         for cell in row.of(data_set):
             value = cell.figures[name]
             if value is not None and (cell.scene, cell.seed) in counted:
                 found.setdefault(cell.scene, {})[cell.seed] = value
         return found
-
-    def _units_differ(self, name: str, data_set: str | None) -> bool:
-        """Distances of several data sets: mm, m and world units have no mean."""
-        if name != "chamfer" or data_set is not None:
-            return False
-        return len({c.data_set for row in self.rows for c in row.cells if c.figures[name] is not None}) > 1
 
     def reasons(self, row: Row) -> dict[str, str]:
         """Why a figure has no mean."""
@@ -128,13 +144,30 @@ class Results:
         means, found = self.mean(row), {}
         for name in (n for n in FIGURES if means[n] is None):
             cell = next((c for c in row.cells if c.figures[name] is None), None)
-            if self._units_differ(name, None):
-                found[name] = "the data sets measure in different units: each has its own mean"
+            if len(kinds := self._kinds(name, None)) > 1 and name not in IMAGES:
+                found[name] = f"measured in different ways, which have no common mean: {'; '.join(sorted(kinds))}"
             elif cell is None:
                 found[name] = "no scene and seed that every row has"
             else:
                 found[name] = f"{cell.scene}, seed {cell.seed}: {cell.reasons.get(name, 'not measured')}"
         return found
+
+
+def measured_on(cell: Cell, metric: str) -> str:
+    """What figures must have in common to have a mean: the split of the views, the protocol and unit of surfaces."""
+    if metric in IMAGES:
+        return f"{cell.details.get('views', 'test')} views"
+    if metric not in ("fscore", "chamfer"):
+        return ""
+    surface = cell.details.get("surface") or {}
+    protocol = str(surface.get("evaluator", "visible-surface"))
+    if metric == "fscore":
+        return f"protocol {protocol}"
+    unit = str(surface.get("unit", "world units"))
+    if unit != "world units":
+        return f"protocol {protocol}, {unit}"
+    # every capture has world units of its own, but for those that one data set has in common
+    return f"protocol {protocol}, units of {cell.data_set if cell.data_set in DATA_SETS else cell.scene}"
 
 
 def by_seed(values: dict[str, dict[int, float]]) -> list[float]:

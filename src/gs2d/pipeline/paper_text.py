@@ -41,6 +41,11 @@ def rows_for(results: Results, *data_sets: str) -> list[Row]:
     return [row for row in results.rows if row.recipe is not None or any(row.paper.get(d) for d in data_sets)]
 
 
+def untrained(table: PaperTable, results: Results) -> dict[str, tuple[str, ...]]:
+    """The paper's data sets that nothing was trained on here, with its metrics."""
+    return {data_set: metrics for data_set, metrics in table.columns.items() if data_set not in results.data_sets}
+
+
 def measured(metric: str, results: Results, row: Row, data_set: str) -> str:
     """Mean, with the spread over seeds where there are several."""
     mean, spread = results.mean(row, data_set)[metric], results.spread(row, data_set)[metric]
@@ -98,6 +103,14 @@ def to_markdown(
                 cells.append(f"{text} {quoted}".strip() or "-")
             lines.append(f"| {row.name} | " + " | ".join(cells) + " |")
         lines.append("")
+    for data_set, metrics in untrained(table, results).items():
+        lines += [f"## The paper's figures on {data_set}", "", "| | " + " | ".join(TITLES[m] for m in metrics) + " |"]
+        lines.append("|---" * (len(metrics) + 1) + "|")
+        for name, known in ((row.name, row.paper.get(data_set)) for row in results.rows):
+            if known:
+                shown_ = [f"({printed(m, data_set, known[m])})" if m in known else "-" for m in metrics]
+                lines.append(f"| {name} | " + " | ".join(shown_) + " |")
+        lines.append("")
     lines += ["## Do the paper's orders hold?", ""]
     lines += [f"- **{v.holds}** ({v.data_set}): {v.text}. {verdict_text(v)}" for v in verdicts] or ["- nothing trained"]
     lines += ["", "## How this differs from the paper", "", *(f"- {text}" for text in deviations), ""]
@@ -119,6 +132,8 @@ def to_csv(results: Results) -> str:
                     [row.name, row.recipe or "", data_set, cell.scene, cell.seed, *figures, *[""] * len(paper)]
                 )
             figures = [_blank(value) for value in results.mean(row, data_set).values()]
+            if not row.of(data_set) and not any(paper):
+                continue  # another method, of which the paper has nothing here
             writer.writerow([row.name, row.recipe or "", data_set, "mean", "", *figures, *paper])
     return out.getvalue()
 
@@ -127,51 +142,54 @@ def _blank(value: float | None) -> float | str:
     return "" if value is None else value
 
 
-_TEX = str.maketrans({"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#"})
+_TEX = str.maketrans(
+    {
+        **{c: f"\\{c}" for c in "&%_#${}"},
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "±": r"$\pm$",
+    }
+)
 
 
 def to_latex(table: PaperTable, results: Results) -> str:
-    """A ``booktabs`` table: for each data set the measured figures, with the paper's in a small line below."""
+    """``booktabs`` tables in one float, one for each data set: the measured figures, the paper's in small print below.
+
+    Data sets that nothing was trained on follow with the paper's figures alone.
+    """
     groups = {data_set: columns_of(table, results, data_set) for data_set in results.data_sets}
-    spec = "l" + "".join("@{\\quad}" + "c" * len(columns) for columns in groups.values())
-    lines = [
-        "% \\usepackage{booktabs}",
-        "\\begin{table}",
-        "  \\centering",
-        f"  \\begin{{tabular}}{{{spec}}}",
-        "    \\toprule",
-    ]
-    head, rules, at = [], [], 2
+    groups |= {data_set: list(metrics) for data_set, metrics in untrained(table, results).items()}
+    lines = ["% \\usepackage{booktabs}", "\\begin{table}", "  \\centering"]
     for data_set, columns in groups.items():
-        head.append(f"\\multicolumn{{{len(columns)}}}{{c}}{{{data_set.translate(_TEX)}}}")
-        rules.append(f"\\cmidrule(lr){{{at}-{at + len(columns) - 1}}}")
-        at += len(columns)
+        lines += [*_latex_tabular(results, data_set, columns), "  \\par\\medskip"]
+    caption = f"{table.title}. In brackets: the figures of the paper.".translate(_TEX)
+    lines += [f"  \\caption{{{caption}}}", f"  \\label{{{table.label}-measured}}", "\\end{table}", ""]
+    return "\n".join(lines)
+
+
+def _latex_tabular(results: Results, data_set: str, columns: Sequence[str]) -> list[str]:
+    """The rows of one data set."""
     arrows = [
         TITLES[m] + ("" if m in ("bytes", "seconds") else r"$\downarrow$" if m in LOWER_IS_BETTER else r"$\uparrow$")
-        for columns in groups.values()
         for m in columns
     ]
-    lines += ["    & " + " & ".join(head) + r" \\", "    " + " ".join(rules), "    & " + " & ".join(arrows) + r" \\"]
+    lines = [f"  \\begin{{tabular}}{{l{'c' * len(columns)}}}", "    \\toprule"]
+    lines.append(f"    {data_set.translate(_TEX)} & " + " & ".join(arrows) + r" \\")
     lines.append("    \\midrule")
-    for row in rows_for(results, *groups):
-        ours, papers = [], []
-        for data_set, columns in groups.items():
-            for metric in columns:
-                text = measured(metric, results, row, data_set).replace("±", r"$\pm$").translate(_TEX)
-                bold = row.name in best_rows(metric, results, data_set)
-                ours.append(f"\\textbf{{{text}}}" if bold else text)
-                figure = row.paper.get(data_set, {}).get(metric)
-                papers.append("" if figure is None else f"\\footnotesize({printed(metric, data_set, figure)})")
-        if row.recipe is None:
+    best = {metric: best_rows(metric, results, data_set) for metric in columns}
+    for row in rows_for(results, data_set):
+        known = row.paper.get(data_set, {})
+        if not known and not row.of(data_set):
+            continue
+        papers = [f"\\footnotesize({printed(m, data_set, known[m])})" if m in known else "" for m in columns]
+        ours = [measured(metric, results, row, data_set).translate(_TEX) for metric in columns]
+        ours = [f"\\textbf{{{x}}}" if row.name in best[m] else x for m, x in zip(columns, ours, strict=True)]
+        if not row.of(data_set):
             ours, papers = [figure or "-" for figure in papers], []
         lines.append(f"    {row.name.translate(_TEX)} & " + " & ".join(ours) + r" \\")
         if any(papers):
             lines.append("     & " + " & ".join(papers) + r" \\")
-    caption = f"{table.title}. In brackets: the figures of the paper.".translate(_TEX)
-    lines += [
-        "    \\bottomrule",
-        "  \\end{tabular}",
-        f"  \\caption{{{caption}}}",
-        f"  \\label{{{table.label}-measured}}",
-    ]
-    return "\n".join([*lines, "\\end{table}", ""])
+    return [*lines, "    \\bottomrule", "  \\end{tabular}"]
