@@ -137,6 +137,41 @@ def test_resets_that_a_short_schedule_has_not_are_a_deviation() -> None:
     assert "captures without points start from 31,623 random ones, not from 100,000" in lines
 
 
+def test_pieces_that_captures_lack_are_deviations_and_those_without_cameras_are_named(tmp_path: Path) -> None:
+    for name in ("lego", "ship"):
+        write_capture(tmp_path / name, train=3, test=2, size=8)
+        (tmp_path / name / "transforms_val.json").write_text('{"camera_angle_x": 1, "frames": []}')
+    (tmp_path / "lego" / "test" / "r_1.png").unlink()
+    (tmp_path / "ship" / "transforms_train.json").unlink()
+    scenes = find_scenes(tmp_path)
+    assert [scene.name for scene in scenes] == ["lego"]
+    options = PaperOptions(table="modules", data=tmp_path, out=Path("out"))
+    lines = deviations_of(options, scenes, PAPER_TABLES["modules"], Results(()))
+    (photo,) = [line for line in lines if "r_1.png" in line]
+    assert photo.startswith(f"lego: {(tmp_path / 'lego' / 'test' / 'r_1.png').resolve()} is missing (for testing): get")
+    (ship,) = [line for line in lines if line.startswith("ship")]
+    assert ship.startswith(f"ship is not trained: {tmp_path / 'ship' / 'transforms_train.json'} is missing (for train")
+    with pytest.raises(
+        DataError, match=r"no scene 'ship' in .*; there is lego; ship: .*transforms_train\.json is miss"
+    ):
+        find_scenes(tmp_path, ("ship",))
+    with pytest.raises(
+        DataError, match=r"found none; .*transforms_train\.json is missing .* get it from nerf_synthetic"
+    ):
+        find_scenes(tmp_path / "ship")
+
+
+def test_what_the_official_scripts_do_otherwise_is_a_deviation(tmp_path: Path) -> None:
+    options = PaperOptions(table="k", data=tmp_path, out=Path("out"))
+    lines = deviations_of(options, (), PAPER_TABLES["k"], Results(()))
+    assert any(line.startswith("the rasterizer is gs2d's own") for line in lines)
+    assert not any(line.startswith("DTU") for line in lines)  # nothing of it is trained
+    write_capture(tmp_path / "lego", train=3, test=2, size=8)
+    scan = replace(find_scenes(tmp_path)[0], data_set=DTU)
+    lines = deviations_of(options, (scan,), PAPER_TABLES["k"], Results(()))
+    assert any(line.startswith("DTU: distortion has no weight") for line in lines)
+
+
 def test_another_weight_of_distortion_than_the_papers_is_a_deviation(tmp_path: Path) -> None:
     write_capture(tmp_path / "ball", train=2, test=1, size=8)
     options = PaperOptions(table="regularisation", data=tmp_path, out=tmp_path / "out")

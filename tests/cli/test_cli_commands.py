@@ -14,8 +14,10 @@ import pytest
 import gs2d
 from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare import prepare
 from gs2d.recipes import RECIPES
-from tiny import write_ball_mesh
+from tiny import write_ball_mesh, write_capture
 
 
 @pytest.mark.parametrize(
@@ -125,6 +127,25 @@ def test_asking_for_a_backend_that_is_not_here_is_one_line(
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--backend", "cuda"]) == 2
     assert "cuda" in one_line(capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_info_and_training_name_each_piece_that_a_scene_of_a_data_set_lacks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_capture(tmp_path / "lego", train=8, test=2, size=8)
+    gone = [scene / "train" / f"r_{i}.png" for i in range(5)]
+    for path in gone:
+        path.unlink()
+    assert run(["info", str(scene)]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("missing: ")]
+    assert [line.split(" is missing (for training): get it from nerf_synthetic.zip")[0] for line in lines] == [
+        f"missing: {path}" for path in gone
+    ]
+    notices: list[str] = []
+    prepare(TrainOptions(scene=scene, out=tmp_path / "run"), lambda e: notices.append(getattr(e, "text", "")))
+    told = [text for text in notices if " is missing (for training): get it from" in text]
+    assert [text.split(" is missing")[0] for text in told] == [str(path) for path in gone[:3]]
+    assert "... and 2 more pieces are missing; `gs2d info` lists them" in notices
 
 
 def test_info_describes_a_run_a_capture_and_a_ply(

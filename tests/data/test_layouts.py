@@ -13,7 +13,7 @@ from capture_writers import ColmapModel, ring, small_blender, small_colmap, smal
 from scipy.io import savemat
 
 from gs2d.data import detect_format, load_scene
-from gs2d.data.layouts import describe, find_scenes, find_truth, protocol_of, recognise
+from gs2d.data.layouts import describe, find_scenes, find_truth, missing_lines, protocol_of, recognise
 from gs2d.errors import DataError, ProtocolError
 from gs2d.protocols_datasets import DATASETS, get_dataset
 
@@ -171,6 +171,41 @@ def test_a_file_that_is_taken_away_is_named_in_one_line(tmp_path: Path, layout: 
     assert len(lines) == 1 or lists
     (scene,) = find_scenes(tmp_path, dataset) or (None,)
     assert scene is None or scene.lines() == lines
+    told = [line for line in missing_lines(root) if _names(line, Path(file).name)]  # what `gs2d train` says of it
+    unread = purpose or (layout == "mip-nerf-360" and "/images/" in file)
+    assert told == ([] if unread else [line])
+
+
+@pytest.mark.parametrize(
+    ("layout", "files"),
+    [
+        ("dtu-neus", ["cameras_sphere.npz"]),
+        ("tnt", ["sparse/0/cameras.bin"]),
+        ("nerf-synthetic", ["transforms_train.json"]),
+        ("mip-nerf-360", ["sparse/0/images.bin", "sparse/0/cameras.bin"]),
+    ],
+)
+def test_a_scene_of_a_data_set_without_its_cameras_says_where_to_get_them(
+    tmp_path: Path, layout: str, files: list[str]
+) -> None:
+    root = LAYOUTS[layout][2](tmp_path)
+    for file in files:
+        (root / file).unlink()
+    with pytest.raises(DataError, match="as a scene of a known data set: .* is missing .* get it from") as caught:
+        detect_format(root)
+    assert "\n" not in str(caught.value)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("")
+    with pytest.raises(DataError) as plain:
+        detect_format(tmp_path / "mine")
+    assert "known data set" not in str(plain.value)
+
+
+def test_the_folder_one_stands_in_is_recognised_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write_tnt(tmp_path)
+    monkeypatch.chdir(root)
+    assert recognise(Path()) == recognise(root)
+    assert recognise(root) is not None
 
 
 def _names(line: str, name: str) -> bool:

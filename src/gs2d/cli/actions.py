@@ -231,7 +231,8 @@ def info(command: c.Info, console: Console) -> None:
         raise DataError(f"expected a run folder, a capture or a PLY file at {path}, found nothing; check the path")
     facts = describe_capture(path) if path.is_dir() else describe_ply(path)
     for name, value in facts.items():
-        console.say(f"{name}: {value}")
+        for part in value if isinstance(value, list) else [value]:
+            console.say(f"{name}: {part}")
     console.result(facts)
 
 

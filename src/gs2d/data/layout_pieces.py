@@ -14,6 +14,7 @@ from gs2d.errors import DataError
 from gs2d.io.files import read_json
 
 TRAINING, TESTING, NOTHING = "for training", "for testing", "distributed, but not read by gs2d"
+FULL_SIZE = "for its folder, full size"  # photographs that are trained from a folder of smaller ones
 _DTU_2DGS = "get it from the preprocessed DTU of 2DGS (linked from github.com/hbb1/2d-gaussian-splatting)"
 _DTU_NEUS = "get it from the DTU scans of NeuS (data_DTU, linked from github.com/Totoro97/NeuS)"
 _PICTURES = {".png", ".jpg", ".jpeg"}
@@ -109,7 +110,7 @@ def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[Missi
     names = sorted(image.name for image in read_images(model, kind))
     last = tuple(folders)
     for folder in last:
-        purpose = TRAINING if folder == last[-1] else "for its folder, full size"
+        purpose = TRAINING if folder == last[-1] else FULL_SIZE
         missing += [Missing(root / folder / n, purpose, source) for n in names if not (root / folder / n).is_file()]
     return missing
 

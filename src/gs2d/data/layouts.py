@@ -6,12 +6,15 @@ and nothing is downloaded.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from gs2d.data.layout_pieces import (
+    FULL_SIZE,
+    NOTHING,
     TESTING,
     TRAINING,
     Missing,
@@ -135,6 +138,7 @@ def recognise(root: Path) -> tuple[DataSet, SceneFacts] | None:
     A COLMAP capture needs more than a name, for many have a garden or a truck: Tanks and Temples the camera log beside
     the photographs or an official file, Mip-NeRF 360 its ``poses_bounds.npy``.
     """
+    root = Path(os.path.abspath(root))  # "." has no name; a link keeps its own
     for dataset in DATASETS.values():
         for facts in dataset.scenes:
             if _is_scene(dataset, facts, root) and (dataset.name not in _BY_NAME or _is_proven(dataset, facts, root)):
@@ -157,6 +161,21 @@ def describe(dataset: DataSet, facts: SceneFacts, root: Path, *, truth: Path | N
     }[dataset.name]()
     found, lacking = find_truth(dataset, facts, root, truth)
     return SceneFolder(dataset, facts, root, found, (*pieces, *lacking))
+
+
+def missing_lines(root: Path) -> tuple[str, ...]:
+    """One line for each piece that gs2d reads of a capture of a known data set, and that is not there.
+
+    Empty for anyone else's capture, and for one whose lists are broken: reading it says so.
+    """
+    known = recognise(root)
+    if known is None:
+        return ()
+    try:
+        pieces = describe(*known, root).missing
+    except DataError:
+        return ()
+    return tuple(piece.line() for piece in pieces if piece.purpose not in (NOTHING, FULL_SIZE, SCORING))
 
 
 def find_truth(

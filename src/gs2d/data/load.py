@@ -8,6 +8,7 @@ from pathlib import Path
 from gs2d.data.capture import build_scene
 from gs2d.data.colmap import MODEL_FOLDERS, model_folder, read_colmap
 from gs2d.data.dtu import CAMERA_FILES, read_dtu
+from gs2d.data.layouts import missing_lines
 from gs2d.data.scene import Scene
 from gs2d.data.transforms import read_blender, read_nerfstudio
 from gs2d.errors import DataError
@@ -36,10 +37,12 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
     if not held:
         raise DataError(f"{root} must hold a capture, got an empty folder")
+    lacking = missing_lines(root)
+    hint = f"; as a scene of a known data set: {lacking[0]}" if lacking else ""
     raise DataError(
         f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
         f"(DTU), or cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP); "
-        f"got {', '.join(held[:8])}{' ...' if len(held) > 8 else ''}"
+        f"got {', '.join(held[:8])}{' ...' if len(held) > 8 else ''}{hint}"
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.data import detect_format, load_scene
+from gs2d.data.layouts import missing_lines
 from gs2d.io.ply import ply_kind, read_mesh, read_points, read_splats
 from gs2d.io.ply_format import read_ply
 
@@ -33,6 +34,8 @@ def describe_capture(path: Path) -> dict[str, Any]:
         facts["skipped"] = list(scene.skipped)
     if scene.notes:
         facts["notes"] = list(scene.notes)
+    if missing := missing_lines(path):
+        facts["missing"] = list(missing)
     return facts
 
 

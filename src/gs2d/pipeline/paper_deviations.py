@@ -10,7 +10,7 @@ from gs2d.images import image_size
 from gs2d.io.run import machine, versions
 from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
 from gs2d.pipeline.paper_rows import NOT_YET, Results, surface_metric
-from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes
+from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes, unreadable
 from gs2d.recipes import get_recipe
 from gs2d.schedule import scale_schedule
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gs2d.pipeline.paper import PaperOptions
 
 NERF_SYNTHETIC_SIZE = (800, 800)  # px
+SHOWN_PIECES = 5  # that a capture lacks
 EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by data set
 
 
@@ -38,7 +39,7 @@ def deviations_of(
             found.append(f"captures without points start from {points[1]:,} random ones, not from {points[0]:,}")
     found += _scenes(options, scenes, table)
     found += [f"changed in the recipes: {text}" for text in options.overrides]
-    found += _methods(table)
+    found += _methods(table, scenes)
     found += _weights(table, scenes)
     found += _missing_figures(results)
     if any(scene.data_set == NERF_SYNTHETIC and scene.scored for scene in scenes):
@@ -66,8 +67,17 @@ def opacity_resets(scale: float) -> int:
     return sum(stage.densify.resets(i, white=False) for i in range(1, stage.iterations + 1))
 
 
-def _methods(table: PaperTable) -> Iterator[str]:
-    """What the paper leaves open in the recipes of a table."""
+def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
+    """What the paper leaves open in the recipes of a table, and where gs2d knowingly does otherwise."""
+    yield (
+        "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
+        "the low-pass filter wins: docs/decisions.md, Rasterizer"
+    )
+    if any(scene.data_set == DTU for scene in scenes):
+        yield (
+            "DTU: distortion has no weight but where a row names one, as in the paper's Table 1 (the official DTU "
+            "script has 1000); image figures are of whole photographs, with their background (the paper does not say)"
+        )
     recipes = {row.recipe: get_recipe(row.recipe) for row in table.trained if row.recipe is not None}
     if any(len(recipe.stages) > 2 for recipe in recipes.values()):
         yield (
@@ -125,7 +135,12 @@ def _scenes(options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTab
         size = _size(scene)
         if scene.data_set == NERF_SYNTHETIC and size is not None and size != NERF_SYNTHETIC_SIZE:
             yield f"{scene.name}: photographs of {size[0]}x{size[1]} px, the data set has 800x800"
-        yield from (f"{scene.name}: {line}" for line in scene.missing)
+        yield from (f"{scene.name}: {line}" for line in scene.missing[:SHOWN_PIECES])
+        if len(scene.missing) > SHOWN_PIECES:
+            more = len(scene.missing) - SHOWN_PIECES
+            yield f"{scene.name}: {more} more pieces are missing; about.json names each"
+    if not options.scenes:
+        yield from (f"{name} is not trained: {line}" for name, line in unreadable(options.data).items())
 
 
 def _size(scene: FoundScene) -> tuple[int, int] | None:

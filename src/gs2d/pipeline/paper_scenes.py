@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.data import detect_format
-from gs2d.data.layouts import DEPTH, MESH_TRUTHS, SCORING, describe, find_truth, protocol_of, recognise, subfolders
-from gs2d.errors import DataError, Gs2dError
+from gs2d.data.layouts import DEPTH, MESH_TRUTHS, find_truth, missing_lines, protocol_of, recognise, subfolders
+from gs2d.errors import DataError
 from gs2d.paper_tables import DTU, NERF_SYNTHETIC, TNT
 from gs2d.protocols import Protocol, get_protocol
 from gs2d.protocols_datasets import DATASETS, DataSet, SceneFacts
@@ -40,7 +39,7 @@ class FoundScene:
     scored : bool
         Whether there is a ground truth.
     missing : tuple of str
-        One line for each piece of the ground truth that is not there, for scenes of known data sets.
+        One line for each piece of the capture, and of the ground truth, that a scene of a known data set lacks.
     """
 
     name: str
@@ -85,35 +84,63 @@ def find_scenes(
     if truths is not None and not truths.is_dir():
         raise DataError(f"--truth must be a folder of true surfaces, found none at {truths}")
     captures = dict(sorted(_captures(data, DEPTH).items()))
+    broken = unreadable(data)
     if not captures:
-        raise DataError(f"{data} must be a capture or hold captures (Blender, nerfstudio, DTU, COLMAP), found none")
+        why = f"; {'; '.join(broken.values())}" if broken else ""
+        raise DataError(
+            f"{data} must be a capture or hold captures (Blender, nerfstudio, DTU, COLMAP), found none{why}"
+        )
     if names:
-        captures = {name: captures[name] for name in dict.fromkeys(_match(want, captures, data) for want in names)}
+        chosen = dict.fromkeys(_match(want, captures, data, broken) for want in names)
+        captures = {name: captures[name] for name in chosen}
     return tuple(_look_at(name, path.resolve(), named, truths) for name, path in captures.items())
 
 
 def _captures(folder: Path, depth: int) -> dict[str, Path]:
     """Name -> folder of the captures at or below a folder; a capture's own folders are not searched."""
+    if _is_capture(folder):
+        return {folder.resolve().name: folder}
+    found: dict[str, Path] = {}
+    for inner in subfolders(folder) if depth else ():
+        for name, path in _captures(inner, depth - 1).items():
+            if name in found:
+                raise DataError(f"{found[name]} and {path} have the same name; give --data one of them")
+            found[name] = path
+    return found
+
+
+def unreadable(folder: Path, depth: int = DEPTH) -> dict[str, str]:
+    """Name -> what is missing first, of folders that are scenes of known data sets but have no cameras."""
+    if _is_capture(folder):
+        return {}
+    lines = missing_lines(folder)
+    found = {folder.resolve().name: lines[0]} if lines else {}
+    for inner in subfolders(folder) if depth else ():
+        found |= unreadable(inner, depth - 1)
+    return found
+
+
+def _is_capture(folder: Path) -> bool:
     try:
         detect_format(folder)
     except DataError:
-        found: dict[str, Path] = {}
-        for inner in subfolders(folder) if depth else ():
-            for name, path in _captures(inner, depth - 1).items():
-                if name in found:
-                    raise DataError(f"{found[name]} and {path} have the same name; give --data one of them") from None
-                found[name] = path
-        return found
-    return {folder.resolve().name: folder}
+        return False
+    return True
 
 
-def _match(want: str, captures: dict[str, Path], data: Path) -> str:
+def _match(want: str, captures: dict[str, Path], data: Path, broken: dict[str, str]) -> str:
     """The capture that a name means."""
-    close = [name for name in captures if name.lower() == want.lower()]
-    close = close or [name for name in captures if name.lower().endswith(f"_{want.lower()}")]
+    close = _named(want, list(captures))
     if len(close) != 1:
-        raise DataError(f"no scene {want!r} in {data}; there is {', '.join(captures)}")
+        why = "".join(f"; {name}: {broken[name]}" for name in _named(want, list(broken)))
+        raise DataError(f"no scene {want!r} in {data}; there is {', '.join(captures)}{why}")
     return close[0]
+
+
+def _named(want: str, names: Sequence[str]) -> list[str]:
+    """The names that are, or else end in, what is wanted."""
+    close = [name for name in names if name.lower() == want.lower()]
+    return close or [name for name in names if name.lower().endswith(f"_{want.lower()}")]
 
 
 def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None) -> FoundScene:
@@ -128,10 +155,9 @@ def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None)
         return FoundScene(name, path, kind, protocol, protocol.downscale, data_set, name, truth, truth is not None, ())
     dataset, facts = known
     truth, scored = _truth_of(dataset, facts, name, path, truths)
-    missing: tuple[str, ...] = ()
-    with contextlib.suppress(Gs2dError):  # a broken capture says so when it is trained
-        pieces = describe(dataset, facts, path, truth=truths).missing
-        missing = () if scored else tuple(piece.line() for piece in pieces if piece.purpose == SCORING)
+    missing = missing_lines(path)
+    if not scored:
+        missing += tuple(piece.line() for piece in find_truth(dataset, facts, path, truths)[1])
     place = (PAPER_NAMES[dataset.name], facts.name)
     downscale = facts.downscale if named is None else protocol.downscale
     return FoundScene(name, path, kind, protocol, downscale, *place, truth, scored, missing)

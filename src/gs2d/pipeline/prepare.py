@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
-from gs2d.data.layouts import protocol_of
+from gs2d.data.layouts import missing_lines, protocol_of
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
@@ -139,6 +139,7 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     if isinstance(named, str) and protocol is not protocol_for(scene_format):
         on_event(Notice(f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"))
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
+    _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
@@ -174,11 +175,17 @@ def read_scene(path: Path, scene_format: str, downscale: int, protocol: Protocol
     """Load a capture and tell what was decided or skipped."""
     test_every = None if scene_format == "blender" else protocol.test_every  # Blender captures bring their split
     scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every)
-    for text in (*scene.notes, *scene.skipped[:SHOWN_SKIPS]):
+    for text in scene.notes:
         on_event(Notice(text))
-    if len(scene.skipped) > SHOWN_SKIPS:
-        on_event(Notice(f"... and {len(scene.skipped) - SHOWN_SKIPS} more views skipped; `gs2d info` lists them"))
+    _say_some(scene.skipped, "views skipped", on_event)
     return scene
+
+
+def _say_some(lines: Sequence[str], what: str, on_event: OnEvent) -> None:
+    for line in lines[:SHOWN_SKIPS]:
+        on_event(Notice(line))
+    if len(lines) > SHOWN_SKIPS:
+        on_event(Notice(f"... and {len(lines) - SHOWN_SKIPS} more {what}; `gs2d info` lists them"))
 
 
 def scene_digest(scene: Scene, on_event: OnEvent) -> str:
