@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import shutil
@@ -17,8 +18,9 @@ from gs2d.images import read_image
 from gs2d.io.run import RunFolder, load_tensors
 from gs2d.pipeline.changes import SAMPLE, mean_changes, take_snapshot
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.figures import error_positions, map_limits, rank_run, write_figures
+from gs2d.pipeline.figures import coverage, error_positions, map_limits, rank_run, write_figures
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.paper_page import coverage_table
 from gs2d.pipeline.prepare import reload_job
 from gs2d.pipeline.train import train
 from gs2d.report_curves import Panel, compared, read_history
@@ -85,6 +87,23 @@ def test_a_comparison_has_a_line_for_each_run_and_leaves_out_what_no_run_has() -
     assert compared(histories, (Panel("mean_area", "Area"),)) is None
 
 
+def test_coverage_is_read_after_the_first_stage_and_at_the_end(tmp_path: Path) -> None:
+    steps = [("surface", 10, 0.3, 0.5), ("surface", 20, 0.2, 0.6), ("refine", 10, 0.1, 0.7), ("refine", 20, 0.4, 0.8)]
+    for name, stages in {"2DGS": ("surface",), "2DGS-R": ("surface", "refine")}.items():
+        run = RunFolder(tmp_path / name)
+        run.path.mkdir()
+        (run.path / "run.json").write_text("{}")
+        for stage, iteration, area, opacity in steps:
+            if stage in stages:
+                step = {"stage": stage, "iteration": iteration, "mean_area": area, "mean_opacity": opacity}
+                run.events.append_text(json.dumps({"kind": "step", **step}).encode() + b"\n")
+    found = coverage({name: tmp_path / name for name in ("2DGS", "2DGS-R")})
+    assert found == {"2DGS": (0.2, 0.6, 0.2, 0.6), "2DGS-R": (0.2, 0.6, 0.4, 0.8)}
+    text = "".join(coverage_table(found))
+    assert "<td>4.00e-01</td>" in text  # with and without NC they differ in the third digit
+    assert "<td>0.800</td>" in text
+
+
 def test_e_i_stands_on_a_logarithmic_scale_between_its_limits() -> None:
     positions = error_positions(torch.tensor([0.0, 1.0, 10.0, 100.0, 1e6], dtype=torch.float64), (1.0, 100.0))
     np.testing.assert_allclose(positions.numpy(), [0, 0, 0.5, 1, 1], atol=1e-12)
@@ -135,6 +154,32 @@ def test_the_ranking_is_that_of_training(runs: dict[str, Path]) -> None:
     assert torch.equal(ranking.worst, load_tensors(end)["state"]["groups"]["high_error"])
 
 
+def test_without_its_first_checkpoint_a_run_is_ranked_by_the_cache_then_by_what_it_knows(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    """As a run whose first two stages were in the cache: it has no checkpoint of the end of stage 1 of its own."""
+    run = RunFolder(tmp_path / "run")
+    shutil.copytree(runs["2DGS-R (ours)"], run.path)
+    job = reload_job(run, lambda _event: None)
+    first, second, _ = (c.path for c in run.checkpoints() if c.iteration is None)
+    trained = load_tensors(second)["state"]["groups"]["high_error"]
+    first.unlink()
+    ranking = rank_run(run, job)
+    assert ranking.when == "after surface"
+    assert torch.equal(ranking.worst, trained)
+    forget_the_cache(run)
+    ranking = rank_run(run, job)
+    assert ranking.when == "after appearance"
+    assert torch.equal(ranking.worst, trained)  # not ranked again: the colours of just these splats have changed
+    second.unlink()
+    assert rank_run(run, job).when == "final splats"
+
+
+def forget_the_cache(run: RunFolder) -> None:
+    metrics = run.metrics()
+    run.write_metrics({**metrics, "stages": [{**s, "reused_from": "gone.pt"} for s in metrics["stages"]]})
+
+
 def test_figures_without_data_are_left_out_and_named(runs: dict[str, Path], tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(runs["2DGS-R (ours)"], run)
@@ -142,6 +187,7 @@ def test_figures_without_data_are_left_out_and_named(runs: dict[str, Path], tmp_
     (run / "events.jsonl").write_text("".join(kept))
     (run / "splats.ply").unlink()
     shutil.rmtree(run / "checkpoints")
+    forget_the_cache(RunFolder(run))
     notices: list[str] = []
 
     def listen(event: Event) -> None:

@@ -20,6 +20,7 @@ from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.jobs import finished_splats
 from gs2d.pipeline.pictures import choose_views, render_view, share_of_group, splatted
 from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.restart import stage_end
 from gs2d.recipe import RankByError, Recipe
 from gs2d.recipe_json import from_json
 from gs2d.render.api import splat_errors
@@ -40,6 +41,7 @@ CHANGES = (
     Panel("change/sh", "SHs: change an iteration, norm of all coefficients", log=True, smooth=True),
 )
 MAP_PERCENTILES = (50.0, 99.9)  # of E_i: the ends of the colour scale, which is logarithmic
+SMALLEST_TOP = 0.01  # of a pixel: less than this is not worth a colour
 DEFAULT_RANK = RankByError()  # of runs whose recipe ranks nothing
 
 
@@ -108,6 +110,30 @@ def write_figures(
     return tuple(files)
 
 
+def coverage(runs: Mapping[str, Path]) -> dict[str, tuple[float, ...]]:
+    """Mean K_a and opacity of each run after its first stage, then both at its end: the numbers of the paper's figure.
+
+    Runs whose log does not hold them are left out.
+
+    Raises
+    ------
+    RunError
+    """
+    found = {}
+    for label, path in runs.items():
+        history = read_history(open_run(path).events.read())
+        if {"mean_area", "mean_opacity"} <= history.series.keys():
+            ends = (history.stages[0].stop, history.stages[-1].stop)
+            names = ("mean_area", "mean_opacity")
+            found[label] = tuple(_value_at(*history.series[name], end) for end in ends for name in names)
+    return found
+
+
+def _value_at(iterations: np.ndarray, values: np.ndarray, end: int) -> float:
+    """The last value that was logged up to an iteration."""
+    return float(values[max(0, int((iterations <= end).sum()) - 1)])
+
+
 def _ranks(run: RunFolder) -> bool:
     stages = from_json(run.definition()["recipe"]).stages
     return any(isinstance(action, RankByError) for stage in stages for action in stage.on_enter)
@@ -121,7 +147,8 @@ class Ranking:
     Attributes
     ----------
     splats : Splats
-        As they were when the recipe ranked them, if that checkpoint is still there; else the final ones.
+        As they were when the recipe ranked them, if that checkpoint is still there (in the run, or where the stage was
+        taken from); else after the stage that they were ranked for; else the final ones.
     errors : Tensor [N] float64
         E_i over all training views.
     worst : Tensor [N] bool
@@ -145,12 +172,7 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
         The run is not finished, or its checkpoint is broken.
     """
     index, action = _first_ranking(job.recipe)
-    ends = {c.stage_index: c.path for c in run.checkpoints() if c.iteration is None}
-    if index - 1 in ends:
-        splats = TrainState.from_state_dict(load_tensors(ends[index - 1])["state"]).splats
-        when = f"after {job.recipe.stages[index - 1].name}"
-    else:
-        splats, when = finished_splats(run), "final splats"
+    splats, group, when = _ranked(run, job, index, action)
     splats = splats.to(job.backend.device)
     total = torch.zeros(len(splats), dtype=torch.float64, device=splats.device)
     views = job.scene.train
@@ -167,9 +189,23 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
             occlusion=action.occlusion,
         )
         total += errors
-    group = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
-    group[worst(total, action.top_percent)] = True
-    return Ranking(splats, total, group, when)
+    if group is None:
+        group = torch.zeros(len(splats), dtype=torch.bool)
+        group[worst(total, action.top_percent).cpu()] = True
+    return Ranking(splats, total, group.to(splats.device), when)
+
+
+def _ranked(run: RunFolder, job: Job, index: int, action: RankByError) -> tuple[Splats, Tensor | None, str]:
+    """The splats nearest to those that stage ``index`` ranked, the group that it found if they know it, and when."""
+    stages = job.recipe.stages
+    before = stage_end(run, job, index - 1) if index else None
+    if before is not None:
+        return before.splats, None, f"after {stages[index - 1].name}"
+    own = [c.path for c in run.checkpoints() if (c.stage_index, c.iteration) == (index, None)]
+    if own and stages[index].on_enter == (action,):  # nothing was cloned since: the same splats in the same places
+        state = TrainState.from_state_dict(load_tensors(own[0])["state"])
+        return state.splats, state.groups.get(action.writes), f"after {stages[index].name}"
+    return finished_splats(run), None, "final splats"
 
 
 def _first_ranking(recipe: Recipe) -> tuple[int, RankByError]:
@@ -218,18 +254,20 @@ def draw_error_maps(
     ranking = rank_run(run, job, on_event)
     limits = map_limits(ranking.errors)
     positions = error_positions(ranking.errors, limits)
+    shown = choose_views(job.scene, views)
+    shares = [share_of_group(ranking.splats, ranking.worst, v, job.settings, job.backend) for _, v in shown]
+    top = max(SMALLEST_TOP, *(float(np.percentile(share, 99.9)) for share in shares))  # these splats are often faint
     rows: list[tuple[str, list[np.ndarray]]] = []
-    for split, view in choose_views(job.scene, views):
+    for (split, view), share in zip(shown, shares, strict=True):
         output = render_view(ranking.splats, view, job.settings, job.backend)
         color, alpha = np.clip(output.color.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
         photo = view.target(job.settings.background)
-        share = share_of_group(ranking.splats, ranking.worst, view, job.settings, job.backend)
         pictures = [
             photo,
             color,
             error_picture(color, photo, view.mask()),
             map_picture(ranking.splats, positions, view, job, alpha),
-            highlight_picture(color, share),
+            highlight_picture(color, np.clip(share / top, 0, 1)),
         ]
         rows.append((f"{Path(view.name).stem} ({split})", pictures))
     count = int(ranking.worst.sum())
@@ -238,7 +276,7 @@ def draw_error_maps(
         f"{title}: $E_i$ {ranking.when}; {count:,} of {len(ranking.splats):,} splats are high-error, "
         f"with {share_of_all:.0%} of the sum"
     )
-    _write_grid(path, rows, head, limits)
+    _write_grid(path, rows, head, limits, top)
 
 
 COLUMNS = (
@@ -246,14 +284,14 @@ COLUMNS = (
     "rendering",
     f"error of the pixel, 0 to {ERROR_TOP}",
     "$E_i$ of the splats",
-    "high-error splats",
+    "high-error splats, full at {top:.0%} of a pixel",
 )
 
 
 def _write_grid(
-    path: Path, rows: Sequence[tuple[str, Sequence[np.ndarray]]], head: str, limits: tuple[float, float]
+    path: Path, rows: Sequence[tuple[str, Sequence[np.ndarray]]], head: str, limits: tuple[float, float], top: float
 ) -> None:
-    """Pictures in rows under their names, with the scale of E_i."""
+    """Pictures in rows under their names, with the scale of E_i; high-error splats have full colour at ``top``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, LogNorm
@@ -271,7 +309,7 @@ def _write_grid(
             axes.set_yticks([])
             axes.spines[:].set_visible(False)
             if i == 0:
-                axes.set_title(COLUMNS[j], fontsize=8)
+                axes.set_title(COLUMNS[j].format(top=top), fontsize=8)
             if j == 0:
                 axes.set_ylabel(name, fontsize=7)
     scale = ScalarMappable(LogNorm(*limits), ListedColormap(error_scale(256)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +216,7 @@ def _picture(path: Path, alt: str) -> str:
 
 def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[str]:
     """The paper's figures (K_a and opacity, traces of the attributes, a map of E_i), a set for each scene."""
-    from gs2d.pipeline.figures import write_figures  # loads torch
+    from gs2d.pipeline.figures import coverage, write_figures  # loads torch
 
     rows = [row for row in results.rows if row.recipe is not None]
     sections: list[str] = []
@@ -227,10 +227,24 @@ def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[str]:
         maps = [name for name in runs if _ranks(name, rows)][-1:]  # they need the photographs: one is enough
         try:
             drawn = [_drawing(path) for path in write_figures(runs, out / "figures" / scene, on_event, maps=maps)]
+            drawn += coverage_table(coverage(runs))
         except Gs2dError as error:
             drawn = [missing(str(error))]
         sections += [f"<h3>{escape(scene)}</h3>", '<div class="figures">', *drawn, "</div>"] if drawn else []
     return ["<h2>How the splats change in training</h2>", *sections] if sections else []
+
+
+def coverage_table(means: Mapping[str, Sequence[float]]) -> list[str]:
+    """Mean K_a and opacity of each row after stage 1, and both at the end."""
+    if not means:
+        return []
+    rows = [
+        [escape(name), *(f"{v:{form}}" for v, form in zip(values, (".2e", ".3f", ".2e", ".3f"), strict=True))]
+        for name, values in means.items()
+    ]
+    heads = ["", "K_a after stage 1", "opacity", "K_a at the end", "opacity"]
+    note = "Means over all splats; the paper's figure compares 2DGS with and without NC after 30k iterations."
+    return [f'<div>{table(heads, rows)}<p class="soft">{escape(note)}</p></div>']
 
 
 def _ranks(name: str, rows: Sequence[Row]) -> bool:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
-from gs2d.io.run import RunFolder, load_tensors, make_folder, open_run, save_tensors
+from gs2d.io.run import RunFolder, is_run, load_tensors, make_folder, open_run, save_tensors
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.prepare import Job
@@ -144,6 +145,34 @@ def _from_cache(job: Job, folder: Path) -> FinishedStage | None:
             if payload["key"] == key:
                 metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
                 return FinishedStage(index, payload, metrics, log, str(path))
+    return None
+
+
+def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
+    """The state at the end of a stage: the run's own checkpoint, or that of the run or cache the stage was taken from.
+
+    None where neither is there any more.
+
+    Raises
+    ------
+    RunError
+        The run's own checkpoint is broken.
+    """
+    for checkpoint in run.checkpoints():
+        if (checkpoint.stage_index, checkpoint.iteration) == (index, None):
+            return TrainState.from_state_dict(load_tensors(checkpoint.path)["state"])
+    stages = run.metrics()["stages"]
+    source = Path(stages[index].get("reused_from") or "") if len(stages) > index else Path()
+    key = job.stage_key(index)
+    paths = [_cache_file(source.parent, key)] if source.suffix == ".pt" else []
+    if is_run(source):
+        ends = RunFolder(source).checkpoints()
+        paths = [c.path for c in ends if (c.stage_index, c.iteration) == (index, None)]
+    for path in paths:
+        with contextlib.suppress(RunError):  # somebody else's: gone or broken, it is not there
+            payload = load_tensors(path)
+            if payload["key"] == key:
+                return TrainState.from_state_dict(payload["state"])
     return None
 
 
