@@ -154,14 +154,16 @@ def _size(scene: FoundScene) -> tuple[int, int] | None:
 
 def _missing_figures(results: Results) -> list[str]:
     """Runs that failed or are not there yet, and figures that nothing has."""
-    found, waiting = [], 0
+    found: list[str] = []
+    waiting, failed = 0, dict[tuple[str, str], list[str]]()
     for row in results.rows:
         for cell in row.cells:
             if cell.figures["bytes"] is None:
                 if cell.reasons["bytes"] in NOT_YET:
                     waiting += 1
                 else:
-                    found.append(f"{row.name}, {cell.scene}, seed {cell.seed}: failed ({cell.reasons['bytes']})")
+                    failed.setdefault((cell.scene, cell.reasons["bytes"]), []).append(f"{row.name} (seed {cell.seed})")
+    found += [f"{scene}: failed for {', '.join(runs)}: {why}" for (scene, why), runs in failed.items()]
     if waiting:
         found.append(f"{waiting} runs are not finished yet")
     for data_set in results.data_sets:
