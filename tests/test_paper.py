@@ -329,6 +329,8 @@ def test_the_page_shows_figures_pictures_and_orders_and_needs_nothing_else(finis
     assert page.count("data:image/jpeg") >= 1 + 3 * 4  # a photograph, and colour, normals and error of four rows
     assert "PSNR I &lt; IV &lt; II &lt; III" in page
     assert "24.89" in page  # the paper's
+    assert "<summary>Protocol nerf-synthetic</summary>" in page
+    assert "2DGS scripts/nerf_eval.py: --white_background" in page
     assert "r_1.png" in page
     assert "http" not in page
     labels = base64.b64encode(b"['(I)', '(II)', '(III)', '(IV)'] ['(IV)']").decode()

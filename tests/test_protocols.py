@@ -18,7 +18,7 @@ from gs2d.protocols_datasets import (
     SceneFacts,
     get_dataset,
 )
-from gs2d.protocols_sources import SOURCES, source
+from gs2d.protocols_sources import SOURCES, source, stated
 from gs2d.protocols_surface import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE, DtuSurface, TntSurface, VisibleSurface
 from gs2d.recipe import LossTerm
 from gs2d.recipes import get_recipe
@@ -194,3 +194,15 @@ def test_sources_that_do_not_exist_say_which_do() -> None:
         source("x", "near")
     with pytest.raises(ProtocolError, match="no field 'far' in protocol dtu"):
         source("dtu", "far")
+
+
+def test_every_number_is_stated_with_its_source() -> None:
+    rows = {number.field: number for number in stated(PROTOCOLS["dtu"])}
+    assert sorted(rows) == sorted(set(SOURCES["dtu"]) - {"name"})
+    assert (rows["fusion.voxel"].value, rows["fusion.voxel"].source) == ("0.004", "2DGS scripts/dtu_eval.py")
+    assert {n.field: n.value for n in stated(PROTOCOLS["generic"])}["near"] == "from the scene"
+    stages = next(number for number in stated(TNT_SURFACE) if number.field == "stages")
+    assert stages.value.startswith("voxel 1.0, threshold 80.0, iterations 30; voxel 0.5, ")
+    assert stages.value.endswith("voxel none, threshold 2.0, iterations 30")
+    assert len(stated(DTU_SURFACE)) == len(fields(DtuSurface))
+    assert len(stated(VISIBLE_SURFACE)) == len(fields(VisibleSurface))

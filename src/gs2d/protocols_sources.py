@@ -1,15 +1,20 @@
 """Where every number of every protocol comes from, by the name of its field.
 
 ``source(protocol, field)`` answers for each field of ``Protocol`` (those of its parts as ``fusion.voxel``), of the
-surface protocols and of the scenes' facts. Pure Python; never imports torch.
+surface protocols and of the scenes' facts; ``stated(protocol)`` lists them all with their values. Pure Python; never
+imports torch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from types import MappingProxyType
+from typing import Any
 
 from gs2d.errors import ProtocolError
+from gs2d.protocols import Protocol
+from gs2d.protocols_surface import DtuSurface, TntSurface, VisibleSurface
 
 _CODE, _2DGS = "the official 2DGS code", "the 2DGS paper"
 _PAPER, _OURS = "the 2DGS-R paper", "gs2d (docs/decisions.md)"
@@ -122,3 +127,38 @@ def source(protocol: str, field: str) -> str:
     if field not in SOURCES[protocol]:
         raise ProtocolError(f"no field {field!r} in protocol {protocol}; there is {', '.join(SOURCES[protocol])}")
     return SOURCES[protocol][field]
+
+
+@dataclass(frozen=True)
+class Stated:
+    """A number of a protocol: the name of its field, its value in words, where it comes from."""
+
+    field: str
+    value: str
+    source: str
+
+
+def stated(protocol: Protocol | TntSurface | DtuSurface | VisibleSurface) -> tuple[Stated, ...]:
+    """Every number of a protocol, or of a surface protocol, with its source."""
+    surfaces = {TntSurface: "surface: tnt", DtuSurface: "surface: dtu", VisibleSurface: "surface: visible"}
+    name = protocol.name if isinstance(protocol, Protocol) else surfaces[type(protocol)]
+    values = _flat(protocol)
+    values.pop("name", None)
+    return tuple(Stated(field, _words(value), source(name, field)) for field, value in values.items())
+
+
+def _flat(value: Any, where: str = "") -> dict[str, Any]:
+    """Fields of a dataclass, those of its parts with a dot."""
+    found: dict[str, Any] = {}
+    for field in fields(value):
+        inner = getattr(value, field.name)
+        found |= _flat(inner, f"{where}{field.name}.") if is_dataclass(inner) else {where + field.name: inner}
+    return found
+
+
+def _words(value: Any) -> str:
+    if value is None:
+        return "from the scene"
+    if is_dataclass(value):
+        return ", ".join(f"{name} {'none' if inner is None else inner}" for name, inner in _flat(value).items())
+    return "; ".join(map(_words, value)) if isinstance(value, tuple) else str(value)

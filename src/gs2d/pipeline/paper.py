@@ -13,7 +13,7 @@ from gs2d.disk import atomic_write
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.files import read_json, write_json
 from gs2d.io.run import machine, make_folder, versions
-from gs2d.paper_tables import PAPER_TABLES, PaperTable
+from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, PaperTable
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.paper_commands import commands_of, paper_command
@@ -24,6 +24,9 @@ from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
 from gs2d.pipeline.paper_text import to_csv, to_latex, to_markdown
 from gs2d.pipeline.sweep import Sweep, SweepJob, stage_keys
 from gs2d.pipeline.sweep_slots import run_sweep
+from gs2d.protocols import Protocol
+from gs2d.protocols_sources import stated
+from gs2d.protocols_surface import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE, DtuSurface, TntSurface, VisibleSurface
 from gs2d.recipe import Recipe, validate
 from gs2d.recipe_json import apply_overrides, to_json
 from gs2d.recipes import RECIPES, get_recipe
@@ -358,6 +361,7 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
         "options": _defining(options),
         "data": str(options.data),
         "scenes": {scene.name: {"data_set": scene.data_set, **_scene_facts(scene)} for scene in plan.scenes},
+        "protocols": {name: [asdict(number) for number in stated(p)] for name, p in _protocols(plan).items()},
         "seeds": list(options.seeds),
         "spread": "standard deviation over seeds of the mean over scenes",
         "orders": [verdict.to_json() for verdict in verdicts],
@@ -367,6 +371,17 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
         "machine": machine(),
         "written": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
+
+
+def _protocols(plan: Plan) -> dict[str, Protocol | DtuSurface | TntSurface | VisibleSurface]:
+    """The protocols of the scenes, and those that surfaces are scored by."""
+    found: dict[str, Any] = {scene.protocol.name: scene.protocol for scene in plan.scenes}
+    surfaces = {DTU: ("surface: dtu", DTU_SURFACE), TNT: ("surface: tnt", TNT_SURFACE)}
+    for scene in plan.scenes:
+        if scene.scored:
+            name, protocol = surfaces.get(scene.data_set, ("surface: visible", VISIBLE_SURFACE))
+            found[name] = protocol
+    return found
 
 
 def _scene_facts(scene: FoundScene) -> dict[str, Any]:

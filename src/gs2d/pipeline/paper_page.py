@@ -320,7 +320,12 @@ def made_with(about: dict[str, Any], commands: Sequence[str]) -> str:
         ("written", about["written"]),
     ]
     lines = "\n".join([about["command"], "", "# which does, run by run:", *commands])
-    return facts(pairs) + f"<details><summary>Commands</summary><pre>{escape(lines)}</pre></details>"
+    folded = [f"<details><summary>Commands</summary><pre>{escape(lines)}</pre></details>"]
+    for name, numbers in about.get("protocols", {}).items():
+        rows = [[escape(number[key]) for key in ("field", "value", "source")] for number in numbers]
+        numbered = table(["", "value", "where it comes from"], rows, texts=(0, 1, 2))
+        folded.append(f"<details><summary>Protocol {escape(name)}</summary>{numbered}</details>")
+    return facts(pairs) + "".join(folded)
 
 
 def _list(lines: Sequence[str]) -> str:
