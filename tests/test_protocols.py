@@ -200,7 +200,8 @@ def test_every_number_is_stated_with_its_source() -> None:
     rows = {number.field: number for number in stated(PROTOCOLS["dtu"])}
     assert sorted(rows) == sorted(set(SOURCES["dtu"]) - {"name"})
     assert (rows["fusion.voxel"].value, rows["fusion.voxel"].source) == ("0.004", "2DGS scripts/dtu_eval.py")
-    assert {n.field: n.value for n in stated(PROTOCOLS["generic"])}["near"] == "from the scene"
+    generic = {number.field: number.value for number in stated(PROTOCOLS["generic"])}
+    assert (generic["near"], generic["fusion.depth"]) == ("from the scene", "that of the losses")
     stages = next(number for number in stated(TNT_SURFACE) if number.field == "stages")
     assert stages.value.startswith("voxel 1.0, threshold 80.0, iterations 30; voxel 0.5, ")
     assert stages.value.endswith("voxel none, threshold 2.0, iterations 30")

@@ -144,6 +144,8 @@ def stated(protocol: Protocol | TntSurface | DtuSurface | VisibleSurface) -> tup
     name = protocol.name if isinstance(protocol, Protocol) else surfaces[type(protocol)]
     values = _flat(protocol)
     values.pop("name", None)
+    if values.get("fusion.depth", "") is None:
+        values["fusion.depth"] = "that of the losses"
     return tuple(Stated(field, _words(value), source(name, field)) for field, value in values.items())
 
 
