@@ -123,6 +123,13 @@ def test_a_score_that_its_own_check_does_not_believe_is_a_deviation() -> None:
     assert any("Barn: its surface is scored by this project's visible-surface protocol" in line for line in lines)
     assert any("the paper prints no thresholds of AbsGS-A" in line for line in lines)
     assert any("2 runs shared the machine" in line for line in lines)
+    frame = (
+        "the capture is not in the frame of Truck_COLMAP_SfM.log (as Truck of TNT_GOF): it was aligned by its cameras"
+    )
+    good = {**details, "surface": {"evaluator": "tnt", "self_check": {"ok": True, "messages": [frame]}}}
+    truck = replace(cell, scene="Truck", details=good)
+    lines = deviations_of(options, (), table, Results((make_row("a", make_cell("Truck"), truck), make_row("b", truck))))
+    assert lines.count(f"Truck: {frame}") == 1
     plain = deviations_of(options, (), PAPER_TABLES["regularisation"], Results((make_row("row", cell),)))
     assert not any("E_i" in line or "AbsGS" in line for line in plain)  # one stage: nothing was left open
 

@@ -101,8 +101,9 @@ def _weights(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
 
 
 def _surfaces(results: Results) -> Iterator[str]:
-    """Surfaces that were not scored as the paper's were, and scores that their own check does not believe."""
+    """Surfaces not scored as the paper's were, what was odd, and scores that their own check does not believe."""
     doubts: dict[tuple[str, str], list[str]] = {}
+    odd: dict[str, Sequence[str]] = {}  # of each scene once: its rows differ in a digit of it
     for row in results.rows:
         for cell in row.cells:
             surface = cell.details.get("surface") or {}
@@ -113,9 +114,13 @@ def _surfaces(results: Results) -> Iterator[str]:
                     f"{cell.data_set}; do not compare it with the paper's"
                 )
             check = surface.get("self_check") or {"ok": True}
+            messages = check.get("messages") or ()
+            if check["ok"] and messages:
+                odd.setdefault(cell.scene, messages)
             if not check["ok"]:
-                why = "; ".join(check.get("messages", ())) or surface.get("reason") or "no reason given"
+                why = "; ".join(messages) or surface.get("reason") or "no reason given"
                 doubts.setdefault((cell.scene, why), []).append(f"{row.name} (seed {cell.seed})")
+    yield from (f"{scene}: {message}" for scene, messages in odd.items() for message in messages)
     for (scene, why), runs in doubts.items():
         yield f"{scene}: do not believe the surface scores of {', '.join(runs)}: {why}"
 
