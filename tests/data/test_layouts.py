@@ -15,6 +15,7 @@ from scipy.io import savemat
 from gs2d.data import detect_format, load_scene
 from gs2d.data.layouts import describe, find_scenes, find_truth, missing_lines, protocol_of, recognise
 from gs2d.errors import DataError, ProtocolError
+from gs2d.pipeline.paper_scenes import find_scenes as find_captures
 from gs2d.protocols_datasets import DATASETS, get_dataset
 
 
@@ -237,6 +238,18 @@ def test_the_ground_truth_may_be_given(tmp_path: Path) -> None:
     found, missing = find_truth(dataset, facts, root)
     assert found == {}  # the log beside the photographs is not a ground truth
     assert len(missing) == 4
+
+
+def test_a_ground_truth_that_is_given_tells_whose_capture_it_is(tmp_path: Path) -> None:
+    root = write_tnt(tmp_path)
+    (root / "Barn_COLMAP_SfM.log").unlink()
+    given = tmp_path / "far/away/GT"
+    shutil.move(tmp_path / "TNT_GT", given)
+    assert recognise(root) is None  # anybody's barn
+    assert recognise(root, given) == (DATASETS["tnt"], DATASETS["tnt"].scene("Barn"))
+    assert (protocol_of(root, "colmap").name, protocol_of(root, "colmap", given).name) == ("generic", "tnt")
+    (scene,) = find_captures(root, truths=given)
+    assert (scene.data_set, scene.scored, scene.protocol.name) == ("TnT", True, "tnt")
 
 
 def test_a_scan_outside_the_tables_is_recognised_by_its_number(tmp_path: Path) -> None:

@@ -132,16 +132,23 @@ def find_scenes(
     return tuple(found)
 
 
-def recognise(root: Path) -> tuple[DataSet, SceneFacts] | None:
+def recognise(root: Path, truth: Path | None = None) -> tuple[DataSet, SceneFacts] | None:
     """The data set and scene that a capture's folder is, by its name and its files; None for anyone else's.
 
     A COLMAP capture needs more than a name, for many have a garden or a truck: Tanks and Temples the camera log beside
     the photographs or an official file, Mip-NeRF 360 its ``poses_bounds.npy``.
+
+    Parameters
+    ----------
+    truth : Path, optional
+        Folder in which official files are looked for; None: beside the capture.
     """
     root = Path(os.path.abspath(root))  # "." has no name; a link keeps its own
     for dataset in DATASETS.values():
         for facts in dataset.scenes:
-            if _is_scene(dataset, facts, root) and (dataset.name not in _BY_NAME or _is_proven(dataset, facts, root)):
+            if _is_scene(dataset, facts, root) and (
+                dataset.name not in _BY_NAME or _is_proven(dataset, facts, root, truth)
+            ):
                 return dataset, facts
     scan = re.search(r"scan_?(\d+)$", root.name.lower())
     if scan and has_dtu_cameras(root):  # one of the scans that are not in the tables
@@ -225,7 +232,7 @@ def find_truth(
     return found, lacking
 
 
-def protocol_of(root: Path, scene_format: str) -> Protocol:
+def protocol_of(root: Path, scene_format: str, truth: Path | None = None) -> Protocol:
     """What ``--protocol auto`` takes: the scene's of a known data set, else that of the format of the capture.
 
     Raises
@@ -233,7 +240,7 @@ def protocol_of(root: Path, scene_format: str) -> Protocol:
     ProtocolError
         Unknown format.
     """
-    known = recognise(root)
+    known = recognise(root, truth)
     if known is None or (known[0].name in _BY_NAME) != (scene_format == "colmap"):
         return protocol_for(scene_format)
     return get_protocol(known[1].protocol)
@@ -288,12 +295,12 @@ def _is_scene(dataset: DataSet, facts: SceneFacts, root: Path) -> bool:
     return dataset is not MIP_NERF_360_SCENES or (root / "poses_bounds.npy").is_file() or (root / facts.images).is_dir()
 
 
-def _is_proven(dataset: DataSet, facts: SceneFacts, root: Path) -> bool:
+def _is_proven(dataset: DataSet, facts: SceneFacts, root: Path, truth: Path | None) -> bool:
     """Whether a folder of the right name is that scene of a data set of COLMAP models."""
     if root.name.lower() != facts.name.lower():
         return False
     if dataset is TNT_SCENES:
-        return published_log(root, facts.name).is_file() or bool(find_truth(dataset, facts, root)[0])
+        return published_log(root, facts.name).is_file() or bool(find_truth(dataset, facts, root, truth)[0])
     return (root / "poses_bounds.npy").is_file()
 
 

@@ -145,8 +145,8 @@ def _named(want: str, names: Sequence[str]) -> list[str]:
 
 def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None) -> FoundScene:
     kind = detect_format(path)
-    protocol = named or protocol_of(path, kind)
-    known = recognise(path)
+    protocol = named or protocol_of(path, kind, truths)
+    known = recognise(path, truths)
     if known is not None and protocol.name not in {scene.protocol for scene in known[0].scenes}:
         known = None  # a capture that only happens to have the name of a scene, or is treated as something else
     if known is None:

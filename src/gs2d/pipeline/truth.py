@@ -97,7 +97,7 @@ def choose_truth(given: Path | None, root: Path, on_event: OnEvent) -> Truth | O
     DataError
         A folder was given, and it does not hold the official ground truth of this scene; names each missing file.
     """
-    known = recognise(root)
+    known = recognise(root, given)
     if known is not None and known[0].evaluator in ("dtu", "tnt"):
         dataset, facts = known
         files, missing = find_truth(dataset, facts, root, given)
