@@ -191,6 +191,14 @@ def test_targets_that_do_not_fit_in_memory_are_made_anew_with_the_same_result(sc
         assert same(train(scene, Recipe("r", (stage,)), backend=backend, target_bytes=limit)[0].splats, kept)
 
 
+@pytest.mark.parametrize("extent", [1e-6, 5.0, 1000.0, 3e6])
+def test_near_lies_before_far_in_scenes_of_any_size(extent: float) -> None:
+    settings = raster_settings(GENERIC, extent, 3)
+    assert settings.near == pytest.approx(0.01 * extent)
+    # 100, or 500 times near, which 0.2 and 100 are: from an extent of 20 on
+    assert settings.far == pytest.approx(max(100.0, 5.0 * extent))
+
+
 def test_the_protocol_sets_near_background_and_open_losses(scene: Scene) -> None:
     settings = raster_settings(NERF_SYNTHETIC, 5.0, 2)
     assert (settings.near, settings.background, settings.sh_degree) == (0.2, (1.0, 1.0, 1.0), 2)

@@ -26,7 +26,10 @@ from gs2d.train.targets import TargetSource
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
     """The rasterizer's constants for a scene of this extent (wu) under a protocol."""
-    return RasterSettings(near=protocol.near_for(extent), background=protocol.background, sh_degree=sh_degree)
+    near = protocol.near_for(extent)
+    # far only scales the distortion; in a large frame it keeps the ratio to near that 0.2 and 100 have.
+    far = max(RasterSettings.far, near * RasterSettings.far / RasterSettings.near)
+    return RasterSettings(near=near, far=far, background=protocol.background, sh_degree=sh_degree)
 
 
 @dataclass(frozen=True, eq=False)
