@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gs2d.camera import Camera
+from gs2d.errors import DataError
 from gs2d.images import composite, read_image
 from gs2d.io.files import read_json
 from gs2d.io.ply import read_mesh
@@ -67,20 +69,53 @@ def read_gallery(renders: Path) -> Gallery | None:
     DataError
         The index is broken.
     """
-    index = renders / "index.json"
-    if not index.is_file():
+    data = read_index(renders)
+    if data is None:
         return None
-    data = read_json(index)
     views = tuple(
         ShownView(
-            str(view["name"]),
-            str(view.get("file", view["name"])),
+            view["name"],
+            view.get("file", view["name"]),
             str(view.get("split", "")),
             tuple(view["depth_limits"]) if view.get("depth_limits") else None,
         )
-        for view in data.get("views", ())
+        for view in data["views"]
     )
-    return Gallery(renders, views, tuple(str(stage) for stage in data.get("stages", ())))
+    return Gallery(renders, views, tuple(data["stages"]))
+
+
+def read_index(renders: Path) -> dict[str, Any] | None:
+    """``index.json`` of the pictures: ``views`` and ``stages``, checked; None where there is none.
+
+    Raises
+    ------
+    DataError
+        It is broken.
+    """
+    path = renders / "index.json"
+    if not path.is_file():
+        return None
+    data = read_json(path)
+    if isinstance(data, dict):
+        views, stages = data.get("views", []), data.get("stages", [])
+        if _are(views, _is_view) and _are(stages, lambda stage: isinstance(stage, str)):
+            return {**data, "views": views, "stages": stages}
+    raise DataError(
+        f"{path} must hold the lists views and stages as gs2d writes them, got something else; "
+        "delete it (the report then has no pictures of views), or train again with --overwrite"
+    )
+
+
+def _are(values: Any, holds: Callable[[Any], bool]) -> bool:
+    return isinstance(values, list) and all(map(holds, values))
+
+
+def _is_view(entry: Any) -> bool:
+    if not (isinstance(entry, dict) and isinstance(entry.get("name"), str)):
+        return False
+    limits = entry.get("depth_limits")
+    known = limits is None or (_are(limits, lambda value: isinstance(value, int | float)) and len(limits) == 2)
+    return known and isinstance(entry.get("file", ""), str) and isinstance(entry.get("camera", {}), dict)
 
 
 def hero(renders: Path) -> str:

@@ -189,3 +189,26 @@ def test_exporting_into_a_folder_that_does_not_exist_is_one_line(
 ) -> None:
     assert run(["export", str(trained), "--out", str(tmp_path / "no" / "x.ply")]) == 2
     assert "the folder does not exist" in one_line(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "command"),
+    [
+        ("renders/index.json", '"camera"', '"cam"', "report"),
+        ("renders/index.json", '"file": "', '"file": 5, "x": "', "report"),
+        ("renders/index.json", '"stages": [', '"stages": 5, "x": [', "report"),
+        ("metrics.json", '"iterations": ', '"iterations": "x", "y": ', "info"),
+        ("metrics.json", '"name": "', '"name": [], "x": "', "report"),
+        ("run.json", '"path": "', '"path": 5, "x": "', "render"),
+    ],
+)
+def test_a_damaged_file_of_a_run_is_named(
+    name: str, old: str, new: str, command: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(trained, copy)
+    text = (copy / name).read_text()
+    assert old in text
+    (copy / name).write_text(text.replace(old, new))
+    assert run([command, str(copy), "--quiet"]) == 2
+    assert Path(name).name in one_line(capsys.readouterr().err)

@@ -200,6 +200,25 @@ def test_a_checkpoint_remembers_the_length_of_the_log(tmp_path: Path) -> None:
     assert torch.equal(payload["tensor"], torch.arange(3))
 
 
+def test_one_changed_byte_of_a_checkpoint_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "x.pt"
+    save_tensors(path, {"a": torch.full((1000,), 0.5)})  # 00 00 00 3f
+    data = bytearray(path.read_bytes())
+    data[data.index(b"\x00\x00\x00\x3f" * 100) + 202] = 1
+    path.write_bytes(bytes(data))
+    with pytest.raises(
+        RunError, match=r"x\.pt is not a readable checkpoint \(the checksum of .* is wrong\); delete it"
+    ):
+        load_tensors(path)
+
+
+@pytest.mark.parametrize("what", [torch.zeros(3), [1, 2], "text"])
+def test_a_file_of_torch_that_is_no_checkpoint_is_named(tmp_path: Path, what: object) -> None:
+    torch.save(what, tmp_path / "x.pt")
+    with pytest.raises(RunError, match=r"x\.pt is not a readable checkpoint"):
+        load_tensors(tmp_path / "x.pt")
+
+
 @pytest.mark.parametrize("damage", ["cut", "garbage", "missing"])
 def test_a_broken_checkpoint_is_named(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "x.pt"

@@ -23,6 +23,8 @@ import platform
 import re
 import shutil
 import sys
+import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +40,7 @@ CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
 SPLATS, MESH, REPORT = "splats.ply", "mesh.ply", "report.html"
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
+_UNREADABLE = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 _CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
 
 
@@ -97,6 +100,8 @@ class RunFolder:
                     f"{self.file(RUN_JSON)} must hold {name!r} with {', '.join(sorted(keys))}, "
                     f"got {str(data.get(name))[:40]}; it was damaged: restore it, or train again with --overwrite"
                 )
+        if not isinstance(data["scene"]["path"], str):
+            raise RunError(f"{self.file(RUN_JSON)} must hold the capture's path, got {data['scene']['path']!r}")
         return data
 
     def metrics(self) -> dict[str, Any]:
@@ -112,7 +117,7 @@ class RunFolder:
             return {"stages": []}
         data = _object(path)
         stages = data.get("stages")
-        if not isinstance(stages, list) or not all(isinstance(s, dict) and s.keys() >= _STAGE for s in stages):
+        if not isinstance(stages, list) or not all(map(_is_stage, stages)):
             raise RunError(
                 f"{path} must hold a list 'stages', each with {', '.join(sorted(_STAGE))}; it was damaged: delete it "
                 "and go on with --resume"
@@ -186,6 +191,13 @@ class RunFolder:
         for folder in self.made:
             with contextlib.suppress(OSError):  # not empty: somebody else's files
                 folder.rmdir()
+
+
+def _is_stage(entry: Any) -> bool:
+    """Whether an entry of ``metrics.json`` has what every stage has: a name, and numbers."""
+    if not (isinstance(entry, dict) and entry.keys() >= _STAGE and isinstance(entry["name"], str)):
+        return False
+    return all(isinstance(entry[key], int | float) for key in _STAGE - {"name"})
 
 
 def _object(path: Path) -> dict[str, Any]:
@@ -302,19 +314,27 @@ def save_tensors(path: Path, payload: dict[str, Any]) -> None:
 def load_tensors(path: Path) -> dict[str, Any]:
     """Read what :func:`save_tensors` wrote; tensors and plain values only, nothing is executed.
 
+    torch does not look at the checksums in its files, so that a damaged one would give other numbers: they are
+    compared first.
+
     Raises
     ------
     RunError
-        Missing, cut short, or not such a file.
+        Missing, cut short, damaged, or not such a file.
     """
     import pickle
 
     import torch
 
     try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"the checksum of {damaged} is wrong")
         return dict(torch.load(path, map_location="cpu", weights_only=True))
-    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
-        raise RunError(f"{path} is not a readable checkpoint ({str(error).splitlines()[0]}); delete it") from error
+    except (*_UNREADABLE, pickle.UnpicklingError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise RunError(f"{path} is not a readable checkpoint ({reason}); delete it") from error
 
 
 def versions() -> dict[str, str]:

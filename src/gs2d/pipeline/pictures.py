@@ -15,14 +15,16 @@ from torch import Tensor
 
 from gs2d.camera import Camera
 from gs2d.data import Scene, View
+from gs2d.errors import DataError
 from gs2d.images import write_image
-from gs2d.io.files import read_json, write_json
+from gs2d.io.files import write_json
 from gs2d.io.run import RENDERS, RunFolder, make_folder
 from gs2d.pipeline.prepare import Job
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.report_images import depth_limits, depth_picture, error_picture, highlight_picture, normal_picture
+from gs2d.report_pictures import read_index
 from gs2d.sh import rgb_to_sh0
 from gs2d.splats import Splats
 
@@ -79,8 +81,8 @@ def draw_stage(
     for name in ("photos", stage):
         make_folder(folder / name)
     index_file = folder / INDEX
-    index: dict[str, Any] = read_json(index_file) if index_file.exists() else {"views": [], "stages": []}
-    limits = {entry["name"]: entry["depth_limits"] for entry in index["views"]}
+    index = read_index(folder) or {"views": [], "stages": []}
+    limits = {entry["name"]: entry.get("depth_limits") for entry in index["views"]}
     views = []
     files = file_names([view for _, view in shown])
     for (split, view), file in zip(shown, files, strict=True):
@@ -114,9 +116,21 @@ def camera_json(camera: Camera) -> dict[str, Any]:
 
 
 def shown_cameras(run: RunFolder) -> list[Camera]:
-    """Cameras of the views that were drawn; none before the first stage was."""
-    index = run.file(RENDERS) / INDEX
-    return [Camera(**entry["camera"]) for entry in read_json(index)["views"]] if index.exists() else []
+    """Cameras of the views that were drawn; none before the first stage was.
+
+    Raises
+    ------
+    DataError
+        The index of the pictures is broken.
+    """
+    index = read_index(run.file(RENDERS)) or {"views": []}
+    try:
+        return [Camera(**entry["camera"]) for entry in index["views"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{run.file(RENDERS) / INDEX} must hold the camera of each view, got another entry ({error}); delete it "
+            "(the report then has no pictures of views), or train again with --overwrite"
+        ) from error
 
 
 def render_view(splats: Splats, view: View, settings: RasterSettings, backend: Backend) -> RenderOutput:
