@@ -66,6 +66,12 @@ def test_a_picture_that_is_missing_broken_or_cut_is_an_error_that_names_it(tmp_p
         assert "\n" not in str(caught.value)
 
 
+def test_a_picture_of_floats_is_refused_because_nobody_knows_what_is_white_in_it(tmp_path: Path) -> None:
+    Image.fromarray(np.full((4, 5), 0.5, np.float32)).save(tmp_path / "f.tif")
+    with pytest.raises(DataError, match=r"f\.tif does not decode: its pixels are floats"):
+        read_image(tmp_path / "f.tif")
+
+
 def test_a_written_picture_reads_back_as_it_was(tmp_path: Path) -> None:
     for channels in (3, 4):
         pixels = np.random.default_rng(channels).integers(0, 256, (7, 5, channels)).astype(np.uint8)

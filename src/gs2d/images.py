@@ -50,7 +50,8 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode an image.
 
     EXIF orientation is **not** applied: COLMAP does not apply it either, so poses belong to the stored pixels.
-    Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit.
+    Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit. Images of floats are refused: what is
+    white in them is not known.
 
     Returns
     -------
@@ -63,6 +64,8 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """
     try:
         with Image.open(path) as file:
+            if file.mode == "F":
+                raise ValueError("its pixels are floats of no known range, 8 or 16 bits are read; convert it")
             if file.mode.startswith("I;16") or file.mode == "I":
                 grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
                 return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)

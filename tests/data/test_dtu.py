@@ -153,6 +153,24 @@ def test_photographs_of_another_size_take_the_cameras_of_their_model(tmp_path: P
     assert any("5 of 5 views are those of sparse/0" in note for note in scene.notes)
 
 
+@pytest.mark.parametrize(
+    ("signature", "byte", "value"),
+    [
+        (b"PK\x01\x02", 6, 255),  # the version of the zip format that is needed: 25.5
+        (b"PK\x01\x02", 8, 1),  # encrypted
+        (b"PK\x01\x02", 10, 8),  # compressed, which it is not
+    ],
+)
+def test_a_damaged_archive_is_an_error(tmp_path: Path, signature: bytes, byte: int, value: int) -> None:
+    small_dtu(tmp_path)
+    path = tmp_path / "cameras_sphere.npz"
+    data = bytearray(path.read_bytes())
+    data[data.index(signature) + byte] = value
+    path.write_bytes(bytes(data))
+    with pytest.raises(DataError, match=r"cameras_sphere\.npz must be a numpy archive"):
+        load_scene(tmp_path)
+
+
 def test_masks_are_given_at_their_own_size_with_the_cameras_of_the_archive(tmp_path: Path) -> None:
     cameras = preprocessed(tmp_path)
     found = dtu_silhouettes(tmp_path)

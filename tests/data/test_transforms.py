@@ -255,3 +255,38 @@ def test_cameras_that_all_stand_at_one_place_are_an_error(tmp_path: Path) -> Non
     edit(tmp_path / "transforms.json", lambda m: [f.update(transform_matrix=same) for f in m["frames"]])
     with pytest.raises(DataError, match="two or more places, got 7 at one place"):
         load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("value", [1e308, -1e308])
+def test_a_rotation_that_overflows_is_an_error_without_a_warning(tmp_path: Path, value: float) -> None:
+    small_nerfstudio(tmp_path)
+    edit(tmp_path / "transforms.json", lambda m: m["frames"][1]["transform_matrix"][1].__setitem__(1, value))
+    with pytest.raises(DataError, match="must hold a rotation"):
+        load_scene(tmp_path)
+
+
+def moved(root: Path, offset: float) -> None:
+    """The ring of cameras (extent 4.4) moved along x."""
+    small_nerfstudio(root)
+    edit(
+        root / "transforms.json",
+        lambda m: [f["transform_matrix"][0].__setitem__(3, f["transform_matrix"][0][3] + offset) for f in m["frames"]],
+    )
+
+
+def test_a_capture_too_far_from_its_origin_for_32_bits_is_an_error(tmp_path: Path) -> None:
+    # 2^-23 of 1e6 is 0.12: a 37th of the extent, where 1e-3 of it is allowed.
+    moved(tmp_path, 1e6)
+    with pytest.raises(DataError, match=r"32-bit numbers, 0\.12 apart .*1e\+06 from the origin.*subtract an offset"):
+        load_scene(tmp_path)
+    edit(tmp_path / "transforms.json", lambda m: m["frames"][2]["transform_matrix"][0].__setitem__(3, 1e300))
+    with pytest.raises(DataError, match=r"within 1e\+12 units of the origin, got one at 1e\+300"):
+        load_scene(tmp_path)
+
+
+def test_a_capture_rather_far_from_its_origin_is_noted(tmp_path: Path) -> None:
+    # 2^-23 of 1000 is 1.2e-4: 2.7e-5 of the extent. At 300 it is 0.8e-5.
+    moved(tmp_path / "far", 1000.0)
+    moved(tmp_path / "near", 300.0)
+    assert any("fine detail is lost" in note for note in load_scene(tmp_path / "far").notes)
+    assert not any("fine detail" in note for note in load_scene(tmp_path / "near").notes)

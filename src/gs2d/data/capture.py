@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,6 +25,10 @@ from gs2d.images import area_downscale, image_size, mask_downscale, read_image, 
 _ASPECT_TOLERANCE = 0.01
 
 _LENSES = (0.01, 1e5)  # focal length / side: fields of view from 178.9 degrees down to 2 arc seconds
+
+# Positions are float32: how far apart they may be in units of the extent. The smallest steps of training are 1e-6.
+_COARSE, _TOO_COARSE = 1e-5, 1e-3
+_FARTHEST = 1e12  # wu from the origin: cubes of it are float32 numbers still
 
 LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
@@ -146,10 +150,13 @@ def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np
     if not np.isfinite(M).all():
         raise DataError(f"{where} must be finite, got NaN or infinity; remove this frame")
     R = M[:3, :3]
-    if np.abs(R.T @ R - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+    with np.errstate(all="ignore"):  # numbers so large that they overflow are no rotation either
+        is_rotation = np.abs(R.T @ R - np.eye(3)).max() <= 1e-2 and np.linalg.det(R) > 0
+        length, volume = np.linalg.norm(R, axis=0).round(4).tolist(), float(np.linalg.det(R))
+    if not is_rotation:
         raise DataError(
-            f"{where} must hold a rotation, got columns of length {np.linalg.norm(R, axis=0).round(4).tolist()} and "
-            f"determinant {np.linalg.det(R):.4g}; remove scale or mirroring from it"
+            f"{where} must hold a rotation, got columns of length {length} and determinant {volume:.4g}; "
+            "remove scale or mirroring from it"
         )
     u, _, vt = np.linalg.svd(R)
     R = u @ vt
@@ -214,12 +221,7 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
     views = [_view(frame, factor, cache, lens_maps) for frame in frames]
     train, test = _split(frames, views, capture.default_test_every, test_every, root)
     cameras = [view.camera for view in train]
-    extent = camera_extent(cameras)
-    if not extent > 1e-9 * (1 + max(float(np.abs(camera.center).max()) for camera in cameras)):
-        raise DataError(
-            f"{root} must have training cameras at two or more places, got {len(cameras)} at one place: "
-            "nothing can be reconstructed without a baseline"
-        )
+    extent, place_notes = _measured_extent(cameras, root)
     points, point_notes = _finite_points(capture.points)
     bounds, bound_notes = scene_bounds(cameras, points, blender=capture.format == "blender")
     return Scene(
@@ -232,9 +234,41 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=capture.skipped,
-        notes=capture.notes + _lens_notes(frames) + point_notes + bound_notes,
+        notes=capture.notes + _lens_notes(frames) + place_notes + point_notes + bound_notes,
         root=root,
     )
+
+
+def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tuple[str, ...]]:
+    """The extent, wu, and a note where 32-bit positions are coarse so far from the origin.
+
+    Raises
+    ------
+    DataError
+        Cameras in one place, or so far from the origin that positions in 32 bits cannot hold the scene.
+    """
+    farthest = max(float(np.abs(camera.center).max()) for camera in cameras)
+    if not farthest <= _FARTHEST:
+        raise DataError(
+            f"{root} must have its cameras within {_FARTHEST:g} units of the origin, got one at {farthest:.4g}; "
+            "move or scale the poses, or remove that view"
+        )
+    extent = camera_extent(cameras)
+    if not extent > 1e-9 * (1 + farthest):
+        raise DataError(
+            f"{root} must have training cameras at two or more places, got {len(cameras)} at one place: "
+            "nothing can be reconstructed without a baseline"
+        )
+    step = farthest * float(np.finfo(np.float32).eps)  # between neighbouring 32-bit numbers so far out
+    if step <= _COARSE * extent:
+        return extent, ()
+    what = f"positions are 32-bit numbers, {step:.2g} apart where the cameras stand ({farthest:.4g} from the origin)"
+    if step > _TOO_COARSE * extent:
+        raise DataError(
+            f"{root} must lie nearer to its origin: {what}, for a scene of extent {extent:.4g}; subtract an offset "
+            "from the poses and points (map coordinates have large ones)"
+        )
+    return extent, (f"{what}: fine detail is lost; subtract an offset from the poses and points",)
 
 
 def _view(frame: Frame, factor: int, cache: ImageCache, lens_maps: LensMaps) -> View:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -167,7 +168,7 @@ def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndar
                 for key in file.files
                 if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key
             }
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, RuntimeError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"{path} must be a numpy archive of camera matrices, got: {error}; copy it again") from error
     world: dict[int, np.ndarray] = {}
     scale: dict[int, np.ndarray] = {}
