@@ -202,6 +202,26 @@ def test_a_scene_of_a_data_set_without_its_cameras_says_where_to_get_them(
     assert "known data set" not in str(plain.value)
 
 
+@pytest.mark.parametrize(
+    ("layout", "folder"),
+    [
+        ("dtu-2dgs", "mask"),
+        ("dtu-2dgs", "images"),
+        ("tnt", "images"),
+        ("tnt", "sparse/0"),
+        ("nerf-synthetic", "test"),
+        ("mip-nerf-360", "images_4"),
+    ],
+)
+def test_a_folder_that_is_taken_away_is_one_line(tmp_path: Path, layout: str, folder: str) -> None:
+    dataset, name, write = LAYOUTS[layout]
+    root = write(tmp_path)
+    shutil.rmtree(root / folder)
+    lines = describe(get_dataset(dataset), get_dataset(dataset).scene(name), root).lines()
+    assert [line.split(" is missing (")[0] for line in lines] == [str(root / folder)]
+    assert missing_lines(root) == lines
+
+
 def test_the_folder_one_stands_in_is_recognised_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = write_tnt(tmp_path)
     monkeypatch.chdir(root)

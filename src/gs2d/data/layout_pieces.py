@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gs2d.data.colmap_model import read_images
@@ -40,6 +40,12 @@ class Missing:
     def line(self) -> str:
         """The file, what it is for and what to do, in one line."""
         return f"{self.path} is missing ({self.purpose}): {self.source}"
+
+
+def whole_folders(pieces: Iterable[Missing]) -> tuple[Missing, ...]:
+    """The pieces, with one for a folder that is not there instead of one for each of its files."""
+    named = (piece if piece.path.parent.is_dir() else replace(piece, path=piece.path.parent) for piece in pieces)
+    return tuple(dict.fromkeys(named))
 
 
 def has_dtu_cameras(root: Path) -> bool:
@@ -101,8 +107,9 @@ def _model_files(folder: Path, source: str, *, purpose: str = TRAINING) -> list[
 
 def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[Missing]:
     """A COLMAP model in ``sparse/0`` and the photographs that it names, in each of the folders."""
-    model = root / "sparse" / "0" if (root / "sparse" / "0").is_dir() else root / "sparse"
-    model = model if model.is_dir() else root / "sparse" / "0"
+    model, flat = root / "sparse" / "0", root / "sparse"
+    if not model.is_dir() and any((*flat.glob("*.bin"), *flat.glob("*.txt"))):
+        model = flat
     missing = _model_files(model, source)
     kind = "bin" if (model / "images.bin").is_file() else "txt" if (model / "images.txt").is_file() else None
     if kind is None:

@@ -22,6 +22,7 @@ from gs2d.data.layout_pieces import (
     colmap_pieces,
     dtu_pieces,
     has_dtu_cameras,
+    whole_folders,
 )
 from gs2d.errors import DataError
 from gs2d.protocols import Protocol, get_protocol, protocol_for
@@ -167,7 +168,7 @@ def describe(dataset: DataSet, facts: SceneFacts, root: Path, *, truth: Path | N
         "mip-nerf-360": lambda: colmap_pieces(root, ("images", facts.images), source),
     }[dataset.name]()
     found, lacking = find_truth(dataset, facts, root, truth)
-    return SceneFolder(dataset, facts, root, found, (*pieces, *lacking))
+    return SceneFolder(dataset, facts, root, found, (*whole_folders(pieces), *lacking))
 
 
 def missing_lines(root: Path) -> tuple[str, ...]:
