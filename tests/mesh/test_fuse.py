@@ -23,7 +23,7 @@ from gs2d.camera import Camera, look_at
 from gs2d.errors import DiskError, ProtocolError, ShapeError
 from gs2d.mesh.extract import extract
 from gs2d.mesh.frames import DepthMap, Frame, Spool, depth_map
-from gs2d.mesh.fuse import fuse, touched_blocks
+from gs2d.mesh.fuse import fuse, least_blocks, touched_blocks
 from gs2d.mesh.integrate import FULL_WEIGHT_BEHIND
 from gs2d.mesh.limits import derive_limits, sample_depths
 from gs2d.mesh.surface import components, marching_cubes
@@ -244,6 +244,35 @@ def test_memory_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
     voxel = float(str(error.value).split("voxel of about ")[1].split(" ")[0])
     volume = fuse(frames, limits(1.3, voxel), max_bytes=max_bytes, threads=1)
     assert 0.3 * max_bytes < volume.nbytes <= max_bytes
+
+
+@pytest.mark.parametrize("voxel", [1e-3, 1e-6])
+def test_a_voxel_that_is_far_too_small_is_refused_at_once(voxel: float) -> None:
+    """To count blocks of 1e-6 wu voxels would take for ever, and all memory. Two errors later a voxel fits."""
+    frames = maps(sphere_frames(orbit(10, 3.0)))
+    max_bytes = 1500 * block_bytes(False)
+    for least in ("at least ", ""):
+        with pytest.raises(ProtocolError, match=rf"need {least}[\d.e+]+ GiB; use a voxel of about") as error:
+            fuse(frames, limits(1.3, voxel), max_bytes=max_bytes)
+        voxel = float(str(error.value).split("voxel of about ")[1].split(" ")[0])
+    assert 0.3 * max_bytes < fuse(frames, limits(1.3, voxel), max_bytes=max_bytes, threads=1).nbytes <= max_bytes
+
+
+@pytest.mark.parametrize("truncation", [0.05, 0.3, 2.0])
+def test_the_least_number_of_blocks_is_not_above_the_number(
+    truncation: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gs2d.mesh.fuse._FEW_SAMPLES", 0)
+    for half in (1.3, 0.9):  # the second box cuts the sphere
+        lim = limits(half, 0.02, truncation)
+        for item in maps(sphere_frames(orbit(3, 3.0))):
+            number = len(touched_blocks(item, lim, block_grid(lim)))
+            assert 0.04 * number < least_blocks(item, lim) <= number
+
+
+def test_a_truncation_larger_than_the_box_is_refused() -> None:
+    with pytest.raises(ProtocolError, match=r"at most the side of the box, 2\.6 wu, was expected, got 1e\+09"):
+        fuse(maps(sphere_frames(orbit(2, 3.0))), limits(1.3, 0.03, 1e9), threads=1)
 
 
 def test_a_volume_weighs_what_the_bound_counts() -> None:

@@ -18,9 +18,10 @@ from gs2d.mesh.frames import DepthMap
 from gs2d.mesh.integrate import integrator
 from gs2d.mesh.limits import FusionLimits, backproject
 from gs2d.mesh.sampling import prepare
-from gs2d.mesh.volume import BLOCK, Budget, Volume, block_grid, unknown_volume
+from gs2d.mesh.volume import BLOCK, Budget, Volume, block_grid, check_truncation, unknown_volume
 
 _MOST_MARKS = 1 << 27  # bytes
+_FEW_SAMPLES = 1e8  # of one depth map: seconds
 
 
 def fuse(
@@ -49,19 +50,21 @@ def fuse(
     Raises
     ------
     ProtocolError
-        If the blocks near the surface need more than ``max_bytes`` (the message names a voxel that fits), or the
-        depth maps see nothing inside the limits.
+        If the blocks near the surface need more than ``max_bytes`` (the message names a voxel that fits), the
+        truncation is larger than the box, or the depth maps see nothing inside the limits.
     BackendError
         If the backend is unknown or cannot run here.
     """
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
+    check_truncation(limits)
     dims = block_grid(limits)
     budget = Budget(limits, max_bytes)
     keys = np.zeros(0, dtype=np.int64)
     colored, count = False, 0
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
+        budget.check_least(least_blocks(item, limits), colored)
         keys = merged(keys, touched_blocks(item, limits, dims))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
@@ -72,6 +75,36 @@ def fuse(
         for item in frames:
             add(prepare(item, limits))
     return volume
+
+
+def least_blocks(item: DepthMap, limits: FusionLimits) -> int:
+    """A number below which ``touched_blocks`` cannot stay, without its work, which grows as voxels shrink.
+
+    0 where that work is small. The bands of the pixels, one truncation before and behind what they saw, cut to the box,
+    are disjoint pieces of space, z^3 / (3 fx fy) between two depths, and a block is b^3 of it. What they saw is at
+    least d^2 / (fx fy) wide, seen face on, and the shadow of a block is at most sqrt(3) b^2.
+    """
+    rows, columns = np.nonzero((item.depth > 0) & (item.depth <= limits.depth_limit))
+    depth = item.depth[rows, columns].astype(np.float64)
+    parts, steps = _samples(item, depth, limits)
+    if len(rows) * parts**2 * steps < _FEW_SAMPLES:
+        return 0
+    center, focal2, block = item.camera.center, item.camera.fx * item.camera.fy, BLOCK * limits.voxel
+    ray = backproject(item.camera, np.ones(len(rows)), rows, columns) - center  # to depth 1
+    with np.errstate(divide="ignore", invalid="ignore"):  # a ray along an axis
+        sides = np.stack([(limits.lower - center) / ray, (limits.upper - center) / ray])
+    near = np.fmax(sides.min(axis=0).max(axis=1), np.maximum(depth - limits.truncation, 0))
+    far = np.fmin(sides.max(axis=0).min(axis=1), depth + limits.truncation)
+    volume = float(np.maximum(far**3 - near**3, 0).sum()) / (3 * focal2)
+    area = float((depth[(near <= depth) & (depth <= far)] ** 2).sum()) / focal2
+    return int(max(volume / block**3, area / (3**0.5 * block**2)))
+
+
+def _samples(item: DepthMap, depth: np.ndarray, limits: FusionLimits) -> tuple[int, int]:
+    """At how many places along a side of each pixel, and along each ray, a depth map is sampled."""
+    half = 0.5 * BLOCK * limits.voxel
+    width = float(depth.max(initial=0.0)) / min(item.camera.fx, item.camera.fy)
+    return max(1, int(np.ceil(width / half))), int(np.ceil(2 * limits.truncation / half)) + 1
 
 
 def touched_blocks(item: DepthMap, limits: FusionLimits, dims: tuple[int, int, int]) -> np.ndarray:
@@ -86,10 +119,8 @@ def touched_blocks(item: DepthMap, limits: FusionLimits, dims: tuple[int, int, i
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
     depth = item.depth[rows, columns].astype(np.float64)
-    width = float(depth.max()) / min(item.camera.fx, item.camera.fy)
-    parts = max(1, int(np.ceil(width / half)))
+    parts, steps = _samples(item, depth, limits)
     shifts = (np.arange(parts) + 0.5) / parts - 0.5
-    steps = int(np.ceil(2 * limits.truncation / half)) + 1
     # The lower of the two nearest blocks along each axis, counted from a border of one block round the grid.
     padded = (dims[0] + 2, dims[1] + 2, dims[2] + 2)
     strides = (padded[1] * padded[2], padded[2], 1)

@@ -17,13 +17,13 @@ import numpy as np
 from gs2d.errors import ProtocolError
 from gs2d.mesh.cases import CORNERS, EDGES, case_table
 from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.fuse import merged, touched_blocks
+from gs2d.mesh.fuse import least_blocks, merged, touched_blocks
 from gs2d.mesh.integrate import integrator
 from gs2d.mesh.limits import backproject
 from gs2d.mesh.nest import STEP, Nest
 from gs2d.mesh.sampling import prepare
 from gs2d.mesh.surface import cell_surface, crossing, mixed_colors
-from gs2d.mesh.volume import BLOCK, VOXELS, Budget, Volume, unknown_volume
+from gs2d.mesh.volume import BLOCK, VOXELS, Budget, Volume, check_truncation, unknown_volume
 from gs2d.triangles import Mesh
 
 FAR_VIEWS = 5.0  # weight from which a voxel outside the innermost level is known: so many views seldom agree on a sky
@@ -63,11 +63,13 @@ def fuse_nested(
     """
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
+    check_truncation(nest.levels[0])
     budget = Budget(nest.levels[0], max_bytes, side=2 * nest.half, step=STEP)
     keys = [np.zeros(0, dtype=np.int64) for _ in nest.levels]
     colored, count = False, 0
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
+        budget.check_least(least_blocks(item, nest.levels[0]), colored)
         for k, found in enumerate(_touched(item, nest)):
             keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from gs2d.mesh.limits import FusionLimits
 
 BLOCK = 8  # voxels along the side of a block
 VOXELS = BLOCK**3
+_ALL_OF_LEAST = 16  # all blocks of a scene, in units of the least that one view needs: 5 to 15 were met
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +79,15 @@ def unknown_volume(
     )
 
 
+def check_truncation(limits: FusionLimits) -> None:
+    """Raise ProtocolError for a truncation beyond the box and many voxels: all of it would be near a surface."""
+    if not limits.truncation <= max(limits.side, 20 * limits.voxel):
+        raise ProtocolError(
+            f"a truncation of at most the side of the box, {limits.side:.4g} wu, was expected, "
+            f"got {limits.truncation:.4g}; leave it out, or give a larger bbox"
+        )
+
+
 def block_grid(limits: FusionLimits) -> tuple[int, int, int]:
     """How many blocks the box holds along x, y, z.
 
@@ -106,10 +117,21 @@ class Budget:
         need = blocks * block_bytes(colored)
         if need <= self.max_bytes or (partial and need <= 16 * self.max_bytes):
             return
-        voxel = self.limits.voxel * (need / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
+        self._refuse(need, need, "at least " if partial else "")
+
+    def check_least(self, blocks: int, colored: bool) -> None:
+        """Stop when blocks that one view alone needs for sure are over the bound: to count them could take for ever.
+
+        The voxel that is named is a guess; where it is still too small, it can be counted.
+        """
+        need = blocks * block_bytes(colored)
+        if need > self.max_bytes:
+            self._refuse(need, _ALL_OF_LEAST * need, "at least ")
+
+    def _refuse(self, need: int, expected: int, least: str) -> NoReturn:
+        voxel = self.limits.voxel * (expected / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
         if self.side is not None:
             voxel = 1.005 * self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
-        least = "at least " if partial else ""
         raise ProtocolError(
             f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} wu "
             f"need {least}{need / 2**30:.3g} GiB; use a voxel of about {voxel:.3g} wu, a smaller bbox, or more memory"

@@ -24,6 +24,7 @@ from gs2d.render.types import RenderOutput
 from gs2d.splats import Splats
 
 OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
+LARGEST = 1e12  # wu; depth and voxels are 32-bit numbers, of which squares and cubes are taken
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
 
@@ -90,9 +91,12 @@ def check_mesh_options(options: MeshOptions) -> None:
         if value is not None and not (value > 0 and math.isfinite(value)):
             unit = "GiB" if name == "max_gib" else "world units"
             raise ProtocolError(f"--{name.replace('_', '-')} must be a positive number of {unit}, got {value}")
+        if value is not None and name != "max_gib" and not 1 / LARGEST <= value <= LARGEST:
+            bounds = f"between {1 / LARGEST:g} and {LARGEST:g} world units"
+            raise ProtocolError(f"--{name.replace('_', '-')} must be {bounds}, got {value:g}")
     if options.bbox is not None:
         low, high = np.asarray(options.bbox, np.float64).reshape(2, 3)
-        if not (np.isfinite(options.bbox).all() and (low < high).all()):
+        if not ((np.abs(options.bbox) <= LARGEST).all() and (low < high).all()):
             raise ProtocolError(f"--bbox must be a lower corner and a higher one, got {low.tolist()} {high.tolist()}")
     if options.keep_components is not None and options.keep_components < 0:
         raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
