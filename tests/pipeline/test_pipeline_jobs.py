@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -193,3 +194,42 @@ def test_a_capture_that_moved_is_named(undisturbed: RunFolder, tmp_path: Path) -
     (copy / "run.json").write_text(json.dumps(definition))
     with pytest.raises(RunError, match="was at .*gone, which is not there"):
         render_run(copy)
+
+
+@pytest.mark.parametrize("name", ["x.obj", "photo.png", "x", "run/run.json", "run/splats.ply"])
+def test_a_result_is_not_written_under_a_name_that_it_is_not_nor_over_the_splats_of_the_run(
+    undisturbed: RunFolder, tmp_path: Path, name: str
+) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    (tmp_path / "photo.png").write_text("mine")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(RunError, match=r"--out .*(a \.ply file|splats of the run)"):
+        export_run(copy, tmp_path / name, "3dgs")
+    with pytest.raises(RunError, match=r"--out .*(a \.ply file|splats of the run)"):
+        mesh_run(copy, out=tmp_path / name)
+    with pytest.raises(RunError, match="is the mesh of the run"):
+        export_run(copy, copy / ".." / "run" / "mesh.ply", "3dgs")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_mesh_written_over_that_of_the_run_is_the_mesh_of_the_run(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    old = json.loads((copy / "metrics.json").read_text())
+    (copy / "metrics.json").write_text(json.dumps({**old, "surface": {"f_score": 1.0}}))
+    mesh_run(copy, MeshOptions(voxel=0.1), out=copy / "mesh.ply", threads=1)
+    assert json.loads((copy / "metrics.json").read_text())["surface"] is None  # was of the mesh before
+
+
+def test_a_rendering_is_not_written_over_a_photograph(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def plain(views: Sequence[View]) -> list[str]:
+        return [Path(view.name).stem for view in views]  # as in captures without sub-folders
+
+    monkeypatch.setattr("gs2d.pipeline.jobs.file_names", plain)
+    photograph = capture / "test" / "r_0.png"
+    before = photograph.read_bytes()
+    with pytest.raises(RunError, match=r"holds the capture's photograph r_0\.png"):
+        render_run(undisturbed.path, out=capture / "test", threads=1)
+    assert photograph.read_bytes() == before
+    assert render_run(undisturbed.path, out=tmp_path / "out", threads=1)["images"] == 2

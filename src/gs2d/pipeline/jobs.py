@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,20 @@ def _open(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder
     return run, job, splats.to(job.backend.device)
 
 
+def checked_output(path: Path, out: Path) -> Path:
+    """``out``, if it may be written: a PLY by its name, and not the splats of the run, from which all else is made.
+
+    Raises
+    ------
+    RunError
+    """
+    if out.suffix.lower() != ".ply":
+        raise RunError(f"--out must name a .ply file, which is what is written, got {out}")
+    if out.resolve() == (path / SPLATS).resolve():
+        raise RunError(f"--out {out} is the splats of the run, which stay as they are; choose another name")
+    return out
+
+
 def mesh_run(
     path: Path,
     options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
@@ -63,8 +78,9 @@ def mesh_run(
     ------
     RunError, DataError, ProtocolError, DiskError
     """
+    out = None if out is None else checked_output(path, out)
     run, job, splats = _open(path, threads, on_event)
-    if out is not None:
+    if out is not None and out.resolve() != run.file(MESH).resolve():
         return extract_mesh(job, splats, options, out, on_event)
     with run.locked():
         result = extract_mesh(job, splats, options, run.file(MESH), on_event)
@@ -104,15 +120,26 @@ def render_run(
         views = list(zip(file_names(chosen), chosen, strict=True))
     if not views:
         raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
+    if out is not None:
+        _spare_photographs(out, [name for name, _ in views], job)
     folder = out or run.file(RENDERS) / ("orbit" if orbit else split)
     make_folder(folder)
     if orbit and out is None:  # the run's own folder: no frame of a longer circle stays among these
-        for old in folder.glob("*.png"):
-            old.unlink()
+        for old in folder.glob("[0-9]*.png"):
+            if old.stem.isdecimal():
+                old.unlink()
     for name, view in counted(views, "rendering", len(views), on_event):
         color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
         write_image(folder / f"{name}.png", color.cpu().numpy())
     return {"folder": str(folder), "images": len(views)}
+
+
+def _spare_photographs(folder: Path, names: Sequence[str], job: Job) -> None:
+    """Raise rather than write a rendering over a photograph of the capture."""
+    photographs = {view.path.resolve() for view in job.scene.views if view.path is not None}
+    for name in names:
+        if (folder / f"{name}.png").resolve() in photographs:
+            raise RunError(f"--out {folder} holds the capture's photograph {name}.png; choose another folder")
 
 
 def orbit_cameras(cameras: list[Camera], frames: int) -> list[Camera]:
@@ -191,6 +218,9 @@ def export_run(path: Path, out: Path, layout: str) -> dict[str, Any]:
     ------
     RunError, DiskError
     """
+    out = checked_output(path, out)
+    if out.resolve() == (path / MESH).resolve():
+        raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
     splats = finished_splats(open_run(path))
     write_splats(out, splats, layout=layout)
     return {"file": str(out), "splats": len(splats), "bytes": out.stat().st_size, "layout": layout}
