@@ -259,9 +259,7 @@ def test_a_voxel_that_is_far_too_small_is_refused_at_once(voxel: float) -> None:
 
 
 @pytest.mark.parametrize("truncation", [0.05, 0.3, 2.0])
-def test_the_least_number_of_blocks_is_not_above_the_number(
-    truncation: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_least_number_of_blocks_is_not_above_the_number(truncation: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gs2d.mesh.fuse._FEW_SAMPLES", 0)
     for half in (1.3, 0.9):  # the second box cuts the sphere
         lim = limits(half, 0.02, truncation)
