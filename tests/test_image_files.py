@@ -72,6 +72,14 @@ def test_a_picture_of_floats_is_refused_because_nobody_knows_what_is_white_in_it
         read_image(tmp_path / "f.tif")
 
 
+def test_a_picture_of_far_too_many_pixels_is_told_to_be_shrunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.new("L", (40, 30)).save(tmp_path / "x.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 500)  # Pillow refuses twice as many
+    for read in (image_size, read_image):
+        with pytest.raises(DataError, match=r"x\.png .*more than 1,000 pixels, .* shrink it"):
+            read(tmp_path / "x.png")
+
+
 def test_a_written_picture_reads_back_as_it_was(tmp_path: Path) -> None:
     for channels in (3, 4):
         pixels = np.random.default_rng(channels).integers(0, 256, (7, 5, channels)).astype(np.uint8)

@@ -89,6 +89,8 @@ def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def _first_line(error: BaseException) -> str:
+    if isinstance(error, Image.DecompressionBombError):
+        return f"more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels, which Pillow refuses to decode; shrink it"
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli_runs import TINY, one_line
+from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
 from tiny import ball_cameras, ball_picture, write_ball_mesh, write_capture
 
@@ -106,6 +106,19 @@ def test_a_capture_that_cannot_be_read_gives_one_line_and_exit_code_2_and_leaves
     assert out == ""
     assert named in one_line(err)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_photograph_with_a_damaged_exif_block_is_read_without_a_word(tmp_path: Path) -> None:
+    from PIL import Image
+
+    write_capture(tmp_path / "capture", train=3, test=1)
+    for path in (tmp_path / "capture" / "train").iterdir():
+        exif = b"Exif\0\0II*\0\x08\0\0\0\xff\xff"  # 65535 entries, of which none follows
+        Image.open(path).convert("RGB").save(path.with_suffix(".jpg"), exif=exif)
+        path.unlink()
+    done = spawn(["info", str(tmp_path / "capture")])
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "training views: 3" in done.stdout
 
 
 def test_the_colmap_capture_of_these_tests_is_good_when_nothing_is_broken(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+import warnings
 
 TYPE_CHECKING = False  # of typing, which is not imported: until `main` runs, Ctrl-C shows Python's own traceback
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from gs2d.cli.app import leave
 
+    # Photographs with a damaged EXIF block decode; what Pillow thinks of it, with lines of its code, helps nobody.
+    warnings.filterwarnings("ignore", module=r"PIL\.")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # None if it is closed
             stream.reconfigure(errors="backslashreplace")  # a terminal that cannot show a name shows its numbers
