@@ -6,6 +6,8 @@ import importlib.metadata
 import json
 import multiprocessing
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -61,6 +63,14 @@ def test_a_folder_with_other_files_is_never_taken(tmp_path: Path, overwrite: boo
     with pytest.raises(RunError, match=r"holds other files \(thesis.tex\)"):
         claim_run(tmp_path, resume=False, overwrite=overwrite)
     assert names(tmp_path) == ["thesis.tex"]
+
+
+def test_a_run_whose_process_was_killed_while_it_wrote_run_json_is_started_again(tmp_path: Path) -> None:
+    kill = "import os; from gs2d.disk import atomic_write\nwith atomic_write('run.json'): os.kill(os.getpid(), 9)"
+    subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, check=False)
+    (left,) = names(tmp_path)
+    assert left != "run.json"
+    assert claim_run(tmp_path, resume=True, overwrite=False).checkpoints() == []
 
 
 def test_a_file_is_not_a_run_folder(tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ FORMAT = 1
 KEPT_CHECKPOINTS = 2
 _UNREADABLE = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 _CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
+_UNFINISHED = re.compile(r"\.run\.json\.\d+\.[0-9a-f]+\.tmp")  # left by a process that was killed while it made a run
 
 
 _SCENE = {"name", "path", "format", "train", "test"}  # of run.json, at least
@@ -251,7 +252,8 @@ def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tup
         if not (resume or overwrite):
             raise RunError(f"{path} already holds a run; continue it with --resume, replace it with --overwrite")
         return
-    others = sorted(entry.name for entry in path.iterdir() if entry.name not in (LOCK, *allowed))
+    names = (entry.name for entry in path.iterdir())
+    others = sorted(name for name in names if name not in (LOCK, *allowed) and not _UNFINISHED.fullmatch(name))
     if others:
         raise RunError(
             f"--out must be new, empty or a run; {path} holds other files ({others[0]}); choose another folder"
