@@ -32,12 +32,12 @@ ROOT = Path(__file__).resolve().parents[1]
 COMMITTED = Path(__file__).parent / "results" / "instructions.json"
 CALLGRIND_TOLERANCE = 0.02
 LOOP_TOLERANCE = 0.03
-LEAST_VECTOR, LONGEST = 25, 400  # zmm instructions of a loop that counts; longer ones are jumps back from cold code
+LEAST_VECTOR, LONGEST = 15, 400  # zmm instructions of a loop that counts; longer ones are jumps back from cold code
 # mangled names of the functions with the blend loops -> label
 LOOP_FUNCTIONS = {
     "blend_tileERNS": "forward",
-    "tile_vjpILb1ELb1ELb0E": "backward, all images",
-    "tile_vjpILb0ELb0ELb0E": "backward, colour image only",
+    "finish_batchILb1ELb1ELb0E": "backward, all images",
+    "finish_batchILb0ELb0ELb0E": "backward, colour image only",
 }
 Counts = dict[str, int]
 

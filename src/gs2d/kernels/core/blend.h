@@ -19,13 +19,14 @@ template <class V> struct BlendLimits {
 template <class V> struct Hit {
     V u, v;      // plane coordinates
     V Q, rq;     // z_c / depth, and its inverse
+    V depth;
     V rho;
     V alpha;     // not yet limited to alpha_max
     mask_t<V> ray;  // the plane decides
 };
 
-// dx, dy: pixel centre - projected splat centre, px.
-template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V dx, V dy, const BlendLimits<V>& k) {
+// All of a hit but its alpha. dx, dy: pixel centre - projected splat centre, px.
+template <class V> GS2D_HD Hit<V> meet(const Record<V>& s, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h;
     const V Q = fma(s.az, dx, fma(s.bz, dy, V(1))), rq = reciprocal(Q);
     const V u = fma(s.au, dx, s.bu * dy) * rq, v = fma(s.av, dx, s.bv * dy) * rq;
@@ -34,8 +35,20 @@ template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V dx, V dy, cons
     h.rho = select(h.ray, rho3d, rho2d);
     h.u = keep(h.ray, u), h.v = keep(h.ray, v);
     h.Q = select(h.ray, Q, V(1)), h.rq = select(h.ray, rq, V(1));
-    const V log2_alpha = fma(V(-0.5 * LOG2E), h.rho, s.log2_opacity);
-    h.alpha = keep((log2_alpha >= k.log2_alpha_min) & (s.zc * h.rq >= k.near), exp2_small(log2_alpha));
+    h.depth = s.zc * h.rq;
+    return h;
+}
+
+// The alpha of a hit (not yet limited to alpha_max), 0 where it is skipped.
+template <class V> GS2D_HD V alpha_of(V log2_opacity, V rho, V depth, const BlendLimits<V>& k) {
+    const V log2_alpha = fma(V(-0.5 * LOG2E), rho, log2_opacity);
+    return keep((log2_alpha >= k.log2_alpha_min) & (depth >= k.near), exp2_small(log2_alpha));
+}
+
+// Both.
+template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V dx, V dy, const BlendLimits<V>& k) {
+    Hit<V> h = meet(s, dx, dy, k);
+    h.alpha = alpha_of(s.log2_opacity, h.rho, h.depth, k);
     return h;
 }
 
@@ -107,13 +120,19 @@ template <class V> struct PairSums {
     V abs_x, abs_y;
 };
 
+// What the sums of a splat need of one pixel, besides the hit and the upstream gradient.
+template <class V> struct PairGradient {
+    V w;         // weight of the splat
+    V ln_alpha;  // dL/d ln(alpha)
+    V z;         // dL/d depth
+};
+
 // One splat at one pixel, front to back. T is 0 where the pixel has stopped (or does not exist).
-// Geo: normal or depth images have gradients. Dist: the distortion has. Abs: the AbsGS signal is wanted.
-// Column: dx is the same in all calls of these sums; finish_column multiplies by it once instead.
-template <bool Geo, bool Dist, bool Abs, bool Column = false, class V>
-GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
-                           const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
-    const V alpha = min(h.alpha, k.alpha_max), depth = s.zc * h.rq;
+// Geo: normal or depth images have gradients. Dist: the distortion has.
+template <bool Geo, bool Dist, class V>
+GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V inverse_zc, V depth, V Q, V raw_alpha, const BlendLimits<V>& k,
+                                  const PixelGradient<V>& g, V& T, V& S) {
+    const V alpha = min(raw_alpha, k.alpha_max);
     const V after = fnma(alpha, T, T);
     const auto goes_on = after >= k.transmittance_min;
     const V w = keep(goes_on, alpha * T);
@@ -122,31 +141,42 @@ GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const H
     if constexpr (Geo) {
         along = fma(s.nx, g.nx, fma(s.ny, g.ny, fma(s.nz, g.nz, along)));
         along = fma(depth, g.depth, along);
-        gz = fma(w, g.depth, keep((w > V(0)) & (T > V(0.5)) & (after <= g.median_below), g.median));
+        // T is above median_below exactly before the median pair, and w > 0 where it falls
+        gz = fma(w, g.depth, keep(goes_on & (T > g.median_below) & (after <= g.median_below), g.median));
     }
     if constexpr (Dist) {
-        const V inverse_depth = inverse_zc * h.Q;
+        const V inverse_depth = inverse_zc * Q;
         const V q = inverse_depth - g.inverse_depth0, lever = fma(q, g.total, -g.M1);
         along = fma(g.distortion, fma(q, lever - g.M1, g.M2), along);
         gz = fnma(V(2) * w * g.distortion * lever, inverse_depth * inverse_depth, gz);
     }
     S = fnma(w, along, S);
     // d alpha / d ln(alpha) = the unclamped alpha: the ceiling passes gradients
-    const V gl = keep(goes_on, fma(T, along, -quotient(S, V(1) - alpha)) * h.alpha);
+    const V gl = keep(goes_on, fma(T, along, -quotient(S, V(1) - alpha)) * raw_alpha);
     T = keep(goes_on, after);
+    return {w, gl, gz};
+}
 
-    sums.ln_alpha = sums.ln_alpha + gl;
-    sums.red = fma(w, g.red, sums.red), sums.green = fma(w, g.green, sums.green), sums.blue = fma(w, g.blue, sums.blue);
+// Adds that pair to the sums: first what follows from the weight and from alpha alone, then the geometry.
+template <bool Geo, class V> GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, PairSums<V>& sums) {
+    sums.ln_alpha = sums.ln_alpha + p.ln_alpha;
+    sums.red = fma(p.w, g.red, sums.red), sums.green = fma(p.w, g.green, sums.green), sums.blue = fma(p.w, g.blue, sums.blue);
+    if constexpr (Geo) sums.nx = fma(p.w, g.nx, sums.nx), sums.ny = fma(p.w, g.ny, sums.ny), sums.nz = fma(p.w, g.nz, sums.nz);
+}
+
+// Abs: the AbsGS signal is wanted. Filtered: the low-pass filter may have decided one of the pairs (if not: the same sums).
+// Column: dx is the same in all calls of these sums; finish_column multiplies by it once instead.
+template <bool Geo, bool Abs, bool Filtered, bool Column, class V>
+GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, const Hit<V>& h, const PairGradient<V>& p, PairSums<V>& sums) {
     // Plane branch: rho = (X^2 + Y^2) / Q^2, z = z_c / Q. Filtered pairs: only zc and the filter's centre.
-    const V t = gl * h.rq, tu = t * h.u, tv = t * h.v;  // -dL/dX, -dL/dY
+    const V t = p.ln_alpha * h.rq, tu = t * h.u, tv = t * h.v;  // -dL/dX, -dL/dY
     V gQ = t * h.rho;
     if constexpr (Geo) {
-        sums.nx = fma(w, g.nx, sums.nx), sums.ny = fma(w, g.ny, sums.ny), sums.nz = fma(w, g.nz, sums.nz);
-        const V gzc = gz * h.rq;
+        const V gzc = p.z * h.rq;
         sums.zc = sums.zc + gzc;
-        gQ = fnma(gzc, depth, gQ);
+        gQ = fnma(gzc, h.depth, gQ);
     }
-    gQ = keep(h.ray, gQ);
+    if constexpr (Filtered) gQ = keep(h.ray, gQ);
     const auto along_x = [&](V g, V& sum) {
         if constexpr (!Column) sum = fma(g, dx, sum);
     };
@@ -157,9 +187,20 @@ GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const H
         const V px = fma(s.au, tu, fma(s.av, tv, -(s.az * gQ))), py = fma(s.bu, tu, fma(s.bv, tv, -(s.bz * gQ)));
         sums.abs_x = sums.abs_x + abs(h.Q * px), sums.abs_y = sums.abs_y + abs(h.Q * py);
     }
-    const V filtered = select(h.ray, V(0), gl);
-    sums.lowpass_x = Column ? sums.lowpass_x + filtered : fma(filtered, dx, sums.lowpass_x);
-    sums.lowpass_y = fma(filtered, dy, sums.lowpass_y);
+    if constexpr (Filtered) {
+        const V filtered = select(h.ray, V(0), p.ln_alpha);
+        sums.lowpass_x = Column ? sums.lowpass_x + filtered : fma(filtered, dx, sums.lowpass_x);
+        sums.lowpass_y = fma(filtered, dy, sums.lowpass_y);
+    }
+}
+
+// All of it.
+template <bool Geo, bool Dist, bool Abs, bool Column = false, class V>
+GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
+                           const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
+    const PairGradient<V> p = weigh_vjp<Geo, Dist>(s, inverse_zc, h.depth, h.Q, h.alpha, k, g, T, S);
+    add_colors<Geo>(g, p, sums);
+    add_geometry<Geo, Abs, true, Column>(s, dx, dy, h, p, sums);
 }
 
 // The part of it that reaches the splat's colour: all that is needed while everything else is frozen.

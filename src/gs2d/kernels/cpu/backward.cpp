@@ -75,31 +75,17 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     }
 }
 
-// The rows of a tile lie far apart: ask for those of the next tile while this one is worked on.
-void prefetch_tile(const Frame& f, const Images& images, const ImageGradients& g, int64_t tile) {
-    if (tile >= f.tiles) return;
-    const TileArea a = tile_area(f, tile);
-    const int64_t W = f.view.width, pixels = W * f.view.height;
-    const real* const rgb[] = {g.color, g.normal, images.color, g.normal ? images.normal : nullptr};
-    const real* const gray[] = {g.alpha, g.depth_mean, g.depth_median, g.distortion, images.alpha, &f.saved[0],
-                                g.depth_mean ? images.depth_mean : nullptr, g.distortion ? images.distortion : nullptr,
-                                g.distortion ? &f.saved[pixels] : nullptr, g.distortion ? &f.saved[2 * pixels] : nullptr,
-                                g.distortion ? &f.saved[3 * pixels] : nullptr};
-    for (int y = 0; y < a.height; ++y) {
-        const int64_t at = (a.y0 + y) * W + a.x0;
-        for (const real* image : rgb)
-            if (image)
-                for (int i = 0; i < 3 * a.width; i += 16) __builtin_prefetch(image + 3 * at + i);
-        for (const real* image : gray)
-            if (image) __builtin_prefetch(image + at);
-    }
+ImageList images_read(const Frame& f, const Images& images, const ImageGradients& g) {
+    const int64_t pixels = int64_t(f.view.width) * f.view.height;
+    ImageList list;
+    list.add(g.color, 3), list.add(g.normal, 3), list.add(images.color, 3), list.add(g.normal ? images.normal : nullptr, 3);
+    list.add(g.alpha, 1), list.add(g.depth_mean, 1), list.add(g.depth_median, 1), list.add(g.distortion, 1);
+    list.add(images.alpha, 1), list.add(g.depth_mean ? images.depth_mean : nullptr, 1), list.add(&f.saved[0], 1);
+    if (!g.distortion) return list;
+    list.add(images.distortion, 1);
+    for (int k = 1; k < 4; ++k) list.add(&f.saved[k * pixels], 1);
+    return list;
 }
-
-// What the first pass over a splat's blocks leaves for the second.
-struct Hits {
-    alignas(64) real u[BLOCKS][LANES], v[BLOCKS][LANES], Q[BLOCKS][LANES], rq[BLOCKS][LANES], rho[BLOCKS][LANES], alpha[BLOCKS][LANES];
-    M ray[BLOCKS];
-};
 
 constexpr int AHEAD = 8;  // records lie far apart: ask for them this many splats early
 
@@ -139,73 +125,169 @@ __attribute__((noinline)) void pass_by(const real* record, uint32_t blocks, Plan
     }
 }
 
-// Two passes per splat: intersections first, whose long chains then overlap, and compositing after.
+// Pairs (splat, block) of some splats in a row. They are worked on in passes, each with a short chain of operations, so that
+// those of many pairs overlap, and with little enough to remember for the registers: the planes; alphas; what moves T and S
+// on; and the sums, splat by splat.
+struct Batch {
+    static constexpr int PAIRS = BLOCKS + 8;
+    alignas(64) real u[PAIRS][LANES], v[PAIRS][LANES], Q[PAIRS][LANES], rq[PAIRS][LANES], depth[PAIRS][LANES], rho[PAIRS][LANES];
+    real alpha[PAIRS][LANES];               // in the end dL/d ln(alpha): all of this is to stay in the first cache
+    real w[PAIRS][LANES], z[PAIRS][LANES];  // weight, dL/dz
+    M ray[PAIRS];
+    uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch
+    // Of each splat. Its pairs are those before `end`; filtered: the low-pass filter decided one of them.
+    const real* record[PAIRS];
+    real inverse_zc[PAIRS];
+    uint8_t end[PAIRS], filtered[PAIRS];
+    int pairs = 0, splats = 0;
+
+    bool has_room(uint32_t blocks) const { return pairs + __builtin_popcount(blocks) <= PAIRS; }
+
+    void add(const real* splat_record, uint32_t blocks) {  // no branch depends on `blocks`: none could be foreseen
+        memset(&splat[pairs], splats, BLOCKS);
+        for (int first = 0; first < BLOCKS; first += 8) {
+            const uint32_t byte = blocks >> first & 255u;
+            uint64_t numbers;
+            memcpy(&numbers, BIT_NUMBERS.of[byte], sizeof numbers);
+            numbers += 0x0101010101010101u * uint64_t(first);  // to each byte
+            memcpy(&block[pairs], &numbers, sizeof numbers);
+            pairs += __builtin_popcount(byte);
+        }
+        record[splats] = splat_record, inverse_zc[splats] = real(1) / splat_record[8], filtered[splats] = 0;
+        end[splats++] = uint8_t(pairs);
+    }
+};
+
+// Pixel centres of the columns and rows of a tile's blocks.
+struct Centres {
+    alignas(64) real x[BLOCKS_X][LANES], y[BLOCKS / BLOCKS_X][LANES];
+    explicit Centres(const TileArea& a) {
+        for (int i = 0; i < BLOCKS_X; ++i) store(x[i], lane_x(a.x0) + V(real(i * BLOCK_W)));
+        for (int i = 0; i < BLOCKS / BLOCKS_X; ++i) store(y[i], lane_y(a.y0) + V(real(i * BLOCK_H)));
+    }
+    V at_x(int b) const { return load(x[b % BLOCKS_X]); }
+    V at_y(int b) const { return load(y[b / BLOCKS_X]); }
+};
+
+template <bool WithQ> inline void find_hits(Batch& w, const Centres& centres, const BlendLimits<V>& limits) {
+    for (int i = 0; i < w.pairs; ++i) {
+        const int b = w.block[i];
+        const Record<V> s = broadcast(w.record[w.splat[i]]);
+        const Hit<V> h = meet(s, centres.at_x(b) - s.cx, centres.at_y(b) - s.cy, limits);
+        store(w.u[i], h.u), store(w.v[i], h.v), store(w.rq[i], h.rq), store(w.depth[i], h.depth), store(w.rho[i], h.rho);
+        if constexpr (WithQ) store(w.Q[i], h.Q);
+        w.ray[i] = h.ray;
+    }
+    for (int i = 0; i < w.pairs; ++i) {
+        const int j = w.splat[i];
+        const V alpha = alpha_of(V(w.record[j][9]), load(w.rho[i]), load(w.depth[i]), limits);
+        store(w.alpha[i], alpha);
+        w.filtered[j] |= any(and_not(alpha > V(0), w.ray[i]));
+    }
+}
+
+template <bool Geo, bool Dist> inline void weigh_pairs(Batch& w, Planes s, const BlendLimits<V>& limits) {
+    for (int i = 0; i < w.pairs; ++i) {
+        const int j = w.splat[i], at = w.block[i] * LANES;
+        V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
+        const V Q = Dist ? load(w.Q[i]) : V(0);
+        const PairGradient<V> p = weigh_vjp<Geo, Dist>(broadcast(w.record[j]), V(w.inverse_zc[j]), load(w.depth[i]), Q,
+                                                       load(w.alpha[i]), limits, load_gradient(s, w.block[i]), pixel_T, pixel_S);
+        store(&s[T][at], pixel_T), store(&s[S][at], pixel_S);
+        store(w.w[i], p.w), store(w.alpha[i], p.ln_alpha), store(w.z[i], p.z);
+    }
+}
+
+// Of one splat, whose pairs these are.
+template <bool Geo, bool Abs, bool Filtered>
+inline void sum_pairs(const Batch& w, int first, int end, const Record<V>& splat, const Planes s, const Centres& centres,
+                      PairSums<V>& sums) {
+    const auto pair = [&](int i) -> PairGradient<V> { return {load(w.w[i]), load(w.alpha[i]), load(w.z[i])}; };
+    const auto geometry = [&](int i) {
+        const int b = w.block[i];
+        Hit<V> h;
+        h.u = load(w.u[i]), h.v = load(w.v[i]), h.rq = load(w.rq[i]), h.depth = load(w.depth[i]), h.rho = load(w.rho[i]);
+        if constexpr (Abs) h.Q = load(w.Q[i]);
+        if constexpr (Filtered) h.ray = w.ray[i];
+        add_geometry<Geo, Abs, Filtered, false>(splat, centres.at_x(b) - splat.cx, centres.at_y(b) - splat.cy, h, pair(i), sums);
+    };
+    const auto colors = [&](int i) { add_colors<Geo>(load_gradient(s, w.block[i]), pair(i), sums); };
+    if constexpr (REGISTERS >= 32) {
+        for (int i = first; i < end; ++i) geometry(i), colors(i);
+    } else {  // the sums do not fit: first one half of them, then the other
+        for (int i = first; i < end; ++i) geometry(i);
+        for (int i = first; i < end; ++i) colors(i);
+    }
+}
+
+template <bool Abs>
+inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool filtered, const Slots& to, const BlendLimits<V>& limits) {
+    RecordGradient<V> g = finish(splat, sums, limits);
+    if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
+    const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz,
+                          g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
+    transpose_reduce<GRADIENT>(fields, to.gradients);
+    if (!to.extras) return;
+    *to.has_extra = Abs || filtered;
+    const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
+    if (Abs || filtered) transpose_reduce<GRADIENT_EXTRA>(extra, to.extras);
+}
+
+// Empties the batch; returns where the next splat's slot is.
 template <bool Geo, bool Dist, bool Abs>
-void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area, const BlendLimits<V>& limits) {
-    alignas(64) real px[BLOCKS][LANES], py[BLOCKS][LANES];
+__attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const Centres& centres, const BlendLimits<V>& limits) {
+    find_hits<Dist || Abs>(w, centres, limits);
+    weigh_pairs<Geo, Dist>(w, s, limits);
+    for (int j = 0, first = 0; j < w.splats; first = w.end[j++], to = to.from(1)) {
+        const V zero = V(0);
+        PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
+                            zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+        const Record<V> splat = broadcast(w.record[j]);
+        if (w.filtered[j])
+            sum_pairs<Geo, Abs, true>(w, first, w.end[j], splat, s, centres, sums);
+        else
+            sum_pairs<Geo, Abs, false>(w, first, w.end[j], splat, s, centres, sums);
+        write_slot<Abs>(splat, sums, w.filtered[j], to, limits);
+    }
+    w.pairs = w.splats = 0;
+    return to;
+}
+
+template <bool Geo, bool Dist, bool Abs>
+void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
+              const BlendLimits<V>& limits, RowsAhead next) {
+    const Centres centres(area);
     const V lx = lane_x(area.x0), ly = lane_y(area.y0);
-    for (int b = 0; b < BLOCKS; ++b) store(px[b], lx + V(real(block_x(b)))), store(py[b], ly + V(real(block_y(b))));
-    Hits hits;
+    Batch batch;
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
     Interest interest(entry, count, rows);
     for (int32_t at = 0; at < count && interest.blocks; ++at, ++entry) {
+        next.ask();
         if (at + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
         const real* record = &f.records[size_t(entry->splat) * RECORD];
-        if (rows) {
-            if (!rows[entry->splat]) {
-                pass_by<Geo, Dist>(record, entry->blocks & interest.blocks, s, lx, ly, limits);
-                continue;
-            }
-            interest.passed(*entry, at);
+        const bool learns = !rows || rows[entry->splat];
+        if (batch.splats && !(learns && batch.has_room(entry->blocks)))
+            to = finish_batch<Geo, Dist, Abs>(batch, to, s, centres, limits);
+        if (!learns) {
+            pass_by<Geo, Dist>(record, entry->blocks & interest.blocks, s, lx, ly, limits);
+            continue;
         }
-        const Record<V> splat = broadcast(record);
-        const V inverse_zc = V(real(1) / record[8]), zero = V(0);
-        bool filtered = false;  // whether the low-pass filter decided any pair
-        int i = 0;
-        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1, ++i) {
-            const int b = __builtin_ctz(blocks);
-            const Hit<V> h = intersect(splat, load(px[b]) - splat.cx, load(py[b]) - splat.cy, limits);
-            store(hits.u[i], h.u), store(hits.v[i], h.v), store(hits.rq[i], h.rq), store(hits.rho[i], h.rho), store(hits.alpha[i], h.alpha);
-            if constexpr (Dist || Abs) store(hits.Q[i], h.Q);
-            hits.ray[i] = h.ray;
-            filtered |= any(and_not(h.alpha > zero, h.ray));
-        }
-        PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
-                            zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
-        i = 0;
-        for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1, ++i) {
-            const int b = __builtin_ctz(blocks);
-            Hit<V> h = {load(hits.u[i]), load(hits.v[i]), zero, load(hits.rq[i]), load(hits.rho[i]), load(hits.alpha[i]), hits.ray[i]};
-            if constexpr (Dist || Abs) h.Q = load(hits.Q[i]);
-            V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
-            composite_vjp<Geo, Dist, Abs>(splat, inverse_zc, load(px[b]) - splat.cx, load(py[b]) - splat.cy, h, limits,
-                                          load_gradient(s, b), pixel_T, pixel_S, sums);
-            store(&s[T][b * LANES], pixel_T);
-            store(&s[S][b * LANES], pixel_S);
-        }
-        RecordGradient<V> g = finish(splat, sums, limits);
-        if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
-        const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz,
-                              g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
-        transpose_reduce<GRADIENT>(fields, to.gradients);
-        if (to.extras) {
-            *to.has_extra = Abs || filtered;
-            const V extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
-            if (Abs || filtered) transpose_reduce<GRADIENT_EXTRA>(extra, to.extras);
-        }
-        to = to.from(1);
+        if (rows) interest.passed(*entry, at);
+        batch.add(record, entry->blocks);
     }
+    if (batch.splats) finish_batch<Geo, Dist, Abs>(batch, to, s, centres, limits);
 }
 
 // Only the colours' gradients: no geometry, no opacity.
 void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
-                    const BlendLimits<V>& limits) {
+                    const BlendLimits<V>& limits, RowsAhead next) {
     const V lx = lane_x(area.x0), ly = lane_y(area.y0);
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
     Interest interest(entry, count, rows);
     for (int32_t i = 0; i < count && interest.blocks; ++i, ++entry) {
+        next.ask();
         if (i + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
         const Record<V> splat = broadcast(&f.records[size_t(entry->splat) * RECORD]);
         const bool wanted = !rows || rows[entry->splat];
@@ -228,7 +310,7 @@ void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows,
     }
 }
 
-using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&);
+using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&, RowsAhead);
 
 TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
     if (color_only) return tile_color_vjp;
@@ -248,12 +330,12 @@ bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, in
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
     const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, !wants_geometry(out));
     const BlendLimits<V> limits = limits_of(f.view);
+    const ImageList read = images_read(f, images, g);
     sums.for_each_tile([&](int64_t tile, int64_t next, Slots to) {
-        prefetch_tile(f, images, g, next);
         alignas(64) real planes[PLANES][PIXELS];
         const TileArea area = tile_area(f, tile);
         start(f, images, g, area, planes);
-        vjp(f, tile, to, out.rows, planes, area, limits);
+        vjp(f, tile, to, out.rows, planes, area, limits, RowsAhead(f, read, next, f.tile_count[tile]));
     });
     clock.done(BLEND_BACKWARD);
     return true;

@@ -46,7 +46,7 @@ constexpr int BATCH = 8;
 
 // What the intersections leave: one row per splat.
 struct Batch {
-    alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
+    alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];  // `alpha` holds rho at first
 };
 
 template <bool Early>
@@ -76,11 +76,13 @@ void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const Blen
         for (int i = 0; i < m; ++i) {
             const uint32_t e = w.list[j + i];
             const Record<V> s = broadcast(w.records[e]);
-            const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
-            store(batch.alpha[i], h.alpha);
-            store(batch.depth[i], s.zc * h.rq);
+            const Hit<V> h = meet(s, x - s.cx, y - s.cy, limits);
+            store(batch.alpha[i], h.rho);
+            store(batch.depth[i], h.depth);
             store(batch.inverse_depth[i], V(w.inverse_zc[e]) * h.Q);
         }
+        for (int i = 0; i < m; ++i)  // a loop of its own: shorter chains, so that more of them overlap
+            store(batch.alpha[i], alpha_of(V(w.records[w.list[j + i]][9]), load(batch.alpha[i]), load(batch.depth[i]), limits));
         if (any(p.live & ((p.alpha <= V(0)) | (p.T > V(real(0.5))))))
             composite_batch<true>(w, w.list + j, m, b, batch, limits, p);
         else
@@ -146,10 +148,21 @@ void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
     for (int k = 0; k < 4; ++k) write_planes<1>(s.planes[saved[k]], &f.saved[k * pixels], v.width, a);
 }
 
-void blend_tile(Frame& f, int64_t tile, const Images& out, const BlockBoxes& boxes, const BlendLimits<V>& limits) {
+ImageList images_written(const Frame& f, const Images& out) {
+    const int64_t pixels = int64_t(f.view.width) * f.view.height;
+    ImageList list;
+    list.add(out.color, 3), list.add(out.normal, 3);
+    list.add(out.alpha, 1), list.add(out.depth_mean, 1), list.add(out.depth_median, 1), list.add(out.distortion, 1);
+    for (int k = 0; k < 4; ++k) list.add(&f.saved[k * pixels], 1);
+    return list;
+}
+
+void blend_tile(Frame& f, int64_t tile, const Images& out, const ImageList& written, const BlockBoxes& boxes,
+                const BlendLimits<V>& limits) {
     TileWork w;
     const TileArea area = tile_area(f, tile);
     start(w.state, area);
+    RowsAhead rows(f, written, tile, BLOCKS);
     Entry* const begin = &f.entries[f.tile_begin[tile]];
     Entry* const end = &f.entries[f.tile_begin[tile + 1]];
     Entry* kept = begin;
@@ -157,6 +170,7 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const BlockBoxes& box
         const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, boxes, area);
         bool live = false;
         for (int b = 0; b < BLOCKS; ++b) {
+            rows.ask();
             if (!w.state.finished[b]) blend_block(w, b, n, real(area.x0), real(area.y0), limits);
             live |= !w.state.finished[b];
         }
@@ -176,7 +190,8 @@ bool blend_tiles(Frame& f, const Images& out) {
     if (!f.tile_count.reserve(f.tiles) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
     const BlockBoxes boxes;
     const BlendLimits<V> limits = limits_of(f.view);
-    parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, boxes, limits); });
+    const ImageList written = images_written(f, out);
+    parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, written, boxes, limits); });
     return true;
 }
 

@@ -26,6 +26,21 @@
 
 #include "core/base.h"
 
+namespace gs2d {
+
+// For each 8-bit mask the numbers of its bits, one after the other.
+struct BitNumbers {
+    uint8_t of[256][8] = {};
+    constexpr BitNumbers() {
+        for (int mask = 0; mask < 256; ++mask)
+            for (int bit = 0, n = 0; bit < 8; ++bit)
+                if (mask >> bit & 1) of[mask][n++] = static_cast<uint8_t>(bit);
+    }
+};
+constexpr BitNumbers BIT_NUMBERS;
+
+}  // namespace gs2d
+
 #if defined(GS2D_DOUBLE)
 #include "cpu/simd_portable.h"
 #elif defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__) && defined(__AVX512BW__)

@@ -60,7 +60,11 @@ GS2D_HD M mask_of(uint32_t b) {
 GS2D_HD M first(int n) {
     return {_mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_set1_epi32(n), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7)))};
 }
-GS2D_HD V select(M m, V a, V b) { return _mm256_blendv_ps(b.v, a.v, m.m); }
+GS2D_HD V select(M m, V a, V b) {
+    __m256 r;  // not the intrinsic: gcc 12 compares the mask with 0 first
+    asm("vblendvps %3, %2, %1, %0" : "=x"(r) : "x"(b.v), "x"(a.v), "x"(m.m));
+    return r;
+}
 GS2D_HD V keep(M m, V a) { return _mm256_and_ps(m.m, a.v); }
 
 GS2D_HD V load(const float* p) { return _mm256_loadu_ps(p); }
@@ -92,17 +96,6 @@ GS2D_HD void transpose(V* v) {
 }
 
 #define GS2D_OWN_INDICES
-// For each 8-bit mask the numbers of its bits, one after the other.
-struct BitNumbers {
-    uint8_t of[256][8] = {};
-    constexpr BitNumbers() {
-        for (int mask = 0; mask < 256; ++mask)
-            for (int bit = 0, n = 0; bit < 8; ++bit)
-                if (mask >> bit & 1) of[mask][n++] = static_cast<uint8_t>(bit);
-    }
-};
-constexpr BitNumbers BIT_NUMBERS;
-
 // Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
 GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m128i shift = _mm_cvtsi32_si128(31 - bit);

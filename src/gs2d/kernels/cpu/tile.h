@@ -65,6 +65,11 @@ template <int C> inline void read_planes(const real* image, int image_width, con
     if (!image || a.width < TILE || a.height < TILE) memset(out, 0, sizeof(real) * C * PIXELS);
     if (!image) return;
     const real* from = image + (int64_t(a.y0) * image_width + a.x0) * C;
+    if (a.width == TILE && a.height == TILE) {  // the bounds known: little code, so that many rows are waited for at once
+        for (int y = 0; y < TILE; ++y, from += int64_t(image_width) * C)
+            for (int x = 0; x < TILE; x += 4) split4<C>(from + x * C, out + block_order(x, y));
+        return;
+    }
     for (int y = 0; y < a.height; ++y, from += int64_t(image_width) * C) {
         int x = 0;
         for (; x + 4 <= a.width; x += 4) split4<C>(from + x * C, out + block_order(x, y));
@@ -75,6 +80,11 @@ template <int C> inline void read_planes(const real* image, int image_width, con
 
 template <int C> inline void write_planes(const real* values, real* image, int image_width, const TileArea& a) {
     real* to = image + (int64_t(a.y0) * image_width + a.x0) * C;
+    if (a.width == TILE && a.height == TILE) {
+        for (int y = 0; y < TILE; ++y, to += int64_t(image_width) * C)
+            for (int x = 0; x < TILE; x += 4) join4<C>(values + block_order(x, y), to + x * C);
+        return;
+    }
     for (int y = 0; y < a.height; ++y, to += int64_t(image_width) * C) {
         int x = 0;
         for (; x + 4 <= a.width; x += 4) join4<C>(values + block_order(x, y), to + x * C);
@@ -82,6 +92,48 @@ template <int C> inline void write_planes(const real* values, real* image, int i
             for (int c = 0; c < C; ++c) to[x * C + c] = values[c * PIXELS + block_order(x, y)];
     }
 }
+
+// Images of which tiles are read or written.
+struct ImageList {
+    struct Image {
+        const real* data;
+        int channels;
+    } images[16];
+    int count = 0;
+    void add(const real* data, int channels) {
+        if (data) images[count++] = {data, channels};
+    }
+};
+
+// The rows of a tile lie far apart: they are asked for while other work is done, a few at each of `times` calls. Of many
+// requests at once a processor drops most. They go to the second cache: the first is full.
+class RowsAhead {
+  public:
+    // Nothing is asked for where there is no such tile.
+    RowsAhead(const Frame& f, const ImageList& list, int64_t tile, int times) : list_(list), width_(f.view.width) {
+        if (tile >= f.tiles || times == 0) return;
+        const TileArea a = tile_area(f, tile);
+        first_ = int64_t(a.y0) * width_ + a.x0, columns_ = a.width, rows_ = a.height;
+        each_ = (rows_ * list.count + times - 1) / times;
+    }
+    inline __attribute__((always_inline)) void ask() {  // inlined: gcc drops calls of functions that only prefetch
+        constexpr int FETCH = LINE / sizeof(real);
+        for (int n = each_; n > 0 && rows_ > 0; --n) {
+            const ImageList::Image image = list_.images[at_];
+            const real* const row = image.data + first_ * image.channels;
+            for (int i = 0; i < image.channels; ++i) __builtin_prefetch(row + i * FETCH, 0, 2);
+            __builtin_prefetch(row + columns_ * image.channels - 1, 0, 2);
+            if (++at_ < list_.count) continue;
+            at_ = 0, --rows_, first_ += width_;
+        }
+    }
+
+  private:
+    const ImageList& list_;
+    const int64_t width_;
+    int64_t first_ = 0;  // pixel of the next row
+    int columns_ = 0, rows_ = 0, at_ = 0, each_ = 0;
+};
 
 // Corners of the pixel centres of all blocks, relative to the tile, LANES blocks per vector.
 struct BlockBoxes {
