@@ -28,7 +28,7 @@ from gs2d.errors import Gs2dError
 from gs2d.io.files import write_json
 from gs2d.io.run import machine, versions
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.paper import PaperOptions, make_job, trained_recipe
+from gs2d.pipeline.paper_plan import PaperOptions, make_job, trained_recipe
 from gs2d.pipeline.paper_rows import Cell, read_cell
 from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
 from gs2d.pipeline.sweep import Sweep, SweepJob

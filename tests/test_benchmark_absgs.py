@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.absgs import CANDIDATES, Candidate, choose, make_jobs, markdown
 
-from gs2d.pipeline.paper import PaperOptions
+from gs2d.pipeline.paper_plan import PaperOptions
 from gs2d.pipeline.paper_rows import FIGURES, Cell
 from gs2d.pipeline.paper_scenes import find_scenes
 from gs2d.recipe_json import apply_overrides

@@ -21,7 +21,8 @@ from gs2d.cli.paper import parse_parameters, parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
 from gs2d.pipeline import sweep as sweep_module
-from gs2d.pipeline.paper import PaperOptions, canonical_recipe, make_plan, paper
+from gs2d.pipeline.paper import paper
+from gs2d.pipeline.paper_plan import PaperOptions, canonical_recipe, make_plan
 from gs2d.pipeline.paper_rows import FIGURES, Results, Row, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes, missing_scenes
 from gs2d.pipeline.paper_text import measured, shown, to_csv, to_latex, to_markdown

@@ -16,9 +16,10 @@ from gs2d.cli.commands import Train
 from gs2d.cli.paper import parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.paper_tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Order
-from gs2d.pipeline.paper import PaperOptions, check_folder, make_plan, paper
+from gs2d.pipeline.paper import check_folder, paper
 from gs2d.pipeline.paper_commands import commands_of, paper_command
 from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
+from gs2d.pipeline.paper_plan import PaperOptions, make_plan
 from gs2d.pipeline.paper_rows import Cell, Results, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes
 from gs2d.protocols import MetricConventions

@@ -7,8 +7,9 @@ import json
 from gs2d.cli.commands import Paper
 from gs2d.cli.console import Console
 from gs2d.errors import RecipeError, RunError
-from gs2d.pipeline.paper import PaperOptions, PaperResult
+from gs2d.pipeline.paper import PaperResult
 from gs2d.pipeline.paper import paper as run_paper
+from gs2d.pipeline.paper_plan import PaperOptions
 from gs2d.pipeline.paper_text import TITLES, columns_of, measured, verdict_text
 
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from typing import TYPE_CHECKING
 
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.paper_plan import PaperOptions
 from gs2d.pipeline.sweep import SweepJob
-
-if TYPE_CHECKING:
-    from gs2d.pipeline.paper import PaperOptions
 
 
 def paper_command(options: PaperOptions) -> str:

@@ -1,0 +1,182 @@
+"""What a table needs before a photograph is read: its scenes, its recipes, and the run of each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.errors import RecipeError
+from gs2d.io.run import versions
+from gs2d.paper_tables import PAPER_TABLES, PaperTable
+from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
+from gs2d.pipeline.sweep import Sweep, SweepJob, stage_keys
+from gs2d.recipe import Recipe, validate
+from gs2d.recipe_json import apply_overrides, to_json
+from gs2d.recipes import RECIPES, get_recipe
+from gs2d.schedule import scale_schedule
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperOptions:
+    """Which table, of which scenes, how.
+
+    Attributes
+    ----------
+    table : str
+        A key of ``PAPER_TABLES``.
+    data, out : Path
+        Captures; where runs, table and page go.
+    scenes : tuple of str
+        Names; empty = all that are found.
+    protocol, backend : str
+    schedule_scale : float
+    downscale : int or None
+        None = what the protocol of each scene says (DTU and TnT: 2).
+    seeds : tuple of int
+    overrides : tuple of str
+        ``stage.field=value``; those of a stage reach the recipes that have it.
+    slots : int or None
+        Processes that train at the same time; None = one a GPU, or one.
+    cache : Path or None
+        Stage cache; None = ``out/cache``. Shared by several tables it trains their common stages once.
+    truth : Path or None
+        Folder of ground truths that do not lie beside their captures.
+    lpips_weights : Path or None
+    threads : int or None
+        CPU threads of each slot; None = what is there, divided among the slots.
+    train : bool
+        False: only tabulate what is there.
+    slurm : dict or None
+        Parameters of a Slurm job (partition, timeout_min ...): slots become Slurm jobs.
+    """
+
+    table: str
+    data: Path
+    out: Path
+    scenes: tuple[str, ...] = ()
+    protocol: str = "auto"
+    backend: str = "auto"
+    schedule_scale: float = 1.0
+    downscale: int | None = None
+    seeds: tuple[int, ...] = (0,)
+    overrides: tuple[str, ...] = ()
+    slots: int | None = None
+    cache: Path | None = None
+    truth: Path | None = None
+    lpips_weights: Path | None = None
+    threads: int | None = None
+    train: bool = True
+    slurm: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A table's work: its scenes, and the job of every (recipe, scene, seed)."""
+
+    options: PaperOptions
+    table: PaperTable
+    scenes: tuple[FoundScene, ...]
+    sweep: Sweep
+    jobs: Mapping[tuple[str, str, int], SweepJob]  # (recipe of the row, scene, seed)
+
+
+def make_plan(options: PaperOptions) -> Plan:
+    """Everything that can be decided, and can be wrong, before a photograph is read.
+
+    Raises
+    ------
+    RecipeError, DataError, ProtocolError
+    """
+    if options.table not in PAPER_TABLES:
+        raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
+    if not options.seeds or len(set(options.seeds)) != len(options.seeds):
+        raise RecipeError(
+            f"--seeds must be different whole numbers, got {', '.join(map(str, options.seeds)) or 'none'}"
+        )
+    for name in ("downscale", "threads"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
+    table = PAPER_TABLES[options.table]
+    scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
+    names = {row.recipe: canonical_recipe(row.recipe) for row in table.trained if row.recipe is not None}
+    recipes = {name: trained_recipe(name, options) for name in dict.fromkeys(names.values())}
+    _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
+    cache = options.cache or options.out / "cache"
+    made: dict[str, SweepJob] = {}
+    jobs: dict[tuple[str, str, int], SweepJob] = {}
+    for scene in scenes:
+        for seed in options.seeds:
+            for row_recipe, name in names.items():
+                job = make_job(options, scene, name, recipes[name], seed, cache)
+                jobs[row_recipe, scene.name, seed] = made.setdefault(job.name, job)
+    sweep = Sweep(folder=options.out, jobs=tuple(made.values()), cache=cache)
+    return Plan(options, table, scenes, sweep, jobs)
+
+
+def canonical_recipe(name: str) -> str:
+    """The first named recipe that trains the same: "2dgs-r" for "2dgs-r-k1"."""
+    recipe = replace(get_recipe(name), name="")
+    return next(other for other in RECIPES if replace(get_recipe(other), name="") == recipe)
+
+
+def trained_recipe(name: str, options: PaperOptions) -> Recipe:
+    """A named recipe at the schedule and with the changes of the options."""
+    recipe = scale_schedule(get_recipe(name), options.schedule_scale)
+    return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
+
+
+def fitting_overrides(recipe: Recipe, overrides: Sequence[str]) -> tuple[str, ...]:
+    """The overrides that speak of the recipe itself or of a stage that it has."""
+    stages = {stage.name for stage in recipe.stages}
+    heads = {text: text.partition("=")[0].split(".") for text in overrides}
+    return tuple(text for text in overrides if len(heads[text]) == 1 or heads[text][0] in stages)
+
+
+def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> None:
+    for text in overrides:
+        if not any(fitting_overrides(recipe, (text,)) for recipe in recipes):
+            stages = dict.fromkeys(stage.name for recipe in recipes for stage in recipe.stages)
+            raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
+
+
+def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int, cache: Path) -> SweepJob:
+    """The run of a recipe (``trained_recipe`` of the name) on a scene."""
+    downscale = options.downscale or scene.downscale
+    train = TrainOptions(
+        scene=scene.path,
+        out=options.out / "runs" / f"{scene.name}-{name}-s{seed}",
+        recipe=name,
+        protocol=scene.protocol.name if options.protocol == "auto" else options.protocol,
+        backend=options.backend,
+        format=scene.format,
+        downscale=downscale,
+        schedule_scale=options.schedule_scale,
+        overrides=fitting_overrides(recipe, options.overrides),
+        seed=seed,
+        resume=True,
+        cache=cache,
+        threads=options.threads,
+    )
+    evaluate = None
+    if scene.scored or options.lpips_weights is not None:
+        evaluate = EvaluateOptions(ground_truth=scene.truth, lpips_weights=options.lpips_weights)
+    facts = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
+    return SweepJob(
+        name=train.out.name,
+        train=train,
+        evaluate=evaluate,
+        stage_keys=stage_keys((*map(repr, facts), recipe.init_points, recipe.sh_degree), to_json(recipe)["stages"]),
+        wanted=tuple(_wanted(scene, options)),
+    )
+
+
+def _wanted(scene: FoundScene, options: PaperOptions) -> Iterator[str]:
+    """What is scored: a run that was scored without it is scored again."""
+    if scene.scored:
+        yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
+    if options.lpips_weights is not None:
+        yield f"lpips: {options.lpips_weights.resolve()}"
