@@ -40,6 +40,16 @@ class Camera:
             raise ShapeError(f"T_cam_world must be [4, 4], got {list(T.shape)}")
         if not (np.isfinite(T).all() and np.allclose(T[3], (0, 0, 0, 1), atol=1e-6)):
             raise ShapeError("T_cam_world must be finite with last row (0, 0, 0, 1)")
+        R = T[:3, :3]
+        with np.errstate(all="ignore"):  # what overflows is no rotation either
+            off, determinant = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
+        if not (off < 1e-2 and determinant > 0):
+            raise ShapeError(
+                f"T_cam_world must be a rotation and a translation, got determinant {determinant:.4g} and rows "
+                f"that are orthonormal to {off:.2g}; take scale and mirroring out of it"
+            )
+        if not np.isfinite((self.fx, self.fy, self.cx, self.cy)).all():
+            raise ShapeError(f"fx, fy, cx, cy must be finite, got {self.fx}, {self.fy}, {self.cx}, {self.cy}")
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ShapeError(
                 f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
