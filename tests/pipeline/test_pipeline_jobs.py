@@ -13,14 +13,16 @@ import pytest
 
 from ball_runs import Stop, options
 from gs2d.data import View
-from gs2d.errors import DataError, ProtocolError, RunError
-from gs2d.io.ply import read_mesh, read_splats, write_mesh
+from gs2d.errors import DataError, DiskError, ProtocolError, RunError
+from gs2d.images import read_image
+from gs2d.io.ply import read_mesh, read_splats, write_mesh, write_splats
 from gs2d.io.run import RunFolder, open_run
 from gs2d.pipeline.events import Event, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.pictures import file_name, file_names
 from gs2d.pipeline.train import train
+from gs2d.splats import Splats
 from gs2d.triangles import Mesh
 from tiny import ball_cameras, write_ball_mesh
 
@@ -233,3 +235,48 @@ def test_a_rendering_is_not_written_over_a_photograph(
         render_run(undisturbed.path, out=capture / "test", threads=1)
     assert photograph.read_bytes() == before
     assert render_run(undisturbed.path, out=tmp_path / "out", threads=1)["images"] == 2
+
+
+def test_a_rendering_that_fails_leaves_none_of_its_pictures_and_no_folder(
+    undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gs2d.pipeline import jobs
+
+    write = jobs.write_image
+
+    def full(path: Path, image: np.ndarray) -> None:
+        if path.name.startswith("0003"):
+            raise DiskError("no space left")
+        write(path, image)
+
+    monkeypatch.setattr(jobs, "write_image", full)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "0001.png").write_text("an older picture")
+    for folder in (tmp_path / "new" / "deep", tmp_path / "mine"):
+        with pytest.raises(DiskError):
+            render_run(undisturbed.path, orbit=5, out=folder, threads=1)
+    assert not (tmp_path / "new").exists()
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["0001.png"]
+
+
+@pytest.mark.parametrize("frames", [-1, 10**9])
+def test_an_orbit_of_a_senseless_number_of_frames_is_refused(undisturbed: RunFolder, frames: int) -> None:
+    with pytest.raises(RunError, match="--orbit must be a number of frames from 1 to 100000"):
+        render_run(undisturbed.path, orbit=frames, threads=1)
+
+
+def test_splats_with_nan_are_not_rendered_as_if_they_were_not_there(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    splats = read_splats(copy / "splats.ply")
+    splats.means[3, 1], splats.shN[5, 0, 0] = float("nan"), float("inf")
+    write_splats(copy / "splats.ply", splats)
+    with pytest.raises(RunError, match=r"splats\.ply must hold finite numbers, got NaN or infinity in 2 splats"):
+        render_run(copy, threads=1)
+
+
+def test_no_splats_at_all_are_an_empty_picture(undisturbed: RunFolder, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    splats = read_splats(copy / "splats.ply")
+    write_splats(copy / "splats.ply", Splats(**{name: tensor[:0] for name, tensor in splats.items()}))
+    assert render_run(copy, out=tmp_path / "out", threads=1)["images"] == 2
+    assert (read_image(next((tmp_path / "out").iterdir())) == 255).all()

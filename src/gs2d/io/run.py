@@ -189,9 +189,7 @@ class RunFolder:
         """Undo a run that failed before it had anything worth keeping: its files and the folders made for it."""
         self.clear()
         self.file(LOCK).unlink(missing_ok=True)
-        for folder in self.made:
-            with contextlib.suppress(OSError):  # not empty: somebody else's files
-                folder.rmdir()
+        remove_made(self.made)
 
 
 def _is_stage(entry: Any) -> bool:
@@ -298,6 +296,13 @@ def make_folder(path: Path) -> tuple[Path, ...]:
     except OSError as error:
         raise disk_error(path, error) from error
     return tuple(missing)
+
+
+def remove_made(folders: tuple[Path, ...]) -> None:
+    """Undo ``make_folder``, as far as the folders are empty."""
+    for folder in folders:
+        with contextlib.suppress(OSError):  # not empty: somebody else's files
+            folder.rmdir()
 
 
 def save_tensors(path: Path, payload: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gs2d.camera import Camera, look_at
 from gs2d.data import View
@@ -16,7 +17,7 @@ from gs2d.evaluate.lpips import load_lpips
 from gs2d.geometry import focus_point
 from gs2d.images import write_image
 from gs2d.io.ply import read_mesh, read_splats, write_splats
-from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, SURFACE, RunFolder, make_folder, open_run
+from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, SURFACE, RunFolder, make_folder, open_run, remove_made
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
@@ -25,6 +26,8 @@ from gs2d.pipeline.scoring import score_views, split_metrics
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
 
+MOST_FRAMES = 100_000  # of an orbit
+
 
 def finished_splats(run: RunFolder) -> Splats:
     """The splats of a finished run.
@@ -32,12 +35,20 @@ def finished_splats(run: RunFolder) -> Splats:
     Raises
     ------
     RunError
-        Not finished yet.
+        Not finished yet, or the file was damaged.
     """
     path = run.file(SPLATS)
     if not path.exists():
         raise RunError(f"{run.path} is not finished: no {SPLATS}; continue it with `gs2d train ... --resume`")
-    return read_splats(path)
+    splats = read_splats(path)
+    whole = torch.stack([tensor.unsqueeze(-1).flatten(1).isfinite().all(dim=1) for _, tensor in splats.items()])
+    broken = len(splats) - int(whole.all(dim=0).sum())
+    if broken:
+        raise RunError(
+            f"{path} must hold finite numbers, got NaN or infinity in {broken} splats, which would not be drawn; "
+            "it was damaged: delete it and continue with `gs2d train ... --resume`"
+        )
+    return splats
 
 
 def _open(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Job, Splats]:
@@ -108,8 +119,8 @@ def render_run(
     RunError, DataError, DiskError
     """
     run, job, splats = _open(path, threads, on_event)
-    if orbit < 0:
-        raise RunError(f"--orbit must be a number of frames >= 1, got {orbit}")
+    if not 0 <= orbit <= MOST_FRAMES:
+        raise RunError(f"--orbit must be a number of frames from 1 to {MOST_FRAMES}, got {orbit}")
     views: list[tuple[str, View]]
     if orbit:
         image = np.zeros((1, 1, 3), np.uint8)
@@ -123,14 +134,23 @@ def render_run(
     if out is not None:
         _spare_photographs(out, [name for name, _ in views], job)
     folder = out or run.file(RENDERS) / ("orbit" if orbit else split)
-    make_folder(folder)
+    made = make_folder(folder)
     if orbit and out is None:  # the run's own folder: no frame of a longer circle stays among these
         for old in folder.glob("[0-9]*.png"):
             if old.stem.isdecimal():
                 old.unlink()
-    for name, view in counted(views, "rendering", len(views), on_event):
-        color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
-        write_image(folder / f"{name}.png", color.cpu().numpy())
+    written: list[Path] = []
+    try:
+        for name, view in counted(views, "rendering", len(views), on_event):
+            color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
+            is_new = not (folder / f"{name}.png").exists()
+            write_image(folder / f"{name}.png", color.cpu().numpy())
+            written += [folder / f"{name}.png"] if is_new else []
+    except BaseException:  # a full disk, Ctrl-C: half of the pictures would look like all of them
+        for picture in written:
+            picture.unlink(missing_ok=True)
+        remove_made(made)
+        raise
     return {"folder": str(folder), "images": len(views)}
 
 
