@@ -254,6 +254,7 @@ def validate(recipe: Recipe) -> Recipe:
     _require(recipe.seed <= LARGEST_SEED, f"{where}: seed must be at most 2^63 - 1, got {recipe.seed}")
     _require(recipe.sh_degree in (0, 1, 2, 3), f"{where}: sh_degree must be 0, 1, 2 or 3, got {recipe.sh_degree!r}")
     _integer(f"{where}: init_points", recipe.init_points, low=1)
+    _require(recipe.init_points < 2**31, f"{where}: init_points must be at most 2^31 - 1, got {recipe.init_points}")
     names = [stage.name for stage in recipe.stages]
     for name in names:
         _require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")
