@@ -90,7 +90,7 @@ def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
         (Recipe("r", (Stage("s", 1, losses=L1), Stage("s", 1, losses=L1))), "two stages are called 's'"),
         (replace(one(), seed=-1), "seed"),
         (replace(one(), sh_degree=4), "sh_degree"),
-        (replace(one(), init_points=2**31), r"init_points must be at most 2\^31 - 1"),
+        (replace(one(), init_points=2**31), "init_points must be at most 2^31 - 1"),
         (one(iterations=-1), "stage 's': iterations must be an integer >= 0, got -1"),
         (one(losses=(LossTerm("l2", 1.0),)), "stage 's': loss must be one of l1, ssim"),
         (one(losses=()), "no loss is active"),
