@@ -1,13 +1,17 @@
-"""Cells and rows of a paper table that nothing was trained for."""
+"""Cells and rows of a table that nothing was trained for; a schedule of seconds, without curves, for one that is."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from gs2d.paper_tables import TNT
 from gs2d.pipeline.paper_rows import FIGURES, Cell, Row
+
+TINY = ["--schedule-scale", "0.0005", "--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
 
 
 def make_cell(scene: str = "a", seed: int = 0, data_set: str = TNT, **figures: float | None) -> Cell:
@@ -18,3 +22,16 @@ def make_cell(scene: str = "a", seed: int = 0, data_set: str = TNT, **figures: f
 
 def make_row(name: str, *cells: Cell, paper: Mapping[str, Any] | None = None) -> Row:
     return Row(name, "2dgs", dict(paper or {}), "", cells)
+
+
+def draw_nothing(patch: pytest.MonkeyPatch) -> None:
+    """No reports and figures, which draw curves for seconds and have tests of their own."""
+    patch.setattr("gs2d.pipeline.jobs.report_run", lambda path: path)
+    patch.setattr("gs2d.pipeline.figures.write_figures", _draw_labels)
+
+
+def _draw_labels(runs: Mapping[str, Path], out: Path, *_: object, maps: Sequence[str]) -> tuple[Path, ...]:
+    """In place of ``write_figures``: a drawing that says what was to be drawn."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "traces.svg").write_text(f"{sorted(runs)} {sorted(maps)}")
+    return (out / "traces.svg",)

@@ -99,7 +99,7 @@ def test_coverage_is_read_after_the_first_stage_and_at_the_end(tmp_path: Path) -
                 run.events.append_text(json.dumps({"kind": "step", **step}).encode() + b"\n")
     found = coverage({name: tmp_path / name for name in ("2DGS", "2DGS-R")})
     assert found == {"2DGS": (0.2, 0.6, 0.2, 0.6), "2DGS-R": (0.2, 0.6, 0.4, 0.8)}
-    text = "".join(coverage_table(found))
+    text = "".join(coverage_table(found, of_paper=True))
     assert "<td>4.00e-01</td>" in text  # with and without NC they differ in the third digit
     assert "<td>0.800</td>" in text
 

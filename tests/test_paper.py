@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,10 +26,8 @@ from gs2d.pipeline.paper_plan import PaperOptions, canonical_recipe, make_plan
 from gs2d.pipeline.paper_rows import FIGURES, Results, Row, judge_order, read_cell
 from gs2d.pipeline.paper_scenes import find_scenes, missing_scenes
 from gs2d.pipeline.paper_text import measured, shown, to_csv, to_latex, to_markdown
-from paper_cells import make_cell, make_row
+from paper_cells import TINY, draw_nothing, make_cell, make_row
 from tiny import write_ball_mesh, write_capture
-
-TINY = ["--schedule-scale", "0.0005", "--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
 
 
 # -- scenes --------------------------------------------------------------------------------------------------------
@@ -271,27 +269,16 @@ def test_figures_have_the_digits_that_fit_them() -> None:
 # -- the command ---------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[str]]]:
-    """The modules table of a ball, and of a capture with a broken photograph; and the command.
-
-    Reports and figures, which draw curves for seconds, have tests of their own.
-    """
+    """The modules table of a ball, and of a capture with a broken photograph; and the command."""
     folder = tmp_path_factory.mktemp("paper")
     for name in ("ball", "broken"):
         write_capture(folder / "data" / name, train=3, test=1, size=20)
     (folder / "data" / "broken" / "train" / "r_1.png").write_bytes(b"no picture")
     words = ["paper", "modules", "--data", str(folder / "data"), "--out", str(folder / "out"), "--threads", "1", *TINY]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gs2d.pipeline.jobs.report_run", lambda path: path)
-        patch.setattr("gs2d.pipeline.figures.write_figures", draw_labels)
+        draw_nothing(patch)
         assert run([*words, "--quiet"]) == 2
         yield folder / "out", words
-
-
-def draw_labels(runs: Mapping[str, Path], out: Path, *_: object, maps: Sequence[str]) -> tuple[Path, ...]:
-    """In place of ``write_figures``: a drawing that says what was to be drawn."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "traces.svg").write_text(f"{sorted(runs)} {sorted(maps)}")
-    return (out / "traces.svg",)
 
 
 def test_the_table_is_a_list_of_rows_in_the_papers_order(finished: tuple[Path, list[str]]) -> None:

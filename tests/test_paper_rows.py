@@ -238,5 +238,5 @@ def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_p
     with pytest.raises(DataError, match="LPIPS weights not found"):  # before anything is trained
         paper(replace(options, lpips_weights=tmp_path / "vgg.pth"))
     (tmp_path / "out" / "about.json").write_text("{}")
-    with pytest.raises(RunError, match="must be one that gs2d paper wrote, got another file"):
+    with pytest.raises(RunError, match="must be one that gs2d paper or sweep wrote, got another file"):
         check_folder(plan)

@@ -1,17 +1,20 @@
 """The tables of the 2DGS-R paper as data: rows in the paper's order, the recipe of each, and the paper's own figures.
 
 Rows without a recipe are quoted: other methods, which this project does not train. What the paper says a table shows
-is here too, as :class:`Order` values that can be checked against any rows. Pure Python; never imports torch.
+is here too, as :class:`Order` values that can be checked against any rows. A table of recipes that somebody chose
+(:func:`recipe_table`) has neither figures of the paper nor orders. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 from gs2d.recipes import TABLES
 
+SWEEP = "sweep"  # the name of a table of chosen recipes
 TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result
 # Which way is better, and how many digits the paper prints.
 METRICS: Mapping[str, str] = MappingProxyType(
@@ -73,7 +76,7 @@ class PaperTable:
     ----------
     name, title : str
     label : str
-        Its LaTeX label in the paper.
+        Its LaTeX label (in the paper).
     columns : data set -> metrics, in the paper's order
     rows : tuple of PaperRow
     orders : tuple of Order
@@ -90,6 +93,23 @@ class PaperTable:
     def trained(self) -> tuple[PaperRow, ...]:
         """The rows that have a recipe."""
         return tuple(row for row in self.rows if row.recipe is not None)
+
+    @property
+    def of_paper(self) -> bool:
+        """Whether it is the paper's; else its rows are compared with each other only."""
+        return self.name != SWEEP
+
+    @property
+    def command(self) -> str:
+        """What makes it."""
+        return f"gs2d paper {self.name}" if self.of_paper else "gs2d sweep"
+
+
+def recipe_table(recipes: Sequence[str]) -> PaperTable:
+    """A table with a row for each recipe, named as it is, and nothing of the paper."""
+    nothing: Mapping[str, Any] = MappingProxyType({})
+    rows = tuple(PaperRow(name, name, nothing) for name in dict.fromkeys(recipes))
+    return PaperTable(SWEEP, "Recipes compared", "tab:sweep", nothing, rows, ())
 
 
 _IMAGE = ("psnr", "ssim", "lpips")

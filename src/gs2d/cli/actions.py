@@ -22,7 +22,8 @@ def execute(command: c.Common, console: Console) -> None:
         c.Export: export,
         c.Report: report,
         c.Recipes: recipes,
-        c.Paper: paper,
+        c.Paper: table,
+        c.Sweep: table,
         c.Doctor: doctor,
         c.Info: info,
     }
@@ -188,11 +189,11 @@ def recipes(command: c.Recipes, console: Console) -> None:
     console.result(to_json(recipe))
 
 
-def paper(command: c.Paper, console: Console) -> None:
-    """``gs2d paper``."""
-    from gs2d.cli.paper import show_paper
+def table(command: c.TableCommon, console: Console) -> None:
+    """``gs2d paper`` and ``gs2d sweep``."""
+    from gs2d.cli.paper import show_table
 
-    show_paper(command, console)
+    show_table(command, console)
 
 
 def doctor(_command: c.Doctor, console: Console) -> None:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import gs2d
-from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Doctor, Info, Paper, Recipes, Train
+from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Doctor, Info, Recipes, TableCommon, Train
 from gs2d.cli.console import Console
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.errors import Gs2dError
@@ -173,7 +173,7 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
     if isinstance(command, Train | Demo) and any((command.out / "checkpoints").glob("*.pt")):
         words = [word for word in argv if word not in ("--resume", "--overwrite")]
         line += f"; resume with: gs2d {shlex.join([*words, '--resume'])}"
-    if isinstance(command, Paper) and not command.no_train:
+    if isinstance(command, TableCommon) and not command.no_train:
         line += f"; go on with: gs2d {shlex.join(argv)}"
     print(line, file=sys.stderr)
     return INTERRUPTED

@@ -179,13 +179,9 @@ class Recipes(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Paper(Common):
-    """Train what one of the paper's tables needs, score it, and write the table beside the paper's figures."""
+class TableCommon(Common):
+    """Options of the commands that train and score many runs, and write a table of them."""
 
-    table: Annotated[
-        Positional[Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"]], arg(metavar="TABLE")
-    ]
-    """Which table: regularisation, benchmark, k, freeze, modules or absgs."""
     data: Annotated[Path, arg(metavar="DIR")]
     """A capture, or a folder of captures."""
     out: Annotated[Path, arg(metavar="DIR")]
@@ -221,6 +217,24 @@ class Paper(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Paper(TableCommon):
+    """Train what one of the paper's tables needs, score it, and write the table beside the paper's figures."""
+
+    table: Annotated[
+        Positional[Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"]], arg(metavar="TABLE")
+    ]
+    """Which table: regularisation, benchmark, k, freeze, modules or absgs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep(TableCommon):
+    """Train and score recipes on every scene and seed, and write a table with a row for each recipe."""
+
+    recipes: Annotated[Positional[tuple[str, ...]], arg(metavar="RECIPE [RECIPE ...]")]
+    """Names that `gs2d recipes` lists. Recipes that --out has already keep their rows."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Doctor(Common):
     """Say what this machine can run, and why not the rest."""
 
@@ -234,7 +248,7 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Paper, Doctor, Info
+    Demo, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
@@ -246,6 +260,7 @@ Command = (
     | Annotated[Report, subcommand("report")]
     | Annotated[Recipes, subcommand("recipes")]
     | Annotated[Paper, subcommand("paper")]
+    | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Info, subcommand("info")]
 )

@@ -1,19 +1,20 @@
-"""``gs2d paper``: from arguments to options, and the table on the screen."""
+"""``gs2d paper`` and ``gs2d sweep``: from arguments to options, and the table on the screen."""
 
 from __future__ import annotations
 
 import json
 
-from gs2d.cli.commands import Paper
+from gs2d.cli.commands import Paper, Sweep, TableCommon
 from gs2d.cli.console import Console
 from gs2d.errors import RecipeError, RunError
+from gs2d.paper_tables import SWEEP
 from gs2d.pipeline.paper import PaperResult
 from gs2d.pipeline.paper import paper as run_paper
 from gs2d.pipeline.paper_plan import PaperOptions
 from gs2d.pipeline.paper_text import TITLES, columns_of, measured, verdict_text
 
 
-def show_paper(command: Paper, console: Console) -> None:
+def show_table(command: TableCommon, console: Console) -> None:
     """Run the command; what failed is an error at the end, when everything else is done and written.
 
     Raises
@@ -42,7 +43,7 @@ def show_paper(command: Paper, console: Console) -> None:
         )
 
 
-def paper_options(command: Paper) -> PaperOptions:
+def paper_options(command: TableCommon) -> PaperOptions:
     """The options of the pipeline.
 
     Raises
@@ -50,10 +51,11 @@ def paper_options(command: Paper) -> PaperOptions:
     RecipeError
     """
     return PaperOptions(
-        table=command.table,
+        table=command.table if isinstance(command, Paper) else SWEEP,
+        recipes=_split(command.recipes) if isinstance(command, Sweep) else (),
         data=command.data,
         out=command.out,
-        scenes=tuple(name for words in command.scenes for name in words.split(",") if name),
+        scenes=_split(command.scenes),
         protocol=command.protocol,
         backend=command.backend,
         schedule_scale=command.schedule_scale,
@@ -70,6 +72,11 @@ def paper_options(command: Paper) -> PaperOptions:
     )
 
 
+def _split(words: tuple[str, ...]) -> tuple[str, ...]:
+    """``a,b c`` and ``a b c`` alike."""
+    return tuple(part for word in words for part in word.split(",") if part)
+
+
 def parse_seeds(words: tuple[str, ...]) -> tuple[int, ...]:
     """``0,1,2`` or ``0 1 2`` are seeds; one number n > 0 is a count, the seeds 0 to n - 1.
 
@@ -77,7 +84,7 @@ def parse_seeds(words: tuple[str, ...]) -> tuple[int, ...]:
     ------
     RecipeError
     """
-    parts = [part for word in words for part in word.split(",") if part]
+    parts = _split(words)
     if not parts or not all(part.isdecimal() for part in parts):
         raise RecipeError(
             f"--seeds must be whole numbers like 0,1,2, or a count like 3, got {' '.join(words) or 'nothing'}"

@@ -1,11 +1,11 @@
-"""One of the paper's tables: find the scenes, train what the rows need, score it, write the table and its page."""
+"""One of the paper's tables, or a table of chosen recipes: train what the rows need, score it, write table and page."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ from gs2d.disk import atomic_write
 from gs2d.errors import RunError
 from gs2d.io.files import read_json, write_json
 from gs2d.io.run import machine, make_folder, versions
-from gs2d.paper_tables import DTU, TNT, PaperTable
-from gs2d.pipeline.events import OnEvent, ignore
+from gs2d.paper_tables import DTU, SWEEP, TNT, PaperTable
+from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.paper_commands import commands_of, paper_command
 from gs2d.pipeline.paper_deviations import deviations_of
 from gs2d.pipeline.paper_page import write_page
@@ -65,8 +65,12 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
     Gs2dError
         The options or the data folder are wrong; nothing is trained then.
     """
-    plan = make_plan(options)
-    check_folder(plan)
+    asked = make_plan(options)
+    check_folder(asked)
+    plan = with_other_rows(asked)
+    others = [name for name in plan.options.recipes if name not in options.recipes]
+    if others:
+        on_event(Notice(f"{options.out} has rows of earlier commands, which stay: {', '.join(others)}"))
     if options.train:
         if options.lpips_weights is not None:
             from gs2d.evaluate.lpips import load_lpips  # loads torch
@@ -83,11 +87,23 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
             slurm=options.slurm,
             after_job=lambda _job: _tabulate_so_far(plan),
         )
-    return tabulate(plan, on_event)
+    return tabulate(with_other_rows(plan), on_event)
 
 
 def _tabulate_so_far(plan: Plan) -> None:
-    tabulate(plan, pictures=False)
+    tabulate(with_other_rows(plan), pictures=False)
+
+
+def with_other_rows(plan: Plan) -> Plan:
+    """A sweep's plan with the rows of other commands too, earlier ones and those under way: none takes them away."""
+    path = plan.options.out / ABOUT
+    if plan.options.table != SWEEP or not path.exists():
+        return plan
+    found = read_json(path).get("recipes")
+    if not isinstance(found, list):
+        raise RunError(f"{path} must list the recipes of its sweep, got {found!r}; choose another --out")
+    names = tuple(dict.fromkeys([*map(str, found), *plan.options.recipes]))
+    return plan if names == plan.options.recipes else make_plan(replace(plan.options, recipes=names))
 
 
 def check_folder(plan: Plan) -> None:
@@ -104,7 +120,7 @@ def check_folder(plan: Plan) -> None:
         return
     before, after = read_json(path).get("options"), json.loads(json.dumps(_defining(plan.options)))
     if not isinstance(before, dict):
-        raise RunError(f"{path} must be one that gs2d paper wrote, got another file; choose another --out")
+        raise RunError(f"{path} must be one that gs2d paper or sweep wrote, got another file; choose another --out")
     for name, value in after.items():
         if before.get(name) != value:
             raise RunError(
@@ -189,6 +205,7 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
     return {
         "table": plan.table.name,
         "title": plan.table.title,
+        "recipes": [row.recipe for row in plan.table.trained],
         "options": _defining(options),
         "data": str(options.data),
         "scenes": {scene.name: {"data_set": scene.data_set, **_scene_facts(scene)} for scene in plan.scenes},

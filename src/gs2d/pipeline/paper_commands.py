@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 
+from gs2d.paper_tables import SWEEP
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.paper_plan import PaperOptions
 from gs2d.pipeline.sweep import SweepJob
@@ -11,7 +12,8 @@ from gs2d.pipeline.sweep import SweepJob
 
 def paper_command(options: PaperOptions) -> str:
     """The command that makes this table."""
-    words = ["gs2d", "paper", options.table, "--data", str(options.data), "--out", str(options.out)]
+    table = ["sweep", *options.recipes] if options.table == SWEEP else ["paper", options.table]
+    words = ["gs2d", *table, "--data", str(options.data), "--out", str(options.out)]
     words += ["--scenes", *options.scenes] if options.scenes else []
     if options.schedule_scale != 1.0:
         words += ["--schedule-scale", str(options.schedule_scale)]

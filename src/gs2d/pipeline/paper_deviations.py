@@ -1,4 +1,4 @@
-"""In what a table differs from the paper's, in sentences."""
+"""In what a table differs from the paper's, or what else to know about its figures, in sentences."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def deviations_of(
             found.append(f"captures without points start from {points[1]:,} random ones, not from {points[0]:,}")
     found += _scenes(options, scenes, table)
     found += [f"changed in the recipes: {text}" for text in options.overrides]
-    found += _methods(table, scenes)
-    found += _weights(table, scenes)
+    if table.of_paper:
+        found += _methods(table, scenes)
+        found += _weights(table, scenes)
     found += _missing_figures(results)
     if any(scene.data_set == NERF_SYNTHETIC and scene.scored for scene in scenes):
         found.append("F-score on NeRF-Synthetic is by this project's own protocol: the paper states none")
@@ -45,13 +46,15 @@ def deviations_of(
     if options.slots is not None and options.slots > 1:
         found.append(f"{options.slots} runs shared the machine: their seconds are longer than those of one alone")
     count, names = len(options.seeds), ", ".join(map(str, options.seeds))
-    found.append(f"{count} seed{'s' if count > 1 else ''} ({names}); the paper does not say how many")
+    unsaid = "; the paper does not say how many" if table.of_paper else ""
+    found.append(f"{count} seed{'s' if count > 1 else ''} ({names}){unsaid}")
     host, installed = machine(), versions()
     backends = ", ".join(
         sorted({cell.details["backend"] for row in results.rows for cell in row.cells if cell.details})
     )
     found.append(
-        f"machine: {host['processor']}, {host['cores']} cores, backend {backends or 'none yet'} (paper: RTX 4090); "
+        f"machine: {host['processor']}, {host['cores']} cores, backend {backends or 'none yet'}"
+        f"{' (paper: RTX 4090)' if table.of_paper else ''}; "
         f"gs2d {installed['2dgs-r']}, torch {installed['torch']}, Python {installed['python']}"
     )
     return found
@@ -124,12 +127,8 @@ def _surfaces(results: Results) -> Iterator[str]:
 
 def _scenes(options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
     """Other photographs, other scenes, pieces of them that are missing."""
-    for data_set in dict.fromkeys(scene.data_set for scene in scenes):
-        if data_set not in table.columns:
-            names = ", ".join(scene.name for scene in scenes if scene.data_set == data_set)
-            yield f"trained on {names} ({data_set}); the paper's table is of {', '.join(table.columns)}"
-    for data_set, (absent, count) in missing_scenes(scenes).items():
-        yield f"{data_set}: {len(absent)} of its {count} scenes are not here: {', '.join(absent)}"
+    if table.of_paper:
+        yield from _other_scenes(scenes, table)
     for scene in scenes:
         factor = options.downscale or scene.downscale
         if factor != scene.downscale:
@@ -143,6 +142,16 @@ def _scenes(options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTab
             yield f"{scene.name}: {more} more pieces are missing; about.json names each"
     if not options.scenes:
         yield from (f"{name} is not trained: {line}" for name, line in unreadable(options.data).items())
+
+
+def _other_scenes(scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
+    """Scenes that are not the paper's, and those of its data sets that are not here."""
+    for data_set in dict.fromkeys(scene.data_set for scene in scenes):
+        if data_set not in table.columns:
+            names = ", ".join(scene.name for scene in scenes if scene.data_set == data_set)
+            yield f"trained on {names} ({data_set}); the paper's table is of {', '.join(table.columns)}"
+    for data_set, (absent, count) in missing_scenes(scenes).items():
+        yield f"{data_set}: {len(absent)} of its {count} scenes are not here: {', '.join(absent)}"
 
 
 def _size(scene: FoundScene) -> tuple[int, int] | None:

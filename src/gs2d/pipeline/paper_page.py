@@ -15,7 +15,16 @@ from gs2d.io.run import RENDERS
 from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.paper_rows import Cell, Results, Row, Verdict
-from gs2d.pipeline.paper_text import TITLES, best_rows, columns_of, rows_for, shown, untrained, verdict_text
+from gs2d.pipeline.paper_text import (
+    TITLES,
+    best_rows,
+    columns_of,
+    deviations_title,
+    rows_for,
+    shown,
+    untrained,
+    verdict_text,
+)
 from gs2d.recipes import RECIPES, get_recipe
 from gs2d.report_html import drawing, escape, facts, missing, page, picture, table
 
@@ -54,25 +63,43 @@ def write_page(
     ------
     DiskError
     """
-    body = [STYLE, f'<div class="eyebrow">gs2d paper {escape(paper_table.name)}</div>']
-    body += [f"<h1>{escape(paper_table.title)}</h1>", lead(verdicts, about)]
+    body = [STYLE, f'<div class="eyebrow">{escape(paper_table.command)}</div>']
+    body += [f"<h1>{escape(paper_table.title)}</h1>", lead(paper_table, verdicts, about)]
     for data_set in results.data_sets:
         body += [f"<h2>{escape(data_set)}</h2>", figures_table(paper_table, results, data_set)]
     body += papers_tables(paper_table, results)
-    body += ["<h2>Do the paper&#8217;s orders hold?</h2>", orders_table(verdicts)]
-    body += ["<h2>How this differs from the paper</h2>", _list(deviations)]
+    if paper_table.of_paper:
+        body += ["<h2>Do the paper&#8217;s orders hold?</h2>", orders_table(verdicts)]
+    body += [f"<h2>{deviations_title(paper_table)}</h2>", _list(deviations)]
     body += ["<h2>Side by side</h2>", *side_by_side(results)]
-    body += own_figures(results, out, on_event)
+    body += own_figures(paper_table, results, out, on_event)
     body += ["<h2>Every run</h2>", runs_table(results)]
     body += ["<h2>How it was made</h2>", made_with(about, commands)]
     path = out / "index.html"
     with atomic_write(path, "w") as file:
-        file.write(page(f"{paper_table.title} - gs2d paper {paper_table.name}", body))
+        file.write(page(f"{paper_table.title} - {paper_table.command}", body))
     return path
 
 
-def lead(verdicts: Sequence[Verdict], about: dict[str, Any]) -> str:
+def lead(paper_table: PaperTable, verdicts: Sequence[Verdict], about: dict[str, Any]) -> str:
     """The result in two sentences."""
+    text = _held(verdicts) if paper_table.of_paper else _counted(about)
+    scale = about["options"]["schedule_scale"]
+    if scale != 1.0:
+        text += f" Trained at {scale:g} of the schedule: compare differences, not absolute figures."
+    if len(about["seeds"]) < 2:
+        text += " One seed: how much a figure moves by chance is not known."
+    return f'<p class="lead">{text}</p>'
+
+
+def _counted(about: dict[str, Any]) -> str:
+    """How much was compared."""
+    counts = {"recipe": len(about["recipes"]), "scene": len(about["scenes"])}
+    return " on ".join(f"{count} {name}{'s' if count != 1 else ''}" for name, count in counts.items()) + "."
+
+
+def _held(verdicts: Sequence[Verdict]) -> str:
+    """How many of the paper's orders hold."""
     known = [verdict for verdict in verdicts if verdict.holds != "unknown"]
     hold = sum(verdict.holds == "yes" for verdict in known)
     if not known:
@@ -84,12 +111,7 @@ def lead(verdicts: Sequence[Verdict], about: dict[str, Any]) -> str:
         ) + " of the paper&#8217;s orders that could be checked hold."
     if len(known) < len(verdicts):
         text += f" {len(verdicts) - len(known)} could not be checked."
-    scale = about["options"]["schedule_scale"]
-    if scale != 1.0:
-        text += f" Trained at {scale:g} of the schedule: compare differences, not absolute figures."
-    if len(about["seeds"]) < 2:
-        text += " One seed: how much a figure moves by chance is not known."
-    return f'<p class="lead">{text}</p>'
+    return text
 
 
 def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> str:
@@ -114,16 +136,17 @@ def figures_table(paper_table: PaperTable, results: Results, data_set: str) -> s
     scenes = (
         f"Means over {len(counted)} scene{'s' if len(counted) != 1 else ''}: {', '.join(counted)}. " if counted else ""
     )
-    note = (
-        "In small print, and in grey rows, the paper's figures. "
-        "MB: float32 parameters. s: training alone, shared stages included."
-    )
+    quoted = "In small print, and in grey rows, the paper's figures. " if paper_table.of_paper else ""
+    note = f"{quoted}MB: float32 parameters. s: training alone, shared stages included."
     return built + f'<p class="soft">{escape(scenes + note)}</p>'
 
 
 def about_row(row: Row) -> str:
-    """What is trained for a row, in words."""
-    return "" if row.recipe is None else RECIPES[row.recipe].about.partition(": ")[2] or RECIPES[row.recipe].about
+    """What is trained for a row, in words: the name of one of the paper's says what the table is about."""
+    if row.recipe is None:
+        return ""
+    about = RECIPES[row.recipe].about
+    return about if row.name == row.recipe else about.partition(": ")[2] or about
 
 
 def _cell(row: Row, metric: str, data_set: str, mean: float | None, spread: float | None, best: bool) -> str:
@@ -214,7 +237,7 @@ def _picture(path: Path, alt: str) -> str:
     return picture(read_image(path), alt=alt, width=PICTURE_WIDTH) if path.exists() else '<div class="soft">none</div>'
 
 
-def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[str]:
+def own_figures(paper_table: PaperTable, results: Results, out: Path, on_event: OnEvent) -> list[str]:
     """The paper's figures (K_a and opacity, traces of the attributes, a map of E_i), a set for each scene."""
     from gs2d.pipeline.figures import coverage, write_figures  # loads torch
 
@@ -227,14 +250,14 @@ def own_figures(results: Results, out: Path, on_event: OnEvent) -> list[str]:
         maps = [name for name in runs if _ranks(name, rows)][-1:]  # they need the photographs: one is enough
         try:
             drawn = [_drawing(path) for path in write_figures(runs, out / "figures" / scene, on_event, maps=maps)]
-            drawn += coverage_table(coverage(runs))
+            drawn += coverage_table(coverage(runs), of_paper=paper_table.of_paper)
         except Gs2dError as error:
             drawn = [missing(str(error))]
         sections += [f"<h3>{escape(scene)}</h3>", '<div class="figures">', *drawn, "</div>"] if drawn else []
     return ["<h2>How the splats change in training</h2>", *sections] if sections else []
 
 
-def coverage_table(means: Mapping[str, Sequence[float]]) -> list[str]:
+def coverage_table(means: Mapping[str, Sequence[float]], *, of_paper: bool) -> list[str]:
     """Mean K_a and opacity of each row after stage 1, and both at the end."""
     if not means:
         return []
@@ -243,7 +266,8 @@ def coverage_table(means: Mapping[str, Sequence[float]]) -> list[str]:
         for name, values in means.items()
     ]
     heads = ["", "K_a after stage 1", "opacity", "K_a at the end", "opacity"]
-    note = "Means over all splats; the paper's figure compares 2DGS with and without NC after 30k iterations."
+    quoted = "; the paper's figure compares 2DGS with and without NC after 30k iterations" if of_paper else ""
+    note = f"Means over all splats{quoted}."
     return [f'<div>{table(heads, rows)}<p class="soft">{escape(note)}</p></div>']
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from gs2d.errors import RecipeError
 from gs2d.io.run import versions
-from gs2d.paper_tables import PAPER_TABLES, PaperTable
+from gs2d.paper_tables import PAPER_TABLES, SWEEP, PaperTable, recipe_table
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
 from gs2d.pipeline.sweep import Sweep, SweepJob, stage_keys
@@ -26,7 +26,9 @@ class PaperOptions:
     Attributes
     ----------
     table : str
-        A key of ``PAPER_TABLES``.
+        A key of ``PAPER_TABLES``, or ``SWEEP``: the rows are ``recipes``.
+    recipes : tuple of str
+        Names; only for ``SWEEP``.
     data, out : Path
         Captures; where runs, table and page go.
     scenes : tuple of str
@@ -56,6 +58,7 @@ class PaperOptions:
     table: str
     data: Path
     out: Path
+    recipes: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
     protocol: str = "auto"
     backend: str = "auto"
@@ -90,8 +93,7 @@ def make_plan(options: PaperOptions) -> Plan:
     ------
     RecipeError, DataError, ProtocolError
     """
-    if options.table not in PAPER_TABLES:
-        raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
+    table = _table(options)
     if not options.seeds or len(set(options.seeds)) != len(options.seeds):
         raise RecipeError(
             f"--seeds must be different whole numbers, got {', '.join(map(str, options.seeds)) or 'none'}"
@@ -100,7 +102,6 @@ def make_plan(options: PaperOptions) -> Plan:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
-    table = PAPER_TABLES[options.table]
     scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
     names = {row.recipe: canonical_recipe(row.recipe) for row in table.trained if row.recipe is not None}
     recipes = {name: trained_recipe(name, options) for name in dict.fromkeys(names.values())}
@@ -115,6 +116,21 @@ def make_plan(options: PaperOptions) -> Plan:
                 jobs[row_recipe, scene.name, seed] = made.setdefault(job.name, job)
     sweep = Sweep(folder=options.out, jobs=tuple(made.values()), cache=cache)
     return Plan(options, table, scenes, sweep, jobs)
+
+
+def _table(options: PaperOptions) -> PaperTable:
+    """The rows that are asked for."""
+    if options.table == SWEEP:
+        if not options.recipes:
+            raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
+        for name in options.recipes:
+            get_recipe(name)  # a name that is wrong is said before anything is looked for
+        return recipe_table(options.recipes)
+    if options.recipes:
+        raise RecipeError(f"recipes must be those of the table {options.table!r}, got {', '.join(options.recipes)}")
+    if options.table not in PAPER_TABLES:
+        raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
+    return PAPER_TABLES[options.table]
 
 
 def canonical_recipe(name: str) -> str:

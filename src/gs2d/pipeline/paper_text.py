@@ -81,12 +81,19 @@ def verdict_text(verdict: Verdict) -> str:
     return prefix + "; ".join(words)
 
 
+def deviations_title(table: PaperTable) -> str:
+    """What stands above the deviations."""
+    return "How this differs from the paper" if table.of_paper else "What to know about these figures"
+
+
 # -- files -----------------------------------------------------------------------------------------------------------
 def to_markdown(
     table: PaperTable, results: Results, verdicts: Sequence[Verdict], deviations: Sequence[str], commands: Sequence[str]
 ) -> str:
     """The whole result as Markdown."""
-    lines = [f"# {table.title}", "", f"Table `{table.name}` (`{table.label}`). In brackets: the paper's figures.", ""]
+    lines = [f"# {table.title}", ""]
+    if table.of_paper:
+        lines += [f"Table `{table.name}` (`{table.label}`). In brackets: the paper's figures.", ""]
     for data_set in results.data_sets:
         columns = columns_of(table, results, data_set)
         arrows = [
@@ -111,21 +118,26 @@ def to_markdown(
                 shown_ = [f"({printed(m, data_set, known[m])})" if m in known else "-" for m in metrics]
                 lines.append(f"| {name} | " + " | ".join(shown_) + " |")
         lines.append("")
-    lines += ["## Do the paper's orders hold?", ""]
-    lines += [f"- **{v.holds}** ({v.data_set}): {v.text}. {verdict_text(v)}" for v in verdicts] or ["- nothing trained"]
-    lines += ["", "## How this differs from the paper", "", *(f"- {text}" for text in deviations), ""]
+    if table.of_paper:
+        judged = [f"- **{v.holds}** ({v.data_set}): {v.text}. {verdict_text(v)}" for v in verdicts]
+        lines += ["## Do the paper's orders hold?", "", *(judged or ["- nothing trained"]), ""]
+    lines += [f"## {deviations_title(table)}", "", *(f"- {text}" for text in deviations), ""]
     lines += ["## Commands", "", "```sh", *commands, "```", ""]
     return "\n".join(lines)
 
 
 def to_csv(results: Results) -> str:
-    """One line for each row, data set, scene and seed, and one with the mean of each data set."""
+    """One line for each row, data set, scene and seed, and one with the mean of each data set.
+
+    The paper's figures have columns where some row has any.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["row", "recipe", "data_set", "scene", "seed", *FIGURES, *(f"paper_{m}" for m in METRICS)])
+    quoted = METRICS if any(row.paper for row in results.rows) else ()
+    writer.writerow(["row", "recipe", "data_set", "scene", "seed", *FIGURES, *(f"paper_{m}" for m in quoted)])
     for row in results.rows:
         for data_set in dict.fromkeys([*(c.data_set for c in row.cells), *row.paper]):
-            paper = [row.paper.get(data_set, {}).get(m, "") for m in METRICS]
+            paper = [row.paper.get(data_set, {}).get(m, "") for m in quoted]
             for cell in row.of(data_set):
                 figures = [_blank(cell.figures[name]) for name in FIGURES]
                 writer.writerow(
@@ -165,7 +177,8 @@ def to_latex(table: PaperTable, results: Results) -> str:
     lines = ["% \\usepackage{booktabs}", "\\begin{table}", "  \\centering"]
     for data_set, columns in groups.items():
         lines += [*_latex_tabular(results, data_set, columns), "  \\par\\medskip"]
-    caption = f"{table.title}. In brackets: the figures of the paper.".translate(_TEX)
+    quoted = " In brackets: the figures of the paper." if table.of_paper else ""
+    caption = f"{table.title}.{quoted}".translate(_TEX)
     lines += [f"  \\caption{{{caption}}}", f"  \\label{{{table.label}-measured}}", "\\end{table}", ""]
     return "\n".join(lines)
 

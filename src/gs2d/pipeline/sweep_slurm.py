@@ -24,7 +24,7 @@ def run_on_slurm(
     """Submit ``slots`` jobs, each of which works until the list is done, and wait for the list.
 
     The folders must be on a disk that the nodes share. A Slurm job that dies is not submitted again; its runs are
-    taken over by the others, or by the next `gs2d paper` with the same --out.
+    taken over by the others, or by the next command with the same --out.
 
     Parameters
     ----------
