@@ -129,9 +129,9 @@ __attribute__((noinline)) void pass_by(const real* record, uint32_t blocks, Plan
 // those of many pairs overlap, and with little enough to remember for the registers: the planes; alphas; what moves T and S
 // on; and the sums, splat by splat.
 struct Batch {
-    static constexpr int PAIRS = BLOCKS + 8;
+    static constexpr int PAIRS = BLOCKS;  // as many as a splat may have; more would push the pixels out of the first cache
     alignas(64) real u[PAIRS][LANES], v[PAIRS][LANES], Q[PAIRS][LANES], rq[PAIRS][LANES], depth[PAIRS][LANES], rho[PAIRS][LANES];
-    real alpha[PAIRS][LANES];               // in the end dL/d ln(alpha): all of this is to stay in the first cache
+    real alpha[PAIRS][LANES];               // in the end dL/d ln(alpha)
     real w[PAIRS][LANES], z[PAIRS][LANES];  // weight, dL/dz
     M ray[PAIRS];
     uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch

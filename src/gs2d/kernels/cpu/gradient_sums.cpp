@@ -65,7 +65,8 @@ void GradientSums::cut_into_chunks() {
         ++chunks_;
         f.chunks[chunks_].first_tile = t, f.chunks[chunks_].first_slot = f.slot_begin[t];
     }
-    for (parts_ = 1; parts_ < static_cast<uint32_t>(get_threads()) && parts_ < 16;) parts_ *= 2;
+    threads_ = get_threads();
+    for (parts_ = 1; parts_ < static_cast<uint32_t>(threads_) && parts_ < 16;) parts_ *= 2;
     for (int64_t c = 0; c <= chunks_; ++c) {
         GradientChunk& chunk = f.chunks[c];
         chunk.first_task = tasks_;

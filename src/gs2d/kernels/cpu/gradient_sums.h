@@ -27,7 +27,8 @@ class GradientSums {
     // Cuts the tiles into chunks and sets f.sums to 0; false when memory is short.
     bool prepare();
 
-    // Calls blend(tile, next tile, slots) for each tile with slots, on all threads, and adds the slots to f.sums.
+    // Calls blend(tile, next, slots) for each tile with slots, on all threads, and adds the slots to f.sums. `next` is the
+    // tile that this thread will probably blend then; there may be none of that number.
     // Tasks are handed out in order: those that blend chunk 0, chunk 1, those that add chunk 0, those that blend chunk 2 ...
     // Each waits only for tasks before it, which somebody is already working on.
     template <class F> void for_each_tile(F&& blend) {
@@ -46,8 +47,11 @@ class GradientSums {
             }
             if (c >= 2) wait_for(f_.chunks[c - 2].sums_left);  // its slots' memory is used again
             const int64_t end = f_.chunks[c + 1].first_tile, first = f_.chunks[c].first_tile + k * TILES_PER_TASK;
-            for (int64_t tile = first; tile < first + TILES_PER_TASK && tile < end; ++tile)
-                if (tile_slots(tile) > 0) blend(tile, tile + 1, slots(c).from(f_.slot_begin[tile] - f_.chunks[c].first_slot));
+            for (int64_t tile = first; tile < first + TILES_PER_TASK && tile < end; ++tile) {
+                const bool last = tile + 1 == first + TILES_PER_TASK;
+                const int64_t next = last ? tile + 1 + (threads_ - 1) * TILES_PER_TASK : tile + 1;
+                if (tile_slots(tile) > 0) blend(tile, next, slots(c).from(f_.slot_begin[tile] - f_.chunks[c].first_slot));
+            }
             f_.chunks[c].tasks_left.fetch_sub(1, std::memory_order_release);
         });
     }
@@ -58,6 +62,7 @@ class GradientSums {
     const ParameterGradients& out_;
     const int64_t sh_rest_;
     int64_t chunks_ = 0, tasks_ = 0;
+    int64_t threads_ = 1;
     uint32_t parts_ = 1;  // tasks that add a chunk, each some of the splats; a power of two
 
     int64_t blend_tasks(int64_t c) const {

@@ -1,6 +1,7 @@
 #include "cpu/threads.h"
 
 #include <pthread.h>
+#include <time.h>
 
 #include <atomic>
 
@@ -10,16 +11,17 @@ namespace gs2d {
 namespace {
 
 constexpr int MAX_THREADS = 256;
+constexpr int64_t LOOK_NS = 50000;
 
 struct Pool {
     pthread_mutex_t run_lock = PTHREAD_MUTEX_INITIALIZER;  // one parallel_for at a time
-    pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;      // guards everything below
+    pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;      // guards everything below; busy and job are also read without it
     pthread_cond_t wake = PTHREAD_COND_INITIALIZER, done = PTHREAD_COND_INITIALIZER;
     int wanted = 1;   // threads asked for, the caller included
     int started = 0;  // pool threads alive
-    int busy = 0;     // pool threads inside the current job
-    int seats = 0;    // pool threads that may still join it
-    uint64_t job = 0;
+    int seats = 0;    // pool threads that may still join the current job
+    std::atomic<int> busy{0};     // pool threads inside it
+    std::atomic<uint64_t> job{0};
     Task task = nullptr;
     void* context = nullptr;
     int64_t count = 0;
@@ -28,6 +30,22 @@ struct Pool {
 
 Pool pool;
 thread_local bool inside = false;
+
+// A thread sleeps only after it has looked for this long: jobs follow each other within microseconds, and to wake a thread
+// takes tens of them. Not longer: torch's threads want the cores too.
+template <class F> void look_for(F&& ready) {
+    timespec start, now;
+    clock_gettime(CLOCK_MONOTONIC, &start);
+    do {
+        for (int n = 0; n < 64; ++n) {
+            if (ready()) return;
+#if defined(__x86_64__)
+            __builtin_ia32_pause();
+#endif
+        }
+        clock_gettime(CLOCK_MONOTONIC, &now);
+    } while ((now.tv_sec - start.tv_sec) * 1000000000 + now.tv_nsec - start.tv_nsec < LOOK_NS);
+}
 
 void work(Task task, void* context, int64_t count) {
     for (int64_t i; (i = pool.next.fetch_add(1, std::memory_order_relaxed)) < count;) task(context, i);
@@ -49,6 +67,9 @@ void* thread_main(void*) {
         work(task, context, count);
         pthread_mutex_lock(&pool.lock);
         if (--pool.busy == 0) pthread_cond_signal(&pool.done);
+        pthread_mutex_unlock(&pool.lock);
+        look_for([&] { return pool.job.load(std::memory_order_relaxed) != seen; });
+        pthread_mutex_lock(&pool.lock);
     }
     return nullptr;
 }
@@ -59,7 +80,8 @@ void after_fork() {
     pthread_mutex_init(&pool.lock, nullptr);
     pthread_cond_init(&pool.wake, nullptr);
     pthread_cond_init(&pool.done, nullptr);
-    pool.started = pool.busy = pool.seats = 0;
+    pool.started = pool.seats = 0;
+    pool.busy = 0;
     inside = false;
 }
 
@@ -113,6 +135,9 @@ void run_tasks(int64_t n, Task task, void* context) {
     inside = false;
     pthread_mutex_lock(&pool.lock);
     pool.seats = 0;  // latecomers find nothing to do
+    pthread_mutex_unlock(&pool.lock);
+    look_for([] { return pool.busy.load(std::memory_order_relaxed) == 0; });
+    pthread_mutex_lock(&pool.lock);
     while (pool.busy > 0) pthread_cond_wait(&pool.done, &pool.lock);
     pthread_mutex_unlock(&pool.lock);
     pthread_mutex_unlock(&pool.run_lock);

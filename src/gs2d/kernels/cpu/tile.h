@@ -135,13 +135,15 @@ class RowsAhead {
     int columns_ = 0, rows_ = 0, at_ = 0, each_ = 0;
 };
 
-// Corners of the pixel centres of all blocks, relative to the tile, LANES blocks per vector.
+// Corners of the pixel centres of all blocks, relative to the tile, LANES blocks (whole rows of them) per vector.
 struct BlockBoxes {
-    V x0[BLOCKS / LANES], y0[BLOCKS / LANES];
+    V x0, y0[BLOCKS / LANES];
     BlockBoxes() {
+        static_assert(LANES % BLOCKS_X == 0);
         alignas(64) real x[BLOCKS], y[BLOCKS];
         for (int b = 0; b < BLOCKS; ++b) x[b] = real(block_x(b)) + real(0.5), y[b] = real(block_y(b)) + real(0.5);
-        for (int i = 0; i < BLOCKS / LANES; ++i) x0[i] = load(x + i * LANES), y0[i] = load(y + i * LANES);
+        x0 = load(x);
+        for (int i = 0; i < BLOCKS / LANES; ++i) y0[i] = load(y + i * LANES);
     }
 };
 
@@ -151,9 +153,9 @@ inline uint32_t blocks_touched(const CullRecord& s, const BlockBoxes& boxes, rea
     const BoxTest<V> test = {V(s.ex - tile_x), V(s.ey - tile_y), V(s.a), V(s.b), V(s.c),
                              V(s.cx - tile_x), V(s.cy - tile_y), V(s.disc2), V(-s.b / s.c), V(-s.b / s.a)};
     uint32_t mask = 0;
+    const V x0 = boxes.x0, x1 = x0 + V(real(BLOCK_W - 1));
     for (int i = 0; i < BLOCKS / LANES; ++i) {
-        const V x0 = boxes.x0[i], y0 = boxes.y0[i];
-        const V x1 = x0 + V(real(BLOCK_W - 1)), y1 = y0 + V(real(BLOCK_H - 1));
+        const V y0 = boxes.y0[i], y1 = y0 + V(real(BLOCK_H - 1));
         mask |= bits(reaches(test, x0, y0, x1, y1)) << (i * LANES % 32);
     }
     return mask;
