@@ -80,6 +80,15 @@ def test_a_picture_of_far_too_many_pixels_is_told_to_be_shrunk(tmp_path: Path, m
             read(tmp_path / "x.png")
 
 
+def test_a_mask_of_zeros_and_ones_is_not_all_black(tmp_path: Path) -> None:
+    pixels = np.array([[0, 1], [1, 0]], np.uint8)
+    for name, factor in (("ones", 1), ("white", 255), ("dark", 100)):
+        Image.fromarray(pixels * np.uint8(factor)).save(tmp_path / f"{name}.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "ones.png"), pixels == 1)
+    np.testing.assert_array_equal(read_mask(tmp_path / "white.png"), pixels == 1)
+    assert not read_mask(tmp_path / "dark.png").any()
+
+
 def test_a_written_picture_reads_back_as_it_was(tmp_path: Path) -> None:
     for channels in (3, 4):
         pixels = np.random.default_rng(channels).integers(0, 256, (7, 5, channels)).astype(np.uint8)

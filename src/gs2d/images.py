@@ -80,9 +80,14 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
-    """Decode a mask: bool [H, W], True where the image is at least half white and half opaque."""
+    """Decode a mask: bool [H, W], True where the image is at least half white and half opaque.
+
+    In a file of zeros and ones, which would be all black, one is white.
+    """
     image = read_image(path)
     grey = image[:, :, :3].max(axis=2)
+    if grey.max() == 1:
+        grey = grey * np.uint8(255)
     if image.shape[2] == 4:
         grey = np.minimum(grey, image[:, :, 3])
     return np.asarray(grey >= 128)

@@ -129,6 +129,38 @@ def test_the_colmap_capture_of_these_tests_is_good_when_nothing_is_broken(
     assert json.loads(capsys.readouterr().out)["points"] == 20
 
 
+def masked_colmap(folder: Path, black: tuple[int, ...]) -> None:
+    """The ball in COLMAP's layout with masks, of which some are black; view 0 is the test view."""
+    from PIL import Image
+
+    colmap(folder)
+    (folder / "masks").mkdir()
+    for i, camera in enumerate(ball_cameras(3)):
+        value = 0 if i in black else 255
+        Image.new("L", (camera.width, camera.height), value).save(folder / "masks" / f"{i}.png")
+
+
+@pytest.mark.parametrize("black", [(0, 1, 2), (1, 2)])
+def test_masks_that_leave_nothing_to_learn_from_are_an_error(
+    black: tuple[int, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    masked_colmap(tmp_path / "capture", black)
+    assert run(["train", str(tmp_path / "capture"), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 2
+    assert f"the masks of {len(black)} of 3 views leave no pixel" in one_line(capsys.readouterr().err)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None:
+    from gs2d.pipeline.events import Event
+    from gs2d.pipeline.options import TrainOptions
+    from gs2d.pipeline.prepare import prepare
+
+    masked_colmap(tmp_path / "capture", (1,))
+    heard: list[Event] = []
+    prepare(TrainOptions(scene=tmp_path / "capture", out=tmp_path / "run"), heard.append)
+    assert any("masks of 1 of 3 views leave no pixel, first 1.png: nothing is learned" in str(e) for e in heard)
+
+
 @pytest.mark.parametrize(
     ("more", "named"),
     [

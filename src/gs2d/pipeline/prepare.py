@@ -14,7 +14,7 @@ import torch
 
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.data.layouts import missing_lines, protocol_of
-from gs2d.errors import RecipeError, RunError
+from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
@@ -140,7 +140,7 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
         on_event(Notice(f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"))
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
-    digest = scene_digest(scene, on_event)
+    digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
         on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
@@ -188,23 +188,31 @@ def _say_some(lines: Sequence[str], what: str, on_event: OnEvent) -> None:
         on_event(Notice(f"... and {len(lines) - SHOWN_SKIPS} more {what}; `gs2d info` lists them"))
 
 
-def scene_digest(scene: Scene, on_event: OnEvent) -> str:
+def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -> str:
     """Decode every photograph once (a broken one stops the run here) and hash what training will see.
 
     Raises
     ------
     DataError
-        A photograph does not decode.
+        A photograph does not decode; or masks are used, and leave nothing of any training view.
     """
     digest = hashlib.sha256()
+    empty: list[View] = []
     train = set(map(id, scene.train))
     on_event(Phase("reading photographs", len(scene.views)))
     for done, view in enumerate(scene.preload(DECODE_THREADS), start=1):
         digest.update(f"{view.name} {'train' if id(view) in train else 'test'}".encode())
+        mask = view.mask()
+        empty += [view] if uses_masks and mask is not None and not mask.any() else []
         for array in _arrays(view):
             digest.update(f"{array.shape} {array.dtype}".encode())
             digest.update(np.ascontiguousarray(array).data)
         on_event(Step(done))
+    if empty:
+        what = f"the masks of {len(empty)} of {len(scene.views)} views leave no pixel, first {empty[0].name}"
+        if set(map(id, empty)) >= train:
+            raise DataError(f"{scene.root}: {what}; white = keep: are they inverted?")
+        on_event(Notice(f"{what}: nothing is learned from them (white = keep)"))
     if scene.points is not None:
         digest.update(np.ascontiguousarray(scene.points.points).tobytes())
         if scene.points.colors is not None:
