@@ -219,7 +219,7 @@ def test_the_command_on_the_page_has_the_seeds_that_were_run(seeds: tuple[int, .
     assert words[words.index("--data") + 1] == "a b"
 
 
-@pytest.mark.parametrize("name", ["downscale", "threads"])
+@pytest.mark.parametrize("name", ["downscale", "threads", "slots"])
 def test_zero_is_not_taken_for_the_default(name: str) -> None:
     options = replace(PaperOptions(table="k", data=Path("data"), out=Path("out")), **{name: 0})
     with pytest.raises(RecipeError, match=f"--{name} must be a whole number >= 1, got 0"):

@@ -136,6 +136,7 @@ def _defining(options: PaperOptions) -> dict[str, Any]:
 # -- tabulating ------------------------------------------------------------------------------------------------------
 def tabulate(plan: Plan, on_event: OnEvent = ignore, *, pictures: bool = True) -> PaperResult:
     """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
+    unfinished = sum(plan.sweep.record(job)["state"] not in ("done", "failed") for job in plan.sweep.jobs)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     verdicts = judge(plan.table, results)
     deviations = deviations_of(plan.options, plan.scenes, plan.table, results)
@@ -156,7 +157,6 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, pictures: bool = True) -
     if pictures:
         facts = about(plan, results, verdicts)
         files.append(write_page(plan.table, results, verdicts, deviations, commands, facts, out, on_event))
-    unfinished = sum(plan.sweep.record(job)["state"] not in ("done", "failed") for job in plan.sweep.jobs)
     return PaperResult(plan.table, tuple(files), results, verdicts, plan.sweep.failures(), unfinished)
 
 

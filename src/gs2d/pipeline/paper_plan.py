@@ -98,7 +98,7 @@ def make_plan(options: PaperOptions) -> Plan:
         raise RecipeError(
             f"--seeds must be different whole numbers, got {', '.join(map(str, options.seeds)) or 'none'}"
         )
-    for name in ("downscale", "threads"):
+    for name in ("downscale", "threads", "slots"):
         value = getattr(options, name)
         if value is not None and value < 1:
             raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
