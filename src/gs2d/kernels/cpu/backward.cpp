@@ -75,16 +75,16 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     }
 }
 
-ImageList images_read(const Frame& f, const Images& images, const ImageGradients& g) {
+RowLines images_read(const Frame& f, const Images& images, const ImageGradients& g) {
     const int64_t pixels = int64_t(f.view.width) * f.view.height;
-    ImageList list;
-    list.add(g.color, 3), list.add(g.normal, 3), list.add(images.color, 3), list.add(g.normal ? images.normal : nullptr, 3);
-    list.add(g.alpha, 1), list.add(g.depth_mean, 1), list.add(g.depth_median, 1), list.add(g.distortion, 1);
-    list.add(images.alpha, 1), list.add(g.depth_mean ? images.depth_mean : nullptr, 1), list.add(&f.saved[0], 1);
-    if (!g.distortion) return list;
-    list.add(images.distortion, 1);
-    for (int k = 1; k < 4; ++k) list.add(&f.saved[k * pixels], 1);
-    return list;
+    RowLines lines(f.view);
+    lines.add(g.color, 3), lines.add(g.normal, 3), lines.add(images.color, 3), lines.add(g.normal ? images.normal : nullptr, 3);
+    lines.add(g.alpha, 1), lines.add(g.depth_mean, 1), lines.add(g.depth_median, 1), lines.add(g.distortion, 1);
+    lines.add(images.alpha, 1), lines.add(g.depth_mean ? images.depth_mean : nullptr, 1), lines.add(&f.saved[0], 1);
+    if (!g.distortion) return lines;
+    lines.add(images.distortion, 1);
+    for (int k = 1; k < 4; ++k) lines.add(&f.saved[k * pixels], 1);
+    return lines;
 }
 
 constexpr int AHEAD = 8;  // records lie far apart: ask for them this many splats early
@@ -330,7 +330,7 @@ bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, in
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
     const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, !wants_geometry(out));
     const BlendLimits<V> limits = limits_of(f.view);
-    const ImageList read = images_read(f, images, g);
+    const RowLines read = images_read(f, images, g);
     sums.for_each_tile([&](int64_t tile, int64_t next, Slots to) {
         alignas(64) real planes[PLANES][PIXELS];
         const TileArea area = tile_area(f, tile);

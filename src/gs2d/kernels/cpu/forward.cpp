@@ -148,16 +148,16 @@ void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
     for (int k = 0; k < 4; ++k) write_planes<1>(s.planes[saved[k]], &f.saved[k * pixels], v.width, a);
 }
 
-ImageList images_written(const Frame& f, const Images& out) {
+RowLines images_written(const Frame& f, const Images& out) {
     const int64_t pixels = int64_t(f.view.width) * f.view.height;
-    ImageList list;
-    list.add(out.color, 3), list.add(out.normal, 3);
-    list.add(out.alpha, 1), list.add(out.depth_mean, 1), list.add(out.depth_median, 1), list.add(out.distortion, 1);
-    for (int k = 0; k < 4; ++k) list.add(&f.saved[k * pixels], 1);
-    return list;
+    RowLines lines(f.view);
+    lines.add(out.color, 3), lines.add(out.normal, 3);
+    lines.add(out.alpha, 1), lines.add(out.depth_mean, 1), lines.add(out.depth_median, 1), lines.add(out.distortion, 1);
+    for (int k = 0; k < 4; ++k) lines.add(&f.saved[k * pixels], 1);
+    return lines;
 }
 
-void blend_tile(Frame& f, int64_t tile, const Images& out, const ImageList& written, const BlockBoxes& boxes,
+void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlockBoxes& boxes,
                 const BlendLimits<V>& limits) {
     TileWork w;
     const TileArea area = tile_area(f, tile);
@@ -190,7 +190,7 @@ bool blend_tiles(Frame& f, const Images& out) {
     if (!f.tile_count.reserve(f.tiles) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
     const BlockBoxes boxes;
     const BlendLimits<V> limits = limits_of(f.view);
-    const ImageList written = images_written(f, out);
+    const RowLines written = images_written(f, out);
     parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, written, boxes, limits); });
     return true;
 }

@@ -93,46 +93,45 @@ template <int C> inline void write_planes(const real* values, real* image, int i
     }
 }
 
-// Images of which tiles are read or written.
-struct ImageList {
-    struct Image {
-        const real* data;
+// The cache lines that a row of a tile takes of some images: where each is for the first row of the first tile.
+struct RowLines {
+    struct Line {
+        const real* at;
         int channels;
-    } images[16];
-    int count = 0;
-    void add(const real* data, int channels) {
-        if (data) images[count++] = {data, channels};
+    } lines[64];
+    int count = 0, width;
+    explicit RowLines(const View& view) : width(view.width) {}
+    void add(const real* image, int channels) {
+        if (!image) return;
+        constexpr int FETCH = LINE / sizeof(real);
+        for (int i = 0; i < channels * TILE; i += FETCH) lines[count++] = {image + i, channels};
+        const bool aligned = reinterpret_cast<uintptr_t>(image) % LINE == 0 && size_t(width) * channels * sizeof(real) % LINE == 0;
+        if (!aligned) lines[count++] = {image + channels * TILE - 1, channels};
     }
 };
 
-// The rows of a tile lie far apart: they are asked for while other work is done, a few at each of `times` calls. Of many
+// The rows of a tile lie far apart: they are asked for while other work is done, a few lines at each of `times` calls. Of many
 // requests at once a processor drops most. They go to the second cache: the first is full.
 class RowsAhead {
   public:
     // Nothing is asked for where there is no such tile.
-    RowsAhead(const Frame& f, const ImageList& list, int64_t tile, int times) : list_(list), width_(f.view.width) {
+    RowsAhead(const Frame& f, const RowLines& row, int64_t tile, int times) : row_(row) {
         if (tile >= f.tiles || times == 0) return;
         const TileArea a = tile_area(f, tile);
-        first_ = int64_t(a.y0) * width_ + a.x0, columns_ = a.width, rows_ = a.height;
-        each_ = (rows_ * list.count + times - 1) / times;
+        first_ = int64_t(a.y0) * row.width + a.x0, left_ = a.height * row.count;
+        each_ = (left_ + times - 1) / times;
     }
     inline __attribute__((always_inline)) void ask() {  // inlined: gcc drops calls of functions that only prefetch
-        constexpr int FETCH = LINE / sizeof(real);
-        for (int n = each_; n > 0 && rows_ > 0; --n) {
-            const ImageList::Image image = list_.images[at_];
-            const real* const row = image.data + first_ * image.channels;
-            for (int i = 0; i < image.channels; ++i) __builtin_prefetch(row + i * FETCH, 0, 2);
-            __builtin_prefetch(row + columns_ * image.channels - 1, 0, 2);
-            if (++at_ < list_.count) continue;
-            at_ = 0, --rows_, first_ += width_;
+        for (int n = each_ < left_ ? each_ : left_; n > 0; --n, --left_) {
+            __builtin_prefetch(row_.lines[at_].at + first_ * row_.lines[at_].channels, 0, 2);
+            if (++at_ == row_.count) at_ = 0, first_ += row_.width;
         }
     }
 
   private:
-    const ImageList& list_;
-    const int64_t width_;
-    int64_t first_ = 0;  // pixel of the next row
-    int columns_ = 0, rows_ = 0, at_ = 0, each_ = 0;
+    const RowLines& row_;
+    int64_t first_ = 0;  // pixel of the row
+    int left_ = 0, at_ = 0, each_ = 0;
 };
 
 // Corners of the pixel centres of all blocks, relative to the tile, LANES blocks (whole rows of them) per vector.
