@@ -178,6 +178,27 @@ def test_a_run_starts_from_the_stages_it_shares_with_another(
     assert run.metrics()["stages"][2]["iterations"] == 6
 
 
+@pytest.mark.parametrize(
+    ("changes", "error", "named"),
+    [
+        ({"start_from": "run"}, RunError, "--from and --out are the same run"),
+        ({"start_from": "other", "seed": 5}, RunError, "no finished stage in common"),
+        ({"start_from": "nowhere"}, RunError, "expected a run folder"),
+        ({"cache": "other/run.json/cache"}, DiskError, "a part of the path is a file"),
+    ],
+)
+def test_an_overwrite_that_has_nothing_to_start_from_keeps_the_old_run(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path, changes: dict[str, Any], error: type[Exception], named: str
+) -> None:
+    for name in ("run", "other"):
+        shutil.copytree(undisturbed.path, tmp_path / name)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    paths = {key: tmp_path / value if isinstance(value, str) else value for key, value in changes.items()}
+    with pytest.raises(error, match=named):
+        train(options(capture, tmp_path / "run", overwrite=True, **paths))
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
 def test_starting_from_a_run_that_shares_no_stage_is_an_error_that_leaves_nothing(
     capture: Path, undisturbed: RunFolder, tmp_path: Path
 ) -> None:

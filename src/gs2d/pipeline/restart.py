@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
-from gs2d.io.run import RunFolder, is_run, load_tensors, make_folder, open_run, save_tensors
+from gs2d.io.run import RunFolder, is_run, load_tensors, make_folder, open_run, remove_made, save_tensors
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.prepare import Job
@@ -72,6 +72,21 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
         run.write_metrics({"stages": [], "surface": None})
         return Start()
     return _adopt(run, job, max(found, key=lambda stage: stage.index), on_event)
+
+
+def check_sources(job: Job, options: TrainOptions) -> None:
+    """Raise what would be raised for ``start_from`` and ``cache``, before the run that is to be overwritten goes.
+
+    Raises
+    ------
+    RunError, DiskError
+    """
+    if options.start_from is not None:
+        if options.start_from.resolve() == options.out.resolve():
+            raise RunError(f"--from and --out are the same run, {options.out}; take another --out")
+        _from_run(job, options.start_from)
+    if options.cache is not None:
+        remove_made(make_folder(options.cache))
 
 
 def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> Start:

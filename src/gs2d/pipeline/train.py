@@ -14,7 +14,7 @@ from gs2d.pipeline.events import OnEvent, Phase, ignore
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
-from gs2d.pipeline.restart import Start, choose_start
+from gs2d.pipeline.restart import Start, check_sources, choose_start
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
 
@@ -45,6 +45,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     check_claim(options.out, **claim)  # type: ignore[arg-type]
     use_threads(options.threads)
     job = prepare(options, on_event)
+    if options.overwrite:
+        check_sources(job, options)
     run = claim_run(options.out, **claim)  # type: ignore[arg-type]
     with run.locked(), undone_if_worthless(run):
         if options.cache is not None:  # now, not when the first stage has been trained
