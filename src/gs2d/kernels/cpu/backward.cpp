@@ -1,4 +1,4 @@
-// Gradients of the blending: tile by tile, splat by splat, front to back, the sums over a splat's pixels in registers.
+// Gradients of the blending: tile by tile, front to back, some splats at a time, the sums over a splat's pixels in registers.
 // Every (tile, splat) has its own slot of gradients (gradient_sums.h), so nothing depends on the order of the tiles.
 #include "cpu/frame.h"
 #include "cpu/gradient_sums.h"
