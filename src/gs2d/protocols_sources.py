@@ -27,6 +27,7 @@ _COMMON = {
     "name": _OURS,
     "background": f"{_CODE}: black unless asked for white",
     "near": f"{_CODE}: its rasterizer's 0.2",
+    "crossing": f"{_CODE}: what its box of a splat that reaches the camera plane comes to",
     "use_mask_in_training": f"{_CODE}: the background is trained",
     "use_mask_in_fusion": f"{_CODE}: depth is cleared outside the alpha mask",
     "fusion.voxel": f"{_OURS}: from the depth maps",
@@ -79,6 +80,7 @@ _OWN: dict[str, dict[str, str]] = {
         "depth": f"{_OURS}: as 2DGS advises for scenes that are not around one object",
         "distortion_weight": f"{_2DGS}: 100 in unbounded scenes",
         "near": f"{_OURS}: 1 % of the extent, for 0.2 means nothing in a frame of unknown size",
+        "crossing": f"{_OURS}: floors and walls pass by the camera",
         "use_mask_in_training": f"{_OURS}: a mask that a capture comes with says which pixels to leave out",
     },
 }

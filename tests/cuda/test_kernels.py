@@ -43,6 +43,20 @@ def test_images_and_radii_agree_with_the_reference_on_random_scenes(emulator: Em
     assert float((torch.cat(radii) > 1e-3).double().mean()) <= 2e-3
 
 
+def test_crossing_splats_are_culled_as_by_the_reference_if_wanted(emulator: Emulator) -> None:
+    settings = replace(SETTINGS, crossing="cull")
+    differences, culled = [], 0
+    for case in cases(12, ("crossing", "huge", "plain")):
+        low = render(emulator, case.splats, case.camera, settings)
+        high = reference.rasterize(double(case.splats), case.camera, settings)
+        drawn = reference.rasterize(double(case.splats), case.camera, SETTINGS)
+        assert torch.equal(low.radii > 0, high.radii > 0)
+        differences.append((low.color.double() - high.color).abs().flatten())
+        culled += int(((drawn.radii > 0) & (high.radii == 0)).sum())
+    assert quantile(torch.cat(differences), 0.998) < 1e-4
+    assert culled > 20
+
+
 @pytest.mark.parametrize("columns", [2, 4])
 def test_gradients_agree_where_every_decision_has_a_margin(
     emulator: Emulator, clear_cases: list[Case], columns: int

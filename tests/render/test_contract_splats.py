@@ -1,4 +1,4 @@
-"""The numbered contract of ``gs2d.render.api``: rules 13 to 17, what is said of each splat, and degenerate scenes.
+"""The numbered contract of ``gs2d.render.api``: rules 13 to 17 and 19, facts of each splat, and degenerate scenes.
 
 Every test runs on every backend. Unless stated: camera at the origin along +z, 9 x 9 px, focal length 10 px, so that
 pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 2 with scale 0.4, where one pixel is
@@ -8,7 +8,7 @@ pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 
 from __future__ import annotations
 
 from dataclasses import replace
-from math import exp, log, sqrt
+from math import exp, log, radians, sin, sqrt
 
 import pytest
 import torch
@@ -222,3 +222,52 @@ def test_17_near_culls_errors_by_splat_and_by_pair(backend: Backend) -> None:
     errors = splat_errors(scene, front_camera(), torch.zeros(9, 9, 3), RasterSettings(near=1.9), backend=backend)
     equal(errors, [9 * 5 * 1.75, 0.0])
     assert not errors.requires_grad
+
+
+# 19 --------------------------------------------------------------------------------------------------------------
+CULL = RasterSettings(crossing="cull")
+
+
+@pytest.mark.parametrize("opacity", [0.02, 0.9])
+def test_19_crossing_splats_are_culled_by_their_3_sigma_disc_if_wanted(backend: Backend, opacity: float) -> None:
+    # Turned 30 degrees about y at z = 2 the disc reaches 3 s_u sin30 in depth, whatever the opacity: s_u = 4/3 is the
+    # limit, and s_v does not matter.
+    for s_u, drawn in ((1.32, True), (1.35, False)):
+        scene = splat(scales=(s_u, 9), axis=Y_AXIS, degrees=30, opacity=opacity)
+        out = rasterize(scene, front_camera(), CULL, backend=backend)
+        assert bool(out.alpha.max() > 0) is drawn
+        assert bool(out.radii[0] > 0) is drawn
+        errors = splat_errors(scene, front_camera(), torch.zeros(9, 9, 3), CULL, backend=backend)
+        assert bool(errors[0] > 0) is drawn
+        assert float(rasterize(scene, front_camera(), backend=backend).alpha.max()) > 0  # drawn unless said otherwise
+
+
+def test_19_the_cutoff_is_that_of_the_errors(backend: Backend) -> None:
+    # error_cutoff 1: the limit is s_u sin30 = 2.
+    settings = replace(CULL, error_cutoff=1.0)
+    for s_u, drawn in ((3.9, True), (4.1, False)):
+        scene = splat(scales=(s_u, 0.1), axis=Y_AXIS, degrees=30)
+        assert bool(rasterize(scene, front_camera(), settings, backend=backend).radii[0] > 0) is drawn
+
+
+def test_19_both_axes_reach_together(backend: Backend) -> None:
+    # Turned about the diagonal of its plane by 30 degrees both axes rise by sin30 / sqrt(2): 3 s sin30 = 2 again.
+    for s, drawn in ((1.32, True), (1.35, False)):
+        scene = splat(scales=(s, s), axis=(sqrt(0.5), sqrt(0.5), 0.0), degrees=30)
+        assert bool(rasterize(scene, front_camera(), CULL, backend=backend).radii[0] > 0) is drawn
+    assert 3 * 1.35 * sin(radians(30)) > 2
+
+
+def test_19_culled_splats_change_nothing_and_have_no_gradients(backend: Backend) -> None:
+    plain, crossing = splat(opacity=0.6), splat((0, 0, 0.5), scales=(3, 3), axis=Y_AXIS, degrees=85)
+    both = requiring_grad(stack(crossing, plain))
+    out = rasterize(both, front_camera(), CULL, backend=backend)
+    alone = rasterize(plain, front_camera(), CULL, backend=backend)
+    for name in IMAGES:
+        assert torch.equal(getattr(out, name), getattr(alone, name)), name
+    (out.color.sum() + out.normal.sum() + out.depth_mean.sum()).backward()
+    for name, tensor in both.items():
+        assert tensor.grad is not None
+        assert bool((tensor.grad[0] == 0).all()), name
+    assert both.means.grad is not None
+    assert bool((both.means.grad[1] != 0).any())

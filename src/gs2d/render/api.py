@@ -15,7 +15,7 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     rho3d <= rho2d the pair's depth is z; where the filter wins it is z_c (``lowpass_depth="center"``), or z
     (``"plane"``: reference only; z_c where there is no hit).
  5. *Near.* A splat with z_c <= near is culled whole; a pair with depth < near is skipped. Splats that cross the near
-    plane or the camera plane are otherwise drawn like any other.
+    plane or the camera plane are otherwise drawn like any other (but see 19).
  6. *Alpha.* alpha = o exp(-rho / 2). A pair with alpha < alpha_min is skipped (equivalently rho > k^2; the footprint
     follows opacity); a splat with o < alpha_min is culled. alpha is then limited to alpha_max; the limit passes
     gradients unchanged.
@@ -49,6 +49,8 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     culled for its opacity here).
 18. *Gradient rows.* With ``gradient_rows`` (bool [N]) the gradients of every other splat, and of its row of
     screen_probe, are zero; images, and the gradients of these rows, are the same bit for bit as without it.
+19. *Crossing.* With ``crossing="cull"`` a splat is culled whole, for images and splat errors alike, if its disc
+    rho3d <= error_cutoff^2 reaches the camera plane: z_c <= error_cutoff |(s_u t_u.z, s_v t_v.z)|.
 """
 
 from __future__ import annotations
@@ -232,3 +234,4 @@ def _check_settings(s: RasterSettings) -> None:
     require(len(s.background) == 3 and all(0 <= b <= 1 for b in s.background), "background", "3 numbers in [0, 1]")
     require(0 <= s.sh_degree <= MAX_DEGREE, "sh_degree", f"0 to {MAX_DEGREE}")
     require(s.lowpass_depth in ("center", "plane"), "lowpass_depth", "'center' or 'plane'")
+    require(s.crossing in ("draw", "cull"), "crossing", "'draw' or 'cull'")

@@ -36,7 +36,7 @@ class _View(ctypes.Structure):
         *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
         *((name, ctypes.c_double) for name in CONSTANTS),
         ("background", ctypes.c_double * 3),
-        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks")),
+        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks", "cull_crossing")),
     )
 
 
@@ -92,6 +92,7 @@ def _view(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
     for name in (*CONSTANTS, "sh_degree"):
         setattr(view, name, getattr(settings, name))
     view.exact_masks = int(exact_masks)
+    view.cull_crossing = int(settings.crossing == "cull")
     return view
 
 

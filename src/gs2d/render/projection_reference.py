@@ -53,7 +53,7 @@ class Block:
 
 
 def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, for_errors: bool) -> Tensor:
-    """Rows that are not culled by rules 5, 6 and 16, by increasing camera depth, ties by index (rule 2).
+    """Rows that are not culled by rules 5, 6, 16 and 19, by increasing camera depth, ties by index (rule 2).
 
     Returns
     -------
@@ -66,10 +66,19 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
         keep &= tensor.isfinite().flatten(1).all(dim=1) if tensor.dim() > 1 else tensor.isfinite()
     depth = _to_camera(used.means, camera)[:, 2]
     keep &= depth > settings.near
+    if settings.crossing == "cull":
+        keep &= depth**2 > settings.error_cutoff**2 * _slant_squared(used, camera)
     if not for_errors:
         keep &= used.opacities >= settings.alpha_min
     rows = keep.nonzero()[:, 0]
     return rows[depth[rows].sort(stable=True).indices]
+
+
+def _slant_squared(splats: Splats, camera: Camera) -> Tensor:
+    """(s_u t_u.z)^2 + (s_v t_v.z)^2 in the camera frame [N], wu^2: how far one sigma of the disc reaches in depth."""
+    tangents = quats_to_matrices(splats.quats)[:, :, :2] * splats.scales[:, None, :]  # [N, 3, 2]
+    forward = torch.as_tensor(camera.rotation[2].copy(), dtype=tangents.dtype, device=tangents.device)
+    return torch.einsum("j,njk->nk", forward, tangents).square().sum(dim=1)
 
 
 def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettings) -> ScreenSplats:

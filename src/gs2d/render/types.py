@@ -33,6 +33,9 @@ class RasterSettings:
     lowpass_depth : str
         Depth of a pair where the low-pass filter wins: "center" (the splat centre's), or "plane" (the ray-plane depth
         of the current official code; reference backend only).
+    crossing : str
+        Splats whose disc of ``error_cutoff`` standard deviations reaches the camera plane: "draw" like any other, or
+        "cull" (what the official rasterizer's meaningless box comes to).
     with_distortion : bool
         False = nobody looks at that image: a backend may leave it out (NaN) where that saves work.
     """
@@ -47,6 +50,7 @@ class RasterSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = 3
     lowpass_depth: str = "center"
+    crossing: str = "draw"
     with_distortion: bool = True
 
 

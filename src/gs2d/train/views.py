@@ -29,7 +29,9 @@ def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> Raster
     near = protocol.near_for(extent)
     # far only scales the distortion; in a large frame it keeps the ratio to near that 0.2 and 100 have.
     far = max(RasterSettings.far, near * RasterSettings.far / RasterSettings.near)
-    return RasterSettings(near=near, far=far, background=protocol.background, sh_degree=sh_degree)
+    return RasterSettings(
+        near=near, far=far, background=protocol.background, sh_degree=sh_degree, crossing=protocol.crossing
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -194,6 +194,11 @@ template <class V> struct Footprint {
     mask_t<V> unbounded;         // crosses, or so nearly that the ellipse cannot be trusted
 };
 
+// Rule 19: the disc rho3d <= k^2 reaches the camera plane.
+template <class V> GS2D_HD mask_t<V> reaches_camera_plane(const Frame3<V>& f, V k2) {
+    return invert(k2 * fma(f.a.z, f.a.z, f.b.z * f.b.z) < f.p.z * f.p.z);
+}
+
 template <class V, class S>
 GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px, const PinholeCamera<S>& cam) {
     Footprint<V> o;

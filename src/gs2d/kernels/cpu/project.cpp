@@ -52,6 +52,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
         for (int64_t i = begin; i < end; i += LANES) {
             const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
             Group g = project_group(f, s, i, lanes, blending);
+            if (f.view.cull_crossing) g.alive = g.alive & invert(reaches_camera_plane(g.frame, error_k2));
             if (any(g.alive)) color_group(f, s, i, lanes, g);
             const uint32_t alive = bits(g.alive);
             for (int l = 0; l < lanes; ++l) f.rects[i + l] = {0, 0, 0, 0};

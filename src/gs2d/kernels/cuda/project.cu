@@ -32,6 +32,7 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     Record<float> r = project(p, frame, v.camera);
     if (!is_finite(parameter_size(p, frame)) || !(r.zc > v.near)) return;
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
+    if (v.cull_crossing && reaches_camera_plane(frame, v.error_k2)) return;
     float sh_size;
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
     const Vec3<float> c = color_of(v.sh_degree, sh, frame.to_splat, sh_size);
