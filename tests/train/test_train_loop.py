@@ -7,15 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from train_toys import same, short, train
+from train_toys import random_splats, same, short, train
 
 from gs2d.data.scene import Scene, View
 from gs2d.protocols import GENERIC, NERF_SYNTHETIC
 from gs2d.recipe import GradDensify, LossTerm, Recipe, Stage
 from gs2d.recipes import PHOTOMETRIC, get_recipe, refine, surface
+from gs2d.render.api import rasterize
 from gs2d.render.backend import get_backend
+from gs2d.splats import Splats
 from gs2d.train import events
 from gs2d.train.loop import raster_settings
+from gs2d.train.state import TrainState
 
 
 def test_the_stages_run_in_order_and_tell_what_they_do(scene: Scene) -> None:
@@ -72,6 +75,44 @@ def test_frozen_rows_and_attributes_are_bit_identical_through_a_stage(scene: Sce
     for name, tensor in start.items():
         assert torch.equal(tensor[clones], tensor[originals]), name
         assert torch.equal(dict(end.items())[name], tensor) == (name == "opacity_logits"), name
+
+
+@pytest.mark.parametrize("crossing", ["cull", "draw"])
+def test_splats_that_no_training_view_sees_go_at_the_end_of_a_stage_if_crossing_ones_are_culled(
+    scene: Scene, backend: str, crossing: str
+) -> None:
+    # A needle of 50 wu along x: no camera of the ring (3 wu away, at 0, 60, ... degrees) has x in its image plane, so
+    # its disc reaches every camera plane.
+    splats = random_splats(12, seed=1)
+    sheet = splats.rows(torch.tensor([0])).clone()
+    sheet.means.zero_(), sheet.quats.copy_(torch.tensor([[1.0, 0, 0, 0]])), sheet.opacity_logits.fill_(3.0)
+    sheet.log_scales.copy_(torch.tensor([[50.0, 0.05]]).log())
+    both = Splats(**{name: torch.cat([tensor, dict(sheet.items())[name]]) for name, tensor in splats.items()})
+    state = TrainState(both, torch.Generator().manual_seed(0))
+    state.groups["needle"] = torch.arange(13) == 12
+    recipe = Recipe("r", (replace(surface(), iterations=2, densify=None),))
+    protocol = replace(GENERIC, crossing=crossing)
+    trainer, recorder = train(scene, recipe, protocol=protocol, state=state, backend=backend)
+    finished = recorder.events[-1]
+    assert isinstance(finished, events.StageFinished)
+    assert finished.unseen == (1 if crossing == "cull" else 0)
+    assert len(trainer.splats) == finished.splats == 13 - finished.unseen
+    trainer.state.check()
+    assert int(trainer.state.groups["needle"].sum()) == 1 - finished.unseen
+    before, after = recorder.splats[-2], recorder.splats[-1]
+    assert len(before) == 13
+    for view in scene.train:
+        pictures = [rasterize(s, view.camera, trainer.settings, backend=backend).color for s in (before, after)]
+        assert torch.equal(*pictures)
+
+
+def test_a_stage_that_moves_nothing_drops_nothing(scene: Scene) -> None:
+    protocol = replace(GENERIC, crossing="cull")
+    _, recorder = train(scene, short(), protocol=protocol)
+    done = [event for event in recorder.events if isinstance(event, events.StageFinished)]
+    start, end = (recorder.at(kind, "appearance") for kind in (events.StageStarted, events.StageFinished))
+    assert len(start) == len(end)
+    assert done[1].unseen == 0
 
 
 def test_clones_only_leaves_the_others_alone(scene: Scene) -> None:

@@ -108,12 +108,13 @@ class OpacityLimited:
 
 @dataclass(frozen=True)
 class StageFinished:
-    """A stage is done; the state already points at the next one."""
+    """A stage is done; the state already points at the next one. ``unseen`` splats were dropped: no view sees them."""
 
     stage: str
     index: int
     iterations: int
     splats: int
+    unseen: int = 0
 
 
 Event = (

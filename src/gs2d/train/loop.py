@@ -30,9 +30,20 @@ from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
 from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
 from gs2d.train.optimizer_fused import fused_adam_step
+from gs2d.train.rows import keep_rows
 from gs2d.train.state import Statistics, TrainState
 from gs2d.train.targets import DeviceTargets, Targets, TargetSource
-from gs2d.train.views import Evaluated, Evaluator, WholeViews, check_losses, diverged, finite, raster_settings, waits
+from gs2d.train.views import (
+    Evaluated,
+    Evaluator,
+    WholeViews,
+    check_losses,
+    diverged,
+    finite,
+    raster_settings,
+    seen_rows,
+    waits,
+)
 
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
 
@@ -318,9 +329,27 @@ class Trainer:
     def _finish(self, stage: Stage) -> None:
         """Point the state at the next stage and say that this one is done."""
         state, index = self.state, self.state.stage
+        unseen = self._drop_unseen(stage)
         state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
         self._evaluator = None
-        self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats)))
+        self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats), unseen))
+
+    def _drop_unseen(self, stage: Stage) -> int:
+        """Drop the splats that no training view sees; how many.
+
+        Where crossing splats are culled, one can grow until every training view culls it, and still hide a new view.
+        No pixel of a training view changes.
+        """
+        frozen = {"means", "quats", "log_scales", "opacity_logits"}.isdisjoint(stage.train)
+        if frozen or self.protocol.crossing != "cull":
+            return 0
+        seen = seen_rows(self.state.splats, self.scene, self.settings, self.backend)
+        unseen = int((~seen).sum())
+        if unseen == len(seen):
+            return 0  # nothing is left to say what the scene is; evaluation will show it
+        if unseen:
+            keep_rows(self.state, seen)
+        return unseen
 
     def _progress(
         self, stage: Stage, iteration: int, losses: Mapping[str, float], rates: Mapping[str, float]

@@ -34,6 +34,16 @@ def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> Raster
     )
 
 
+@torch.no_grad()
+def seen_rows(splats: Splats, scene: Scene, settings: RasterSettings, backend: Backend) -> Tensor:
+    """Splats [N] bool whose footprint reaches a pixel of some training view, hidden there or not."""
+    bare = replace(settings, sh_degree=0, with_distortion=False)
+    seen = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
+    for view in scene.train:
+        seen |= rasterize(splats, view.camera, bare, backend=backend).radii > 0
+    return seen
+
+
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """Loss terms of one iteration with the gradients of the trained attributes and, if gathered, screen gradients.
