@@ -108,7 +108,7 @@ class OpacityLimited:
 
 @dataclass(frozen=True)
 class StageFinished:
-    """A stage is done; the state already points at the next one. ``unseen`` splats were dropped: no view sees them."""
+    """A stage is done; the state already points at the next one. ``unseen`` splats, in no training view, are gone."""
 
     stage: str
     index: int
