@@ -1,0 +1,69 @@
+"""How much long and unseen splats of a run cost: the figures of docs/results.md, "Longer schedules".
+
+::
+
+    python -m benchmarks.sheets RUN [RUN ...] [--longer 0.1]
+
+Prints, for the splats of each run under its rasterizer settings: how many no training view sees, how many are
+longer than a share of the scene's extent, how much of the empty background (alpha of the photographs < 1/2) of the test
+views they cover, and the PSNR of the test views (8 bit) with and without either.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gs2d.evaluate.images import psnr_8bit
+from gs2d.io.ply import read_splats
+from gs2d.io.run import open_run
+from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.render.api import rasterize
+from gs2d.splats import Splats
+from gs2d.train.views import seen_rows
+
+
+@torch.no_grad()
+def score(splats: Splats, job: Job) -> tuple[float, float, float]:
+    """Mean and least PSNR of the test views in dB, and the mean alpha of their empty background."""
+    values, covered = [], []
+    for view in job.scene.test:
+        out = rasterize(splats, view.camera, job.settings, backend=job.backend)
+        target = torch.from_numpy(view.target(job.settings.background).copy())
+        values.append(float(psnr_8bit(out.color, target, None)))
+        alpha = view.alpha()
+        if alpha is not None and (alpha < 0.5).any():
+            covered.append(float(out.alpha[torch.from_numpy(alpha < 0.5)].mean()))
+    return float(np.mean(values)), min(values), float(np.mean(covered)) if covered else float("nan")
+
+
+def report(run: Path, longer: float) -> None:
+    """The figures of one run."""
+    job = reload_job(open_run(run), lambda event: None)
+    splats = read_splats(run / "splats.ply")
+    seen = seen_rows(splats, job.scene, job.settings, job.backend)
+    sizes = splats.scales.max(dim=1).values
+    long = sizes > longer * job.scene.extent
+    print(f"{run}: {len(splats):,} splats, crossing ones: {job.settings.crossing}, longest {float(sizes.max()):.4g} wu")
+    kept = {"all": seen | ~seen, f"without {int((~seen).sum())} unseen": seen}
+    kept |= {f"without {int(long.sum())} long": ~long, "without both": seen & ~long}
+    for name, rows in kept.items():
+        mean, least, covered = score(splats.rows(rows), job)
+        print(f"  {name}: {mean:.2f} dB, least {least:.1f} dB, empty background covered {100 * covered:.1f} %")
+
+
+def main() -> None:
+    """Parse the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--longer", type=float, default=0.1, help="share of the scene's extent")
+    args = parser.parse_args()
+    for run in args.runs:
+        report(run, args.longer)
+
+
+if __name__ == "__main__":
+    main()
