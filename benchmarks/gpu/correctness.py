@@ -18,6 +18,7 @@ from benchmarks.gpu.bench import ROOT, Bench, attempt
 from benchmarks.gpu.probes import ceilings
 from gs2d.kernels.cuda import launch, ops
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
+from gs2d.kernels.cuda.nearest import NEIGHBOURS, build_tree, choose_spread, find_nearest
 from gs2d.kernels.fusion import arguments_of, fuse_on_gpu
 from gs2d.render import cuda, reference
 from gs2d.render.api import rasterize, splat_errors
@@ -127,6 +128,7 @@ def exercise(bench: Bench) -> list[str]:
         _all_losses(bench)
         _three_stages(bench)
         _fusion(bench)
+        _neighbours(bench)
     bench.wait()
     return sorted(set(kernel_sources()) - launched)
 
@@ -185,6 +187,15 @@ def _fusion(bench: Bench) -> None:
     colors = {"color": random(blocks, 512, 3), "color_weight": random(blocks, 512)}
     arrays = depth | pixels | place | {"offsets": 0.1 * random(3, 512)} | volume | colors
     fuse_on_gpu(launch.launcher_for(bench.device), arguments_of((height, width), 0.5, arrays))
+
+
+def _neighbours(bench: Bench) -> None:
+    """Nearest points of a cloud, and some that keep a distance."""
+    points = torch.rand(100, 3, dtype=torch.float64, device=bench.device)
+    launcher, tree = launch.launcher_for(bench.device), build_tree(points)
+    for neighbours in NEIGHBOURS:
+        find_nearest(tree, points[::3] + 0.1, launcher=launcher, neighbours=neighbours)
+    choose_spread(points, 0.2, launcher=launcher)
 
 
 def determinism(bench: Bench) -> dict[str, Any]:

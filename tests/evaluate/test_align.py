@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 from oracle_scenes import moved, rotation, similarity
-from scipy.spatial import cKDTree
 
 from gs2d.errors import DataError
 from gs2d.evaluate.align import apply, ransac_similarity, rotation_degrees, similarity_scale, umeyama
-from gs2d.evaluate.icp import icp, nearest, uniform_downsample, voxel_downsample
+from gs2d.evaluate.icp import icp, uniform_downsample, voxel_downsample
+from gs2d.evaluate.neighbours import Cloud
 
 KNOWN = similarity(2.5, rotation((1, -2, 0.5), 130), (4, -7, 0.3))
 
@@ -108,8 +108,8 @@ def test_voxels_do_not_depend_on_how_the_points_are_chunked(monkeypatch: pytest.
     whole = voxel_downsample(points, 0.3)
     monkeypatch.setattr("gs2d.evaluate.icp.CHUNK", 100)
     np.testing.assert_allclose(voxel_downsample(points, 0.3), whole, atol=1e-12)
-    distances, index = nearest(cKDTree(whole), points)
-    np.testing.assert_allclose(np.linalg.norm(points - whole[index], axis=1), distances)
+    distances, index = Cloud(whole).nearest(points)
+    np.testing.assert_allclose(np.linalg.norm(points - whole[index[:, 0]], axis=1), distances[:, 0])
 
 
 def test_voxels_too_fine_to_number_keep_every_point() -> None:

@@ -27,6 +27,7 @@ from gs2d.triangles import Mesh
 FIGURES = json.loads((Path(__file__).parent / "oracle_open3d.json").read_text())
 HEADLINE = {"evaluator", "unit", "f_score", "chamfer", "accuracy", "completeness", "mesh_points", "truth_points",
             "reason", "thresholds", "self_check", "protocol", "ground_truth", "files"}  # fmt: skip
+CPU = SimpleNamespace(device="cpu")
 
 
 def notices(heard: list[Event]) -> list[str]:
@@ -38,7 +39,7 @@ def scored(mesh: Mesh, root: Path, folder: Path, given: Path | None = None, **op
     heard: list[Event] = []
     truth = choose_truth(given, root, heard.append)
     assert truth is not None
-    job: Any = SimpleNamespace(scene=load_scene(root))
+    job: Any = SimpleNamespace(scene=load_scene(root), backend=CPU)
     result = score_surface(mesh, truth, job, EvaluateOptions(**options), heard.append, folder=folder)
     assert set(result) >= HEADLINE
     assert set(result["self_check"]) >= {"ok", "messages"}
@@ -162,7 +163,7 @@ def test_the_visible_surface_has_its_headline_at_half_a_per_cent_of_the_true_siz
     np.save(root / "mesh_gt_seen.npy", np.full(800, 9))
     truth = choose_truth(None, root, ignore)
     assert isinstance(truth, Truth)
-    job: Any = SimpleNamespace(scene=SimpleNamespace(train=(), T_metric_scene=np.eye(4)))
+    job: Any = SimpleNamespace(scene=SimpleNamespace(train=(), T_metric_scene=np.eye(4)), backend=CPU)
     result = score_surface(flat(0.01), truth, job, EvaluateOptions(), ignore, folder=tmp_path)
     assert set(result) >= HEADLINE
     assert result["evaluator"] == "visible-surface"
@@ -177,3 +178,25 @@ def test_the_visible_surface_has_its_headline_at_half_a_per_cent_of_the_true_siz
     elsewhere = score_surface(flat(0.5), truth, job, EvaluateOptions(), far.append, folder=tmp_path)
     assert not elsewhere["self_check"]["ok"]
     assert "is it in the capture's frame" in notices(far)[-1]
+
+
+@pytest.mark.parametrize("protocol", ["tnt", "dtu", "visible-surface"])
+def test_surfaces_are_compared_on_the_device_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: str
+) -> None:
+    class Asked(Exception):
+        pass
+
+    def asked(*_: Any, device: str, **__: Any) -> None:
+        raise Asked(device)
+
+    for name in ("truth.evaluate_surface", "truth_official.evaluate_dtu", "truth_official.evaluate_tnt"):
+        monkeypatch.setattr(f"gs2d.pipeline.{name}", asked)
+    root, *_ = write_dtu_capture(tmp_path) if protocol == "dtu" else write_tnt_capture(tmp_path)
+    truth = choose_truth(None, root, ignore)
+    if protocol == "visible-surface":
+        truth = Truth(tmp_path, flat(0.0), None)
+    assert truth is not None
+    job: Any = SimpleNamespace(scene=load_scene(root), backend=SimpleNamespace(device="the run's"))
+    with pytest.raises(Asked, match="the run's"):
+        score_surface(flat(0.01), truth, job, EvaluateOptions(), ignore, folder=tmp_path / "surface")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import torch
+from torch import Tensor
 
+from gs2d.evaluate.neighbours import Cloud
 from gs2d.triangles import Mesh
 
 _CANDIDATES = 8  # triangles tried for each point
+_CHUNK = 1 << 16  # points and triangles at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +58,21 @@ def sample_surface(mesh: Mesh, count: int, *, seed: int = 0, mask: np.ndarray | 
     return SurfaceSamples(points, faces)
 
 
-def distances_to_points(queries: np.ndarray, points: np.ndarray, *, workers: int | None = None) -> np.ndarray:
+def distances_to_points(
+    queries: np.ndarray, points: np.ndarray, *, device: str = "cpu", workers: int | None = None
+) -> np.ndarray:
     """Distance [Q] of each query to the nearest of the points [P, 3]."""
-    return np.asarray(cKDTree(points).query(queries, workers=workers or os.cpu_count() or 1)[0])
+    return Cloud(points, device=device, workers=workers).nearest(queries)[0][:, 0]
 
 
 def distances_to_mesh(
-    queries: np.ndarray, mesh: Mesh, *, samples: int = 200_000, seed: int = 0, workers: int | None = None
+    queries: np.ndarray,
+    mesh: Mesh,
+    *,
+    samples: int = 200_000,
+    seed: int = 0,
+    device: str = "cpu",
+    workers: int | None = None,
 ) -> np.ndarray:
     """Distance [Q] of each query [Q, 3] to the surface.
 
@@ -73,31 +83,45 @@ def distances_to_mesh(
     t = mesh.vertices.astype(np.float64)[mesh.faces]
     spread = sample_surface(mesh, samples, seed=seed)
     points = np.concatenate([t.mean(axis=1), spread.points])
-    owner = np.concatenate([np.arange(len(t)), spread.faces])
-    k = min(_CANDIDATES, len(points))
-    _, index = cKDTree(points).query(queries, k=k, workers=workers or os.cpu_count() or 1)
-    best = np.full(len(queries), np.inf)
-    for column in np.reshape(index, (len(queries), k)).T:
-        best = np.minimum(best, point_triangle_distances(queries, t[owner[column]]))
+    _, index = Cloud(points, device=device, workers=workers).nearest(queries, neighbours=_CANDIDATES)
+    owner = np.concatenate([np.arange(len(t)), spread.faces, [0]])  # there may be fewer than eight points: any face
+    return _least_distances(queries, t, owner[index], device)
+
+
+def _least_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray, device: str) -> np.ndarray:
+    """Least distance [Q] of each query to some of the triangles [F, 3, 3], ``faces`` [Q, K]."""
+    corners = torch.from_numpy(np.ascontiguousarray(t)).to(device)
+    best = np.empty(len(queries))
+    for start in range(0, len(queries), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        p = torch.from_numpy(np.ascontiguousarray(queries[part], np.float64)).to(device)
+        columns = torch.from_numpy(faces[part]).to(device).unbind(dim=1)
+        found = [_triangle_distances(p, corners[column]) for column in columns]
+        best[part] = torch.stack(found).amin(dim=0).cpu().numpy()
     return best
 
 
 def point_triangle_distances(p: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Distance [n] of points [n, 3] to triangles [n, 3, 3]: to the plane where the foot lies inside, else the edges."""
-    a, b, c = t[:, 0], t[:, 1], t[:, 2]
-    normal = np.cross(b - a, c - a)
-    squared = np.einsum("ni,ni->n", normal, normal)
+    given = (torch.from_numpy(np.ascontiguousarray(array, np.float64)) for array in (p, t))
+    return np.asarray(_triangle_distances(*given).numpy())
+
+
+def _triangle_distances(p: Tensor, t: Tensor) -> Tensor:
+    a, b, c = t.unbind(dim=1)
+    normal = torch.linalg.cross(b - a, c - a)
+    squared = normal.square().sum(dim=1)
     inside = squared > 0
     for u, v in ((a, b), (b, c), (c, a)):
-        inside &= np.einsum("ni,ni->n", np.cross(v - u, p - u), normal) >= 0
-    plane = np.abs(np.einsum("ni,ni->n", p - a, normal)) / np.sqrt(np.where(squared > 0, squared, 1))
-    edges = np.minimum(np.minimum(_segment(p, a, b), _segment(p, b, c)), _segment(p, c, a))
-    return np.where(inside, plane, edges)
+        inside &= (torch.linalg.cross(v - u, p - u) * normal).sum(dim=1) >= 0
+    plane = ((p - a) * normal).sum(dim=1).abs() / squared.where(squared > 0, 1).sqrt()
+    edges = _segment(p, a, b).minimum(_segment(p, b, c)).minimum(_segment(p, c, a))
+    return plane.where(inside, edges)
 
 
-def _segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _segment(p: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Distance of points to segments."""
     along = b - a
-    length = np.einsum("ni,ni->n", along, along)
-    s = np.clip(np.einsum("ni,ni->n", p - a, along) / np.where(length > 0, length, 1), 0, 1)
-    return np.asarray(np.linalg.norm(p - a - s[:, None] * along, axis=1))
+    length = along.square().sum(dim=1)
+    s = (((p - a) * along).sum(dim=1) / length.where(length > 0, 1)).clamp(0, 1)
+    return (p - a - s[:, None] * along).square().sum(dim=1).sqrt()

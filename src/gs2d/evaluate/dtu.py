@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from gs2d.camera import Camera
 from gs2d.evaluate.align import apply, similarity_scale
 from gs2d.evaluate.dtu_files import DtuTruth
-from gs2d.evaluate.icp import nearest
+from gs2d.evaluate.neighbours import Cloud, first_of_neighbours, on_gpu
 from gs2d.evaluate.surface_clouds import ScoredClouds
 from gs2d.protocols_surface import DTU_SURFACE, DtuSurface
 from gs2d.triangles import Mesh
@@ -82,6 +82,7 @@ def evaluate_dtu(
     *,
     protocol: DtuSurface = DTU_SURFACE,
     seed: int = 0,
+    device: str = "cpu",
     workers: int | None = None,
 ) -> DtuScore:
     """Score a mesh in the scene's frame.
@@ -92,6 +93,8 @@ def evaluate_dtu(
         Of all views; empty: nothing is culled.
     T_metric_scene : ndarray [4, 4]
         scale_mat: from the scene to mm.
+    device, workers
+        Where points are thinned and nearest ones found, see ``neighbours.Cloud``.
     """
     similarity_scale(T_metric_scene, "T_metric_scene")
     keep = inside_silhouettes(mesh.vertices.astype(np.float64), silhouettes, protocol)
@@ -99,9 +102,9 @@ def evaluate_dtu(
     used = keep if len(silhouettes) else np.ones(len(keep), bool)
     low, high = truth.bounds[0] - protocol.margin_low, truth.bounds[1] + protocol.margin_high
     points = mesh_points(_touching(culled, low, high), protocol.density, vertices=culled.vertices[used])
-    points = thin(points, protocol.density, seed=seed)
+    points = thin(points, protocol.density, seed=seed, device=device)
     points = points[((points >= low) & (points < high)).all(axis=1)]
-    return _score(points, truth, float(1 - used.mean()) if len(used) else 0.0, protocol, workers)
+    return _score(points, truth, float(1 - used.mean()) if len(used) else 0.0, protocol, device, workers)
 
 
 def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
@@ -111,7 +114,9 @@ def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces[touch])
 
 
-def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurface, workers: int | None) -> DtuScore:
+def _score(
+    points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurface, device: str, workers: int | None
+) -> DtuScore:
     """Distances both ways between the thinned points inside the box, and the scan."""
     observed = points[truth.is_observed(points)]
     above = truth.above_plane()
@@ -127,8 +132,8 @@ def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurf
             message = "every corner of the mesh lies outside some silhouette: are the masks those of these views?"
         counts = (len(observed), len(above))
         return DtuScore(None, None, None, *counts, 1.0, 1.0, culled, False, (message,), clouds, why)
-    d2s, _ = nearest(cKDTree(truth.points), observed, limit=limit, workers=workers)
-    s2d, _ = nearest(cKDTree(points), above, limit=limit, workers=workers)
+    d2s = Cloud(truth.points, device=device, workers=workers).nearest(observed, limit=limit)[0][:, 0]
+    s2d = Cloud(points, device=device, workers=workers).nearest(above, limit=limit)[0][:, 0]
     clouds = ScoredClouds(observed, d2s, above, s2d, GREEN_WITHIN)
     near, back = np.isfinite(d2s), np.isfinite(s2d)
     dropped = (float(1 - near.mean()), float(1 - back.mean()))
@@ -209,18 +214,25 @@ def _half_steps(n1: int, n2: int) -> np.ndarray:
     return np.stack([u, v], axis=-1).reshape(-1, 2)[(u + v < 1).ravel()]
 
 
-def thin(points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _SLAB) -> np.ndarray:
+def thin(
+    points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _SLAB, device: str = "cpu"
+) -> np.ndarray:
     """A subset of which no two points are within ``radius``, and every point left out is within it of one that is kept.
 
     Points are taken greedily: slab by slab along the longest axis, in an order shuffled from the seed within a slab.
     Within a slab all points that come before their neighbours are taken at once, again and again: the same set as one
-    by one.
+    by one. On a GPU the same order decides, without slabs.
     """
     if not len(points):
         return points
     axis = int(np.ptp(points, axis=0).argmax())
     points = points[np.argsort(points[:, axis], kind="stable")]
     rng = np.random.default_rng(seed)
+    if on_gpu(device):
+        starts = range(0, len(points), slab_size)
+        turns = [start + rng.permutation(min(slab_size, len(points) - start)) for start in starts]
+        points = points[np.concatenate(turns)]
+        return np.asarray(points[first_of_neighbours(points, radius, device)])
     kept: list[np.ndarray] = []
     for start in range(0, len(points), slab_size):
         slab = points[start : start + slab_size]

@@ -7,27 +7,14 @@ the official Tanks and Temples script calls; ``scripts/oracle_open3d.py`` compar
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gs2d.evaluate.align import apply, umeyama
+from gs2d.evaluate.neighbours import Cloud
 
-CHUNK = 1 << 20  # points asked for at a time: bounds memory beside the clouds themselves
-
-
-def nearest(
-    tree: cKDTree, queries: np.ndarray, *, limit: float = math.inf, workers: int | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distance and index [Q] of the nearest point of a tree; infinity and the tree's size beyond the limit."""
-    distances, index = np.empty(len(queries)), np.empty(len(queries), np.int64)
-    threads = workers or os.cpu_count() or 1
-    for start in range(0, len(queries), CHUNK):
-        part = slice(start, start + CHUNK)
-        distances[part], index[part] = tree.query(queries[part], distance_upper_bound=limit, workers=threads)
-    return distances, index
+CHUNK = 1 << 22  # points thinned at a time: bounds memory beside the clouds themselves
 
 
 def voxel_downsample(points: np.ndarray, voxel: float) -> np.ndarray:
@@ -44,8 +31,8 @@ def voxel_downsample(points: np.ndarray, voxel: float) -> np.ndarray:
     keys: list[np.ndarray] = []
     sums: list[np.ndarray] = []
     counts: list[np.ndarray] = []
-    for start in range(0, len(points), 4 * CHUNK):
-        part = np.asarray(points[start : start + 4 * CHUNK], np.float64)
+    for start in range(0, len(points), CHUNK):
+        part = np.asarray(points[start : start + CHUNK], np.float64)
         cell = np.floor((part - low) / voxel).astype(np.int64)
         key, total, count = _grouped((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], part, None)
         keys.append(key)
@@ -107,6 +94,7 @@ def icp(
     with_scale: bool = True,
     share_change: float = 1e-6,
     rms_change: float = math.inf,
+    device: str = "cpu",
     workers: int | None = None,
 ) -> IcpResult:
     """Move ``source`` [P, 3] onto ``target`` [Q, 3]: pair with the nearest, fit, repeat (Besl and McKay 1992).
@@ -123,31 +111,29 @@ def icp(
         It has converged when the share of paired points and their rms change by less, both. The official Tanks and
         Temples script leaves the rms out in effect (it passes 20).
     """
-    tree = cKDTree(target) if len(target) else None
+    cloud = Cloud(target, device=device, workers=workers)
     T = np.eye(4)
     moved = np.asarray(source, np.float64)
-    share, rms, index, paired = _paired(tree, moved, threshold, workers)
+    share, rms, index, paired = _paired(cloud, moved, threshold)
     first, done, converged = (share, rms), 0, False
     for done in range(1, iterations + 1):  # noqa: B007
-        if tree is None or paired.sum() < 3:
+        if paired.sum() < 3:
             break
-        step = umeyama(moved[paired], tree.data[index[paired]], with_scale=with_scale)
+        step = umeyama(moved[paired], cloud.points[index[paired]], with_scale=with_scale)
         T, moved = step @ T, apply(step, moved)
         before = (share, rms)
-        share, rms, index, paired = _paired(tree, moved, threshold, workers)
+        share, rms, index, paired = _paired(cloud, moved, threshold)
         if abs(before[0] - share) < share_change and abs(before[1] - rms) < rms_change:
             converged = True
             break
     return IcpResult(T, first[0], share, first[1] if first[0] else None, rms if share else None, done, converged)
 
 
-def _paired(
-    tree: cKDTree | None, points: np.ndarray, threshold: float, workers: int | None
-) -> tuple[float, float, np.ndarray, np.ndarray]:
+def _paired(cloud: Cloud, points: np.ndarray, threshold: float) -> tuple[float, float, np.ndarray, np.ndarray]:
     """Share and rms of the points with a neighbour within the threshold, the neighbours, and which points those are."""
-    if tree is None or not len(points):
-        return 0.0, 0.0, np.zeros(len(points), np.int64), np.zeros(len(points), bool)
-    distances, index = nearest(tree, points, limit=threshold, workers=workers)
+    if not len(points):
+        return 0.0, 0.0, np.zeros(0, np.int64), np.zeros(0, bool)
+    distances, index = (found[:, 0] for found in cloud.nearest(points, limit=threshold))
     paired = np.isfinite(distances)
     rms = float(np.sqrt(np.square(distances[paired]).mean())) if paired.any() else 0.0
     return float(paired.mean()), rms, index, paired

@@ -13,8 +13,9 @@ The protocol (ours; docs/decisions.md, Evaluation):
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -29,6 +30,7 @@ from gs2d.protocols_surface import VISIBLE_SURFACE
 from gs2d.triangles import Mesh
 
 _T = TypeVar("_T")
+_Counts = Callable[[np.ndarray, Mesh], np.ndarray]  # in how many views points [P, 3] of a mesh are visible
 FRACTIONS = VISIBLE_SURFACE.fractions  # of the truth's bounding-box diagonal
 SEEN_TOLERANCE = VISIBLE_SURFACE.seen_tolerance  # of the same diagonal: how far behind the depth buffer one sees
 
@@ -100,6 +102,7 @@ def evaluate_surface(
     thresholds: Sequence[float] | None = None,
     samples: int = VISIBLE_SURFACE.samples,
     seed: int = 0,
+    device: str = "cpu",
     workers: int | None = None,
 ) -> SurfaceScore:
     """Score a reconstruction.
@@ -122,6 +125,8 @@ def evaluate_surface(
         In the truth's units; default 0.25 %, 0.5 % and 1 % of the diagonal of the truth's bounding box.
     samples : int
         Points on each surface.
+    device, workers
+        Where distances and visibility are computed: a device as torch names it; on the CPU with so many threads.
 
     Raises
     ------
@@ -139,18 +144,20 @@ def evaluate_surface(
     # Everything below happens in the mesh's frame; distances return to the truth's units at the end.
     local = _moved(truth, np.linalg.inv(T))
     tolerance = SEEN_TOLERANCE * diagonal / scale
-    theirs = _true_side(local, cameras, seen, min_views, samples, seed, tolerance, workers)
-    ours = _reconstructed_side(mesh, cameras, samples, seed, tolerance, workers)
+    counts = partial(visible_counts, cameras=cameras, tolerance=tolerance, device=device, workers=workers)
+    to_mesh = partial(distances_to_mesh, samples=samples, seed=seed, device=device, workers=workers)
+    theirs = _true_side(local, cameras, seen, min_views, samples, seed, counts)
+    ours = _reconstructed_side(mesh, cameras, samples, seed, counts)
     if not len(mesh.faces) or not len(ours.points):
         why = "the mesh is empty" if not len(mesh.faces) else "no camera sees any of the mesh"
         nothing = tuple(ThresholdScore(t, None, 0.0, 0.0) for t in tau)
         n = len(theirs.points)
         return SurfaceScore(None, None, None, None, None, nothing, diagonal, 0, n, ours.hidden, theirs.hidden, why)
     if isinstance(local, Mesh):
-        accuracy = scale * distances_to_mesh(ours.points, local, samples=samples, seed=seed, workers=workers)
+        accuracy = scale * to_mesh(ours.points, local)
     else:
-        accuracy = scale * distances_to_points(ours.points, local, workers=workers)
-    completeness = scale * distances_to_mesh(theirs.points, mesh, samples=samples, seed=seed, workers=workers)
+        accuracy = scale * distances_to_points(ours.points, local, device=device, workers=workers)
+    completeness = scale * to_mesh(theirs.points, mesh)
     return SurfaceScore(
         accuracy=float(accuracy.mean()),
         completeness=float(completeness.mean()),
@@ -188,8 +195,7 @@ def _true_side(
     min_views: int,
     samples: int,
     seed: int,
-    tolerance: float,
-    workers: int | None,
+    counts: _Counts,
 ) -> _Side:
     """True points that enough cameras see."""
     if not isinstance(truth, Mesh):
@@ -205,8 +211,7 @@ def _true_side(
     points = sample_surface(truth, samples, seed=seed).points
     if not len(cameras):
         return _side(points, np.ones(len(points), bool), samples, seed)
-    counts = visible_counts(points, truth, cameras, tolerance=tolerance, workers=workers)
-    return _side(points, counts >= min_views, samples, seed)
+    return _side(points, counts(points, truth) >= min_views, samples, seed)
 
 
 def _side(points: np.ndarray, keep: np.ndarray, samples: int, seed: int) -> _Side:
@@ -218,14 +223,12 @@ def _side(points: np.ndarray, keep: np.ndarray, samples: int, seed: int) -> _Sid
     return _Side(kept, float(1.0 - keep.mean()))
 
 
-def _reconstructed_side(
-    mesh: Mesh, cameras: Sequence[Camera], samples: int, seed: int, tolerance: float, workers: int | None
-) -> _Side:
+def _reconstructed_side(mesh: Mesh, cameras: Sequence[Camera], samples: int, seed: int, counts: _Counts) -> _Side:
     """Reconstructed points that some camera would see."""
     points = sample_surface(mesh, samples, seed=seed + 1).points  # other points than on an equal truth
     if not len(points) or not len(cameras):
         return _Side(points, 0.0)
-    keep = visible_counts(points, mesh, cameras, tolerance=tolerance, workers=workers) > 0
+    keep = counts(points, mesh) > 0
     return _Side(points[keep], float(1.0 - keep.mean()))
 
 

@@ -16,11 +16,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gs2d.errors import DataError
 from gs2d.evaluate.align import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
-from gs2d.evaluate.icp import IcpResult, icp, nearest, uniform_downsample, voxel_downsample
+from gs2d.evaluate.icp import IcpResult, icp, uniform_downsample, voxel_downsample
+from gs2d.evaluate.neighbours import Cloud
 from gs2d.evaluate.surface_clouds import ScoredClouds
 from gs2d.evaluate.tnt_files import TntTruth, match_cameras
 from gs2d.images import natural_key
@@ -127,6 +127,7 @@ def evaluate_tnt(
     published: np.ndarray | None = None,
     protocol: TntSurface = TNT_SURFACE,
     seed: int = 0,
+    device: str = "cpu",
     workers: int | None = None,
 ) -> TntScore:
     """Score a mesh.
@@ -144,6 +145,8 @@ def evaluate_tnt(
         m.
     published : ndarray [m, 4, 4], optional
         The log that came with the photographs: checked against the cameras, never used.
+    device, workers
+        Where nearest points are found, see ``neighbours.Cloud``.
 
     Raises
     ------
@@ -156,12 +159,12 @@ def evaluate_tnt(
     start = T = fit.T_target_source
     reports: list[StageReport] = []
     for stage in protocol.stages:
-        step, report = _stage(source, target, T, truth, stage, tau, protocol, workers)
+        step, report = _stage(source, target, T, truth, stage, tau, protocol, device, workers)
         T = step.T_target_source @ T
         reports.append(report)
     moved = truth.crop.apply(apply(T, source))
     alignment = _check(fit, start, T, moved, truth, tau, tuple(reports), frame_notes, protocol)
-    return _score(moved, target, tau, alignment, protocol, workers)
+    return _score(moved, target, tau, alignment, protocol, device, workers)
 
 
 def point_set(mesh: Mesh) -> np.ndarray:
@@ -212,6 +215,7 @@ def _stage(
     stage: IcpStage,
     tau: float,
     protocol: TntSurface,
+    device: str,
     workers: int | None,
 ) -> tuple[IcpResult, StageReport]:
     """One stage on the cropped and thinned clouds."""
@@ -229,6 +233,7 @@ def _stage(
         iterations=stage.iterations,
         share_change=protocol.share_change,
         rms_change=protocol.rms_change,
+        device=device,
         workers=workers,
     )
     report = StageReport(
@@ -315,6 +320,7 @@ def _score(
     tau: float,
     alignment: Alignment,
     protocol: TntSurface,
+    device: str,
     workers: int | None,
 ) -> TntScore:
     """Precision, recall and F of the cropped clouds."""
@@ -326,8 +332,9 @@ def _score(
         clouds = ScoredClouds(ours, np.zeros(0), theirs, np.full(len(theirs), np.inf), tau)
         why = "no part of the mesh lies inside the crop volume"
         return TntScore(tau, None, 0.0, 0.0, None, None, None, 0, len(theirs), alignment, clouds, why)
-    accuracy, _ = nearest(cKDTree(theirs), ours, workers=workers)
-    completeness, _ = nearest(cKDTree(ours), theirs, workers=workers)
+    accuracy, _ = Cloud(theirs, device=device, workers=workers).nearest(ours)
+    completeness, _ = Cloud(ours, device=device, workers=workers).nearest(theirs)
+    accuracy, completeness = accuracy[:, 0], completeness[:, 0]
     precision, recall = float((accuracy < tau).mean()), float((completeness < tau).mean())
     return TntScore(
         tau=tau,

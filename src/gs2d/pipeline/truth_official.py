@@ -32,7 +32,8 @@ def score_dtu(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job
     DataError, DiskError
     """
     truth = read_dtu_truth(scene.scan or 0, files)
-    score = evaluate_dtu(mesh, _silhouettes(job), job.scene.T_metric_scene, truth)
+    silhouettes, T = _silhouettes(job), job.scene.T_metric_scene
+    score = evaluate_dtu(mesh, silhouettes, T, truth, device=job.backend.device)
     return {
         "evaluator": "dtu",
         "unit": "mm",
@@ -80,6 +81,7 @@ def score_tnt(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job
         read_tnt_truth(scene.name, files),
         scene.tau,
         published=read_trajectory(log) if log is not None and log.is_file() and log.stat().st_size else None,
+        device=job.backend.device,
     )
     row = {"threshold": score.tau, "precision": score.precision, "recall": score.recall, "f_score": score.f_score}
     return {
