@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.gpu import __main__ as command
 from benchmarks.gpu import bench as bench_module
-from benchmarks.gpu import correctness
+from benchmarks.gpu import correctness, kernels
 from benchmarks.gpu.peers import activated
 from benchmarks.gpu.scenes import gpu_scene
 
@@ -120,3 +121,110 @@ def test_the_probes_compile_for_the_newest_and_the_oldest_architecture() -> None
         usage = compile_text(text, "probes.cu", arch).usage()
         assert set(usage) == set(KERNEL.findall(text)) == {"probe_fma", "probe_shuffle", "probe_exp2", "probe_red"}
         assert all(used.spilled_bytes == 0 for used in usage.values())
+
+
+def test_parts_are_not_begun_once_the_time_is_up_and_the_file_says_so(tmp_path: Path) -> None:
+    late = {"skipped": "out of time (--minutes)"}
+    assert dry("correctness", tmp_path, "--only", "ceil", "parity", "--minutes", "0") == {
+        "ceilings": late,
+        "parity": late,
+    }
+    assert dry("kernels", tmp_path, "--minutes", "0") == {"60-32x16-A": {"measure_scene": late, "measure_peers": late}}
+
+
+def test_a_scene_that_cannot_be_made_loses_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_large(*_: Any) -> Any:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(kernels, "gpu_scene", too_large)
+    monkeypatch.setattr(kernels, "installed", lambda name: True)
+    seen: list[dict[str, Any]] = []
+    found = kernels.run(bench_module.Bench(None, None, True), [], seen.append)  # type: ignore[arg-type]
+    why = {"failed": "OutOfMemoryError: CUDA out of memory"}
+    assert found == {"60-32x16-A": {"measure_scene": why, "measure_peers": why}}
+    assert len(seen) == 2
+    assert kernels.table(found) == ["60-32x16-A: iteration ? ms; {}; times faster than gsplat: ?, official: ?"]
+
+
+def test_a_program_whose_time_is_up_ends_with_its_children_and_keeps_its_words(tmp_path: Path) -> None:
+    alive = tmp_path / "alive"
+    child = f"import time; time.sleep(2); open({str(alive)!r}, 'w')"
+    parent = f"import subprocess, sys; print('begun'); subprocess.run([sys.executable, '-c', {child!r}])"
+    done = bench_module.run_program([sys.executable, "-c", parent], seconds=1)
+    assert (done.exit, done.lines) == (None, ["begun"])
+    time.sleep(1.5)
+    assert not alive.exists()
+    done = bench_module.run_program([sys.executable, "-c", "import sys; sys.exit('no')"], seconds=60)
+    assert (done.exit, done.lines) == (1, ["no"])
+
+
+PYTEST_SAYS = """
+tests/gpu/test_gpu.py::test_every_kernel_loads PASSED                    [ 10%]
+tests/gpu/test_gpu.py::test_waits[one-FAILED] FAILED                     [ 20%]
+tests/gpu/test_gpu.py::test_two_devices SKIPPED (one GPU)                [ 30%]
+tests/gpu/test_gpu.py::test_a PASSED                                     [ 40%]
+"""
+
+
+def test_gpu_tests_are_counted_also_where_their_time_was_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_module.Bench(None, None, False)  # type: ignore[arg-type]
+    for code, last in ((1, "= 1 failed in 3 s ="), (None, "")):
+        lines = [*PYTEST_SAYS.strip().splitlines(), *([last] if last else [])]
+        monkeypatch.setattr(correctness, "run_program", lambda *_, **__: bench_module.Finished(code, lines))  # noqa: B023
+        found = correctness.gpu_tests(bench)
+        assert found["counts"] == {"passed": 2, "failed": 1, "skipped": 1}
+        assert found["summary"] == (last or "its time was up")
+        assert correctness.wrong({"tests": found})
+    assert found["not_passed"] == [PYTEST_SAYS.splitlines()[2]]
+
+
+def test_without_pytest_or_its_plugin_the_gpu_tests_still_have_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_module.Bench(None, None, False)  # type: ignore[arg-type]
+    commands: list[list[str]] = []
+
+    def run(command: list[str], **_: Any) -> bench_module.Finished:
+        commands.append(command)
+        return bench_module.Finished(0, ["1 passed"])
+
+    monkeypatch.setattr(correctness, "run_program", run)
+    monkeypatch.setattr(correctness.importlib.util, "find_spec", lambda name: None if name == "pytest_timeout" else 1)
+    assert correctness.gpu_tests(bench)["exit"] == 0
+    assert "addopts=-ra" in commands[0]  # --timeout, which pyproject.toml gives, is an option of the plugin
+    monkeypatch.setattr(correctness.importlib.util, "find_spec", lambda name: None)
+    assert correctness.gpu_tests(bench) == {"skipped": "pytest is not installed here"}
+
+
+def test_without_the_sanitizer_its_parts_are_skipped_and_a_toolkits_own_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+    if correctness.sanitizer() is None:  # none in /usr/local/cuda either
+        bench = bench_module.Bench(None, None, False)  # type: ignore[arg-type]
+        assert "compute-sanitizer" in correctness.sanitize(bench, "memcheck")["skipped"]
+    tool = tmp_path / "bin" / "compute-sanitizer"
+    tool.parent.mkdir()
+    tool.touch(mode=0o755)
+    assert correctness.sanitizer() == str(tool)
+
+
+def test_a_python_that_cannot_run_it_is_told_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(command.sys, "version_info", (3, 10, 12))
+    assert command.main(["kernels"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: Python 3.11 or newer is needed")
+    assert said.count("\n") == 1
+    monkeypatch.undo()
+    monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None if name in ("torch", "PIL") else 1)
+    assert "lacks torch, PIL" in command.unfit()
+    monkeypatch.setattr(command.importlib.util, "find_spec", lambda name: None if name == "gs2d" else 1)
+    assert "does not find gs2d" in command.unfit()
+
+
+def test_without_git_the_commit_is_what_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert bench_module.commit().startswith("not known")
+    monkeypatch.setenv("GS2D_COMMIT", "abc123")
+    assert bench_module.commit() == "abc123"

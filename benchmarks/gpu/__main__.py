@@ -7,24 +7,41 @@
     python -m benchmarks.gpu training    [--out FILE.json] [--dry-run] --capture FOLDER ... [--schedule-scale 1.0]
                                          [--downscale 1] [--runs FOLDER]
 
-Each writes one file, after every part of it, and prints a short table last. ``--dry-run`` goes through all of it on any
-machine, at toy size, with the kernels emulated; its times mean nothing.
+Each writes one file, after every part of it, and prints a short table last. ``--minutes M`` begins no part after so
+many, for machines that are lent by the minute. ``--dry-run`` goes through all of it on any machine, at toy size, with
+the kernels emulated; its times mean nothing.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import math
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+if TYPE_CHECKING:
+    from benchmarks.gpu.bench import Bench
 
-from benchmarks.gpu import correctness, kernels, training
-from benchmarks.gpu.bench import RESULTS, Bench, clocks, commit, facts, opened, write
-from gs2d.errors import Gs2dError
+NEEDED = ("torch", "numpy", "scipy", "PIL")
+
+
+def unfit() -> str:
+    """Why this Python cannot run the benchmarks; "" where it can."""
+    version: tuple[int, ...] = tuple(sys.version_info[:2])
+    here = ".".join(map(str, version))
+    if version < (3, 11):
+        return f"Python 3.11 or newer is needed, {sys.executable} is {here}; use the .venv of `make install`"
+    lacking = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if lacking:
+        return f"{sys.executable} (Python {here}) lacks {', '.join(lacking)}; use the .venv of `make install`"
+    if importlib.util.find_spec("gs2d") is None:
+        return f"{sys.executable} does not find gs2d; set PYTHONPATH=src in the checkout, or use its .venv"
+    return ""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,11 +57,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--schedule-scale", type=float, default=1.0)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no part after so many")
     args = parser.parse_args(arguments)
     if args.command == "training" and not args.capture and not args.dry_run:
         parser.error("training needs --capture FOLDER")
+    reason = unfit()
+    if reason:
+        print(f"error: {reason}", file=sys.stderr)
+        return 2
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+    from benchmarks.gpu import correctness
+    from benchmarks.gpu.bench import RESULTS, opened
+    from gs2d.errors import Gs2dError
+
     try:
-        with opened(args.dry_run) as bench:
+        with opened(args.dry_run, args.minutes) as bench:
             if args.command == "exercise":
                 print("not run:", *correctness.exercise(bench) or ["-"])
                 return 0
@@ -57,20 +84,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
     """One command to its file."""
+    from benchmarks.gpu import correctness, kernels, training
+    from benchmarks.gpu.bench import clocks, commit, facts, write
+
     document: dict[str, Any] = {"command": args.command, "commit": commit(), "machine": facts(bench)}
 
     def progress(results: dict[str, Any]) -> None:
         write(out, {**document, "results": results})
 
+    progress({})  # where it cannot be written is known before anything slow
+    module: ModuleType
     if args.command == "correctness":
         results, module = correctness.run(bench, args.only, progress), correctness
     elif args.command == "kernels":
-        results, module = kernels.run(bench, args.only, progress), kernels  # type: ignore[assignment]
+        results, module = kernels.run(bench, args.only, progress), kernels
     else:
-        results, module = (  # type: ignore[assignment]
-            training.run(bench, args.capture, args.schedule_scale, args.downscale, args.runs, progress),
-            training,
-        )
+        captures = (args.capture, args.schedule_scale, args.downscale, args.runs)
+        results, module = training.run(bench, *captures, progress), training
     if not bench.dry:
         document["clocks_after"] = clocks()
     progress(results)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
+import os
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,11 +41,24 @@ class Bench:
         "cuda"; with ``dry`` its kernels run emulated on the CPU, at toy size, and no time means anything.
     launcher : Launcher
     dry : bool
+    end : float
+        By ``time.monotonic()``: no part is begun after it.
     """
 
     backend: Backend
     launcher: Launcher
     dry: bool
+    end: float = math.inf
+
+    def attempt(self, name: str, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """:func:`attempt`, unless the time is up: what is done by then is in the file."""
+        if time.monotonic() >= self.end:
+            return {"skipped": "out of time (--minutes)"}
+        return attempt(name, work)
+
+    def seconds_left(self, most: float) -> float:
+        """Until the time is up, at most so many."""
+        return max(1.0, min(most, self.end - time.monotonic()))
 
     @property
     def device(self) -> torch.device:
@@ -158,12 +174,13 @@ class TimingLauncher:
 
 
 @contextmanager
-def opened(dry: bool) -> Iterator[Bench]:
+def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
     """The bench; with ``dry`` every launcher and the backend "cuda" are the emulator's until the end."""
+    end = time.monotonic() + 60 * minutes
     if not dry:
         backend = get_backend("cuda")
         device = torch.device("cuda", torch.cuda.current_device())
-        yield Bench(backend, launch.launcher_for(device), False)
+        yield Bench(backend, launch.launcher_for(device), False, end)
         return
     sys.path.insert(0, str(ROOT / "tests" / "cuda"))
     from emulate import Emulator
@@ -175,7 +192,7 @@ def opened(dry: bool) -> Iterator[Bench]:
         launch.launcher_for = lambda device: emulator
         backends._LOADERS["cuda"] = lambda: backend
         try:
-            yield Bench(backend, emulator, True)
+            yield Bench(backend, emulator, True, end)
         finally:
             launch.launcher_for, backends._LOADERS["cuda"] = before
 
@@ -200,7 +217,10 @@ def facts(bench: Bench) -> dict[str, Any]:
 
 def clocks() -> dict[str, str] | str:
     """Clocks, temperature and power now; or why they are not known."""
-    command = ["nvidia-smi", f"--query-gpu={CLOCKS}", "--format=csv,noheader", "-i", str(torch.cuda.current_device())]
+    device = torch.cuda.current_device()
+    known = getattr(torch.cuda.get_device_properties(device), "uuid", None)  # its numbers ignore CUDA_VISIBLE_DEVICES
+    which = str(device) if known is None else f"GPU-{known}"
+    command = ["nvidia-smi", f"--query-gpu={CLOCKS}", "--format=csv,noheader", "-i", which]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
     except (OSError, subprocess.SubprocessError) as error:
@@ -209,11 +229,48 @@ def clocks() -> dict[str, str] | str:
 
 
 def commit() -> str:
-    """The checkout that was measured."""
-    done = subprocess.run(
-        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
-    )
+    """The checkout that was measured; of a copy without history what ``GS2D_COMMIT`` says."""
+    given = os.environ.get("GS2D_COMMIT")
+    if given:
+        return given
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.SubprocessError) as error:
+        return f"not known: {error}"
     return done.stdout.strip() or "not a git checkout"
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A program that ended, or was ended: ``exit`` is None where its time was up. Output and errors in one."""
+
+    exit: int | None
+    lines: list[str]
+
+
+def run_program(command: Sequence[str], *, seconds: float, environment: Mapping[str, str] | None = None) -> Finished:
+    """Run a program in the checkout; when its time is up it ends with all it has started, and what it said is kept."""
+    process = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    )
+    try:
+        output, _ = process.communicate(timeout=seconds)
+        return Finished(process.returncode, output.strip().splitlines())
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        output, _ = process.communicate()
+        return Finished(None, output.strip().splitlines())
+    except BaseException:
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
 
 
 def rounded(values: dict[str, float], digits: int = 4) -> dict[str, float]:

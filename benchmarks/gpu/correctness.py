@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shutil
-import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.gpu.bench import ROOT, Bench, attempt
+from benchmarks.gpu.bench import ROOT, Bench, run_program
 from benchmarks.gpu.probes import ceilings
 from gs2d.kernels.cuda import launch, ops
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
@@ -31,19 +33,19 @@ IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion"
 
 
 def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
-    """Ceilings, registers, parity, determinism, sanitizer, tests; ``progress`` gets the results so far after each."""
+    """Ceilings, registers, parity, determinism, tests, sanitizer; ``progress`` gets the results so far after each."""
     parts: dict[str, Any] = {
         "ceilings": lambda: ceilings(bench),
         "registers": lambda: registers(bench),
         "parity": lambda: parity(bench, 2 if bench.dry else 60),
         "determinism": lambda: determinism(bench),
-        **{tool: lambda tool=tool: sanitize(bench, tool) for tool in TOOLS},
         "tests": lambda: gpu_tests(bench),
+        **{tool: lambda tool=tool: sanitize(bench, tool) for tool in TOOLS},
     }
     found: dict[str, Any] = {}
     for name, work in parts.items():
         if not only or any(word in name for word in only):
-            found[name] = attempt(name, work)
+            found[name] = bench.attempt(name, work)
             progress(found)
     return found
 
@@ -215,37 +217,52 @@ def determinism(bench: Bench) -> dict[str, Any]:
 
 
 def gpu_tests(bench: Bench) -> dict[str, Any]:
-    """``pytest -m gpu``: how many passed, failed and were skipped."""
-    # Warnings of other versions of packages than the pinned ones are no failures here.
-    command = [sys.executable, "-m", "pytest", "-W", "default", "-m", "gpu", "-q"]
+    """``pytest -m gpu``: how many passed, failed and were skipped; as far as it came where its time was up."""
+    if importlib.util.find_spec("pytest") is None:
+        return {"skipped": "pytest is not installed here"}
+    # Warnings of other versions of packages than the pinned ones are no failures here; -v names each test as it ends.
+    command = [sys.executable, "-m", "pytest", "-W", "default", "-m", "gpu", "-q" if bench.dry else "-v"]
+    if importlib.util.find_spec("pytest_timeout") is None:
+        command += ["-o", "addopts=-ra"]  # the project's name an option of it
     command += ["--collect-only"] if bench.dry else []
-    command += [
-        "tests/gpu",
-        *([] if bench.dry else ["tests/render"]),
-    ]  # where they are: other folders need other packages
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1500, check=False)
-    last = done.stdout.strip().splitlines()[-1:] or [done.stderr.strip()[-200:]]
-    counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed|skipped|error)", last[0])}
-    names = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return {"exit": done.returncode, "summary": last[0], "counts": counts, "not_passed": names}
+    # where they are: other folders need other packages
+    command += ["tests/gpu", *([] if bench.dry else ["tests/render"])]
+    path = {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
+    done = run_program(command, seconds=bench.seconds_left(1500), environment=path)
+    outcomes = Counter(re.findall(r"::\S.* (PASSED|FAILED|SKIPPED|ERROR)\b", "\n".join(done.lines)))
+    last = (done.lines or ["it said nothing"])[-1] if done.exit is not None else "its time was up"
+    counts = {kind.lower(): number for kind, number in outcomes.items()}
+    names = [line for line in done.lines if line.startswith(("FAILED", "ERROR"))]
+    names += [line for line in done.lines if re.search(r"::\S.* (FAILED|ERROR)\b", line) and done.exit is None]
+    return {"exit": done.exit, "summary": last, "counts": counts, "not_passed": names}
 
 
 def sanitize(bench: Bench, tool: str) -> dict[str, Any]:
     """Every kernel once under a tool of compute-sanitizer, without torch's cache of memory, which would hide faults."""
     command = [sys.executable, "-m", "benchmarks.gpu", "exercise"]
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
+    environment = {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
     if bench.dry:
         if tool != TOOLS[0]:
             return {"skipped": "needs a GPU"}
         command.append("--dry-run")
     else:
-        program = shutil.which("compute-sanitizer")
+        program = sanitizer()
         if program is None:
-            return {"skipped": "compute-sanitizer is not on the PATH; it comes with the CUDA toolkit"}
+            return {
+                "skipped": "compute-sanitizer is neither on the PATH nor in CUDA_HOME; it comes with the CUDA toolkit"
+            }
         command = [program, "--tool", tool, "--error-exitcode", "9", "--print-limit", "20", *command]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1500, check=False)
-    lines = (done.stdout + done.stderr).strip().splitlines()
-    return {"exit": done.returncode, "clean": done.returncode == 0, "last_lines": lines[-5:]}
+    done = run_program(command, seconds=bench.seconds_left(1500), environment=environment)
+    if done.exit is None:
+        return {"exit": None, "clean": None, "summary": "its time was up", "last_lines": done.lines[-5:]}
+    return {"exit": done.exit, "clean": done.exit == 0, "last_lines": done.lines[-5:]}
+
+
+def sanitizer() -> str | None:
+    """The path of compute-sanitizer: on the PATH, or in the folder of a toolkit."""
+    homes = [os.environ[name] for name in ("CUDA_HOME", "CUDA_PATH") if os.environ.get(name)] + ["/usr/local/cuda"]
+    folders = [str(Path(home) / part) for home in homes for part in ("bin", "compute-sanitizer")]
+    return shutil.which("compute-sanitizer") or shutil.which("compute-sanitizer", path=os.pathsep.join(folders))
 
 
 def table(found: dict[str, Any]) -> list[str]:

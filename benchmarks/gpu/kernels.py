@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.gpu.bench import Bench, TimingLauncher, attempt
+from benchmarks.gpu.bench import Bench, TimingLauncher
 from benchmarks.gpu.peers import PEERS, PeerIteration
-from benchmarks.gpu.scenes import SIZES, TOY, GpuScene, gpu_scene
+from benchmarks.gpu.scenes import SIZES, TOY, GpuScene, gpu_scene, scene_name
 from benchmarks.iteration import steady
 from gs2d.data.scene import Scene, View
+from gs2d.errors import BackendError
 from gs2d.protocols import GENERIC
 from gs2d.recipe import Recipe
 from gs2d.recipes import two_dgs_r
@@ -24,6 +28,7 @@ from gs2d.train.loop import Trainer
 from gs2d.train.state import TrainState
 
 SETTINGS = RasterSettings()
+Parts = Iterator[tuple[str, Callable[[], dict[str, Any]]]]  # to be done in turn
 REPEATS, WARMUP = 50, 10
 # Counted for the design (not measured): milliseconds at the issue limit of an H200, scene A.
 FLOORS = {
@@ -48,42 +53,67 @@ INSTRUCTIONS = {"blend_forward": (20, 50), "blend_vjp": (108, 77)}
 
 
 def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
-    """All scenes; ``progress`` gets the document so far after each."""
-    found: dict[str, Any] = {}
-    for count, width, height in TOY if bench.dry else SIZES:
-        for spread in "A" if bench.dry else "AB":
-            if only and not any(word in f"{count}-{width}x{height}-{spread}" for word in only):
-                continue
-            scene = gpu_scene(count, width, height, spread, bench.device)
-            if bench.dry:
-                scene = replace(scene, cameras=scene.cameras[:1])
-            found[scene.name] = measure_scene(bench, scene, FLOORS.get((count, width), {}))
-            progress(found)
-            del scene
+    """All scenes, then all scenes with the peers; ``progress`` gets the document so far after each part.
+
+    A peer may compile for minutes, or leave an error behind after which nothing runs in this process: they come last.
+    """
+    sizes = [(*size, spread) for size in (TOY if bench.dry else SIZES) for spread in ("A" if bench.dry else "AB")]
+    chosen = [size for size in sizes if not only or any(word in scene_name(*size) for word in only)]
+    found: dict[str, Any] = {scene_name(*size): {} for size in chosen}
+    report = partial(progress, found)
+    for kind in (measure_scene, measure_peers):
+        for size in chosen:
+            result = found[scene_name(*size)]
+            stopped = bench.attempt(kind.__name__, partial(_through, bench, kind(bench, *size, result), result, report))
+            if stopped:  # beside its parts: the scene could not be made, or there is no time for it
+                result[kind.__name__] = stopped
+            report()
             if not bench.dry:
-                torch.cuda.empty_cache()
+                with suppress(RuntimeError):  # an error that a part has left behind
+                    torch.cuda.empty_cache()
     return found
 
 
-def measure_scene(bench: Bench, scene: GpuScene, floors: dict[str, float]) -> dict[str, Any]:
-    """Counts, kernels, passes, iterations and peers of one scene."""
-    result: dict[str, Any] = {"counts": attempt("counts", lambda: counts(bench, scene))}
-    result["kernels_ms"] = attempt("kernels", lambda: kernels(bench, scene))
-    result["passes"] = attempt("passes", lambda: passes(bench, scene))
-    result["sorts_ms"] = attempt("sorts", lambda: sorts(bench, scene))
-    targets = pictures(bench, scene)
-    result["iteration"] = attempt("iteration", lambda: iterations(bench, scene, targets))
+def _through(bench: Bench, parts: Parts, result: dict[str, Any], progress: Any) -> dict[str, Any]:
+    for name, work in parts:
+        result[name] = bench.attempt(name, work)
+        progress()
+    return {}
+
+
+def _scene(bench: Bench, count: int, width: int, height: int, spread: str) -> GpuScene:
+    scene = gpu_scene(count, width, height, spread, bench.device)
+    return replace(scene, cameras=scene.cameras[:1]) if bench.dry else scene
+
+
+def measure_scene(bench: Bench, count: int, width: int, height: int, spread: str, result: dict[str, Any]) -> Parts:
+    """Counts, kernels, passes, iterations of one scene."""
+    scene = _scene(bench, count, width, height, spread)
+    yield "counts", lambda: counts(bench, scene)
+    yield "kernels_ms", lambda: kernels(bench, scene)
+    yield "passes", lambda: passes(bench, scene)
+    yield "sorts_ms", lambda: sorts(bench, scene)
+    yield "iteration", lambda: iterations(bench, scene, pictures(bench, scene))
     times = result["iteration"].get("surface_kernels_ms", {}) | result["kernels_ms"]
-    result["floors_ms"] = {name: floor for name, floor in floors.items() if name in times}
-    result["times_floor"] = {name: round(times[name] / floor, 3) for name, floor in result["floors_ms"].items()}
+    floors = {name: floor for name, floor in FLOORS.get((count, width), {}).items() if name in times}
+    yield "floors_ms", lambda: floors
+    yield "times_floor", lambda: {name: round(times[name] / floor, 3) for name, floor in floors.items()}
+
+
+def measure_peers(bench: Bench, count: int, width: int, height: int, spread: str, result: dict[str, Any]) -> Parts:
+    """Other rasterizers on one scene, with an iteration of ours measured again beside them."""
+    if not any(installed(name) for name in PEERS):
+        yield from ((name, lambda name=name: peer(bench, None, [], name)) for name in PEERS)
+        return
+    scene = _scene(bench, count, width, height, spread)
+    targets = pictures(bench, scene)
+    yield "iteration_beside_peers", lambda: iterations(bench, scene, targets, stages=1)
+    ours = result["iteration_beside_peers"].get("surface", {}).get("median")
     for name in PEERS:
-        result[name] = attempt(name, lambda name=name: peer(bench, scene, targets, name))  # type: ignore[misc]
-    ours = result["iteration"].get("surface", {}).get("median")
-    for name in PEERS:
+        yield name, lambda name=name: peer(bench, scene, targets, name)
         theirs = result[name].get("iteration_ms", {}).get("median")
         if ours and theirs:
             result[f"times_faster_than_{name}"] = round(theirs / ours, 2)
-    return result
 
 
 def parameters(scene: GpuScene) -> list[Tensor]:
@@ -177,8 +207,8 @@ def disturbed(splats: Splats) -> Splats:
     return start
 
 
-def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor]) -> dict[str, Any]:
-    """Whole iterations of the trainer in each stage of 2DGS-R, with all losses; nothing is densified."""
+def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor], *, stages: int = 3) -> dict[str, Any]:
+    """Whole iterations of the trainer in the stages of 2DGS-R, with all losses; nothing is densified."""
     views = tuple(
         View.from_arrays(f"{i}.png", camera, (target * 255).round().byte().cpu().numpy())
         for i, (camera, target) in enumerate(zip(scene.cameras, targets, strict=True))
@@ -186,7 +216,7 @@ def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor]) -> dict[str
     bounds = np.array([[-3.0] * 3, [3.0] * 3])
     capture = Scene(name=scene.name, format="blender", train=views, test=(), points=None, extent=3.0, bounds=bounds)
     recipe = two_dgs_r()
-    recipe = Recipe("bench", tuple(steady(stage) for stage in recipe.stages))
+    recipe = Recipe("bench", tuple(steady(stage) for stage in recipe.stages[:stages]))
     protocol = replace(GENERIC, near=0.2)
     state = TrainState(disturbed(scene.splats), torch.Generator().manual_seed(2))
     trainer = Trainer(capture, recipe, protocol, backend=bench.backend, state=state, progress_every=10**9)
@@ -211,10 +241,19 @@ def _in_iterations(bench: Bench, trainer: Trainer) -> dict[str, float]:
     return timing.medians(skip=0 if bench.dry else WARMUP)
 
 
-def peer(bench: Bench, scene: GpuScene, targets: list[Tensor], name: str) -> dict[str, Any]:
+def installed(name: str) -> bool:
+    """Whether a peer can be imported."""
+    try:
+        PEERS[name]()
+    except BackendError:
+        return False
+    return True
+
+
+def peer(bench: Bench, scene: GpuScene | None, targets: list[Tensor], name: str) -> dict[str, Any]:
     """The same splats and views with another rasterizer."""
     found = PEERS[name]()
-    if bench.dry:
+    if bench.dry or scene is None:
         return {"skipped": "peers need a GPU"}
     trainer = PeerIteration(found, disturbed(scene.splats), targets)
 
@@ -225,6 +264,8 @@ def peer(bench: Bench, scene: GpuScene, targets: list[Tensor], name: str) -> dic
     def both(i: int) -> None:
         images = trainer.forward(scene.cameras[i % len(scene.cameras)])
         (images.color.mean() + images.normal.mean()).backward()
+        for leaf in trainer.leaves.values():
+            leaf.grad = None
 
     def step(i: int) -> None:
         trainer.step(scene.cameras[i % len(scene.cameras)], i % len(targets))
@@ -246,10 +287,12 @@ def table(found: dict[str, Any]) -> list[str]:
     lines = []
     for name, scene in found.items():
         iteration = scene.get("iteration", {}).get("surface", {})
-        slow = sorted(scene["kernels_ms"].items(), key=lambda item: -item[1] if isinstance(item[1], float) else 0)[:3]
-        peers = ", ".join(f"{p}: {scene.get(f'times_faster_than_{p}', scene[p].get('failed', '?'))}" for p in PEERS)
+        times = {name: time for name, time in scene.get("kernels_ms", {}).items() if isinstance(time, float)}
+        slow = sorted(times.items(), key=lambda item: -item[1])[:3]
+        why = {p: next(iter(scene.get(p, {}).values()), "?") for p in PEERS}  # what stopped it
+        peers = ", ".join(f"{p}: {scene.get(f'times_faster_than_{p}', why[p])}" for p in PEERS)
         lines.append(f"{name}: iteration {iteration.get('median', '?')} ms; {dict(slow)}; times faster than {peers}")
     return lines
 
 
-__all__ = ["measure_scene", "run", "table"]
+__all__ = ["run", "table"]

@@ -57,29 +57,51 @@ def _module(name: str) -> Any:
         raise BackendError(f"{name} is not installed here ({error})") from error
 
 
+class _Kept:
+    """What a peer needs of a camera, made when it is first seen: their trainers too hold cameras on the device."""
+
+    def __init__(self, make: Callable[[Camera, torch.device], Any]) -> None:
+        self._make = make
+        self._made: dict[tuple[int, torch.device], tuple[Camera, Any]] = {}
+
+    def of(self, camera: Camera, device: torch.device) -> Any:
+        key = (id(camera), device)
+        if key not in self._made:
+            self._made[key] = camera, self._make(camera, device)  # the camera too, so that no other gets its id
+        return self._made[key][1]
+
+
+def _pose(camera: Camera, device: torch.device) -> Tensor:
+    return torch.as_tensor(camera.T_cam_world, dtype=torch.float32, device=device)
+
+
 def gsplat() -> Peer:
-    """gsplat's 2DGS.
+    """gsplat's 2DGS, of versions 1.4 to 1.6.
 
     Raises
     ------
     BackendError
-        It is not installed.
+        It is not installed, or has no 2DGS.
     """
     module = _module("gsplat")
+    version = getattr(module, "__version__", "?")
+    if not hasattr(module, "rasterization_2dgs"):
+        raise BackendError(f"gsplat {version} has no rasterization_2dgs; install gsplat 1.4 or newer")
+
+    def matrices(camera: Camera, device: torch.device) -> dict[str, Tensor]:
+        K = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+        return {"viewmats": _pose(camera, device)[None], "Ks": torch.tensor([K], dtype=torch.float32, device=device)}
+
+    kept = _Kept(matrices)
 
     def render(p: dict[str, Tensor], camera: Camera) -> PeerImages:
-        pose = torch.as_tensor(camera.T_cam_world, dtype=torch.float32, device=p["means"].device)
-        K = torch.tensor(
-            [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32, device=pose.device
-        )
         colors, alphas, normals, depth_normals, *_ = module.rasterization_2dgs(
             means=p["means"],
             quats=p["quats"],
             scales=torch.cat([p["scales"], torch.ones_like(p["scales"][:, :1])], dim=1),
             opacities=p["opacities"],
             colors=p["sh"],
-            viewmats=pose[None],
-            Ks=K[None],
+            **kept.of(camera, p["means"].device),
             width=camera.width,
             height=camera.height,
             near_plane=NEAR,
@@ -92,7 +114,7 @@ def gsplat() -> Peer:
         normal, depth_normal = (x.reshape(*size, 3) for x in (normals, depth_normals))
         return PeerImages(colors.reshape(*size, -1)[..., :3], normal, depth_normal, alphas.reshape(size))
 
-    return Peer("gsplat", getattr(module, "__version__", "?"), render)
+    return Peer("gsplat", version, render)
 
 
 def official() -> Peer:
@@ -105,39 +127,43 @@ def official() -> Peer:
     """
     module = _module("diff_surfel_rasterization")
 
-    def render(p: dict[str, Tensor], camera: Camera) -> PeerImages:
-        means = p["means"]
-        device = means.device
+    def settings(camera: Camera, device: torch.device) -> dict[str, Any]:
         tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
-        pose = torch.as_tensor(camera.T_cam_world, dtype=torch.float32, device=device)
+        pose = _pose(camera, device)
         projection = torch.zeros(4, 4, device=device)
         projection[0, 0], projection[1, 1] = 1 / tan_x, 1 / tan_y
         projection[2, 2], projection[2, 3], projection[3, 2] = FAR / (FAR - NEAR), -FAR * NEAR / (FAR - NEAR), 1.0
-        settings = module.GaussianRasterizationSettings(
-            image_height=camera.height,
-            image_width=camera.width,
-            tanfovx=tan_x,
-            tanfovy=tan_y,
-            bg=torch.zeros(3, device=device),
-            scale_modifier=1.0,
-            viewmatrix=pose.T.contiguous(),
-            projmatrix=(projection @ pose).T.contiguous(),
-            sh_degree=math.isqrt(p["sh"].shape[1]) - 1,
-            campos=torch.as_tensor(camera.center, dtype=torch.float32, device=device),
-            prefiltered=False,
-            debug=False,
-        )
-        screen = torch.zeros_like(means, requires_grad=True)
-        color, _, planes = module.GaussianRasterizer(raster_settings=settings)(
+        return {
+            "image_height": camera.height,
+            "image_width": camera.width,
+            "tanfovx": tan_x,
+            "tanfovy": tan_y,
+            "bg": torch.zeros(3, device=device),
+            "scale_modifier": 1.0,
+            "viewmatrix": pose.T.contiguous(),
+            "projmatrix": (projection @ pose).T.contiguous(),
+            "campos": torch.as_tensor(camera.center, dtype=torch.float32, device=device),
+            "prefiltered": False,
+            "debug": False,
+        }
+
+    kept = _Kept(settings)
+
+    def render(p: dict[str, Tensor], camera: Camera) -> PeerImages:
+        means = p["means"]
+        given = kept.of(camera, means.device)
+        degree = math.isqrt(p["sh"].shape[1]) - 1
+        chosen = module.GaussianRasterizationSettings(**given, sh_degree=degree)
+        color, _, planes = module.GaussianRasterizer(raster_settings=chosen)(
             means3D=means,
-            means2D=screen,
+            means2D=torch.zeros_like(means, requires_grad=True),
             shs=p["sh"],
             opacities=p["opacities"][:, None],
             scales=p["scales"],
             rotations=p["quats"],
         )
         # Planes: depth sum, alpha, normal (3, camera frame), median depth, distortion.
-        alpha, normal = planes[1], planes[2:5].permute(1, 2, 0) @ pose[:3, :3]
+        alpha, normal = planes[1], planes[2:5].permute(1, 2, 0) @ given["viewmatrix"][:3, :3].T
         depth = torch.nan_to_num(planes[0] / alpha, 0, 0)
         return PeerImages(color.permute(1, 2, 0), normal, losses_reference.normals_from_depth(depth, camera), alpha)
 

@@ -33,4 +33,9 @@ def gpu_scene(count: int, width: int, height: int, spread: str, device: torch.de
         splats.opacity_logits = 1.5 * torch.randn(count, generator=generator)
     near = [(x + 0.07, y - 0.05, z + 0.1) for x, y, z in PLACES]
     cameras = tuple(camera(width, height, place) for place in (*PLACES, *near))
-    return GpuScene(f"{count}-{width}x{height}-{spread}", splats.to(device), cameras)
+    return GpuScene(scene_name(count, width, height, spread), splats.to(device), cameras)
+
+
+def scene_name(count: int, width: int, height: int, spread: str) -> str:
+    """For instance ``1000000-1600x1060-A``."""
+    return f"{count}-{width}x{height}-{spread}"

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.gpu.bench import ROOT, Bench, attempt
+from benchmarks.gpu.bench import ROOT, Bench
 from gs2d.pipeline.events import Phase
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
@@ -25,7 +25,7 @@ def run(
         if bench.dry:
             captures, scale = [toy_capture(Path(temporary))], 0.0005
         for capture in captures:
-            found[capture.resolve().name] = attempt(
+            found[capture.resolve().name] = bench.attempt(
                 str(capture),
                 lambda capture=capture: whole_run(bench, capture, scale, downscale, folder),  # type: ignore[misc]
             )
