@@ -1,4 +1,4 @@
-"""The triangle mesh."""
+"""Triangle meshes: with vertex colours, or with a texture."""
 
 from __future__ import annotations
 
@@ -29,3 +29,36 @@ class Mesh:
         check_shapes({"vertices": (self.vertices, "P 3"), "faces": (self.faces, "F 3")})
         if self.colors is not None:
             check_shapes({"vertices": (self.vertices, "P 3"), "colors": (self.colors, "P 3")})
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """Triangles with a picture on them. A vertex on a seam of the texture stands there once for each side.
+
+    Attributes
+    ----------
+    vertices : ndarray [P, 3] float, wu
+    normals : ndarray [P, 3] float32, unit
+    faces : ndarray [F, 3] int32
+        Vertex indices, counter-clockwise seen from outside.
+    uv : ndarray [P, 2] float32
+        Places in the texture, (0, 0) its upper left and (1, 1) its lower right corner (glTF's convention).
+    texture : ndarray [S, S, 3] uint8, sRGB
+    """
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    texture: np.ndarray
+
+    def __post_init__(self) -> None:
+        check_shapes(
+            {
+                "vertices": (self.vertices, "P 3"),
+                "normals": (self.normals, "P 3"),
+                "faces": (self.faces, "F 3"),
+                "uv": (self.uv, "P 2"),
+                "texture": (self.texture, "S S 3"),
+            }
+        )

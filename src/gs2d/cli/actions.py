@@ -8,7 +8,7 @@ from typing import Any
 
 from gs2d.cli import commands as c
 from gs2d.cli.console import Console, figure
-from gs2d.errors import DataError, RecipeError
+from gs2d.errors import DataError, ProtocolError, RecipeError
 
 
 def execute(command: c.Common, console: Console) -> None:
@@ -102,6 +102,10 @@ def mesh(command: c.Mesh, console: Console) -> None:
         keep_components=command.keep_components,
     )
     result = mesh_run(command.run, options, console.on_event, out=command.out, threads=command.threads)
+    if command.texture:
+        _textured_mesh(command, options, console)
+        return
+    _refuse_texture_options(command)
     console.close()
     console.say(f"{result['file']}: {result['vertices']:,} vertices, {result['faces']:,} triangles")
     console.say(f"voxel {result['voxel']:.4g}, truncation {result['truncation']:.4g}, depth {result['depth']}")
@@ -109,6 +113,32 @@ def mesh(command: c.Mesh, console: Console) -> None:
 
 
 def render(command: c.Render, console: Console) -> None:
+def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None:
+    from gs2d.pipeline.options import TextureOptions
+    from gs2d.pipeline.texture import texture_run
+
+    options = TextureOptions(
+        faces=command.faces,
+        size=command.texture_size,
+        source=command.texture_from,
+        downscale=command.texture_downscale,
+    )
+    result = texture_run(command.run, options, mesh_options, console.on_event, out=command.out, threads=command.threads)
+    console.close()
+    size, unseen = result["texture_size"], result["texels_unseen"] / max(result["texels"], 1)
+    console.say(f"{result['files'][0]}: {result['faces']:,} triangles, {result['bytes'] / 1e6:.1f} MB")
+    console.say(f"texture {size}x{size} in {result['charts']:,} charts, {unseen:.2%} of it seen by no photograph")
+    console.result(result)
+
+
+def _refuse_texture_options(command: c.Mesh) -> None:
+    """An option that would do nothing is an error."""
+    defaults = c.Mesh(run=command.run)
+    for name in ("faces", "texture_size", "texture_from", "texture_downscale"):
+        if getattr(command, name) != getattr(defaults, name):
+            raise ProtocolError(f"--{name.replace('_', '-')} belongs to --texture, which was not given; give both")
+
+
     """``gs2d render``."""
     from gs2d.pipeline.jobs import render_run
 

@@ -6,7 +6,7 @@
       run.json       what defines the run (recipe, protocol, scene, backend, seed ...), versions, machine
       events.jsonl   one JSON object a line; after a resume it reads as if the run had never stopped
       checkpoints/   <stage number>-<stage>-<iteration>.pt (the last two), <stage number>-<stage>-end.pt (all)
-      metrics.json  splats.ply  mesh.ply  renders/  report.html
+      metrics.json  splats.ply  mesh.ply  mesh.glb (textured, if asked for)  renders/  report.html
       .lock          held by the process that trains; the kernel frees it when that process dies
 
 Every file is written to a temporary name and renamed, except the log, which only grows: each checkpoint holds the
@@ -37,7 +37,7 @@ from gs2d.io.files import read_json, write_json
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
-SPLATS, MESH, REPORT = "splats.ply", "mesh.ply", "report.html"
+SPLATS, MESH, TEXTURED, REPORT = "splats.ply", "mesh.ply", "mesh.glb", "report.html"
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
 _UNREADABLE = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
@@ -182,7 +182,7 @@ class RunFolder:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
         for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
-        for name in (EVENTS, METRICS, SPLATS, MESH, REPORT, RUN_JSON):
+        for name in (EVENTS, METRICS, SPLATS, MESH, TEXTURED, REPORT, RUN_JSON):
             self.file(name).unlink(missing_ok=True)
 
     def discard(self) -> None:

@@ -17,7 +17,18 @@ from gs2d.evaluate.lpips import load_lpips
 from gs2d.geometry import focus_point
 from gs2d.images import write_image
 from gs2d.io.ply import read_mesh, read_splats, write_splats
-from gs2d.io.run import MESH, RENDERS, REPORT, SPLATS, SURFACE, RunFolder, make_folder, open_run, remove_made
+from gs2d.io.run import (
+    MESH,
+    RENDERS,
+    REPORT,
+    SPLATS,
+    SURFACE,
+    TEXTURED,
+    RunFolder,
+    make_folder,
+    open_run,
+    remove_made,
+)
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
@@ -51,7 +62,13 @@ def finished_splats(run: RunFolder) -> Splats:
     return splats
 
 
-def _open(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Job, Splats]:
+def open_job(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Job, Splats]:
+    """A finished run, what defines it, and its splats on the device of its backend.
+
+    Raises
+    ------
+    RunError, DataError
+    """
     from gs2d.pipeline.train import use_threads
 
     use_threads(threads)
@@ -90,7 +107,7 @@ def mesh_run(
     RunError, DataError, ProtocolError, DiskError
     """
     out = None if out is None else checked_output(path, out)
-    run, job, splats = _open(path, threads, on_event)
+    run, job, splats = open_job(path, threads, on_event)
     if out is not None and out.resolve() != run.file(MESH).resolve():
         return extract_mesh(job, splats, options, out, on_event)
     with run.locked():
@@ -99,6 +116,9 @@ def mesh_run(
         if metrics.get("surface"):  # was of the mesh before
             run.write_metrics({**metrics, "surface": None})
             shutil.rmtree(run.file(SURFACE), ignore_errors=True)
+        if run.file(TEXTURED).exists():
+            run.file(TEXTURED).unlink()
+            on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
     report_run(path)
     return result
 
@@ -118,7 +138,7 @@ def render_run(
     ------
     RunError, DataError, DiskError
     """
-    run, job, splats = _open(path, threads, on_event)
+    run, job, splats = open_job(path, threads, on_event)
     if not 0 <= orbit <= MOST_FRAMES:
         raise RunError(f"--orbit must be a number of frames from 1 to {MOST_FRAMES}, got {orbit}")
     views: list[tuple[str, View]]
@@ -204,7 +224,7 @@ def evaluate_run(
     given = options.ground_truth
     truth: Truth | OfficialTruth | None = None if given is None or given.is_dir() else read_truth(given)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
-    run, job, splats = _open(path, threads, on_event)
+    run, job, splats = open_job(path, threads, on_event)
     lpips = None if lpips is None else lpips.to(job.backend.device)
     result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
     if truth is None and job.scene.root is not None:

@@ -106,6 +106,28 @@ class MeshOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TextureOptions:
+    """How the mesh gets its texture.
+
+    Attributes
+    ----------
+    faces : int
+        A larger mesh is simplified to this many triangles.
+    size : int or None
+        Side of the texture, texels; None = two texels for each pixel's length, as a power of two, at most 4096.
+    source : str
+        Where the colours come from: "photographs", or "renders" of the splats from the same cameras.
+    downscale : int or None
+        Of these photographs; None = as in training.
+    """
+
+    faces: int = 50_000
+    size: int | None = None
+    source: str = "photographs"
+    downscale: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
     """What is measured.
 

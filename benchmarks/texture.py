@@ -1,0 +1,113 @@
+"""How much a texture adds to a mesh: pictures of it from the test views, beside vertex colours and the photographs.
+
+::
+
+    python -m benchmarks.texture RUN [--downscale N] [--faces 50000] [--every 1] [--pictures FOLDER]
+
+Bakes a texture from the photographs and one from the renderings of a run with a ``mesh.ply``, draws all of them with
+the demo's ray caster (2 x 2 rays a pixel) and prints the mean PSNR over the test views: of the whole picture, and of
+the pixels that both the mesh and the photograph's alpha channel (where there is one) cover wholly. ``--downscale`` is
+that of the photographs that are baked and compared (default: the run's).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.data import View
+from gs2d.data.toy_rays import Hits, cast_camera
+from gs2d.images import write_image
+from gs2d.io.ply import read_mesh
+from gs2d.io.run import MESH, open_run
+from gs2d.mesh.bake import bilinear
+from gs2d.pipeline.jobs import finished_splats
+from gs2d.pipeline.options import TextureOptions
+from gs2d.pipeline.prepare import read_scene, reload_job
+from gs2d.pipeline.texture import textured_mesh
+from gs2d.triangles import Mesh, TexturedMesh
+
+SAMPLES = 2  # rays a pixel along each axis
+
+
+def picture(
+    mesh: Mesh | TexturedMesh, camera: Camera, background: Sequence[float] = (1.0, 1.0, 1.0), samples: int = SAMPLES
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh, unshaded, [H, W, 3] in [0, 1], and how much of each pixel it covers [H, W]."""
+    hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, camera, samples=samples)
+    rays = np.ones((*hits.face.shape, 3)) * np.asarray(background)
+    rays[hits.face >= 0] = _colors(mesh, hits)
+    blocks = (camera.height, samples, camera.width, samples)
+    covered = (hits.face >= 0).reshape(blocks).mean(axis=(1, 3))
+    return rays.reshape(*blocks, 3).mean(axis=(1, 3)), covered
+
+
+def _colors(mesh: Mesh | TexturedMesh, hits: Hits) -> np.ndarray:
+    """Colours [hits, 3] in [0, 1]: interpolated between vertices, or from the texture."""
+    hit = hits.face >= 0
+    corners, weights = mesh.faces[hits.face[hit]], hits.weights[hit].astype(np.float64)
+    if isinstance(mesh, Mesh):
+        assert mesh.colors is not None
+        return np.asarray(np.einsum("hk,hkc->hc", weights, mesh.colors[corners] / 255))
+    uv = np.einsum("hk,hkc->hc", weights, mesh.uv[corners].astype(np.float64)) * len(mesh.texture)
+    return bilinear(mesh.texture, uv[:, 0], uv[:, 1]) / 255
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """dB, of values in [0, 1]."""
+    return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+
+def compare(
+    meshes: dict[str, Mesh | TexturedMesh], views: Sequence[View], background: Sequence[float], pictures: Path | None
+) -> None:
+    """Print the figures of each mesh, and write the pictures."""
+    for name, mesh in meshes.items():
+        whole, inside = [], []
+        for i, view in enumerate(views):
+            target = view.target(background)
+            drawn, covered = picture(mesh, view.camera, background)
+            alpha = view.alpha()
+            both = (covered == 1) & (alpha == 1 if alpha is not None else True)
+            whole.append(psnr(drawn, target))
+            inside.append(psnr(drawn[both], target[both]))
+            if pictures is not None:
+                write_image(pictures / f"{i:03d}-{name}.png", drawn)
+                write_image(pictures / f"{i:03d}-photograph.png", target)
+        print(f"{name:>16}: {np.mean(whole):.2f} dB, {np.mean(inside):.2f} dB where both cover a pixel")
+
+
+def main() -> None:
+    """Parse the arguments."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--downscale", type=int)
+    parser.add_argument("--faces", type=int, default=TextureOptions().faces)
+    parser.add_argument("--size", type=int)
+    parser.add_argument("--every", type=int, default=1, help="only every so many test views")
+    parser.add_argument("--pictures", type=Path, help="an existing folder")
+    arguments = parser.parse_args()
+    run = open_run(arguments.run)
+    job, splats, mesh = reload_job(run, lambda _event: None), finished_splats(run), read_mesh(run.file(MESH))
+    scene, shrink = job.scene, arguments.downscale or job.downscale
+    if shrink != job.downscale and scene.root is not None:
+        scene = read_scene(scene.root, scene.format, shrink, job.protocol, lambda _event: None)
+    meshes: dict[str, Mesh | TexturedMesh] = {"vertex colours": mesh}
+    for source in ("photographs", "renders"):
+        options = TextureOptions(faces=arguments.faces, size=arguments.size, source=source, downscale=shrink)
+        start, cpu = time.perf_counter(), time.process_time()
+        baked = textured_mesh(job, splats, mesh, options)
+        took = f"{time.perf_counter() - start:.1f} s ({time.process_time() - cpu:.1f} s of CPU)"
+        size, unseen = len(baked.mesh.texture), baked.unseen / baked.texels
+        print(f"from {source}: {size}x{size}, {len(baked.mesh.faces):,} faces, {unseen:.2%} unseen, {took}", flush=True)
+        meshes[f"from {source}"] = baked.mesh
+    compare(meshes, (scene.test or scene.train)[:: arguments.every], job.settings.background, arguments.pictures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""Textured meshes on disk: glTF binary (.glb, one file) and Wavefront OBJ (.obj with .mtl and .png)."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gs2d.disk import atomic_write
+from gs2d.errors import DataError
+from gs2d.triangles import TexturedMesh
+
+SUFFIXES = (".glb", ".obj")
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON", "BIN\0"
+_FLOAT, _UINT = 5126, 5125  # component types
+_VERTICES, _INDICES = 34962, 34963  # targets of a buffer view: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
+_CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987  # CLAMP_TO_EDGE, LINEAR, LINEAR_MIPMAP_LINEAR
+
+
+def written_files(path: Path) -> tuple[Path, ...]:
+    """The files that ``write_textured`` makes for a name.
+
+    Raises
+    ------
+    DataError
+        The name ends in something else than .glb or .obj, or is one that an OBJ file cannot refer to.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise DataError(f"a textured mesh is written as .glb or .obj, got {path}; choose such a name")
+    if suffix == ".glb":
+        return (path,)
+    if len(path.name.split()) > 1:
+        raise DataError(f"an OBJ file names its texture without spaces, got {path.name!r}; choose such a name, or .glb")
+    return path, path.with_suffix(".mtl"), path.with_suffix(".png")
+
+
+def write_textured(path: str | Path, mesh: TexturedMesh, *, up: np.ndarray | None = None) -> None:
+    """Write a textured mesh as its name says.
+
+    Parameters
+    ----------
+    path : path
+        Ends in ``.glb`` or ``.obj``; its folder must exist.
+    mesh : TexturedMesh
+    up : ndarray [3], optional
+        What is up in the mesh's frame: the node of a .glb is turned so that viewers, which take y for up (glTF 2.0,
+        3.4), show it upright. The vertices stay as they are. An OBJ file says nothing about that.
+
+    Raises
+    ------
+    DataError, DiskError
+    """
+    files = written_files(Path(path))
+    if len(files) == 1:
+        write_glb(files[0], mesh, up=up)
+    else:
+        write_obj(files[0], mesh)
+
+
+def write_glb(path: Path, mesh: TexturedMesh, *, up: np.ndarray | None = None) -> None:
+    """Write glTF 2.0 in one file: positions, normals, texture coordinates, triangles and the texture as PNG.
+
+    The material is unlit (KHR_materials_unlit), because the light of the photographs is in their colours; viewers that
+    do not know the extension shade a rough, non-metallic surface instead.
+    """
+    vertices = np.ascontiguousarray(mesh.vertices, "<f4")
+    blobs = [
+        vertices.tobytes(),
+        np.ascontiguousarray(mesh.normals, "<f4").tobytes(),
+        np.ascontiguousarray(mesh.uv, "<f4").tobytes(),
+        np.ascontiguousarray(mesh.faces, "<u4").tobytes(),
+        png_bytes(mesh.texture),
+    ]
+    views: list[dict[str, Any]] = []
+    offset = 0
+    for blob, target in zip(blobs, [_VERTICES] * 3 + [_INDICES, None], strict=True):
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": len(blob)}
+        views.append(view if target is None else {**view, "target": target})
+        offset += len(blob) + -len(blob) % 4
+    count = len(vertices)
+    bounds = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+    surface = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    document = {
+        "asset": {"version": "2.0", "generator": "gs2d"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0} if up is None else {"mesh": 0, "rotation": turn_to_y(up)}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0}]}
+        ],
+        "materials": [{"pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}}],
+        "textures": [{"source": 0, "sampler": 0}],
+        "images": [{"bufferView": 4, "mimeType": "image/png"}],
+        "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
+        "accessors": [
+            {"bufferView": 0, "componentType": _FLOAT, "count": count, "type": "VEC3", **bounds},
+            {"bufferView": 1, "componentType": _FLOAT, "count": count, "type": "VEC3"},
+            {"bufferView": 2, "componentType": _FLOAT, "count": count, "type": "VEC2"},
+            {"bufferView": 3, "componentType": _UINT, "count": mesh.faces.size, "type": "SCALAR"},
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_write(path) as file:
+        file.write(struct.pack("<III", _MAGIC, 2, 12 + 8 + len(text) + 8 + offset))
+        file.write(struct.pack("<II", len(text), _JSON) + text)
+        file.write(struct.pack("<II", offset, _BIN))
+        for blob in blobs:
+            file.write(blob + b"\0" * (-len(blob) % 4))
+
+
+def turn_to_y(up: np.ndarray) -> list[float]:
+    """The smallest rotation that takes ``up`` [3] to +y, as a quaternion x, y, z, w (glTF's order)."""
+    x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
+    if y < -1 + 1e-9:
+        return [1.0, 0.0, 0.0, 0.0]  # upside down: half a turn about x
+    quaternion = np.array([-z, 0.0, x, 1 + y])  # up x (0, 1, 0), 1 + up . (0, 1, 0)
+    return [float(q) for q in quaternion / np.linalg.norm(quaternion)]
+
+
+def write_obj(path: Path, mesh: TexturedMesh) -> None:
+    """Write ``path``, and beside it the material and the texture under the same name; positions are not split at seams.
+
+    The texture and the material go first: an OBJ file that is there is complete.
+    """
+    obj, mtl, png = written_files(path)
+    positions, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    place = place.reshape(-1)[mesh.faces] + 1  # [F, 3]; the format counts from 1
+    corner = mesh.faces + 1
+    with atomic_write(png) as file:
+        file.write(png_bytes(mesh.texture))
+    with atomic_write(mtl, "w") as file:
+        file.write(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {png.name}\n")
+    with atomic_write(obj, "w") as file:
+        file.write(f"mtllib {mtl.name}\nusemtl texture\n")
+        _lines(file, "v %.9g %.9g %.9g\n", positions)
+        _lines(file, "vt %.7g %.7g\n", np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1))  # from the lower left
+        _lines(file, "vn %.5g %.5g %.5g\n", mesh.normals)
+        _lines(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([place, corner, corner], axis=2).reshape(-1, 9))
+
+
+def _lines(file: Any, template: str, rows: np.ndarray, chunk: int = 10_000) -> None:
+    for start in range(0, len(rows), chunk):
+        part = rows[start : start + chunk]
+        file.write((template * len(part)) % tuple(part.reshape(-1).tolist()))
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """An image [H, W, 3] uint8 as the bytes of a PNG file."""
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG")
+    return buffer.getvalue()

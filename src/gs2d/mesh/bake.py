@@ -1,0 +1,334 @@
+"""The colours of a texture: for every texel, a mean of the few photographs that see its point of the surface best.
+
+A photograph with focal lengths f_x, f_y that sees the point at depth z, along the ray r, on a surface of unit normal n,
+has q = f_x f_y |n . r| / z^3 pixels per unit of surface (the Jacobian of the projection): the cosine and the resolution
+in one number. Its score is s = q b, where b falls from 1 to 0.01 over the last ``FEATHER`` pixels before an outline, a
+border of the image or of its mask. The ``best`` + 1 highest scores of a texel are kept, and its colour is
+
+    sum_v w_v c_v / sum_v w_v,    w_v = s_v - (the lowest of them)
+
+so the weights of ``best`` photographs, continuous across the surface: where one photograph takes the place of another
+in the choice, both have weight 0. See docs/math.md and docs/decisions.md.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+
+from gs2d.camera import Camera
+from gs2d.data.toy_rays import cast_camera
+from gs2d.errors import ProtocolError
+from gs2d.mesh.atlas import Atlas, Texels, texels_of, vertex_normals
+from gs2d.triangles import Mesh, TexturedMesh
+
+BEST = 4  # photographs in the mean
+FEATHER = 4.0  # px
+LEAST_FEATHER = 0.01
+GRAZING = 0.1  # cosine below which a surface is not seen
+JUMP = 3.0  # bend of the depth between pixels that is an outline, in footprints of a pixel
+MAX_SIDE = 1600  # px, of the depth maps that decide what is hidden
+MIN_SIZE, MAX_SIZE, MAX_AUTO_SIZE = 64, 8192, 4096
+_CHUNK = 1 << 17  # texels
+_TYPICAL_USE = 0.7  # part of the atlas that charts cover
+_FINER = 2.0  # texels in the length of a pixel: a picture drawn twice over keeps its edges
+_SAMPLES = 5000  # faces that choose the size
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A picture to take colours from.
+
+    Attributes
+    ----------
+    camera : Camera
+    image : ndarray [H, W, 3 or 4] uint8
+        Straight alpha; pixels below one half show nothing of the surface.
+    valid : ndarray [H, W] bool or None
+        False: not to be used.
+    """
+
+    camera: Camera
+    image: np.ndarray
+    valid: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """A textured mesh and how much of it the photographs know."""
+
+    mesh: TexturedMesh
+    texels: int  # on the surface
+    unseen: int  # of them, filled from their neighbours
+    charts: int
+
+
+def texture_size(mesh: Mesh, cameras: list[Camera]) -> int:
+    """The side, a power of two, of a texture with at least two texels in the length of the pixels that see best.
+
+    Of some faces (spread evenly over the list) the camera that has most pixels per unit area before it decides; what
+    hides them does not.
+    """
+    vertices = mesh.vertices.astype(np.float64)
+    a, b, c = (vertices[mesh.faces[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    some = np.linspace(0, len(area) - 1, min(len(area), _SAMPLES)).astype(np.int64)
+    normals = np.cross(b - a, c - a)[some] / np.maximum(2 * area[some, None], 1e-30)
+    density = np.zeros(len(some))
+    for camera in cameras:
+        ray = (a + b + c)[some] / 3 - camera.center
+        z = ray @ camera.forward
+        facing = -(ray * normals).sum(axis=1)
+        ahead = z > 0
+        q = camera.fx * camera.fy * facing[ahead] / z[ahead] ** 3
+        density[ahead] = np.maximum(density[ahead], q)
+    ranked = np.argsort(density)
+    share = np.cumsum(area[some][ranked])
+    median = density[ranked[min(np.searchsorted(share, share[-1] / 2), len(ranked) - 1)]]
+    side = _FINER * np.sqrt(max(float(area.sum() * median) / _TYPICAL_USE, 1.0))
+    return int(np.clip(2 ** np.ceil(np.log2(side)), 4 * MIN_SIZE, MAX_AUTO_SIZE))
+
+
+def bake(
+    atlas: Atlas,
+    photographs: Iterable[Photograph],
+    size: int,
+    *,
+    best: int = BEST,
+    threads: int | None = None,
+) -> Baked:
+    """Colour the texels of an atlas from photographs.
+
+    Parameters
+    ----------
+    atlas : Atlas
+    photographs : iterable of Photograph
+        Read once, one at a time.
+    size : int
+        Side of the texture, texels. Memory: about 70 bytes for each texel on the surface.
+    best : int
+        Photographs that a texel's colour is made of.
+    threads : int, optional
+
+    Raises
+    ------
+    ProtocolError
+        The size is out of bounds, or no photograph sees any of the surface.
+    """
+    if not MIN_SIZE <= size <= MAX_SIZE:
+        raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {size}")
+    texels = texels_of(atlas, size)
+    chooser = _Chooser(atlas, texels, best, threads or os.cpu_count() or 1)
+    for photograph in photographs:
+        chooser.add(photograph)
+    colors, seen = chooser.colors()
+    if not seen.any():
+        raise ProtocolError(
+            f"photographs that see the mesh were expected, none of {chooser.count} does; is it of this capture?"
+        )
+    fill_unseen(atlas, texels, colors, seen)
+    mesh = TexturedMesh(
+        vertices=atlas.mesh.vertices[atlas.source],
+        normals=vertex_normals(atlas.mesh)[atlas.source],
+        faces=atlas.faces,
+        uv=atlas.uv,
+        texture=spread(texels, colors),
+    )
+    return Baked(mesh, len(seen), int(len(seen) - seen.sum()), atlas.charts)
+
+
+class _Chooser:
+    """The best photographs of each texel so far."""
+
+    def __init__(self, atlas: Atlas, texels: Texels, best: int, threads: int) -> None:
+        self._mesh = atlas.mesh
+        self._origin = atlas.mesh.vertices.astype(np.float64).mean(axis=0)
+        self._threads = threads
+        self.count = 0
+        n = len(texels.index)
+        self._parts = [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
+        places, normals = atlas.mesh.vertices - self._origin, vertex_normals(atlas.mesh)
+        self._places, self._normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+        for part in self._parts:
+            self._places[part] = texels.interpolated(places, atlas.mesh.faces, part)
+            normal = texels.interpolated(normals, atlas.mesh.faces, part)
+            self._normals[part] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        self._heights = (self._places * self._normals).sum(axis=1)  # n . x
+        self._scores = np.zeros((n, best + 1), np.float32)
+        self._least = np.zeros(n, np.float32)  # of the scores
+        self._colors = np.zeros((n, best + 1, 3), np.uint8)
+
+    def add(self, photograph: Photograph) -> None:
+        """Let every texel choose whether it wants this photograph."""
+        self.count += 1
+        looked = _Looked(self._mesh, photograph, self._origin)
+        with ThreadPoolExecutor(self._threads) as pool:
+            for _ in pool.map(lambda part: self._choose(looked, part), self._parts):
+                pass
+
+    def _choose(self, looked: _Looked, part: slice) -> None:
+        places, scores, least = self._places[part], self._scores[part], self._least[part]
+        rows, density = looked.before(places, self._normals[part], self._heights[part], least)
+        chosen, score, color = looked.visible(places[rows], self._normals[part][rows], density, least[rows])
+        rows = rows[chosen]
+        worst = scores[rows].argmin(axis=1)
+        scores[rows, worst], self._colors[part][rows, worst] = score, color
+        least[rows] = scores[rows].min(axis=1)
+
+    def colors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean colours [T, 3] uint8 of the texels, and which of them some photograph saw [T]."""
+        colors = np.zeros((len(self._scores), 3), np.uint8)
+        for part in self._parts:
+            weights = self._scores[part] - 0.999 * self._least[part][:, None]  # equal scores: equal weights, not none
+            total = np.maximum(weights.sum(axis=1), 1e-30)
+            mean = np.einsum("tk,tkc->tc", weights, self._colors[part].astype(np.float32)) / total[:, None]
+            colors[part] = np.rint(mean)
+        return colors, self._scores.max(axis=1) > 0
+
+
+class _Looked:
+    """A photograph, with what of the mesh it sees and how near to an outline."""
+
+    def __init__(self, mesh: Mesh, photograph: Photograph, origin: np.ndarray) -> None:
+        camera = photograph.camera
+        shrink = max(camera.width, camera.height) / MAX_SIDE
+        small = camera
+        if shrink > 1:
+            small = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
+        self._camera, self._small, self._image = camera, small, photograph.image
+        self._rotation = camera.rotation.astype(np.float32)
+        self._shift = (camera.T_cam_world[:3, 3] + camera.rotation @ origin).astype(np.float32)
+        self._center = (camera.center - origin).astype(np.float32)
+        self._depth = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, small).depth
+        self._feather = feather(self._depth, small.fx, _shown(photograph, small))
+
+    def before(
+        self, places: np.ndarray, normals: np.ndarray, heights: np.ndarray, least: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [m] of the texels that face the camera and have a density q [m] above ``least``; cheap, for all."""
+        facing = normals @ self._center - heights
+        z = places @ self._rotation[2] + self._shift[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            density = np.float32(self._camera.fx * self._camera.fy) * facing / (z * z * z)
+        rows = np.flatnonzero((facing > 0) & (z > 0) & (density > least))
+        return rows, density[rows]
+
+    def visible(
+        self, places: np.ndarray, normals: np.ndarray, density: np.ndarray, least: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows [m] of the places [t, 3] that are seen better than ``least``, their scores [m] and colours [m, 3]."""
+        camera, small = self._camera, self._small
+        x, y, z = (places @ self._rotation[i] + self._shift[i] for i in range(3))
+        x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        rows = np.flatnonzero((x >= 0.5) & (y >= 0.5) & (x <= camera.width - 0.5) & (y <= camera.height - 0.5))
+        column = np.minimum((x[rows] * (small.width / camera.width)).astype(np.int32), small.width - 1)
+        row = np.minimum((y[rows] * (small.height / camera.height)).astype(np.int32), small.height - 1)
+        pixel = row * small.width + column
+        score = density[rows] * self._feather.reshape(-1)[pixel]
+        better = score > least[rows]
+        rows, pixel, score = rows[better], pixel[better], score[better]
+        ray = places[rows] - self._center
+        cosine = -(ray * normals[rows]).sum(axis=1) / np.sqrt((ray * ray).sum(axis=1))
+        # depth changes by tan(incidence) footprints within a pixel of a plane; twice that, and a footprint of its own
+        tolerance = z[rows] / small.fx * (1 + 2 / np.maximum(cosine, GRAZING))
+        seen = (cosine > GRAZING) & (np.abs(z[rows] - self._depth.reshape(-1)[pixel]) <= tolerance)
+        rows, score = rows[seen], score[seen]
+        return rows, score, bilinear(self._image, x[rows], y[rows])
+
+
+def _shown(photograph: Photograph, small: Camera) -> np.ndarray:
+    """Which pixels [H, W] of the smaller camera's image may be used."""
+    image, valid = photograph.image, photograph.valid
+    height, width = image.shape[:2]
+    row = ((np.arange(small.height) + 0.5) * height / small.height).astype(np.int64)[:, None]
+    column = ((np.arange(small.width) + 0.5) * width / small.width).astype(np.int64)[None]
+    shown = np.ones((small.height, small.width), bool)
+    if image.shape[2] == 4:
+        shown &= image[row, column, 3] >= 128
+    if valid is not None:
+        shown &= valid[row, column]
+    return shown
+
+
+def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:
+    """How far pixels are from what must not bleed into them, float32 [H, W]; 0 where nothing may be taken.
+
+    1 at ``FEATHER`` pixels or more from an outline, the border of the image and pixels that are not ``shown``, falling
+    to ``LEAST_FEATHER`` beside them. An outline is where 1 / depth, which is linear on a plane, bends.
+    """
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
+    bend = np.zeros_like(inverse)
+    middle = inverse[:, 1:-1]
+    bend[:, 1:-1] = np.abs(inverse[:, :-2] + inverse[:, 2:] - 2 * middle)
+    middle = inverse[1:-1]
+    bend[1:-1] = np.maximum(bend[1:-1], np.abs(inverse[:-2] + inverse[2:] - 2 * middle))
+    usable = (depth > 0) & shown
+    clear = np.pad(usable & (bend * depth * focal <= JUMP), 1)  # nothing is known beyond the border
+    distance = distance_transform_edt(clear)[1:-1, 1:-1]
+    return np.where(usable, np.clip(distance / FEATHER, LEAST_FEATHER, 1), 0).astype(np.float32)
+
+
+def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Colours [m, 3] uint8 of an image [H, W, >= 3] at places in px (pixel centres at +0.5), clamped to it."""
+    height, width = image.shape[:2]
+    flat = image.reshape(height * width, -1)
+    x, y = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
+    column, row = np.minimum(x.astype(np.int64), max(width - 2, 0)), np.minimum(y.astype(np.int64), max(height - 2, 0))
+    right, below = int(width > 1), width * int(height > 1)
+    corner = row * width + column
+    fx, fy = (x - column).astype(np.float32)[:, None], (y - row).astype(np.float32)[:, None]
+    upper = flat[corner, :3] * (1 - fx) + flat[corner + right, :3] * fx
+    lower = flat[corner + below, :3] * (1 - fx) + flat[corner + below + right, :3] * fx
+    return np.asarray(np.rint(upper * (1 - fy) + lower * fy).astype(np.uint8))
+
+
+def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarray) -> None:
+    """Colour the texels that no photograph saw, in place, from what lies beside them on the surface, across charts.
+
+    Vertices take the mean of the seen texels around them; the others, ring after ring, the mean of their coloured
+    neighbours; a piece without any, the mean of all. Unseen texels are interpolated between the vertices of their face.
+    """
+    if seen.all():
+        return
+    faces, count = atlas.mesh.faces, len(atlas.mesh.vertices)
+    face, w = texels.face[seen], texels.weights[seen].astype(np.float64)
+    weights = [w[:, 0], w[:, 1], 1 - w[:, 0] - w[:, 1]]
+    total, known = np.zeros((count, 3)), np.zeros(count)
+    for k, weight in enumerate(weights):
+        known += np.bincount(faces[face, k], weight, count)
+        for channel in range(3):
+            total[:, channel] += np.bincount(faces[face, k], weight * colors[seen, channel], count)
+    done = known > 1e-6
+    values = np.where(done[:, None], total / np.maximum(known, 1e-6)[:, None], 0)
+    ends = faces.reshape(-1), np.roll(faces, 1, axis=1).reshape(-1)
+    half = coo_array((np.ones(faces.size), ends), shape=(count, count)).tocsr()
+    edges = half + half.T
+    while True:
+        degree = edges @ done
+        ring = ~done & (degree > 0)
+        if not ring.any():
+            break
+        values[ring] = (edges @ np.where(done[:, None], values, 0))[ring] / degree[ring, None]
+        done |= ring
+    values[~done] = colors[seen].mean(axis=0)
+    rows = np.flatnonzero(~seen)
+    hidden = Texels(texels.size, texels.index[rows], texels.face[rows], texels.weights[rows])
+    colors[rows] = np.rint(np.clip(hidden.interpolated(values, faces), 0, 255))
+
+
+def spread(texels: Texels, colors: np.ndarray) -> np.ndarray:
+    """The texture [S, S, 3] uint8: texels of no chart take the colour of the nearest one that is of some.
+
+    So neither filtering at the border of a chart nor a smaller copy of the texture mixes in a colour of nothing.
+    """
+    size = texels.size
+    texture, empty = np.zeros((size * size, 3), np.uint8), np.ones(size * size, bool)
+    texture[texels.index], empty[texels.index] = colors, False
+    nearest = distance_transform_edt(empty.reshape(size, size), return_distances=False, return_indices=True)
+    return np.asarray(texture.reshape(size, size, 3)[nearest[0], nearest[1]])

@@ -1,0 +1,143 @@
+"""The textured mesh of a run: its surface, with colours from the photographs."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.data import View
+from gs2d.errors import ProtocolError, RunError
+from gs2d.images import to_uint8
+from gs2d.io.ply import read_mesh
+from gs2d.io.run import MESH, TEXTURED, RunFolder
+from gs2d.io.textured import write_textured, written_files
+from gs2d.mesh.atlas import required, simplified, unwrap
+from gs2d.mesh.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
+from gs2d.pipeline.events import OnEvent, Phase, counted, ignore
+from gs2d.pipeline.jobs import mesh_run, open_job
+from gs2d.pipeline.options import MeshOptions, TextureOptions
+from gs2d.pipeline.paths import up_direction
+from gs2d.pipeline.pictures import render_view
+from gs2d.pipeline.prepare import Job, read_scene
+from gs2d.pipeline.surface import OPAQUE, extract_mesh
+from gs2d.splats import Splats
+from gs2d.triangles import Mesh
+
+
+def texture_run(
+    path: Path,
+    options: TextureOptions = TextureOptions(),  # noqa: B008 (frozen)
+    mesh_options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    out: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Write the mesh of a finished run with a texture; returns its files and counts.
+
+    The mesh is ``mesh.ply`` of the run as it is, unless some mesh option is given or it is not there: then it is
+    extracted anew, and takes the place of ``mesh.ply`` if ``out`` is None.
+
+    Raises
+    ------
+    RunError, DataError, ProtocolError, BackendError, DiskError
+    """
+    check_texture_options(options)
+    for package in ("xatlas", "fast_simplification"):
+        required(package)  # before minutes are spent
+    target = path / TEXTURED if out is None else out
+    files = written_files(target)
+    if not target.parent.is_dir() and out is not None:
+        raise RunError(f"--out {out} must be in a folder that exists; make {target.parent} first")
+    if out is None and (mesh_options != MeshOptions() or not (path / MESH).exists()):
+        mesh_run(path, mesh_options, on_event, threads=threads)
+        mesh_options = MeshOptions()
+    run, job, splats = open_job(path, threads, on_event)
+    for view in job.scene.views:
+        if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
+            raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
+    mesh = _mesh(run, job, splats, mesh_options, target.parent, on_event)
+    baked = textured_mesh(job, splats, mesh, options, on_event)
+    write_textured(target, baked.mesh, up=up_direction([view.camera for view in job.scene.train]))
+    return {
+        "files": [str(file) for file in files],
+        "faces": len(baked.mesh.faces),
+        "faces_before": len(mesh.faces),
+        "vertices": len(baked.mesh.vertices),
+        "texture_size": len(baked.mesh.texture),
+        "charts": baked.charts,
+        "texels": baked.texels,
+        "texels_unseen": baked.unseen,
+        "texture_from": options.source,
+        "bytes": sum(file.stat().st_size for file in files),
+    }
+
+
+def textured_mesh(job: Job, splats: Splats, mesh: Mesh, options: TextureOptions, on_event: OnEvent = ignore) -> Baked:
+    """Simplify a mesh of a run, cut it into charts and colour them.
+
+    Raises
+    ------
+    BackendError, DataError, ProtocolError
+    """
+    on_event(Phase("cutting the surface into charts", 0))
+    atlas = unwrap(simplified(mesh, options.faces))
+    views = _views(job, options, on_event)
+    size = options.size or texture_size(atlas.mesh, [view.camera for view in views])
+    return bake(atlas, _photographs(job, views, splats, options, on_event), size, threads=torch.get_num_threads())
+
+
+def check_texture_options(options: TextureOptions) -> None:
+    """Raise for numbers that make no texture.
+
+    Raises
+    ------
+    ProtocolError
+    """
+    if options.faces < 4:
+        raise ProtocolError(f"--faces must be a whole number >= 4, got {options.faces}")
+    if options.downscale is not None and options.downscale < 1:
+        raise ProtocolError(f"--texture-downscale must be a whole number >= 1, got {options.downscale}")
+    if options.size is not None and not MIN_SIZE <= options.size <= MAX_SIZE:
+        raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.size}")
+
+
+def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder: Path, on_event: OnEvent) -> Mesh:
+    """The run's mesh as it is, or one of its own for other options."""
+    if options == MeshOptions() and run.file(MESH).exists():
+        return read_mesh(run.file(MESH))
+    with tempfile.TemporaryDirectory(prefix=".gs2d-", dir=folder) as temporary:
+        extract_mesh(job, splats, options, Path(temporary) / MESH, on_event)
+        return read_mesh(Path(temporary) / MESH)
+
+
+def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
+    """The training views, in another size if one is asked for."""
+    if options.downscale in (None, job.downscale) or job.scene.root is None:
+        return job.scene.train
+    return read_scene(job.scene.root, job.scene.format, options.downscale or 1, job.protocol, on_event).train
+
+
+def _photographs(
+    job: Job, views: Sequence[View], splats: Splats, options: TextureOptions, on_event: OnEvent
+) -> Iterator[Photograph]:
+    """The views, or what the splats look like from them."""
+    for view in counted(views, "colouring the texture", len(views), on_event):
+        if options.source == "renders":
+            output = render_view(splats, view, job.settings, job.backend)
+            shown = (output.alpha >= OPAQUE).cpu().numpy()
+            yield Photograph(view.camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
+        else:
+            yield Photograph(view.camera, view.image(), _usable(view, job))
+
+
+def _usable(view: View, job: Job) -> np.ndarray | None:
+    """Pixels of a photograph that show the surface: not masked out, and on the object if fusion looked only there."""
+    masks = [view.mask(), view.object_mask() if job.protocol.use_mask_in_fusion else None]
+    given = [mask for mask in masks if mask is not None]
+    return np.logical_and.reduce(given) if given else None

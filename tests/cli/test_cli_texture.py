@@ -1,0 +1,109 @@
+"""``gs2d mesh RUN --texture``: the files, what the user is told, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli_runs import one_line
+from gs2d.cli import run
+from gs2d.pipeline.paths import up_direction
+from tiny import RADIUS, ball_cameras, write_ball_mesh
+
+pytest.importorskip("xatlas", reason="xatlas is not installed (extra `texture`)")
+pytest.importorskip("fast_simplification", reason="fast-simplification is not installed (extra `texture`)")
+
+
+@pytest.fixture
+def ball(trained: Path, tmp_path: Path) -> Path:
+    """The run, with the true ball as its mesh."""
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    write_ball_mesh(folder / "mesh.ply")
+    return folder
+
+
+def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
+    ball: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    before = (ball / "mesh.ply").read_bytes()
+    assert run(["mesh", str(ball), "--texture", "--threads", "1"]) == 0
+    out, _ = capsys.readouterr()
+    assert "mesh.glb: 2,304 triangles" in out
+    assert "seen by no photograph" in out
+    assert (ball / "mesh.ply").read_bytes() == before
+    scene = trimesh.load(ball / "mesh.glb")
+    mesh = next(iter(scene.geometry.values()))
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), RADIUS, rtol=1e-5)  # in the capture's frame
+    seen = mesh.vertices[:, 2] > 0.1  # red, green and blue follow x, y, z; the cameras are above
+    colors = np.asarray(mesh.visual.to_color().vertex_colors)[:, :3] / 255
+    expected = 0.5 + 0.4 * mesh.vertices / RADIUS + 0.1 * np.sin(9 * mesh.vertices)
+    assert np.median(np.abs(colors - expected)[seen]) < 0.03  # photographs of 20 x 20
+
+
+def test_the_options_reach_the_texture(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "small.obj"
+    words = ["--texture", "--faces", "300", "--texture-size", "64", "--texture-from", "renders", "--out", str(out)]
+    assert run(["mesh", str(ball), *words, "--json", "--threads", "1"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["faces"] <= 300 < result["faces_before"] == 2304
+    assert result["texture_size"] == 64
+    assert result["texture_from"] == "renders"
+    assert 0 <= result["texels_unseen"] < result["texels"] < 64 * 64
+    assert [Path(name).name for name in result["files"]] == ["small.obj", "small.mtl", "small.png"]
+    assert result["bytes"] == sum(Path(name).stat().st_size for name in result["files"])
+    assert not (ball / "mesh.glb").exists()
+
+
+def test_a_mesh_extracted_anew_takes_the_old_texture_with_it(ball: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (ball / "mesh.glb").write_bytes(b"of another mesh")
+    assert run(["mesh", str(ball), "--voxel", "0.2", "--threads", "1"]) == 0
+    assert "mesh.glb was of the mesh before: removed" in capsys.readouterr().err
+    assert not (ball / "mesh.glb").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--faces", "100"], "--faces belongs to --texture"),
+        (["--texture-size", "64"], "--texture-size belongs to --texture"),
+        (["--texture", "--faces", "2"], "--faces must be a whole number >= 4, got 2"),
+        (["--texture", "--texture-size", "10"], "--texture-size must be 64 to 8192 texels, got 10"),
+        (["--texture", "--texture-downscale", "0"], "--texture-downscale must be a whole number >= 1"),
+        (["--texture", "--out", "mesh.ply"], "written as .glb or .obj, got mesh.ply"),
+        (["--texture", "--out", "no/such/folder/a.glb"], "must be in a folder that exists"),
+    ],
+)
+def test_what_makes_no_texture_is_one_line(
+    trained: Path, words: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["mesh", str(trained), *words]) == 2
+    assert named in one_line(capsys.readouterr().err)
+
+
+def test_no_photograph_is_written_over(ball: Path, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["mesh", str(ball), "--texture", "--out", str(capture / "train" / "r_0.obj")]) == 2
+    assert "would write over the photograph" in one_line(capsys.readouterr().err.splitlines()[-1])
+
+
+def test_without_the_extra_the_remedy_is_named(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "xatlas", None)  # import raises ModuleNotFoundError
+    assert run(["mesh", str(trained), "--texture"]) == 2
+    assert "pip install '2dgs-r[texture]'" in one_line(capsys.readouterr().err)
+
+
+def test_up_is_across_the_horizontal_axes_of_level_cameras() -> None:
+    cameras = ball_cameras(6)
+    np.testing.assert_allclose(up_direction(cameras), [0, 0, 1], atol=1e-9)
+    # three that look down from one side: their own up vectors lean away from them
+    leaning = ball_cameras(40)[30:39:4]
+    np.testing.assert_allclose(up_direction(leaning), [0, 0, 1], atol=1e-9)
+    one = up_direction(cameras[:1])
+    np.testing.assert_allclose(one, -cameras[0].rotation[1])

@@ -1,0 +1,323 @@
+"""Texture baking: which photographs colour a texel and how much, what is filled, and the files."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.texture import picture, psnr
+from texture_shapes import above, box, checkers, flat_atlas, grid_plane, join, photograph, ring
+
+from gs2d.errors import BackendError, DataError, ProtocolError
+from gs2d.io.obj import read_obj
+from gs2d.io.textured import turn_to_y, write_textured
+from gs2d.mesh import atlas as atlas_module
+from gs2d.mesh.atlas import simplified, texels_of, unwrap, vertex_normals
+from gs2d.mesh.bake import (
+    FEATHER,
+    LEAST_FEATHER,
+    Photograph,
+    bake,
+    bilinear,
+    feather,
+    fill_unseen,
+    spread,
+    texture_size,
+)
+from gs2d.triangles import Mesh, TexturedMesh
+
+RED, GREEN, BLUE = (np.array(c, float) for c in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+
+
+def plain(camera_height: float, color: np.ndarray, size: int = 64) -> Photograph:
+    """A picture of one colour, from above."""
+    image = np.broadcast_to(np.rint(255 * color).astype(np.uint8), (size, size, 3))
+    return Photograph(above(camera_height, size), np.ascontiguousarray(image))
+
+
+def middle(texture: np.ndarray) -> list[int]:
+    return [int(v) for v in texture[len(texture) // 2, len(texture) // 2]]
+
+
+def test_a_checkered_box_is_drawn_from_its_texture_as_its_photographs_show_it() -> None:
+    pytest.importorskip("xatlas")
+    mesh = box()
+    photographs = [photograph(mesh, camera, checkers) for camera in ring(14)]
+    baked = bake(unwrap(mesh), photographs, 256, threads=1)
+    assert baked.unseen < 10  # of 60 000: at the corners
+    colors = np.rint(255 * np.clip(checkers(mesh.vertices), 0, 1)).astype(np.uint8)
+    by_vertex, by_texture = [], []
+    for camera in ring(3, turn=0.4):  # none of those
+        truth = photograph(mesh, camera, checkers)
+        target = np.where(truth.image[..., 3:] > 0, truth.image[..., :3] / 255, 1.0)
+        inside = truth.image[..., 3] == 255
+        by_texture.append(psnr(picture(baked.mesh, camera)[0][inside], target[inside]))
+        by_vertex.append(psnr(picture(Mesh(mesh.vertices, mesh.faces, colors), camera)[0][inside], target[inside]))
+    assert min(by_texture) > 31
+    assert max(by_vertex) < 20  # six squares of colours for three of checkers
+
+
+def test_a_texel_takes_the_photographs_with_most_pixels_per_area_less_the_first_that_is_left_out() -> None:
+    # f = 64; straight above a plane q = f^2 / z^2: 4096, 1024, 256 and 64 at z = 1, 2, 4, 8. The best two, less the
+    # third: 3840 and 768, which is 5 to 1.
+    heights = ((4, GREEN), (1, RED), (8, GREEN), (2, BLUE))
+    baked = bake(flat_atlas(grid_plane()), [plain(z, c, 256) for z, c in heights], 64, best=2, threads=1)
+    assert middle(baked.mesh.texture) == pytest.approx([255 * 5 / 6, 0, 255 / 6], abs=1)
+
+
+def test_the_order_of_photographs_does_not_matter() -> None:
+    photographs = [plain(z, c, 256) for z, c in ((1, RED), (2, BLUE), (4, GREEN), (8, RED))]
+    one = bake(flat_atlas(grid_plane()), photographs, 64, best=2, threads=1)
+    other = bake(flat_atlas(grid_plane()), photographs[::-1], 64, best=2, threads=2)
+    np.testing.assert_array_equal(one.mesh.texture, other.mesh.texture)
+
+
+def test_two_photographs_of_one_place_count_the_same() -> None:
+    baked = bake(flat_atlas(grid_plane()), [plain(2, RED, 256), plain(2, BLUE, 256)], 64, best=1, threads=1)
+    assert middle(baked.mesh.texture) == [128, 0, 128]
+
+
+def test_a_slanted_view_counts_by_its_cosine() -> None:
+    # From 60 degrees aside at the same distance d: |n . r| = d / 2 and z = d, so half of f^2 / d^2. With room for both
+    # the least score is 0 and the weights are 2 to 1.
+    from gs2d.camera import look_at
+
+    eye = 2 * np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
+    slanted = look_at(eye, np.zeros(3), np.array([0, 1.0, 0]), width=256, height=256, fx=64.0)
+    photographs = [plain(2, RED, 256), Photograph(slanted, plain(2, BLUE, 256).image)]
+    baked = bake(flat_atlas(grid_plane(16)), photographs, 64, best=2, threads=1)
+    assert middle(baked.mesh.texture) == pytest.approx([170, 0, 85], abs=2)
+
+
+def test_what_stands_before_the_surface_does_not_colour_it() -> None:
+    # A plate of half the side hides the middle of the floor from the near camera; the far one comes in from aside.
+    floor, plate = grid_plane(16, side=2.0), grid_plane(4, side=1.0, z=0.5)
+    both = join([floor, plate])
+    uv = np.concatenate([0.25 + 0.25 * floor.vertices[:, :2], 0.75 + 0.2 * plate.vertices[:, :2]]).astype(np.float32)
+    sheet = atlas_module.Atlas(both, np.arange(len(both.vertices)), both.faces, uv, charts=2)
+    image = np.zeros((200, 200, 3), np.uint8)
+    photographs = [Photograph(above(4.0, 200, 300.0), image + np.uint8([255, 0, 0]))]
+    baked = bake(sheet, photographs, 128, best=1, threads=1)
+    # seen from 4 wu above, a plate of half the side 0.5 wu above the floor hides (0.5 * 4 / 3.5)^2 of it
+    floor_texels = (128 * 0.5) ** 2
+    assert baked.unseen == pytest.approx(floor_texels * (4 / 3.5) ** 2 / 4, rel=0.15)
+    aside = [Photograph(camera, image + np.uint8([0, 0, 255])) for camera in ring(8, 4.0, 200)[::2]]
+    texture = bake(sheet, photographs + aside, 128, best=1, threads=1).mesh.texture
+    assert texture[32, 32].tolist() == [0, 0, 255]  # the middle of the floor
+    assert texture[96, 96].tolist() == [255, 0, 0]  # the plate
+
+
+def test_pixels_that_are_masked_or_transparent_are_not_used() -> None:
+    masked = Photograph(above(1, 256), plain(1, RED, 256).image, np.zeros((256, 256), bool))
+    clear = np.concatenate([plain(1, GREEN, 256).image, np.zeros((256, 256, 1), np.uint8)], axis=2)
+    photographs = [masked, Photograph(above(1, 256), clear), plain(2, BLUE, 256)]
+    assert middle(bake(flat_atlas(grid_plane()), photographs, 64, threads=1).mesh.texture) == [0, 0, 255]
+    with pytest.raises(ProtocolError, match="none of 1 does"):
+        bake(flat_atlas(grid_plane()), [masked], 64, threads=1)
+
+
+def test_the_back_of_a_surface_has_no_colour() -> None:
+    below = Photograph(above(-2.0, 256), plain(2, RED, 256).image)
+    with pytest.raises(ProtocolError, match="photographs that see the mesh"):
+        bake(flat_atlas(grid_plane()), [below], 64, threads=1)
+
+
+def test_gains_between_photographs_leave_no_step_at_the_border_of_a_picture() -> None:
+    # One of two pictures is a fifth brighter and ends in the middle of the plane: 4 px, as many texels, are feathered.
+    mesh = grid_plane(16)
+    one = photograph(mesh, above(2.0, 128, 128.0), lambda p: np.full_like(p, 0.5))
+    image = one.image.copy()
+    image[..., :3] = 153  # 0.6
+    valid = np.zeros((128, 128), bool)
+    valid[:, :64] = True
+    texture = bake(flat_atlas(mesh), [one, Photograph(one.camera, image, valid)], 128, best=2, threads=1).mesh.texture
+    row = texture[64, :, 0].astype(int)
+    assert row[16] == 140  # (128 + 153) / 2
+    assert row[120] == 128
+    assert np.abs(np.diff(row)).max() <= 5  # b / (1 + b) of 25 for b = 1/4, 2/4 ...; not 12 at once
+
+
+def test_feathering_falls_towards_outlines_but_not_on_slanted_planes() -> None:
+    focal, columns = 100.0, np.arange(40)
+    plane = np.broadcast_to(1 / (0.5 + 0.01 * columns), (30, 40))  # 1 / depth is linear in the image
+    shown = np.ones((30, 40), bool)
+    inside = feather(plane, focal, shown)[10:20, 10:30]
+    assert (inside == 1).all()
+    step = plane.copy()
+    step[:, 20:] *= 0.7
+    values = feather(step, focal, shown)[15]
+    assert values[19] == values[20] == np.float32(LEAST_FEATHER)
+    np.testing.assert_allclose(values[21:25], np.array([1, 2, 3, 4]) / FEATHER)
+    assert feather(np.where(step > 0, 0, step), focal, shown).max() == 0
+    border = feather(plane, focal, shown)[15]
+    np.testing.assert_allclose(border[:4], np.array([1, 2, 3, 4]) / FEATHER)
+
+
+def test_unseen_texels_take_the_colour_of_the_surface_beside_them() -> None:
+    # The left half of a plane was seen, green above and red below; another plane lies behind it, far away.
+    mesh = join([grid_plane(8), grid_plane(2, z=5.0)])
+    texels = texels_of(flat_atlas(grid_plane(8)), 64)
+    colors, seen = np.zeros((len(texels.index), 3), np.uint8), texels.index % 64 < 32
+    colors[seen] = (200, 10, 10)
+    colors[seen & (texels.index // 64 < 32)] = (10, 200, 10)
+    fill_unseen(flat_atlas(mesh), texels, colors, seen)
+    picture_ = np.zeros((64 * 64, 3), np.uint8)
+    picture_[texels.index] = colors
+    picture_ = picture_.reshape(64, 64, 3)
+    assert picture_[60, 60, 0] > 160  # what is between the two mixes them
+    assert picture_[4, 60, 1] > 160
+    assert picture_[:, :32].reshape(-1, 3).tolist() == [[10, 200, 10]] * 1024 + [[200, 10, 10]] * 1024  # untouched
+
+
+def test_a_piece_that_nobody_saw_takes_the_mean_colour() -> None:
+    pieces = [grid_plane(4), grid_plane(4)]
+    pieces = [
+        Mesh(p.vertices * np.float32([0.4, 0.8, 1]) + np.float32([x, 0, 0]), p.faces)
+        for p, x in zip(pieces, (-0.5, 0.5), strict=True)
+    ]
+    atlas = flat_atlas(join(pieces))
+    texels = texels_of(atlas, 64)
+    colors, seen = np.zeros((len(texels.index), 3), np.uint8), texels.index % 64 < 32
+    colors[seen] = np.where((texels.index[seen] // 64 < 32)[:, None], (100, 0, 0), (200, 0, 0))
+    fill_unseen(atlas, texels, colors, seen)
+    assert set(map(tuple, colors[~seen].tolist())) == {(150, 0, 0)}
+
+
+def test_no_texel_of_the_texture_is_without_a_colour_of_its_nearest_chart() -> None:
+    mesh = Mesh(grid_plane(2).vertices * np.float32(0.5), grid_plane(2).faces)  # the middle half of the texture
+    texels = texels_of(flat_atlas(mesh), 64)
+    assert len(texels.index) == 32 * 32
+    texture = spread(texels, np.where((texels.index % 64 < 32)[:, None], (9, 8, 7), (1, 2, 3)).astype(np.uint8))
+    assert (texture[:, :32] == (9, 8, 7)).all()
+    assert (texture[:, 32:] == (1, 2, 3)).all()
+
+
+def test_texels_know_their_place_on_the_surface() -> None:
+    pytest.importorskip("xatlas")
+    mesh = box(3)
+    atlas = unwrap(mesh)
+    assert np.array_equal(atlas.source[atlas.faces], mesh.faces)
+    for size in (64, 100):
+        texels = texels_of(atlas, size)
+        assert len(np.unique(texels.index)) == len(texels.index) > size * size / 3
+        places = texels.interpolated(mesh.vertices, mesh.faces)
+        np.testing.assert_allclose(np.abs(places).max(axis=1), 1, atol=1e-5)  # on the box
+        uv = texels.interpolated(atlas.uv, atlas.faces) * size
+        np.testing.assert_allclose(uv[:, 0], texels.index % size + 0.5, atol=1e-3)
+        np.testing.assert_allclose(uv[:, 1], texels.index // size + 0.5, atol=1e-3)
+
+
+def test_bilinear_colours_are_those_of_pixels_at_their_centres_and_means_between() -> None:
+    image = np.zeros((2, 3, 3), np.uint8)
+    image[0, :, 0], image[1, :, 0] = (10, 20, 40), (30, 60, 80)
+    x, y = np.array([0.5, 1.5, 1.0, 2.0, 0.0, 3.0, 1.0]), np.array([0.5, 0.5, 0.5, 0.5, 0.0, 2.0, 1.0])
+    assert bilinear(image, x, y)[:, 0].tolist() == [10, 20, 15, 30, 10, 80, 30]
+
+
+def test_a_simplified_mesh_has_so_many_faces_and_the_same_shape() -> None:
+    pytest.importorskip("fast_simplification")
+    mesh = box(20)
+    assert simplified(mesh, len(mesh.faces)) is mesh
+    far = Mesh((mesh.vertices.astype(np.float64) + 1e6), mesh.faces)  # 32 bits hold these to 1/16 only
+    small = simplified(far, 400)
+    assert 300 <= len(small.faces) <= 400
+    np.testing.assert_allclose(np.abs(small.vertices - 1e6).max(axis=1), 1, atol=1e-3)
+    with pytest.raises(ProtocolError, match="--faces"):
+        simplified(mesh, 3)
+
+
+def test_the_size_of_a_texture_follows_the_pixels() -> None:
+    # 2 x 2 wu at 64 px per wu: 128 px, 256 half pixels, / sqrt(0.7) = 306: 512. From twice as near: 612: 1024.
+    assert texture_size(grid_plane(), [above(1.0, 256, 64.0), above(2.0, 256, 64.0)]) == 512
+    assert texture_size(grid_plane(), [above(0.5, 256, 64.0)]) == 1024
+    assert texture_size(grid_plane(), [above(-1.0, 256, 64.0)]) == 256  # nobody sees it: the least
+    with pytest.raises(ProtocolError, match="--texture-size must be 64 to 8192"):
+        bake(flat_atlas(grid_plane()), [], 32)
+
+
+def test_a_missing_package_is_one_line_with_the_remedy() -> None:
+    with pytest.raises(BackendError, match=r"pip install '2dgs-r\[texture\]'"):
+        atlas_module.required("no_such_package_of_gs2d")
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+def textured() -> TexturedMesh:
+    """The unit square in four triangles around its middle, red above and blue below."""
+    mesh = grid_plane(2)
+    texture = np.zeros((16, 16, 3), np.uint8)
+    texture[:8], texture[8:] = (250, 0, 0), (0, 0, 250)
+    return TexturedMesh(mesh.vertices, vertex_normals(mesh), mesh.faces, flat_atlas(mesh).uv, texture)
+
+
+@pytest.mark.parametrize("name", ["mesh.glb", "mesh.obj"])
+def test_other_programs_open_the_files_with_their_texture(tmp_path: Path, name: str) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    mesh = textured()
+    write_textured(tmp_path / name, mesh)
+    loaded = trimesh.load(tmp_path / name, force="mesh", process=False)
+    assert len(loaded.faces) == len(mesh.faces)
+    np.testing.assert_allclose(
+        np.sort(loaded.triangles.reshape(-1, 3), 0), np.sort(mesh.vertices[mesh.faces].reshape(-1, 3), 0)
+    )
+    np.testing.assert_allclose(loaded.face_normals, np.tile([0, 0, 1], (8, 1)), atol=1e-6)
+    material = loaded.visual.material
+    image = material.baseColorTexture if name.endswith("glb") else material.image
+    np.testing.assert_array_equal(np.asarray(image.convert("RGB")), mesh.texture)
+    colors = np.asarray(loaded.visual.to_color().vertex_colors)[:, :3].astype(int)  # y is up: red above, blue below
+    top, bottom = loaded.vertices[:, 1] > 0.5, loaded.vertices[:, 1] < -0.5
+    assert (colors[top] == (250, 0, 0)).all()
+    assert (colors[bottom] == (0, 0, 250)).all()
+
+
+def test_a_glb_file_is_what_the_format_says(tmp_path: Path) -> None:
+    path = tmp_path / "a.GLB"
+    write_textured(path, textured(), up=np.array([0.0, 0, 1]))
+    data = path.read_bytes()
+    magic, version, length = struct.unpack("<4sII", data[:12])
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack("<I4s", data[12:20])
+    assert (kind, size % 4) == (b"JSON", 0)
+    document = json.loads(data[20 : 20 + size])
+    binary, kind = struct.unpack("<I4s", data[20 + size : 28 + size])
+    assert kind == b"BIN\0"
+    assert binary == document["buffers"][0]["byteLength"] == len(data) - 28 - size
+    assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
+    assert document["accessors"][0]["min"] == [-1, -1, 0]
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    # z up to y up is a quarter turn about x, backwards: sin and cos of -45 degrees
+    np.testing.assert_allclose(document["nodes"][0]["rotation"], [-(0.5**0.5), 0, 0, 0.5**0.5])
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 0, 0), (0.3, -0.5, 0.8)])
+def test_up_is_turned_to_y(up: tuple[float, float, float]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_quat(turn_to_y(np.array(up))).apply(up)
+    np.testing.assert_allclose(turned / np.linalg.norm(up), [0, 1, 0], atol=1e-9)
+
+
+def test_an_obj_file_is_not_torn_at_the_seams_of_its_texture(tmp_path: Path) -> None:
+    mesh = textured()
+    split = TexturedMesh(
+        mesh.vertices[mesh.faces].reshape(-1, 3),
+        mesh.normals[mesh.faces].reshape(-1, 3),
+        np.arange(mesh.faces.size, dtype=np.int32).reshape(-1, 3),
+        mesh.uv[mesh.faces].reshape(-1, 2),
+        mesh.texture,
+    )
+    write_textured(tmp_path / "a.obj", split)
+    read = read_obj(tmp_path / "a.obj")
+    assert len(read.vertices) == len(mesh.vertices)
+    np.testing.assert_array_equal(read.vertices[read.faces], mesh.vertices[mesh.faces])
+    assert {path.name for path in tmp_path.iterdir()} == {"a.obj", "a.mtl", "a.png"}
+    assert "map_Kd a.png" in (tmp_path / "a.mtl").read_text()
+
+
+def test_names_that_no_viewer_could_open_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"\.glb or \.obj"):
+        write_textured(tmp_path / "a.ply", textured())
+    with pytest.raises(DataError, match="without spaces"):
+        write_textured(tmp_path / "a b.obj", textured())
