@@ -101,18 +101,17 @@ def mesh(command: c.Mesh, console: Console) -> None:
         depth=command.depth,
         keep_components=command.keep_components,
     )
-    result = mesh_run(command.run, options, console.on_event, out=command.out, threads=command.threads)
     if command.texture:
         _textured_mesh(command, options, console)
         return
     _refuse_texture_options(command)
+    result = mesh_run(command.run, options, console.on_event, out=command.out, threads=command.threads)
     console.close()
     console.say(f"{result['file']}: {result['vertices']:,} vertices, {result['faces']:,} triangles")
     console.say(f"voxel {result['voxel']:.4g}, truncation {result['truncation']:.4g}, depth {result['depth']}")
     console.result(result)
 
 
-def render(command: c.Render, console: Console) -> None:
 def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None:
     from gs2d.pipeline.options import TextureOptions
     from gs2d.pipeline.texture import texture_run
@@ -139,6 +138,7 @@ def _refuse_texture_options(command: c.Mesh) -> None:
             raise ProtocolError(f"--{name.replace('_', '-')} belongs to --texture, which was not given; give both")
 
 
+def render(command: c.Render, console: Console) -> None:
     """``gs2d render``."""
     from gs2d.pipeline.jobs import render_run
 

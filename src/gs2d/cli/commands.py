@@ -108,6 +108,17 @@ class Mesh(Common):
     """Depth that is fused (default: the run's protocol)."""
     keep_components: int | None = None
     """Keep the so many largest connected pieces (default: all that are not small)."""
+    texture: bool = False
+    """Write it with a texture from the photographs: mesh.glb, or what --out names, .glb or .obj. Without options that
+    change the mesh it is the run's mesh.ply."""
+    faces: int = 50_000
+    """With --texture: simplify a larger mesh to so many triangles."""
+    texture_size: int | None = None
+    """With --texture: its side in texels (default: two for each pixel's length, at most 4096)."""
+    texture_from: Literal["photographs", "renders"] = "photographs"
+    """With --texture: colours from the photographs, or from the splats as they look from there."""
+    texture_downscale: int | None = None
+    """With --texture: shrink the photographs by this integer (default: as in training; 1 = their full size)."""
     threads: int | None = None
     """CPU threads."""
 
@@ -141,17 +152,6 @@ class Evaluate(Common):
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights for the LPIPS metric."""
     threads: int | None = None
-    texture: bool = False
-    """Write it with a texture from the photographs: mesh.glb, or what --out names, .glb or .obj. Without options that
-    change the mesh it is the run's mesh.ply."""
-    faces: int = 50_000
-    """With --texture: simplify a larger mesh to so many triangles."""
-    texture_size: int | None = None
-    """With --texture: its side in texels (default: two for each pixel's length, at most 4096)."""
-    texture_from: Literal["photographs", "renders"] = "photographs"
-    """With --texture: colours from the photographs, or from the splats as they look from there."""
-    texture_downscale: int | None = None
-    """With --texture: shrink the photographs by this integer (default: as in training; 1 = their full size)."""
     """CPU threads."""
 
 
