@@ -43,9 +43,10 @@ def test_images_and_radii_agree_with_the_reference_on_random_scenes(emulator: Em
     assert float((torch.cat(radii) > 1e-3).double().mean()) <= 2e-3
 
 
-def test_crossing_splats_are_culled_as_by_the_reference_if_wanted(emulator: Emulator) -> None:
-    settings = replace(SETTINGS, crossing="cull")
-    differences, culled = [], 0
+@pytest.mark.parametrize("crossing", ["cull", "box"])
+def test_crossing_splats_are_culled_or_boxed_as_by_the_reference_if_wanted(emulator: Emulator, crossing: str) -> None:
+    settings = replace(SETTINGS, crossing=crossing)
+    differences, culled, smaller = [], 0, 0
     for case in cases(12, ("crossing", "huge", "plain")):
         low = render(emulator, case.splats, case.camera, settings)
         high = reference.rasterize(double(case.splats), case.camera, settings)
@@ -53,8 +54,10 @@ def test_crossing_splats_are_culled_as_by_the_reference_if_wanted(emulator: Emul
         assert torch.equal(low.radii > 0, high.radii > 0)
         differences.append((low.color.double() - high.color).abs().flatten())
         culled += int(((drawn.radii > 0) & (high.radii == 0)).sum())
+        smaller += int(((drawn.radii > high.radii) & (high.radii > 0)).sum())
     assert quantile(torch.cat(differences), 0.998) < 1e-4
-    assert culled > 20
+    assert culled > (20 if crossing == "cull" else 0)
+    assert (smaller > 20) is (crossing == "box")
 
 
 @pytest.mark.parametrize("columns", [2, 4])

@@ -271,3 +271,51 @@ def test_19_culled_splats_change_nothing_and_have_no_gradients(backend: Backend)
         assert bool((tensor.grad[0] == 0).all()), name
     assert both.means.grad is not None
     assert bool((both.means.grad[1] != 0).any())
+
+
+BOX = RasterSettings(crossing="box")
+
+
+def slanted(backend: Backend, camera: Camera, settings: RasterSettings) -> tuple[Tensor, float, float]:
+    """Alpha image, radius and splat error of a splat turned 60 degrees about y, s_u = 1: it reaches z = 2 - 3 sin60."""
+    scene = splat(scales=(1, 0.1), axis=Y_AXIS, degrees=60, opacity=0.9)
+    out = rasterize(scene, camera, settings, backend=backend)
+    errors = splat_errors(scene, camera, torch.zeros(camera.height, camera.width, 3), settings, backend=backend)
+    return out.alpha, float(out.radii[0]), float(errors[0])
+
+
+def test_19_a_box_is_the_tiles_of_the_official_square(backend: Backend) -> None:
+    # 64 x 48 px, focal length 32: xu = 32 cos60 = 16, a.z = -sin60, yv = 3.2. <Tw, Tw> = 9 * 3/4 - 4 = 2.75, so
+    # e_x = -9 * 16 sin60 / 2.75 = -45.35 and |e_x^2 - 9 * 16^2 / 2.75|^1/2 = 34.91, up to 35: the square reaches from
+    # column 32 - 45.35 - 0.5 - 35 < 0 to 21.15, which touches the tiles of columns 0 to 31, and all rows.
+    # The splat is seen right of u = -3: x = 32 - 32 * 1.5 / 4.6 = 21.6.
+    camera = front_camera(64, 48, 32.0)
+    drawn, _, all_errors = slanted(backend, camera, RasterSettings())
+    boxed, radius, errors = slanted(backend, camera, BOX)
+    assert bool((drawn[:, 32:] > 0).any())
+    assert bool((boxed[:, 32:] == 0).all())
+    assert bool((boxed[24, 24:32] > 0).all())
+    assert torch.equal(boxed[:, :32], drawn[:, :32])
+    assert radius == 24.0  # half of 48 rows
+    assert 0 < errors < all_errors
+
+
+def test_19_a_box_beside_the_image_culls(backend: Backend) -> None:
+    # The principal point 22 columns further left: the square ends at column -0.85 (with 15 px to the next tile: 14.15).
+    alpha, radius, errors = slanted(backend, front_camera(64, 48, 32.0, cx=10.0), BOX)
+    assert float(alpha.max()) == radius == errors == 0.0
+
+
+def test_19_the_square_is_at_least_that_of_the_low_pass_filter_and_clipped_to_the_image(backend: Backend) -> None:
+    # Seen edge-on, along x = 0: xu = xv = 0, so e_x = 0 and the half width is that of 0.01; y: yv = 0 as well, a.z = -1
+    # alone reaches. 3 lowpass_px = 2.1, up to 3: columns 10 - 0.5 - 3 = 6.5 to 12.5, the tiles of columns 0 to 15.
+    scene = splat(scales=(1, 1e-4), axis=Y_AXIS, degrees=90, opacity=0.9)
+    radii = rasterize(scene, front_camera(40, 12, 32.0, cx=10.0), BOX, backend=backend).radii
+    assert float(radii[0]) == 8.0  # 16 columns, 12 rows
+
+
+def test_19_splats_that_do_not_reach_the_camera_plane_are_drawn_as_ever(backend: Backend) -> None:
+    scene = stack(splat(), splat((0.2, 0, 1.5), scales=(0.4, 9), axis=Y_AXIS, degrees=50))
+    out, plain = (rasterize(scene, front_camera(), s, backend=backend) for s in (BOX, RasterSettings()))
+    for name in (*IMAGES, "radii"):
+        assert torch.equal(getattr(out, name), getattr(plain, name)), name

@@ -115,6 +115,7 @@ def test_a_larger_image_with_many_tiles_and_layers_agrees(native: Backend) -> No
         {"lowpass_px": 1.7},
         {"sh_degree": 1, "background": (1.0, 1.0, 1.0)},
         {"crossing": "cull"},
+        {"crossing": "box"},
     ],
     ids=str,
 )

@@ -49,8 +49,12 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     culled for its opacity here).
 18. *Gradient rows.* With ``gradient_rows`` (bool [N]) the gradients of every other splat, and of its row of
     screen_probe, are zero; images, and the gradients of these rows, are the same bit for bit as without it.
-19. *Crossing.* With ``crossing="cull"`` a splat is culled whole, for images and splat errors alike, if its disc
-    rho3d <= error_cutoff^2 reaches the camera plane: z_c <= error_cutoff |(s_u t_u.z, s_v t_v.z)|.
+19. *Crossing.* A splat whose disc rho3d <= k^2, k = error_cutoff, reaches the camera plane (z_c <= k |(s_u t_u.z,
+    s_v t_v.z)|) is drawn like any other with ``crossing="draw"``. With "cull" it is culled whole, for images and splat
+    errors alike. With "box" it is seen, and counts in splat errors, only in the 16x16 tiles that the square of the
+    official rasterizer touches: centre b and half side h = ceil(max(|b^2 - a|_+^1/2, lowpass_px k)) of the line that
+    touches an ellipse (docs/math.md, "Footprint"), although the disc's image is a hyperbola; its radius is half the
+    longer side of these tiles, clipped to the image.
 """
 
 from __future__ import annotations
@@ -65,7 +69,7 @@ from gs2d.camera import Camera
 from gs2d.check import check_shapes
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.backend import Backend, get_backend
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.types import CROSSING, RasterSettings, RenderOutput
 from gs2d.sh import MAX_DEGREE, sh_degree_of
 from gs2d.splats import Splats
 
@@ -234,4 +238,4 @@ def _check_settings(s: RasterSettings) -> None:
     require(len(s.background) == 3 and all(0 <= b <= 1 for b in s.background), "background", "3 numbers in [0, 1]")
     require(0 <= s.sh_degree <= MAX_DEGREE, "sh_degree", f"0 to {MAX_DEGREE}")
     require(s.lowpass_depth in ("center", "plane"), "lowpass_depth", "'center' or 'plane'")
-    require(s.crossing in ("draw", "cull"), "crossing", "'draw' or 'cull'")
+    require(s.crossing in CROSSING, "crossing", "'draw', 'cull' or 'box'")

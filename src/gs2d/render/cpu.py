@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from gs2d.camera import Camera
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import Library, prepare
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.types import CROSSING, RasterSettings, RenderOutput
 from gs2d.splats import ATTRIBUTES, Splats
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
@@ -36,7 +36,7 @@ class _View(ctypes.Structure):
         *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
         *((name, ctypes.c_double) for name in CONSTANTS),
         ("background", ctypes.c_double * 3),
-        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks", "cull_crossing")),
+        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks", "crossing")),
     )
 
 
@@ -92,7 +92,7 @@ def _view(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
     for name in (*CONSTANTS, "sh_degree"):
         setattr(view, name, getattr(settings, name))
     view.exact_masks = int(exact_masks)
-    view.cull_crossing = int(settings.crossing == "cull")
+    view.crossing = CROSSING.index(settings.crossing)
     return view
 
 

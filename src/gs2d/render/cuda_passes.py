@@ -33,7 +33,7 @@ from gs2d.kernels.cuda.arguments import (
 )
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.cuda_budget import MOST_PAIRS, PairBudget, room_for
-from gs2d.render.types import RasterSettings
+from gs2d.render.types import CROSSING, RasterSettings
 
 __all__ = ["IMAGES", "PARAMETERS", "Frame", "Wanted", "backward", "errors", "forward", "view_of"]
 
@@ -125,7 +125,7 @@ def view_of(camera: Camera, settings: RasterSettings) -> View:
         setattr(view, name, getattr(settings, name))
     view.inv_lowpass2 = 1 / settings.lowpass_px**2
     view.log2_alpha_min = math.log2(settings.alpha_min)
-    view.error_k2, view.cull_crossing = settings.error_cutoff**2, settings.crossing == "cull"
+    view.error_k2, view.crossing = settings.error_cutoff**2, CROSSING.index(settings.crossing)
     view.distortion_scale = (settings.far * settings.near / (settings.far - settings.near)) ** 2
     view.tiles_x, view.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     return view

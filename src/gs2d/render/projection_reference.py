@@ -138,17 +138,25 @@ def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, s
         x_min, y_min, x_max, y_max. Empty boxes have max < min.
     """
     k2 = cutoff_squared.detach().double()
+    exact = _boxes(screen, k2, camera, settings)
+    if settings.crossing != "box":
+        return exact
+    k2 = torch.full_like(k2, settings.error_cutoff**2)
+    crosses = _dot(k2, screen.Tw.detach().double(), screen.Tw.detach().double()) >= 0
+    return torch.where(crosses[:, None], _square_boxes(screen, k2, camera, settings), exact)
+
+
+def _boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
+    """Rule 14: boxes [M, 4] of the disc rho3d <= k2, clipped to the image; all of it where that reaches the camera."""
     center, Au, Av, Tw = (t.detach().double() for t in (screen.center, screen.Au, screen.Av, screen.Tw))
     # The line x = X on the screen is (Au - X Tw) . (u, v, 1) = 0 on the disc's plane. It touches |(u, v)| = k where
     # k^2 |(Au - X Tw).uv|^2 = ((Au - X Tw).1)^2, a quadratic in X: d (X^2 - 2 b X + a) = 0; the same for y.
-    t = torch.stack([k2, k2, -torch.ones_like(k2)], dim=1)  # [M, 3]
-    d = (t * Tw * Tw).sum(dim=1)  # < 0 while the whole disc is in front of the camera
+    d = _dot(k2, Tw, Tw)  # < 0 while the whole disc is in front of the camera
     crosses = d >= 0
     safe = torch.where(crosses, -torch.ones_like(d), d)
     low, high = [], []
     for axis, A in enumerate((Au, Av)):
-        b = (t * A * Tw).sum(dim=1) / safe
-        a = (t * A * A).sum(dim=1) / safe
+        b, a = _dot(k2, A, Tw) / safe, _dot(k2, A, A) / safe
         half = (b * b - a).clamp(min=0).sqrt()
         disc = settings.lowpass_px * k2.sqrt()
         low.append(center[:, axis] + torch.minimum(b - half, -disc))
@@ -157,6 +165,28 @@ def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, s
     lower = torch.where(crosses[:, None], torch.zeros_like(size), torch.stack(low, dim=1).clamp(min=0))
     upper = torch.where(crosses[:, None], size, torch.minimum(torch.stack(high, dim=1), size))
     return torch.cat([lower, upper], dim=1)
+
+
+def _square_boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
+    """Rule 19, "box": the tiles [M, 4] px that the official square touches, clipped to the image; none: max < min."""
+    center, Au, Av, Tw = (t.detach().double() for t in (screen.center, screen.Au, screen.Av, screen.Tw))
+    d = _dot(k2, Tw, Tw)
+    middle = torch.stack([_dot(k2, A, Tw) / d for A in (Au, Av)], dim=1)  # [M, 2]
+    squares = middle.square() - torch.stack([_dot(k2, A, A) / d for A in (Au, Av)], dim=1)
+    half = squares.amax(dim=1).clamp(min=1e-4).sqrt().maximum(settings.lowpass_px * k2.sqrt())
+    middle = middle + center
+    known = middle.abs().sum(dim=1) + half < 1e9  # not where the disc only touches the plane
+    first = torch.where(known[:, None], middle - 0.5 - half.ceil()[:, None], 0.0)  # pixel centres are whole numbers
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=d.device)
+    end = torch.where(known, 2 * half.ceil() + TILE - 1, 0.0)[:, None]
+    lower, upper = (TILE * (side / TILE).clamp(min=0).floor() for side in (first, first + end))
+    none = (upper <= lower).any(dim=1) | (lower >= size).any(dim=1)
+    return torch.where(none[:, None], size.new_tensor([1.0, 1.0, 0.0, 0.0]), torch.cat([lower, upper.minimum(size)], 1))
+
+
+def _dot(k2: Tensor, A: Tensor, B: Tensor) -> Tensor:
+    """<A, B> = k^2 (A.u B.u + A.v B.v) - A.1 B.1 [M] (docs/math.md, "Footprint")."""
+    return k2 * (A[:, :2] * B[:, :2]).sum(dim=1) - A[:, 2] * B[:, 2]
 
 
 def holds_pixel(boxes: Tensor) -> Tensor:

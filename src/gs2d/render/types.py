@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+CROSSING = ("draw", "cull", "box")  # the values of RasterSettings.crossing; the kernels know them by their place
+
 
 @dataclass(frozen=True)
 class RasterSettings:
@@ -35,7 +37,7 @@ class RasterSettings:
         of the current official code; reference backend only).
     crossing : str
         Splats whose disc of ``error_cutoff`` standard deviations reaches the camera plane: "draw" like any other, or
-        "cull" (what the official rasterizer's meaningless box comes to).
+        "cull", or "box": only in the tiles of the official rasterizer's box, which has no meaning for them (rule 19).
     with_distortion : bool
         False = nobody looks at that image: a backend may leave it out (NaN) where that saves work.
     """

@@ -194,18 +194,46 @@ template <class V> struct Footprint {
     mask_t<V> unbounded;         // crosses, or so nearly that the ellipse cannot be trusted
 };
 
-// Rule 19: the disc rho3d <= k^2 reaches the camera plane.
+// Rule 19: what becomes of a splat whose disc rho3d <= error_cutoff^2 reaches the camera plane.
+constexpr int CROSSING_DRAW = 0, CROSSING_CULL = 1, CROSSING_BOX = 2;
+
+// The disc rho3d <= k^2 reaches the camera plane.
 template <class V> GS2D_HD mask_t<V> reaches_camera_plane(const Frame3<V>& f, V k2) {
     return invert(k2 * fma(f.a.z, f.a.z, f.b.z * f.b.z) < f.p.z * f.p.z);
+}
+
+// Screen offsets from the projected centre: (x z, y z, z) = (xu, xv, 0; yu, yv, 0; a.z, b.z, z_c) (u, v, 1).
+template <class V> struct ScreenAxes {
+    V xu, xv, yu, yv;
+};
+
+template <class V, class S> GS2D_HD ScreenAxes<V> screen_axes(const Frame3<V>& f, const PinholeCamera<S>& cam) {
+    const V inv_z = V(S(1)) / f.p.z, rx = f.p.x * inv_z, ry = f.p.y * inv_z;
+    return {V(cam.fx) * fnma(rx, f.a.z, f.a.x), V(cam.fx) * fnma(rx, f.b.z, f.b.x),
+            V(cam.fy) * fnma(ry, f.a.z, f.a.y), V(cam.fy) * fnma(ry, f.b.z, f.b.y)};
+}
+
+// Rule 19, "box": centre and half side, px, of the official square around a disc that reaches the camera plane: the
+// formula of an ellipse's box, for what is a hyperbola. Not finite where the disc only touches the plane.
+template <class V> struct Square {
+    V x, y, half;
+};
+
+template <class V, class S>
+GS2D_HD Square<V> official_square(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px, const PinholeCamera<S>& cam) {
+    const ScreenAxes<V> s = screen_axes(f, cam);
+    const V scale = -k2 / fnma(f.p.z, f.p.z, k2 * fma(f.a.z, f.a.z, f.b.z * f.b.z));  // < 0
+    const V ex = -scale * fma(s.xu, f.a.z, s.xv * f.b.z), ey = -scale * fma(s.yu, f.a.z, s.yv * f.b.z);
+    const V sxx = fma(ex, ex, scale * fma(s.xu, s.xu, s.xv * s.xv)), syy = fma(ey, ey, scale * fma(s.yu, s.yu, s.yv * s.yv));
+    return {r.cx + ex, r.cy + ey, max(sqrt(max(max(sxx, syy), V(S(1e-4)))), V(lowpass_px) * sqrt(k2))};
 }
 
 template <class V, class S>
 GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px, const PinholeCamera<S>& cam) {
     Footprint<V> o;
-    // Screen offsets from the projected centre: (x z, y z, z) = (mu, mv, 0; ..; zu, zv, zc) (u, v, 1).
-    const V inv_z = V(S(1)) / f.p.z, rx = f.p.x * inv_z, ry = f.p.y * inv_z, zero = V(S(0)), one = V(S(1));
-    const V xu = V(cam.fx) * fnma(rx, f.a.z, f.a.x), xv = V(cam.fx) * fnma(rx, f.b.z, f.b.x);
-    const V yu = V(cam.fy) * fnma(ry, f.a.z, f.a.y), yv = V(cam.fy) * fnma(ry, f.b.z, f.b.y);
+    const V zero = V(S(0)), one = V(S(1));
+    const ScreenAxes<V> s = screen_axes(f, cam);
+    const V xu = s.xu, xv = s.xv, yu = s.yu, yv = s.yv;
     const V zz = f.p.z * f.p.z, reach = k2 * fma(f.a.z, f.a.z, f.b.z * f.b.z), d = reach - zz;
     o.crosses = d >= zero;
     const V scale = -k2 / select(o.crosses, -zz, d);  // > 0

@@ -55,6 +55,23 @@ GS2D_HD TileRectangle tile_rectangle(const PixelBox<S>& o, bool unbounded, int w
             (unsigned short)(ty1 < tiles_y ? ty1 + 1 : tiles_y)};
 }
 
+// Rule 19, "box": the tiles that a square (centre and half side, px) touches; none where it is not finite.
+template <class S> GS2D_HD TileRectangle square_tiles(S x, S y, S half, int tiles_x, int tiles_y) {
+    if (!(abs(x) + abs(y) + half < S(1e9))) return {0, 0, 0, 0};
+    const S side = ceil(half), left = x - S(0.5) - side, top = y - S(0.5) - side;
+    const S end = side + side + S(TILE_PX - 1);
+    return {(unsigned short)tile_floor(left, tiles_x), (unsigned short)tile_floor(top, tiles_y),
+            (unsigned short)tile_floor(left + end, tiles_x), (unsigned short)tile_floor(top + end, tiles_y)};
+}
+
+// Half the longer side of some tiles, clipped to the image; 0 for none.
+template <class S> GS2D_HD S tiles_radius(const TileRectangle& t, int width, int height) {
+    if (t.x1 <= t.x0 || t.y1 <= t.y0) return S(0);
+    const int right = t.x1 * TILE_PX < width ? t.x1 * TILE_PX : width, bottom = t.y1 * TILE_PX < height ? t.y1 * TILE_PX : height;
+    const int w = right - t.x0 * TILE_PX, h = bottom - t.y0 * TILE_PX;
+    return S(w > h ? w : h) / S(2);
+}
+
 // Rule 14. crosses: the splat's disc reaches the camera plane.
 template <class S> GS2D_HD S clipped_radius(const PixelBox<S>& o, bool crosses, int width, int height) {
     const S w = S(width), h = S(height), half = S(0.5), zero = S(0);

@@ -51,7 +51,7 @@ struct View {
     double near, far, alpha_min, alpha_max, transmittance_min, error_cutoff, lowpass_px;
     double background[3];
     int32_t width, height, sh_degree, exact_masks;  // exact_masks = 0: no culling inside tiles (tests)
-    int32_t cull_crossing;                          // rule 19
+    int32_t crossing;                               // rule 19: CROSSING_*
 };
 
 struct Parameters {

@@ -37,6 +37,19 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     g.record.red = max(c.x, V(0)), g.record.green = max(c.y, V(0)), g.record.blue = max(c.z, V(0));
 }
 
+// Rectangles and radii of the splats `boxed` (a bit each) of a group: rule 19, "box".
+void box_group(Frame& f, const Group& g, int64_t i, uint32_t boxed, V k2, real* radii) {
+    const Square<V> s = official_square(g.frame, g.record, k2, real(f.view.lowpass_px), f.camera);
+    alignas(64) real x[LANES], y[LANES], half[LANES];
+    store(x, s.x), store(y, s.y), store(half, s.half);
+    for (int l = 0; l < LANES; ++l) {
+        if (!(boxed >> l & 1)) continue;
+        const TileRect rect = square_tiles(x[l], y[l], half[l], f.tiles_x, f.tiles_y);
+        f.rects[i + l] = rect;
+        if (radii) radii[i + l] = tiles_radius<real>(rect, f.view.width, f.view.height);
+    }
+}
+
 }  // namespace
 
 bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
@@ -52,7 +65,8 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
         for (int64_t i = begin; i < end; i += LANES) {
             const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
             Group g = project_group(f, s, i, lanes, blending);
-            if (f.view.cull_crossing) g.alive = g.alive & invert(reaches_camera_plane(g.frame, error_k2));
+            const M reaches = reaches_camera_plane(g.frame, error_k2);
+            if (f.view.crossing == CROSSING_CULL) g.alive = g.alive & invert(reaches);
             if (any(g.alive)) color_group(f, s, i, lanes, g);
             const uint32_t alive = bits(g.alive);
             for (int l = 0; l < lanes; ++l) f.rects[i + l] = {0, 0, 0, 0};
@@ -71,8 +85,10 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             alignas(64) real box[4][LANES];
             store(box[0], o.x_min), store(box[1], o.y_min), store(box[2], o.x_max), store(box[3], o.y_max);
             const uint32_t unbounded = bits(o.unbounded), crosses = bits(o.crosses);
+            const uint32_t boxed = f.view.crossing == CROSSING_BOX ? alive & bits(reaches) : 0;
+            if (boxed) box_group(f, g, i, boxed, error_k2, radii);
             for (int l = 0; l < lanes; ++l) {
-                if (!(alive >> l & 1)) continue;
+                if (!((alive & ~boxed) >> l & 1)) continue;
                 const PixelBox<real> o_l = {box[0][l], box[1][l], box[2][l], box[3][l]};
                 f.rects[i + l] = tile_rectangle(o_l, unbounded >> l & 1, f.view.width, f.view.height, f.tiles_x, f.tiles_y);
                 if (radii) radii[i + l] = clipped_radius(o_l, crosses >> l & 1, f.view.width, f.view.height);

@@ -24,7 +24,7 @@ struct View {
     float distortion_scale;  // (far near / (far - near))^2
     float background[3];
     int width, height, tiles_x, tiles_y;
-    int sh_degree, cull_crossing;
+    int sh_degree, crossing;
 };
 
 __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {

@@ -32,7 +32,8 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     Record<float> r = project(p, frame, v.camera);
     if (!is_finite(parameter_size(p, frame)) || !(r.zc > v.near)) return;
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
-    if (v.cull_crossing && reaches_camera_plane(frame, v.error_k2)) return;
+    const bool crossing = v.crossing != CROSSING_DRAW && reaches_camera_plane(frame, v.error_k2);
+    if (crossing && v.crossing == CROSSING_CULL) return;
     float sh_size;
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
     const Vec3<float> c = color_of(v.sh_degree, sh, frame.to_splat, sh_size);
@@ -42,8 +43,15 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     const float k2 = a.errors ? v.error_k2 : max(float(2 * LN2) * (r.log2_opacity - v.log2_alpha_min), 0.f);
     const Footprint<float> o = footprint(frame, r, k2, v.lowpass_px, v.camera);
     const PixelBox<float> box = {o.x_min, o.y_min, o.x_max, o.y_max};
-    const TileRectangle rect = tile_rectangle(box, o.unbounded, v.width, v.height, v.tiles_x, v.tiles_y);
-    a.radii[i] = clipped_radius(box, o.crosses, v.width, v.height);
+    TileRectangle rect;
+    if (crossing) {
+        const Square<float> s = official_square(frame, r, v.error_k2, v.lowpass_px, v.camera);
+        rect = square_tiles(s.x, s.y, s.half, v.tiles_x, v.tiles_y);
+        a.radii[i] = tiles_radius<float>(rect, v.width, v.height);
+    } else {
+        rect = tile_rectangle(box, o.unbounded, v.width, v.height, v.tiles_x, v.tiles_y);
+        a.radii[i] = clipped_radius(box, o.crosses, v.width, v.height);
+    }
     const int tiles = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
     if (tiles == 0) return;
     float4* to = reinterpret_cast<float4*>(a.records + RECORD * i);
