@@ -41,6 +41,7 @@ FLOORS = {
     "losses": 5,
     "train": 6,
     "evaluate": 6,
+    "sfm": 6,
     "mesh": 6,
     "report": 6,
     "pipeline": 7,

@@ -15,6 +15,7 @@ def execute(command: c.Common, console: Console) -> None:
     """Run a parsed command."""
     actions: dict[type, Callable[[Any, Console], None]] = {
         c.Demo: demo,
+        c.Poses: poses,
         c.Train: train,
         c.Mesh: mesh,
         c.Render: render,
@@ -224,6 +225,13 @@ def table(command: c.TableCommon, console: Console) -> None:
     from gs2d.cli.paper import show_table
 
     show_table(command, console)
+
+
+def poses(command: c.Poses, console: Console) -> None:
+    """``gs2d poses``."""
+    from gs2d.cli.poses import poses as find
+
+    find(command, console)
 
 
 def doctor(_command: c.Doctor, console: Console) -> None:

@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional, arg, subcommand
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
+LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 RunPath = Annotated[Positional[Path], arg(metavar="RUN")]
 Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), tyro.conf.UseAppendAction]
 
@@ -50,6 +51,38 @@ class Demo(TrainingCommon):
     """Run folder; the capture goes to its sub-folder `capture`. An earlier demo there is replaced."""
     schedule_scale: float | None = None
     """Fraction of the full schedule (default: what fits five minutes on two cores)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Poses(Common):
+    """Photographs without cameras to a capture that `gs2d train` reads: structure from motion, by COLMAP."""
+
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
+    """Folder of photographs, with or without sub-folders; it is only read."""
+    out: Annotated[Path, arg(metavar="CAPTURE")]
+    """Capture folder to make: images/, sparse/0, poses.json, poses.png. It appears when all is done."""
+    cameras: Literal["auto", "one", "each"] = "auto"
+    """Which photographs share a camera: same folder, size, camera, lens and focal length; all; none."""
+    camera_model: LensModel = "auto"
+    """Lens (auto: OPENCV where 8 or more photographs share a camera, else SIMPLE_RADIAL)."""
+    matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
+    """Pairs to match: all; next ones by name (frames of a video); next and most similar ones. auto: all up to 150."""
+    overlap: int = 10
+    """Next photographs that each is matched with, where not all pairs are."""
+    neighbours: int = 40
+    """Similar photographs that each is matched with, where not all pairs are."""
+    max_size: int | None = None
+    """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
+    feature_size: int = 1600
+    """Longer side on which features are found, px: larger is slower and a little more accurate."""
+    link: bool = False
+    """Hard links instead of copies of the photographs: no disk is used."""
+    threads: int | None = None
+    """CPU threads (default: all cores that this process may use)."""
+    seed: int = 0
+    """Seed; the same bytes for up to 50 photographs or with --threads 1, else cameras differ by rounding."""
+    overwrite: bool = False
+    """Replace the capture in --out, if this command made it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,10 +292,11 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
+    Demo, Poses, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
+    | Annotated[Poses, subcommand("poses")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Mesh, subcommand("mesh")]
     | Annotated[Render, subcommand("render")]

@@ -14,6 +14,7 @@ from gs2d.data.transforms import read_blender, read_nerfstudio
 from gs2d.errors import DataError
 
 FORMATS = ("blender", "nerfstudio", "dtu", "colmap")
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic")
 DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures
 
 
@@ -39,11 +40,22 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         raise DataError(f"{root} must hold a capture, got an empty folder")
     lacking = missing_lines(root)
     hint = f"; as a scene of a known data set: {lacking[0]}" if lacking else ""
+    photographs = next((folder for folder in (root, root / "images") if _photographs(folder)), None)
+    if photographs is not None and not lacking:
+        raise DataError(
+            f"{root} must hold cameras, got {_photographs(photographs)} photographs without any; find them first: "
+            f"gs2d poses {photographs} --out CAPTURE, then train CAPTURE"
+        )
     raise DataError(
         f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
         f"(DTU), or cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP); "
         f"got {', '.join(held[:8])}{' ...' if len(held) > 8 else ''}{hint}"
     )
+
+
+def _photographs(folder: Path) -> int:
+    """Files of a folder that are photographs by their names."""
+    return sum(path.suffix.lower() in _PHOTOGRAPHS for path in folder.iterdir()) if folder.is_dir() else 0
 
 
 def _folder(path: str | os.PathLike[str]) -> Path:

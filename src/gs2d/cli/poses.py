@@ -1,0 +1,58 @@
+"""What ``gs2d poses`` shows: how many photographs have a camera, which do not and why, and what to do next."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gs2d.cli import commands as c
+from gs2d.cli.console import Console
+
+_MOST_LINES = 12  # of photographs without a place; poses.json has them all
+
+
+def poses(command: c.Poses, console: Console) -> None:
+    """``gs2d poses``."""
+    from gs2d.pipeline.poses import PosesOptions, find_poses
+
+    options = PosesOptions(
+        photos=command.photos,
+        out=command.out,
+        cameras=command.cameras,
+        camera_model=command.camera_model,
+        matching=command.matching,
+        overlap=command.overlap,
+        neighbours=command.neighbours,
+        max_size=command.max_size,
+        feature_size=command.feature_size,
+        link=command.link,
+        threads=command.threads,
+        seed=command.seed,
+        overwrite=command.overwrite,
+    )
+    result = find_poses(options, console.on_event)
+    console.close()
+    for line in poses_lines(result):
+        console.say(line)
+    console.result(result)
+
+
+def poses_lines(result: dict[str, Any]) -> list[str]:
+    """The outcome in lines for people."""
+    lines = [
+        f"{result['placed']} of {result['count']} photographs have a place; {result['points']:,} points, each seen by "
+        f"{result['photos_per_point']:.1f} of them, {result['mean_error_px']:.2f} px off in the mean",
+        *(f"camera: {camera['about']}" for camera in result["cameras"][:4]),
+    ]
+    if len(result["cameras"]) > 4:
+        lines.append(f"and {len(result['cameras']) - 4} more cameras, in poses.json")
+    left_out = [row for row in result["photographs"] if not row["placed"]]
+    lines += [f"no place: {row['source']}: {row['reason']}" for row in left_out[:_MOST_LINES]]
+    if len(left_out) > _MOST_LINES:
+        lines.append(f"no place: {len(left_out) - _MOST_LINES} more, in poses.json")
+    for other in result["other_models"]:
+        lines.append(
+            f"{other['folder']} holds a separate piece: {len(other['photos'])} photographs, {other['points']:,} points"
+        )
+    capture = result["capture"]
+    lines.append(f"{capture}: look at {capture}/poses.png, then: gs2d train {capture} --out RUN")
+    return lines

@@ -1,0 +1,304 @@
+"""``gs2d poses``: a folder of photographs becomes a capture, in one step or not at all.
+
+The finished capture is read back by the loader that training uses before it gets its name (``sfm.workplace``).
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gs2d.data import load_scene
+from gs2d.errors import RunError
+from gs2d.io.files import write_json
+from gs2d.io.run import make_folder, now, remove_made
+from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
+from gs2d.sfm.outcome import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
+from gs2d.sfm.photos import Photo, camera_groups, find_photos, read_photos
+from gs2d.sfm.picture import write_picture
+from gs2d.sfm.solve import Facts, Group, Request, check_installed, read_facts, solve
+from gs2d.sfm.stage import stage_photos
+from gs2d.sfm.workplace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workplace
+
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+MATCHINGS = ("auto", "exhaustive", "sequential", "similar")
+ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
+SHARED_ENOUGH = 8  # photographs of one camera that tell more than its focal length and one distortion
+SMALLEST_SIDE, MOST_THREADS = 64, 1024
+_DOUBTFUL_SHARE, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosesOptions:
+    """One run of structure from motion.
+
+    Attributes
+    ----------
+    photos, out : Path
+        The folder of photographs, which is only read, and the capture to make.
+    cameras : "auto", "one" or "each"
+        Which photographs share a camera: those of the same folder, size, camera, lens and focal length; all; none.
+    camera_model : str
+        A name of ``CAMERA_MODELS``, or "auto": OPENCV where ``SHARED_ENOUGH`` photographs share it, else SIMPLE_RADIAL.
+    matching : str
+        A name of ``MATCHINGS``; "auto" is "exhaustive" up to ``ALL_PAIRS`` photographs, then "similar".
+    overlap, neighbours : int
+        Next photographs and similar photographs that each is matched with ("sequential": only next ones).
+    max_size : int or None
+        Longer side of the photographs in the capture, px; None keeps all pixels.
+    feature_size : int
+        Longer side on which features are found, px.
+    link : bool
+        Hard links instead of copies.
+    threads : int or None
+    seed : int
+    overwrite : bool
+        Replace a capture that this command made.
+    """
+
+    photos: Path
+    out: Path
+    cameras: str = "auto"
+    camera_model: str = "auto"
+    matching: str = "auto"
+    overlap: int = 10
+    neighbours: int = 40
+    max_size: int | None = None
+    feature_size: int = 1600
+    link: bool = False
+    threads: int | None = None
+    seed: int = 0
+    overwrite: bool = False
+
+
+def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, Any]:
+    """Make the capture; returns what ``poses.json`` holds, with ``capture``: its path.
+
+    Raises
+    ------
+    BackendError
+        pycolmap is not installed.
+    DataError, RunError, DiskError
+    """
+    started = time.monotonic()
+    check_installed()
+    _check(options)
+    paths, notes = find_photos(options.photos)
+    for note in notes:
+        on_event(Notice(note))
+    out = options.out.resolve()
+    check_out(options.out, options.photos, overwrite=options.overwrite)
+    threads = options.threads or _cores()
+    reading = read_photos(paths, options.photos, threads=threads)
+    photos = list(counted(reading, "reading photographs", len(paths), on_event))
+    sizes = [photo.size_within(options.max_size) for photo in photos]
+    groups = camera_groups(photos, sizes, options.cameras)
+    made = make_folder(out.parent)
+    try:
+        with workplace(out) as work:
+            capture = work / "capture"
+            staged = _stage(photos, capture / IMAGES, options, threads, on_event)
+            request = _request(options, work, photos, sizes, groups, threads)
+            done = solve(request, _progress(on_event))
+            pieces = [read_piece(capture / SPARSE / str(i), facts) for i, facts in enumerate(done)]
+            facts = read_facts(Path(request.database))
+            check_any(pieces, facts, options.photos)
+            result = _result(options, request, photos, staged, pieces, facts)
+            result["seconds"] = round(time.monotonic() - started, 1)
+            on_event(Phase("checking the capture", 0))
+            write_picture(capture / POSES_PNG, pieces[0], _title(result))
+            write_json(capture / POSES_JSON, result)
+            load_scene(capture, format="colmap")
+            put_in_place(capture, out, work)
+    except BaseException:
+        remove_made(made)
+        raise
+    for doubt in _doubts(result):
+        on_event(Notice(doubt))
+    return {"capture": str(options.out), **result}
+
+
+def _check(options: PosesOptions) -> None:
+    """Raise RunError for an option that means nothing."""
+    for name, allowed in (
+        ("cameras", ("auto", "one", "each")),
+        ("camera_model", ("auto", *CAMERA_MODELS)),
+        ("matching", MATCHINGS),
+    ):
+        got = getattr(options, name)
+        if got not in allowed:
+            raise RunError(f"--{name.replace('_', '-')} must be one of {', '.join(allowed)}, got {got}")
+    numbers = (
+        ("max_size", SMALLEST_SIDE, 1 << 16),
+        ("feature_size", SMALLEST_SIDE, 1 << 16),
+        ("overlap", 1, 1000),
+        ("neighbours", 1, 10_000),
+        ("threads", 1, MOST_THREADS),
+        ("seed", 0, (1 << 31) - 1),
+    )
+    for name, least, most in numbers:
+        value = getattr(options, name)
+        if value is not None and not least <= value <= most:
+            raise RunError(f"--{name.replace('_', '-')} must be from {least} to {most}, got {value}")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _stage(photos: Sequence[Photo], folder: Path, options: PosesOptions, threads: int, on_event: OnEvent) -> list[str]:
+    """Put the photographs into the capture; what was done to each."""
+    copying = stage_photos(photos, folder, max_size=options.max_size, link=options.link, threads=threads)
+    staged = list(counted(copying, "copying photographs", len(photos), on_event))
+    counts = Counter(staged)
+    if options.link and counts["copied"]:
+        on_event(Notice(f"{counts['copied']} photographs were copied: --out is on a disk that cannot link to theirs"))
+    if turned := sum(photo.orientation != 1 for photo in photos):
+        on_event(Notice(f"{turned} photographs were turned upright, as their EXIF orientation says"))
+    return staged
+
+
+def _request(
+    options: PosesOptions,
+    work: Path,
+    photos: Sequence[Photo],
+    sizes: Sequence[tuple[int, int]],
+    groups: Sequence[Sequence[int]],
+    threads: int,
+) -> Request:
+    matching = options.matching
+    if matching == "auto":
+        matching = "exhaustive" if len(photos) <= ALL_PAIRS else "similar"
+    return Request(
+        images=str(work / "capture" / IMAGES),
+        database=str(work / "database.db"),
+        output=str(work / "capture" / SPARSE),
+        groups=tuple(
+            Group(
+                tuple(photos[i].name for i in group),
+                _camera_model(options, len(group)),
+                sizes[group[0]],
+                str(photos[group[0]].source.resolve()),
+            )
+            for group in groups
+        ),
+        in_order=tuple(photo.name for photo in photos),
+        matching=matching,
+        overlap=options.overlap,
+        neighbours=options.neighbours,
+        feature_size=options.feature_size,
+        threads=threads,
+        seed=options.seed,
+    )
+
+
+def _camera_model(options: PosesOptions, photographs: int) -> str:
+    if options.camera_model != "auto":
+        return options.camera_model
+    return "OPENCV" if photographs >= SHARED_ENOUGH else "SIMPLE_RADIAL"
+
+
+def _progress(on_event: OnEvent) -> Any:
+    """Phases and steps from what the solver tells; a phase is announced once."""
+    current = ""
+
+    def tell(name: str, done: int, total: int) -> None:
+        nonlocal current
+        on_event(Step(done) if name == current else Phase(name, total))
+        current = name
+
+    return tell
+
+
+def _result(
+    options: PosesOptions,
+    request: Request,
+    photos: Sequence[Photo],
+    staged: Sequence[str],
+    pieces: Sequence[Piece],
+    facts: Facts,
+) -> dict[str, Any]:
+    """All that is known about the capture, for ``poses.json``."""
+    best = pieces[0]
+    per_camera = Counter(image.camera_id for image in best.images)
+    rows = []
+    for photo, how in zip(photos, staged, strict=True):
+        row = {"name": photo.name, "source": photo.label, "file": how, "features": facts.features.get(photo.name, 0)}
+        placed = photo.name in best.names
+        reason = {} if placed else {"reason": why_not_placed(photo.name, pieces, facts)}
+        rows.append({**row, "placed": placed, **reason})
+    return {
+        "photos": str(options.photos.resolve()),
+        "count": len(photos),
+        "placed": len(best.images),
+        "points": len(best.points.xyz),
+        "mean_error_px": best.mean_error,
+        "photos_per_point": best.mean_track,
+        "median_angle_degrees": best.median_angle,
+        "up": "+z" if best.upright else None,
+        "cameras": [
+            {
+                "model": best.cameras[number].model,
+                "size": [best.cameras[number].width, best.cameras[number].height],
+                "params": list(best.cameras[number].params),
+                "focal_px": focal_length(best.cameras[number]),
+                "photos": count,
+                "about": camera_line(best.cameras[number], count),
+            }
+            for number, count in sorted(per_camera.items())
+        ],
+        "other_models": [
+            {"folder": f"{SPARSE}/{i}", "photos": sorted(piece.names), "points": len(piece.points.xyz)}
+            for i, piece in enumerate(pieces[1:], start=1)
+        ],
+        "photographs": rows,
+        "options": {
+            "matching": request.matching,
+            "pairs_matched": len(facts.matches),
+            "overlap": options.overlap,
+            "neighbours": options.neighbours,
+            "max_size": options.max_size,
+            "feature_size": options.feature_size,
+            "threads": request.threads,
+            "seed": options.seed,
+        },
+        "created": now(),
+    }
+
+
+def _title(result: dict[str, Any]) -> str:
+    return (
+        f"{result['placed']} of {result['count']} photographs placed, {result['points']:,} points, "
+        f"{result['mean_error_px']:.2f} px"
+    )
+
+
+def _doubts(result: dict[str, Any]) -> list[str]:
+    """What a person should look at before training."""
+    doubts = []
+    if result["placed"] < _DOUBTFUL_SHARE * result["count"]:
+        doubts.append(
+            f"only {result['placed']} of {result['count']} photographs have a place: look at {POSES_PNG}, and take "
+            "more between those that are missing and the others"
+        )
+    if result["median_angle_degrees"] < _DOUBTFUL_ANGLE:
+        doubts.append(
+            f"the photographs were taken from nearly one place ({result['median_angle_degrees']:.1f} degrees between "
+            "the rays to a point, 10 or more are good): depth is guesswork; step sideways between photographs"
+        )
+    if result["mean_error_px"] > _DOUBTFUL_ERROR:
+        doubts.append(
+            f"points are {result['mean_error_px']:.2f} px from where they should be in the mean (expected below "
+            f"{_DOUBTFUL_ERROR}): try --cameras each, or --camera-model OPENCV_FISHEYE for a very wide lens"
+        )
+    if result["up"] is None:
+        doubts.append("the photographs do not agree on what is up: the axes are COLMAP's own")
+    return doubts
+
+
+__all__ = ["PosesOptions", "find_poses"]

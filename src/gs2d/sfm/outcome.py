@@ -1,0 +1,143 @@
+"""What came out of structure from motion, and why some photographs have no place in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.data.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_cameras, read_images, read_points
+from gs2d.errors import DataError
+from gs2d.sfm.solve import Facts
+
+_MOST_ANGLES = 2000
+FEW_FEATURES = 50  # of a photograph: fewer verify nothing
+_SHOOTING = "take photographs a step apart, each showing two thirds of what the one before shows"
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One model: photographs that are connected with each other.
+
+    Attributes
+    ----------
+    images : tuple of ColmapImage
+    cameras : dict of int to ColmapCamera
+    points : ColmapPoints
+    mean_error : float
+        px; of all observations.
+    mean_track : float
+        Photographs that see a point.
+    median_angle : float
+        Degrees; of the widest angle between the rays that see a point. Near 0 for a camera that only turned.
+    upright : bool
+        Turned so that +z is up.
+    """
+
+    images: tuple[ColmapImage, ...]
+    cameras: Mapping[int, ColmapCamera]
+    points: ColmapPoints
+    mean_error: float
+    mean_track: float
+    median_angle: float
+    upright: bool
+
+    @property
+    def names(self) -> set[str]:
+        """Of the photographs that are placed in it."""
+        return {image.name for image in self.images}
+
+
+def read_piece(folder: Path, done: Mapping[str, Any]) -> Piece:
+    """Read a model that the worker wrote, by our own reader."""
+    points = read_points(folder, "bin")
+    images = sorted(read_images(folder, "bin", observations=True), key=lambda image: image.name)
+    assert points is not None  # the worker writes no model without points
+    return Piece(
+        tuple(images),
+        read_cameras(folder, "bin"),
+        points,
+        float(done["mean_error"]),
+        float(done["mean_track"]),
+        _median_angle(images, points),
+        bool(done["upright"]),
+    )
+
+
+def _median_angle(images: Sequence[ColmapImage], points: ColmapPoints) -> float:
+    """See ``Piece``; over at most ``_MOST_ANGLES`` points."""
+    step = -(-len(points.ids) // _MOST_ANGLES)
+    rays: dict[int, list[np.ndarray]] = {int(number): [] for number in points.ids[::step]}
+    places = dict(zip(rays, points.xyz[::step], strict=True))
+    for image in images:
+        assert image.point_ids is not None
+        center = -image.T_cam_world[:3, :3].T @ image.T_cam_world[:3, 3]
+        for number in rays.keys() & set(image.point_ids.tolist()):
+            ray = places[number] - center
+            rays[number].append(ray / np.linalg.norm(ray))
+    cosines = [np.min(np.array(seen) @ np.array(seen).T) for seen in rays.values() if len(seen) > 1]
+    return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))) if cosines else 0.0
+
+
+def check_any(pieces: Sequence[Piece], facts: Facts, root: Path) -> None:
+    """Raise DataError where there is no model at all; says at which step it ended, and what to do."""
+    if pieces:
+        return
+    features = sorted(facts.features.values())
+    if features[len(features) // 2] < FEW_FEATURES:
+        raise DataError(
+            f"{root} must hold photographs with texture, got {features[len(features) // 2]} features in the median "
+            f"photograph (expected {FEW_FEATURES} or more): blurred, dark, or of plain surfaces; photograph it in "
+            "better light, on a patterned base"
+        )
+    if not facts.matches:
+        raise DataError(
+            f"{root} must hold photographs that overlap, got no two that show the same points (of "
+            f"{len(facts.features)} photographs); {_SHOOTING}"
+        )
+    best = max(facts.matches.values())
+    raise DataError(
+        f"{root} must hold photographs taken from different places: {len(facts.matches)} pairs show the same points "
+        f"(up to {best}), but none of them from two places far enough apart; do not turn on the spot: {_SHOOTING}"
+    )
+
+
+def why_not_placed(name: str, pieces: Sequence[Piece], facts: Facts) -> str:
+    """The reason, as far as it is known, why a photograph has no camera in the first piece."""
+    for number, piece in enumerate(pieces[1:], start=1):
+        if name in piece.names:
+            return f"in a separate piece (sparse/{number}): too little in it is seen from the photographs of sparse/0"
+    features = facts.features.get(name, 0)
+    if features < FEW_FEATURES:
+        return f"{features} features: blurred, or nothing in it has texture"
+    partners = {a if b == name else b: rows for (a, b), rows in facts.matches.items() if name in (a, b)}
+    if not partners:
+        return "nothing in it was found in another photograph"
+    placed = {other: rows for other, rows in partners.items() if other in pieces[0].names}
+    if not placed:
+        return f"matches only photographs that are not placed either ({_first(partners)})"
+    best = max(placed, key=lambda other: placed[other])
+    return f"{placed[best]} matches with {best} at best: too few points of known place in it"
+
+
+def _first(names: Mapping[str, int]) -> str:
+    listed = sorted(names)
+    return ", ".join(listed[:2]) + (" ..." if len(listed) > 2 else "")
+
+
+def camera_line(camera: ColmapCamera, photographs: int) -> str:
+    """One line about an estimated camera: model, focal length, field of view."""
+    focal = focal_length(camera)
+    angle = np.degrees(2 * np.arctan(camera.width / (2 * focal)))
+    return (
+        f"{camera.model} of {photographs} photographs, {camera.width}x{camera.height}, f = {focal:.0f} px "
+        f"({angle:.0f} degrees wide)"
+    )
+
+
+def focal_length(camera: ColmapCamera) -> float:
+    """px; the first parameter of every model of COLMAP."""
+    return float(camera.params[0])

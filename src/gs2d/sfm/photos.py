@@ -1,0 +1,236 @@
+"""The photographs of a folder: which files they are, how they must be turned, and which camera took them."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import ExifTags, Image
+
+from gs2d.errors import DataError
+from gs2d.images import natural_key, read_image
+
+JPEG, PNG = (".jpg", ".jpeg"), (".png",)
+CONVERTED = (".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv")
+RAWS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+_KINDS = {
+    suffix: kind
+    for kind, suffixes in (("photo", JPEG + PNG + CONVERTED), ("video", VIDEOS), ("raw", RAWS))
+    for suffix in suffixes
+}
+FEWEST = 3  # two photographs give no point that a third confirms
+_MASKS = "masks"
+_ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,  # counter-clockwise: a quarter turn clockwise
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+_SHOOTING = "take 30 or more, each showing most of what the one before shows, from places a step apart"
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photograph.
+
+    Attributes
+    ----------
+    source : Path
+    label : str
+        Its path below the user's folder, with ``/``: what messages call it.
+    name : str
+        Its path below ``images/`` of the capture: no white space (COLMAP's lists have none), ``.png`` where converted.
+    size : (int, int)
+        Width and height as it is seen, px: after its EXIF orientation.
+    orientation : int
+        EXIF, 1 (upright) to 8.
+    made_by : tuple of str
+        Camera, lens and focal length as EXIF has them; empty strings where it has none.
+    """
+
+    source: Path
+    label: str
+    name: str
+    size: tuple[int, int]
+    orientation: int
+    made_by: tuple[str, ...]
+
+    @property
+    def is_converted(self) -> bool:
+        """Whether it is stored as PNG, because not everybody reads its own format."""
+        return self.source.suffix.lower() in CONVERTED
+
+    def size_within(self, max_size: int | None) -> tuple[int, int]:
+        """Its size when its longer side may have ``max_size`` px."""
+        width, height = self.size
+        if max_size is None or max(width, height) <= max_size:
+            return self.size
+        scale = max_size / max(width, height)
+        return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """The photographs in a folder and its sub-folders, in the order of people, and lines about what is not used.
+
+    Raises
+    ------
+    DataError
+        No folder, a video, formats that are not read, or too few photographs.
+    """
+    if root.is_file():
+        raise DataError(_not_a_folder(root))
+    if not root.is_dir():
+        raise DataError(f"{root} must be a folder of photographs, got no such folder")
+    sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "raw": [], "mask": [], "other": []}
+    for path in _files(root):
+        is_mask = _MASKS in path.relative_to(root).parts[:-1]
+        sorted_out["mask" if is_mask else _KINDS.get(path.suffix.lower(), "other")].append(path)
+    photos, videos, raws, masks, others = sorted_out.values()
+    notes = [f"{_some(raws, root)} not read: {_raw_remedy(raws[0])}"] if raws else []
+    if videos:
+        notes.append(f"{_some(videos, root)} not read: a video; {_frames_command(videos[0])}")
+    if masks:
+        notes.append(f"{_some(masks, root)} not read: put {_MASKS}/ beside images/ of the capture, for training")
+    if others:
+        notes.append(f"{_some(others, root)} not read: no photographs")
+    if len(photos) < FEWEST:
+        got = f"{len(photos)} photographs" if photos else "none"
+        why = f"; {notes[0]}" if notes else ""
+        raise DataError(f"{root} must hold {FEWEST} or more photographs, got {got}{why or '; ' + _SHOOTING}")
+    return photos, tuple(notes)
+
+
+def _files(root: Path) -> Iterator[Path]:
+    """Files below a folder that are not hidden, in natural order of their paths."""
+
+    def refuse(error: OSError) -> None:
+        raise DataError(f"cannot read the folder {error.filename}: {error.strerror}") from error
+
+    found = []
+    for folder, folders, names in os.walk(root, onerror=refuse):
+        folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
+        found += [Path(folder, name) for name in names if not name.startswith(".")]
+    yield from sorted(found, key=lambda path: natural_key(path.relative_to(root).as_posix()))
+
+
+def _some(paths: Sequence[Path], root: Path) -> str:
+    """``a.heic`` or ``a.heic and 3 more``."""
+    first = paths[0].relative_to(root).as_posix()
+    return f"{first} was" if len(paths) == 1 else f"{first} and {len(paths) - 1} more were"
+
+
+def _not_a_folder(path: Path) -> str:
+    if path.suffix.lower() in VIDEOS:
+        return f"{path} must be a folder of photographs, got a video; {_frames_command(path)}"
+    return f"{path} must be a folder of photographs, got a file; give its folder"
+
+
+def _frames_command(video: Path) -> str:
+    folder = video.stem
+    return (
+        f"take frames from it: mkdir {folder}; ffmpeg -i {video.name} -vf fps=2 -q:v 2 {folder}/%05d.jpg; "
+        f"then gs2d poses {folder} --matching sequential"
+    )
+
+
+def _raw_remedy(path: Path) -> str:
+    kind = path.suffix.lower()
+    if kind in (".heic", ".heif", ".avif"):
+        return f"{kind[1:].upper()} is not decoded here; convert to JPEG (magick mogrify -format jpg *{path.suffix})"
+    return f"raw files ({kind}) are not developed here; export JPEG or PNG from your photo program"
+
+
+def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[Photo]:
+    """What each file says about itself; every one is decoded, so that a broken one is found before the slow part.
+
+    Raises
+    ------
+    DataError
+        One that does not decode; names it.
+    """
+    names = _names([path.relative_to(root).as_posix() for path in paths])
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(lambda path, name: _read(path, root, name), paths, names)
+
+
+def _read(path: Path, root: Path, name: str) -> Photo:
+    height, width = read_image(path).shape[:2]
+    orientation, made_by = _exif(path)
+    if path.suffix.lower() in (".tif", ".tiff"):  # Pillow has turned it
+        orientation = 1
+    size = (height, width) if orientation >= 5 else (width, height)
+    return Photo(path, path.relative_to(root).as_posix(), name, size, orientation, made_by)
+
+
+def _exif(path: Path) -> tuple[int, tuple[str, ...]]:
+    """Orientation, and what made the picture. A damaged EXIF block is none."""
+    base = ExifTags.Base
+    try:
+        with Image.open(path) as file:
+            exif = file.getexif()
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            orientation = exif.get(base.Orientation, 1)
+            tags = [exif.get(base.Make), exif.get(base.Model)]
+            tags += [details.get(tag) for tag in (base.LensModel, base.FocalLength, base.FocalLengthIn35mmFilm)]
+            made_by = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
+    except (OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, struct.error):
+        return 1, ("",) * 5
+    return orientation if orientation in _ORIENTATIONS else 1, made_by
+
+
+def _names(labels: Sequence[str]) -> list[str]:
+    """Names in the capture: white space becomes ``_``; made different again where that made two the same."""
+    names: list[str] = []
+    taken = set()
+    for label in labels:
+        name = "_".join(label.split())
+        if Path(name).suffix.lower() in CONVERTED:
+            name += ".png"
+        while name.lower() in taken:  # file systems that do not tell cases apart
+            name = str(Path(name).with_name(f"_{Path(name).name}").as_posix())
+        taken.add(name.lower())
+        names.append(name)
+    return names
+
+
+def turn(image: Image.Image, orientation: int) -> Image.Image:
+    """The picture as it is meant to be seen."""
+    return image if orientation == 1 else image.transpose(_ORIENTATIONS[orientation])
+
+
+def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cameras: str) -> list[list[int]]:
+    """Which photographs share a camera: lists of their numbers.
+
+    "auto": same folder, size, camera, lens and focal length; "one": all; "each": none.
+
+    Raises
+    ------
+    DataError
+        "one", but the sizes differ.
+    """
+    if cameras == "each":
+        return [[i] for i in range(len(photos))]
+    if cameras == "one":
+        for photo, size in zip(photos, sizes, strict=True):
+            if size != sizes[0]:
+                raise DataError(
+                    f"--cameras one needs photographs of one size, got {photos[0].label} {_by(sizes[0])} and "
+                    f"{photo.label} {_by(size)}; use --cameras auto"
+                )
+        return [list(range(len(photos)))]
+    groups: dict[tuple[object, ...], list[int]] = {}
+    for i, (photo, size) in enumerate(zip(photos, sizes, strict=True)):
+        groups.setdefault((os.path.dirname(photo.name), size, photo.made_by), []).append(i)
+    return list(groups.values())
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

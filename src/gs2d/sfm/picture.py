@@ -1,0 +1,77 @@
+"""``poses.png``: cameras and points from above and from the side, to see at one glance whether they are right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.disk import atomic_write
+from gs2d.sfm.outcome import Piece, focal_length
+
+MOST_POINTS = 20_000
+_VIEWS = (("from above", 0, 1), ("from the side", 0, 2))
+_WEDGE = 0.06  # length of a camera's wedge, of the picture's width
+_CAMERA = "#d62728"
+
+
+def write_picture(path: Path, piece: Piece, title: str) -> None:
+    """Draw a model in the plane of its first two axes, and of the first and third.
+
+    Raises
+    ------
+    DiskError
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    centers = np.stack([-image.T_cam_world[:3, :3].T @ image.T_cam_world[:3, 3] for image in piece.images])
+    points, colors = _thinned(piece)
+    low, high = _limits(points, centers)
+    figure = Figure(figsize=(12, 6.4), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=11)
+    for place, (name, across, upwards) in enumerate(_VIEWS, start=1):
+        axes = figure.add_subplot(1, 2, place)
+        plane = [across, upwards]
+        axes.scatter(points[:, across], points[:, upwards], s=1.5, c=colors, linewidths=0)
+        wedges = [_wedge(image.T_cam_world, center, piece, image.camera_id, high - low, plane)
+                  for image, center in zip(piece.images, centers, strict=True)]  # fmt: skip
+        axes.add_collection(LineCollection(wedges, colors=_CAMERA, linewidths=0.9))
+        axes.plot(*centers[:, plane].T, ".", color=_CAMERA, markersize=3)
+        axes.set_xlim(low[across], high[across])
+        axes.set_ylim(low[upwards], high[upwards])
+        axes.set_aspect("equal", adjustable="box")
+        axes.set_xlabel("xyz"[across])
+        axes.set_ylabel("xyz"[upwards] + (" (up)" if piece.upright and upwards == 2 else ""))
+        axes.set_title(name if piece.upright else f"axes {'xyz'[across]} and {'xyz'[upwards]}", fontsize=10)
+        axes.grid(linewidth=0.3)
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})
+
+
+def _thinned(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+    """At most ``MOST_POINTS`` points [P, 3] and their colours [P, 3] in [0, 1], evenly from the list."""
+    step = max(1, -(-len(piece.points.xyz) // MOST_POINTS))
+    return piece.points.xyz[::step], piece.points.rgb[::step] / 255
+
+
+def _limits(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The box [3] and [3] that holds all cameras and all points but the farthest 2 % on each side, with a margin."""
+    low = np.minimum(np.quantile(points, 0.02, axis=0), centers.min(axis=0))
+    high = np.maximum(np.quantile(points, 0.98, axis=0), centers.max(axis=0))
+    margin = 0.06 * float((high - low).max())
+    return low - margin, high + margin
+
+
+def _wedge(
+    T_cam_world: np.ndarray, center: np.ndarray, piece: Piece, camera_id: int, box: np.ndarray, plane: list[int]
+) -> np.ndarray:
+    """What a camera sees, from its centre to the two ends of its picture's middle row: [4, 2], closed."""
+    camera = piece.cameras[camera_id]
+    half = camera.width / (2 * focal_length(camera))
+    ends = np.array([[-half, 0.0, 1.0], [half, 0.0, 1.0]]) @ T_cam_world[:3, :3]
+    length = _WEDGE * float(box.max())
+    path = np.stack([center, center + length * ends[0], center + length * ends[1], center])
+    return np.asarray(path[:, plane])

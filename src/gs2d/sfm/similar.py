@@ -1,0 +1,91 @@
+"""Which photographs to compare with which, where all pairs would be too many. Numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+WORDS = 64
+_ROUNDS = 10  # of k-means
+_SAMPLES = 30_000  # descriptors that the words are learnt from
+
+
+def neighbour_pairs(count: int, overlap: int) -> set[tuple[int, int]]:
+    """Pairs (i < j) of each photograph with the next ``overlap`` ones, and with those 2^k places on.
+
+    The far ones (k < overlap) bridge what a stretch of blurred frames would cut, as COLMAP's quadratic overlap does.
+    """
+    steps = {*range(1, overlap + 1), *(1 << k for k in range(overlap))}
+    return {(i, i + step) for i in range(count) for step in steps if i + step < count}
+
+
+def similar_pairs(
+    read: Callable[[int], np.ndarray], count: int, *, neighbours: int, seed: int = 0
+) -> set[tuple[int, int]]:
+    """Pairs (i < j) of each photograph with those that look most like it.
+
+    Each photograph becomes one vector: sums of the residuals of its SIFT descriptors to ``WORDS`` cluster centres,
+    normalised per centre and as a whole (VLAD with intra-normalisation: Jegou et al. 2010, Arandjelovic and
+    Zisserman 2013). The words are learnt from the photographs themselves: nothing is downloaded.
+
+    Parameters
+    ----------
+    read : function of a number
+        The descriptors [M, 128] of a photograph; called twice for each.
+    neighbours : int
+        Most similar photographs that each is paired with.
+    """
+    rng = np.random.default_rng(seed)
+    each = max(1, _SAMPLES // max(count, 1))
+    chosen = [_sample(read(i), each, rng) for i in range(count)]
+    samples = np.concatenate(chosen) if chosen else np.empty((0, 128), np.float32)
+    if len(samples) < WORDS:
+        return set()
+    words = _cluster(samples, rng)
+    vectors = np.stack([_vlad(read(i).astype(np.float32), words) for i in range(count)])
+    return _nearest((vectors[i : i + 256] @ vectors.T for i in range(0, count, 256)), neighbours)
+
+
+def _sample(descriptors: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+    rows = rng.permutation(len(descriptors))[:most]
+    return np.asarray(descriptors[np.sort(rows)], dtype=np.float32)
+
+
+def _cluster(samples: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Centres [WORDS, 128] by Lloyd's algorithm from random samples; one that loses all its samples stays."""
+    words = samples[rng.choice(len(samples), WORDS, replace=False)]
+    for _ in range(_ROUNDS):
+        nearest = _nearest_word(samples, words)
+        counts = np.bincount(nearest, minlength=WORDS)
+        sums = np.zeros_like(words)
+        np.add.at(sums, nearest, samples)
+        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words).astype(np.float32)
+    return words
+
+
+def _nearest_word(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
+    return np.asarray(((words**2).sum(axis=1) - 2 * descriptors @ words.T).argmin(axis=1))
+
+
+def _vlad(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """[WORDS * 128], unit length (or 0 without descriptors)."""
+    vector = np.zeros_like(words, dtype=np.float32)
+    if len(descriptors):
+        nearest = _nearest_word(descriptors, words)
+        np.add.at(vector, nearest, descriptors - words[nearest])
+        vector /= np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-12)
+    flat = vector.ravel()
+    return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12))
+
+
+def _nearest(blocks: Iterable[np.ndarray], neighbours: int) -> set[tuple[int, int]]:
+    pairs = set()
+    row = 0
+    for block in blocks:
+        for similarity in block:
+            order = np.argsort(-similarity, kind="stable")
+            best = [int(j) for j in order if j != row][:neighbours]
+            pairs |= {(min(row, j), max(row, j)) for j in best}
+            row += 1
+    return pairs

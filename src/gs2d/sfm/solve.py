@@ -1,0 +1,194 @@
+"""Run COLMAP in a process of its own and follow what it does."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import queue
+import sqlite3
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from gs2d.disk import atomic_write
+from gs2d.errors import BackendError, DataError
+
+OnProgress = Callable[[str, int, int], None]  # name of the phase, steps done, steps in all
+MISSING = 'structure from motion needs pycolmap, which is not installed: pip install "2dgs-r[sfm]"'
+POLL_SECONDS = 0.5
+_COUNTED = {"features": "keypoints", "matching": "two_view_geometries"}  # phase -> table that grows by one a step
+_PHASES = {
+    "features": "finding features",
+    "comparing": "finding similar photographs",
+    "matching": "matching pairs",
+    "cameras": "placing cameras",
+}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Photographs of one camera: their names, its COLMAP model, its picture size, and an original with EXIF."""
+
+    names: tuple[str, ...]
+    camera_model: str
+    size: tuple[int, int]
+    original: str
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the worker is asked to do; every path is absolute.
+
+    Attributes
+    ----------
+    images : str
+        Folder of the photographs.
+    database, output : str
+        COLMAP's database, and the folder for the models ``0``, ``1`` ...; neither exists.
+    groups : tuple of Group
+    in_order : tuple of str
+        All names, in the order in which they were taken as far as names tell.
+    matching : "exhaustive", "sequential" or "similar"
+    overlap, neighbours : int
+        Next photographs, and similar ones, that each is matched with where not all pairs are.
+    feature_size : int
+        Longer side on which features are found, px.
+    """
+
+    images: str
+    database: str
+    output: str
+    groups: tuple[Group, ...]
+    in_order: tuple[str, ...]
+    matching: str
+    overlap: int
+    neighbours: int
+    feature_size: int
+    threads: int
+    seed: int
+
+
+def check_installed() -> None:
+    """Raise BackendError where pycolmap is not installed."""
+    if importlib.util.find_spec("pycolmap") is None:
+        raise BackendError(MISSING)
+
+
+def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Find the cameras; returns what was done to each model that was written, the largest first (none: no model).
+
+    Parameters
+    ----------
+    command : sequence of str
+        The worker's command line, without the request; empty: our own.
+
+    Raises
+    ------
+    DataError
+        COLMAP gave up or died; says when, and its last words.
+    """
+    work = Path(request.database).parent
+    with atomic_write(work / "request.json", "w") as file:
+        json.dump(asdict(request), file)
+    words = [*(command or (sys.executable, "-m", "gs2d.sfm.worker")), str(work / "request.json")]
+    # Passive waiting: cores are often shared, and spinning threads of one library then stop those of another.
+    environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
+    with open(work / "worker.log", "wb") as log:
+        process = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=environment, encoding="utf-8"
+        )
+        try:
+            models, phase = _follow(process, Path(request.database), on_progress)
+        finally:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    pipe.close()
+    if models is None:
+        raise DataError(_last_words(phase, process.returncode, work / "worker.log"))
+    return models
+
+
+def _follow(
+    process: subprocess.Popen[str], database: Path, on_progress: OnProgress
+) -> tuple[list[dict[str, Any]] | None, str]:
+    """Pass progress on until the worker has finished or died."""
+    lines: queue.Queue[str | None] = queue.Queue()
+    assert process.stdout is not None
+    reader = threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True)
+    reader.start()
+    phase, total, models = "", 0, None
+    while True:
+        try:
+            line = lines.get(timeout=POLL_SECONDS)
+        except queue.Empty:
+            if phase in _COUNTED:
+                on_progress(_PHASES[phase], min(_rows(database, _COUNTED[phase]), total), total)
+            continue
+        if line is None:
+            process.wait()
+            reader.join()
+            return models, phase
+        message = json.loads(line)
+        models = message.get("models", models)
+        if "phase" in message:
+            phase, total = message["phase"], message["total"]
+            on_progress(_PHASES[phase], 0, total)
+        if "done" in message:
+            on_progress(_PHASES[phase], message["done"], total)
+
+
+def _read_lines(pipe: IO[str], lines: queue.Queue[str | None]) -> None:
+    with contextlib.suppress(ValueError):  # closed under our hands: the command was interrupted
+        for line in pipe:
+            lines.put(line)
+    lines.put(None)
+
+
+def _rows(database: Path, table: str) -> int:
+    """Rows of a table that COLMAP is writing (in WAL mode, in which readers stop nobody); 0 where it cannot be read."""
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(_open(database)) as connection:
+        return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    return 0
+
+
+def _open(database: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=1.0)
+
+
+def _last_words(phase: str, code: int, log: Path) -> str:
+    """The one line about a worker that died."""
+    lines = [line.strip() for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
+    how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
+    said = lines[-1][:300] if lines else "it said nothing"
+    remedy = "give it less with --threads 2 or --feature-size 1000" if code < 0 else "see if the disk is full"
+    return f"COLMAP {how} while {_PHASES.get(phase, 'it started')}: {said}; {remedy}"
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the database knows: features of each photograph, and verified matches of each pair that has some."""
+
+    features: dict[str, int]
+    matches: dict[tuple[str, str], int]
+
+
+def read_facts(database: Path) -> Facts:
+    """Read the database of a finished worker.
+
+    A pair's number is 2147483647 * (smaller image id) + (larger one) (COLMAP's documentation, Database Format).
+    """
+    with contextlib.closing(_open(database)) as connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        features = dict.fromkeys(names.values(), 0)
+        features |= {names[i]: rows for i, rows in connection.execute("SELECT image_id, rows FROM keypoints")}
+        found = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
+        matches = {(names[pair // 2147483647], names[pair % 2147483647]): rows for pair, rows in found}
+    return Facts(features, matches)

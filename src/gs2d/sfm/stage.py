@@ -1,0 +1,85 @@
+"""Photographs into the capture's own folder: the same bytes, or upright and smaller copies. Theirs are only read."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from PIL import ExifTags, Image
+
+from gs2d.disk import atomic_write, disk_error
+from gs2d.errors import DataError
+from gs2d.images import read_image
+from gs2d.sfm.photos import JPEG, Photo, turn
+
+QUALITY = 95  # of JPEG files that had to be written again, without chroma subsampling
+
+
+def stage_photos(
+    photos: Sequence[Photo], folder: Path, *, max_size: int | None, link: bool, threads: int
+) -> Iterator[str]:
+    """Put the photographs into ``folder``; yields for each what was done: "copied", "linked", "turned", "resized".
+
+    Parameters
+    ----------
+    max_size : int or None
+        The longer side may have so many px.
+    link : bool
+        Hard links where the bytes stay the same: no disk is used. Copied all the same where the disk is another one.
+
+    Raises
+    ------
+    DiskError, DataError
+    """
+    for parent in sorted({(folder / photo.name).parent for photo in photos}):
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise disk_error(parent, error) from error
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(lambda photo: _stage(photo, folder / photo.name, max_size, link), photos)
+
+
+def _stage(photo: Photo, target: Path, max_size: int | None, link: bool) -> str:
+    size = photo.size_within(max_size)
+    if size == photo.size and photo.orientation == 1 and not photo.is_converted:
+        if link:
+            with contextlib.suppress(OSError):
+                os.link(photo.source, target)
+                return "linked"
+        return _copy(photo.source, target)
+    return _rewrite(photo, target, size)
+
+
+def _copy(source: Path, target: Path) -> str:
+    try:
+        file = open(source, "rb")  # noqa: SIM115 - closed below; its errors are not the target's
+    except OSError as error:
+        raise DataError(f"cannot read {source}: {error.strerror or error}") from error
+    with file, atomic_write(target) as copy:
+        shutil.copyfileobj(file, copy, 1 << 20)
+    return "copied"
+
+
+def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> str:
+    """Write a picture again: upright, of ``size``, in its own format or as PNG; EXIF stays, but for the orientation."""
+    image = turn(Image.fromarray(read_image(photo.source)), photo.orientation)
+    if image.size != size:
+        premultiplied = image.convert("RGBa") if image.mode == "RGBA" else image
+        image = premultiplied.resize(size, Image.Resampling.LANCZOS).convert(image.mode)
+    with Image.open(photo.source) as file:
+        exif, profile = file.getexif(), file.info.get("icc_profile")
+    exif.pop(ExifTags.Base.Orientation, None)
+    keep = {"icc_profile": profile} if profile else {}
+    with atomic_write(target) as out:
+        if target.suffix.lower() in JPEG:
+            image.save(out, "JPEG", quality=QUALITY, subsampling=0, exif=exif, **keep)
+        else:
+            image.save(out, "PNG", **keep)
+    if size != photo.size:
+        return "resized"
+    return "turned" if photo.orientation != 1 else "converted"

@@ -1,0 +1,100 @@
+"""Where a capture is made before it has its name: it appears as a whole or not at all.
+
+All work is done in the hidden folder ``.NAME.poses`` beside the capture: copies, COLMAP's database, models. A command
+that fails or is interrupted removes it; what a killed one leaves is removed by the next one with the same ``--out``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from gs2d.disk import disk_error
+from gs2d.errors import RunError
+from gs2d.io.run import LOCK, RunFolder, make_folder, remove_made
+
+IMAGES, SPARSE, POSES_JSON, POSES_PNG = "images", "sparse", "poses.json", "poses.png"
+OLD = "old"  # an earlier capture, until the new one has its name
+OURS = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
+
+
+def check_out(given: Path, photographs: Path, *, overwrite: bool) -> None:
+    """Raise before anything slow begins, where the capture cannot or must not be put.
+
+    Raises
+    ------
+    RunError, DiskError
+    """
+    out, photos = given.resolve(), photographs.resolve()
+    if out == photos or photos in out.parents or out in photos.parents:
+        raise RunError(
+            f"--out {given} must lie beside the photographs, not in their folder or above it ({photographs}): "
+            "that folder is only read"
+        )
+    try:
+        entries = {entry.name for entry in out.iterdir()}
+    except FileNotFoundError:
+        return
+    except NotADirectoryError as error:
+        raise RunError(f"--out must be a folder, {given} is a file or lies below one") from error
+    except OSError as error:
+        raise disk_error(out, error) from error
+    others = sorted(entries - set(OURS))
+    if POSES_JSON in entries and not others:
+        if not overwrite:
+            raise RunError(f"{given} already holds a capture; replace it with --overwrite")
+    elif entries:
+        raise RunError(
+            f"--out must be new, empty or a capture of this command; {given} holds other files "
+            f"({(others or sorted(entries))[0]}); choose another folder"
+        )
+    if out == Path.cwd() or out in Path.cwd().parents:
+        raise RunError(f"--out {given} is the folder that you are in, and is replaced as a whole; go elsewhere")
+
+
+@contextlib.contextmanager
+def workplace(out: Path) -> Iterator[Path]:
+    """The hidden folder beside the capture, empty and held against other processes; removed at the end.
+
+    Raises
+    ------
+    RunError
+        Another process makes the same capture.
+    """
+    work = out.with_name(f".{out.name[:200]}.poses")
+    made = make_folder(work)
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(RunFolder(work).locked())
+        except RunError as error:
+            raise RunError(f"{out} is being made by another process; wait for it or choose another --out") from error
+        try:
+            if (work / OLD).exists() and not out.exists():  # killed between two renames
+                os.rename(work / OLD, out)
+            for entry in work.iterdir():
+                if entry.name != LOCK:
+                    shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            yield work
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    remove_made(made)  # where an open lock cannot be deleted
+
+
+def put_in_place(capture: Path, out: Path, work: Path) -> None:
+    """Rename the finished capture to its name; an older one goes with the workplace.
+
+    Raises
+    ------
+    DiskError
+    """
+    try:
+        if out.exists():
+            os.rename(out, work / OLD)
+        os.rename(capture, out)
+    except OSError as error:
+        if (work / OLD).exists() and not out.exists():
+            os.rename(work / OLD, out)
+        raise disk_error(out, error) from error

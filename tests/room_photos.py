@@ -1,0 +1,90 @@
+"""Photographs of the corner of a room with mottled walls, drawn by a formula, for tests of structure from motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from gs2d.camera import Camera, look_at
+
+SIZE, FOCAL = 200, 203.0  # px
+UP = np.array([0.0, 0.0, 1.0])
+STORED = {
+    3: Image.Transpose.ROTATE_180,
+    6: Image.Transpose.ROTATE_90,
+    8: Image.Transpose.ROTATE_270,
+}  # EXIF -> to store
+_CELLS = 512  # of a texture, over 4 wu
+
+
+def textures(seed: int = 0) -> np.ndarray:
+    """Noise of several scales [3, _CELLS, _CELLS, 3] in [0, 255]: corners wherever one looks, none like another."""
+    rng = np.random.default_rng(seed)
+    out = np.zeros((3, _CELLS, _CELLS, 3))
+    for cells, weight in ((16, 1.0), (32, 1.2), (64, 1.0)):
+        noise = rng.random((3, cells, cells, 3)).repeat(_CELLS // cells, axis=1).repeat(_CELLS // cells, axis=2)
+        out += weight * noise
+    return np.asarray(255 * (out - out.min()) / (out.max() - out.min()))
+
+
+def room_picture(camera: Camera, walls: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3]: floor z = 0 and walls x = 0, y = 0 of the octant x, y, z > 0, each with its own texture."""
+    samples = 2  # along each side of a pixel
+    rows, columns = (np.mgrid[: camera.height * samples, : camera.width * samples] + 0.5) / samples
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
+    rays = rays @ camera.rotation
+    picture, nearest = np.zeros((*rows.shape, 3)), np.full(rows.shape, np.inf)
+    for axis in range(3):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = -camera.center[axis] / rays[..., axis]
+        hit = (distance > 0) & (distance < nearest)
+        others = [other for other in range(3) if other != axis]
+        points = camera.center[others] + np.where(hit, distance, 0.0)[..., None] * rays[..., others]
+        cell = np.floor(points * (_CELLS / 4)).astype(int) % _CELLS
+        picture = np.where(hit[..., None], walls[axis][cell[..., 0], cell[..., 1]], picture)
+        nearest = np.where(hit, distance, nearest)
+    blocks = picture.reshape(camera.height, samples, camera.width, samples, 3).mean(axis=(1, 3))
+    return np.rint(blocks).astype(np.uint8)
+
+
+def room_cameras(count: int, *, width: int = SIZE, height: int = SIZE, focal: float = FOCAL) -> list[Camera]:
+    """Cameras on an arc before the corner, level, at changing heights and distances, that look at it."""
+    cameras = []
+    for i, angle in enumerate(np.radians(np.linspace(15, 75, count))):
+        radius, rise = 3.0 + 0.35 * np.sin(2.1 * i), 1.2 + 0.45 * np.sin(1.3 * i)
+        eye = np.array([radius * np.cos(angle), radius * np.sin(angle), rise])
+        target = np.array([0.3, 0.3, 0.7]) + 0.1 * np.sin([1.7 * i, 2.3 * i, 3.1 * i])
+        cameras.append(look_at(eye, target, UP, width=width, height=height, fx=focal))
+    return cameras
+
+
+def write_room(folder: Path, count: int = 12, *, seed: int = 0, suffix: str = ".jpg", start: int = 0) -> list[Camera]:
+    """Write the photographs ``000.jpg`` ...; returns their true cameras."""
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras, walls = room_cameras(count), textures(seed)
+    for i, camera in enumerate(cameras):
+        Image.fromarray(room_picture(camera, walls)).save(folder / f"{start + i:03}{suffix}", quality=95)
+    return cameras
+
+
+def turn_file(path: Path, orientation: int) -> None:
+    """Store a picture as a camera held otherwise stores it: turned, with the EXIF orientation that turns it back."""
+    with Image.open(path) as file:
+        stored = file.transpose(STORED[orientation])
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.save(path, exif=exif, quality=95)
+
+
+@dataclass(frozen=True)
+class Room:
+    """Photographs, the capture made of them, what the command printed, and the true cameras by name."""
+
+    photos: Path
+    capture: Path
+    printed: dict[str, Any]
+    cameras: dict[str, Camera]

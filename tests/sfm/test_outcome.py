@@ -1,0 +1,219 @@
+"""What is said about photographs without a camera, a worker that dies, folders that are taken. No COLMAP."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli_runs import one_line
+from gs2d.cli import run
+from gs2d.data.colmap_model import ColmapCamera, ColmapImage, ColmapPoints
+from gs2d.errors import BackendError, DataError, RunError
+from gs2d.io.run import RunFolder
+from gs2d.sfm.outcome import Piece, camera_line, check_any, why_not_placed
+from gs2d.sfm.solve import Facts, Group, Request, check_installed, solve
+from gs2d.sfm.workplace import check_out, put_in_place, workplace
+
+
+def piece(*names: str) -> Piece:
+    images = tuple(ColmapImage(i, 1, name, np.eye(4)) for i, name in enumerate(names))
+    points = ColmapPoints(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0))
+    return Piece(images, {}, points, 0.5, 3.0, 20.0, True)
+
+
+FEATURES = {**dict.fromkeys("abcdefg", 900), "blurred": 7}
+FACTS = Facts(
+    FEATURES,
+    {("a", "b"): 300, ("a", "c"): 250, ("d", "a"): 17, ("d", "b"): 21, ("e", "f"): 400, ("g", "blurred"): 16},
+)
+PIECES = [piece("a", "b", "c"), piece("x", "y", "z")]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("y", "in a separate piece (sparse/1): too little in it is seen from the photographs of sparse/0"),
+        ("blurred", "7 features: blurred, or nothing in it has texture"),
+        ("d", "21 matches with b at best: too few points of known place in it"),
+        ("e", "matches only photographs that are not placed either (f)"),
+        ("g", "matches only photographs that are not placed either (blurred)"),
+        ("lonely", "nothing in it was found in another photograph"),
+    ],
+)
+def test_the_reason_for_a_photograph_without_a_place(name: str, expected: str) -> None:
+    facts = Facts({**FEATURES, "lonely": 500, "y": 900}, FACTS.matches)
+    assert why_not_placed(name, PIECES, facts) == expected
+
+
+@pytest.mark.parametrize(
+    ("facts", "expected"),
+    [
+        (Facts({"a": 10, "b": 20, "c": 900}, {("a", "c"): 20}), "got 20 features in the median photograph"),
+        (Facts(dict.fromkeys("abc", 900), {}), r"got no two that show the same points \(of 3 photographs\)"),
+        (Facts(dict.fromkeys("abc", 900), {("a", "b"): 80}), r"1 pairs show the same points \(up to 80\), but none"),
+    ],
+)
+def test_no_model_at_all_says_at_which_step_it_ended(facts: Facts, expected: str) -> None:
+    with pytest.raises(DataError, match=expected):
+        check_any([], facts, Path("photos"))
+    check_any(PIECES, facts, Path("photos"))
+
+
+def test_a_camera_is_described_by_its_field_of_view() -> None:
+    """Half of 1000 px over f = 500 px: 2 atan(1) = 90 degrees."""
+    camera = ColmapCamera("OPENCV", 1000, 600, (500.0, 501.0, 500.0, 300.0, 0, 0, 0, 0))
+    assert camera_line(camera, 12) == "OPENCV of 12 photographs, 1000x600, f = 500 px (90 degrees wide)"
+
+
+# -- the worker --------------------------------------------------------------------------------------------------------
+def request(work: Path) -> Request:
+    group = Group(("a.jpg",), "OPENCV", (9, 9), "a.jpg")
+    database, output = str(work / "database.db"), str(work / "out")
+    return Request("images", database, output, (group,), ("a.jpg",), "exhaustive", 1, 1, 64, 1, 0)
+
+
+def follow(work: Path, code: str) -> tuple[list[object], list[dict[str, object]]]:
+    """Run a worker of these lines of Python, in which ``say(...)`` sends a message."""
+    program = "import json, os, sys\ndef say(**m): print(json.dumps(m), flush=True)\n" + code
+    seen: list[object] = []
+    models = solve(request(work), lambda *step: seen.append(step), command=(sys.executable, "-c", program))
+    return seen, models
+
+
+def test_what_the_worker_tells_becomes_phases_and_steps(tmp_path: Path) -> None:
+    code = (
+        "assert json.load(open(sys.argv[1]))['groups'][0]['camera_model'] == 'OPENCV'\n"
+        "say(phase='cameras', total=5); say(done=2); say(done=5); say(models=[{'upright': True}])"
+    )
+    seen, models = follow(tmp_path, code)
+    assert seen == [("placing cameras", 0, 5), ("placing cameras", 2, 5), ("placing cameras", 5, 5)]
+    assert models == [{"upright": True}]
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        (
+            "raise RuntimeError('database or disk is full')",
+            "ended with code 1 while it started: .*database or disk is full",
+        ),
+        (
+            "say(phase='matching', total=3); os.kill(os.getpid(), 11)",
+            "was ended by signal 11 while matching pairs: .*--threads",
+        ),
+        ("say(phase='features', total=3)", "ended with code 0 while finding features: it said nothing"),
+    ],
+)
+def test_a_worker_that_dies_is_one_line_with_its_last_words(tmp_path: Path, code: str, expected: str) -> None:
+    with pytest.raises(DataError, match=expected) as caught:
+        follow(tmp_path, code)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    with pytest.raises(BackendError):
+        check_installed()
+    assert run(["poses", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
+    assert 'pip install "2dgs-r[sfm]"' in one_line(capsys.readouterr().err)
+
+
+def test_the_worker_does_not_load_torch() -> None:
+    import subprocess
+
+    code = "import sys, gs2d.sfm.worker; assert 'torch' not in sys.modules; assert 'pycolmap' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# -- where the capture goes --------------------------------------------------------------------------------------------
+def test_the_photographs_folder_and_what_is_in_it_or_above_it_are_no_place_for_the_capture(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for out in (photos, photos / "capture", tmp_path):
+        with pytest.raises(RunError, match="must lie beside the photographs"):
+            check_out(out, photos, overwrite=True)
+    check_out(tmp_path / "capture", photos, overwrite=False)
+
+
+def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "capture"
+    out.mkdir()
+    check_out(out, tmp_path / "photos", overwrite=False)  # empty
+    for name in ("poses.json", "images", "sparse"):
+        (out / name).mkdir()
+    with pytest.raises(RunError, match="already holds a capture; replace it with --overwrite"):
+        check_out(out, tmp_path / "photos", overwrite=False)
+    check_out(out, tmp_path / "photos", overwrite=True)
+    (out / "thesis.tex").touch()
+    with pytest.raises(RunError, match=r"holds other files \(thesis.tex\)"):
+        check_out(out, tmp_path / "photos", overwrite=True)
+    (out / "thesis.tex").unlink()
+    (out / "poses.json").rmdir()  # images and sparse of somebody else
+    with pytest.raises(RunError, match=r"holds other files \(images\)"):
+        check_out(out, tmp_path / "photos", overwrite=True)
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="must be a folder"):
+        check_out(tmp_path / "file", tmp_path / "photos", overwrite=True)
+
+
+def test_the_folder_one_is_in_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "out")
+    with pytest.raises(RunError, match="is the folder that you are in"):
+        check_out(Path("."), tmp_path / "photos", overwrite=False)
+
+
+def test_a_capture_takes_its_place_as_a_whole_and_an_older_one_goes(tmp_path: Path) -> None:
+    out = tmp_path / "room"
+    for content in ("first", "second"):
+        with workplace(out) as work:
+            (work / "capture").mkdir()
+            (work / "capture" / "poses.json").write_text(content)
+            put_in_place(work / "capture", out, work)
+        assert (out / "poses.json").read_text() == content
+        assert [path.name for path in tmp_path.iterdir()] == ["room"]
+
+
+def test_what_a_killed_command_left_is_removed_and_an_older_capture_comes_back(tmp_path: Path) -> None:
+    """Killed between the two renames of put_in_place."""
+    left = tmp_path / ".room.poses"
+    (left / "old").mkdir(parents=True)
+    (left / "old" / "poses.json").write_text("mine")
+    (left / "capture" / "images").mkdir(parents=True)
+    (left / "database.db").touch()
+    with workplace(tmp_path / "room") as work:
+        assert [path.name for path in work.iterdir()] == [".lock"]
+    assert (tmp_path / "room" / "poses.json").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["room"]
+
+
+def test_two_commands_do_not_make_the_same_capture(tmp_path: Path) -> None:
+    work = tmp_path / ".room.poses"
+    work.mkdir()
+    with (
+        RunFolder(work).locked(),
+        pytest.raises(RunError, match="is being made by another process"),
+        workplace(tmp_path / "room"),
+    ):
+        raise AssertionError("both have it")
+    assert work.is_dir()  # theirs
+
+
+@pytest.mark.parametrize("below", [".", "images"])
+def test_training_on_photographs_without_cameras_names_this_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], below: str
+) -> None:
+    photos = tmp_path / "photos" / below
+    photos.mkdir(parents=True)
+    for i in range(3):
+        (photos / f"{i}.JPG").touch()
+    assert run(["train", str(tmp_path / "photos"), "--out", str(tmp_path / "run")]) == 2
+    line = one_line(capsys.readouterr().err)
+    assert f"got 3 photographs without any; find them first: gs2d poses {photos} --out CAPTURE" in line
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,314 @@
+"""Which files of a folder are photographs, how they get into the capture, and what shares a camera. No COLMAP."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image, ImageOps
+
+from gs2d.camera import look_at
+from gs2d.errors import DataError
+from gs2d.images import image_size, read_image
+from gs2d.sfm.photos import Photo, camera_groups, find_photos, read_photos, turn
+from gs2d.sfm.similar import neighbour_pairs, similar_pairs
+from gs2d.sfm.stage import stage_photos
+from gs2d.sfm.upright import rotation_to_z, up_direction
+
+DETAILS = ExifTags.IFD.Exif
+
+
+def picture(
+    path: Path, *, size: tuple[int, int] = (24, 16), orientation: int = 1, model: str = "", focal: float = 0
+) -> None:
+    """A JPEG or PNG whose left half is red and whose top is bright, with EXIF."""
+    width, height = size
+    pixels = np.zeros((height, width, 3), np.uint8)
+    pixels[:, : width // 2, 0] = 200
+    pixels[: height // 2] += 50
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    if model:
+        exif[ExifTags.Base.Model] = model
+    if focal:
+        exif.get_ifd(DETAILS)[ExifTags.Base.FocalLength] = focal
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path, exif=exif, **({"quality": 95} if path.suffix in (".jpg", ".JPG") else {}))
+
+
+def photos_of(root: Path) -> list[Photo]:
+    return list(read_photos(find_photos(root)[0], root, threads=1))
+
+
+def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path: Path) -> None:
+    for name in ("b/frame_10.jpg", "b/frame_2.jpg", "a 1.JPG", "c.png", ".hidden.jpg", ".git/d.jpg", "__MACOSX/e.jpg"):
+        picture(tmp_path / name)
+    found, notes = find_photos(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in found] == [
+        "a 1.JPG", "b/frame_2.jpg", "b/frame_10.jpg", "c.png"
+    ]  # fmt: skip
+    assert notes == ()
+
+
+def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: Path) -> None:
+    for name in ("a b.png", "a_b.png", "c.tif", "c.tif.png"):
+        picture(tmp_path / name)
+    names = {photo.label: photo.name for photo in photos_of(tmp_path)}
+    assert names == {"a b.png": "a_b.png", "a_b.png": "_a_b.png", "c.tif": "c.tif.png", "c.tif.png": "_c.tif.png"}
+
+
+def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path) -> None:
+    for i in range(3):
+        picture(tmp_path / f"{i}.jpg")
+    for name in ("x.HEIC", "y.heic", "clip.MOV", "notes.txt", "masks/0.jpg.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"?")
+    found, notes = find_photos(tmp_path)
+    assert len(found) == 3
+    heic, video, masks, other = notes
+    assert heic.startswith("x.HEIC and 1 more were not read: HEIC is not decoded here; convert to JPEG (magick mogrify")
+    assert "clip.MOV was not read: a video" in video
+    assert "ffmpeg -i clip.MOV" in video
+    assert masks.startswith("masks/0.jpg.png was not read: put masks/ beside images/ of the capture")
+    assert other == "notes.txt was not read: no photographs"
+
+
+def write_nothing(root: Path) -> Path:
+    return root / "none"
+
+
+def write_file(root: Path) -> Path:
+    picture(root / "one.jpg")
+    return root / "one.jpg"
+
+
+def write_video(root: Path) -> Path:
+    (root / "walk.mp4").write_bytes(b"?")
+    return root / "walk.mp4"
+
+
+def write_empty(root: Path) -> Path:
+    return root
+
+
+def write_two(root: Path) -> Path:
+    picture(root / "0.jpg")
+    picture(root / "1.jpg")
+    return root
+
+
+def write_only_heic(root: Path) -> Path:
+    (root / "IMG_1.HEIC").write_bytes(b"?")
+    return root
+
+
+def write_only_raw(root: Path) -> Path:
+    (root / "a.CR2").write_bytes(b"?")
+    return root
+
+
+def write_only_video(root: Path) -> Path:
+    (root / "walk.mp4").write_bytes(b"?")
+    return root
+
+
+@pytest.mark.parametrize(
+    ("write", "expected"),
+    [
+        (write_nothing, "got no such folder"),
+        (write_file, "got a file; give its folder"),
+        (
+            write_video,
+            r"got a video; take frames from it: mkdir walk; ffmpeg -i walk.mp4 -vf fps=2 .*%05d.jpg; then gs2d",
+        ),
+        (write_empty, "3 or more photographs, got none; take 30 or more"),
+        (write_two, "3 or more photographs, got 2 photographs; take 30 or more"),
+        (write_only_heic, "got none; IMG_1.HEIC was not read: HEIC is not decoded here; convert to JPEG"),
+        (write_only_raw, r"raw files \(.cr2\) are not developed here; export JPEG"),
+        (write_only_video, "got none; walk.mp4 was not read: a video; take frames from it"),
+    ],
+)
+def test_a_folder_without_photographs_is_one_line_with_a_remedy(tmp_path: Path, write: object, expected: str) -> None:
+    with pytest.raises(DataError, match=expected) as caught:
+        find_photos(write(tmp_path))  # type: ignore[operator]
+    assert "\n" not in str(caught.value)
+
+
+def test_a_photograph_that_does_not_decode_is_named(tmp_path: Path) -> None:
+    for i in range(3):
+        picture(tmp_path / f"{i}.jpg", size=(64, 64))
+    path = tmp_path / "1.jpg"
+    path.write_bytes(path.read_bytes()[:400])
+    with pytest.raises(DataError, match=r"1\.jpg does not decode: .*; replace or remove the file"):
+        photos_of(tmp_path)
+
+
+def test_a_damaged_exif_block_is_no_exif_block(tmp_path: Path) -> None:
+    for i in range(3):
+        picture(tmp_path / f"{i}.jpg", orientation=6, model="phone")
+    path = tmp_path / "0.jpg"
+    raw = path.read_bytes()
+    at = raw.index(b"Exif\0\0") + 6
+    path.write_bytes(raw[:at] + b"XX" + raw[at + 2 :])  # neither II nor MM
+    first, second, _ = photos_of(tmp_path)
+    assert (first.orientation, first.size, first.made_by[1]) == (1, (24, 16), "")
+    assert (second.orientation, second.size, second.made_by[1]) == (6, (16, 24), "phone")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_picture_is_turned_as_pillow_turns_it(tmp_path: Path, orientation: int) -> None:
+    picture(tmp_path / "a.png", orientation=orientation)
+    with Image.open(tmp_path / "a.png") as file:
+        expected = np.asarray(ImageOps.exif_transpose(file))
+    got = turn(Image.fromarray(read_image(tmp_path / "a.png")), orientation)
+    np.testing.assert_array_equal(np.asarray(got), expected)
+
+
+def stage(root: Path, folder: Path, *, max_size: int | None = None, link: bool = False) -> list[str]:
+    return list(stage_photos(photos_of(root), folder, max_size=max_size, link=link, threads=1))
+
+
+def test_upright_photographs_are_copied_byte_for_byte_and_theirs_stay_as_they_were(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    for name in ("0.jpg", "sub/1.png", "2.jpg"):
+        picture(root / name)
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in root.rglob("*.*")}
+    assert stage(root, tmp_path / "images") == ["copied"] * 3
+    for path, (content, _) in before.items():
+        assert (tmp_path / "images" / path.relative_to(root)).read_bytes() == content
+    assert {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in root.rglob("*.*")} == before
+
+
+def test_a_photograph_that_exif_turns_is_stored_upright_and_keeps_its_focal_length(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    picture(root / "0.jpg", size=(64, 48), orientation=6, model="phone", focal=4.25)
+    picture(root / "1.jpg", size=(64, 48), orientation=3)
+    picture(root / "2.png", size=(64, 48), orientation=8)
+    assert stage(root, tmp_path / "images") == ["turned"] * 3
+    for name, size in (("0.jpg", (48, 64)), ("1.jpg", (64, 48)), ("2.png", (48, 64))):
+        with Image.open(root / name) as theirs, Image.open(tmp_path / "images" / name) as ours:
+            assert ours.size == size
+            assert ExifTags.Base.Orientation not in ours.getexif()
+            upright = np.asarray(ImageOps.exif_transpose(theirs), float)
+            assert np.abs(np.asarray(ours, float) - upright).mean() < 1.0  # JPEG once more, quality 95
+            if name == "0.jpg":
+                assert ours.getexif()[ExifTags.Base.Model] == "phone"
+                assert float(ours.getexif().get_ifd(DETAILS)[ExifTags.Base.FocalLength]) == 4.25
+
+
+def test_max_size_bounds_the_longer_side_and_leaves_small_photographs_alone(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    picture(root / "0.jpg", size=(100, 60))
+    picture(root / "1.jpg", size=(100, 60), orientation=6)
+    picture(root / "2.jpg", size=(40, 50))
+    assert stage(root, tmp_path / "images", max_size=50) == ["resized", "resized", "copied"]
+    sizes = [image_size(tmp_path / "images" / f"{i}.jpg") for i in range(3)]
+    assert sizes == [(50, 30), (30, 50), (40, 50)]
+
+
+def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    picture(root / "0.jpg")
+    picture(root / "1.bmp")
+    Image.fromarray(np.full((16, 24), 40_000, np.uint16)).save(root / "2.tif")
+    assert stage(root, tmp_path / "images") == ["copied", "converted", "converted"]
+    with Image.open(tmp_path / "images/2.tif.png") as file:
+        assert (file.format, file.mode, file.getpixel((0, 0))) == ("PNG", "RGB", (156,) * 3)  # 40000 / 257 = 155.6
+
+
+def test_link_makes_hard_links_of_what_needs_no_change(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    picture(root / "0.jpg")
+    picture(root / "1.jpg", orientation=3)
+    picture(root / "2.jpg")
+    assert stage(root, tmp_path / "images", link=True) == ["linked", "turned", "linked"]
+    assert os.path.samefile(root / "0.jpg", tmp_path / "images/0.jpg")
+
+
+def test_photographs_of_one_folder_size_camera_and_focal_length_share_a_camera(tmp_path: Path) -> None:
+    picture(tmp_path / "0.jpg", model="A", focal=5)
+    picture(tmp_path / "1.jpg", model="A", focal=5)
+    picture(tmp_path / "2.jpg", model="A", focal=9)  # zoomed
+    picture(tmp_path / "3.jpg", model="B", focal=5)
+    picture(tmp_path / "4.jpg", size=(16, 24), model="A", focal=5, orientation=6)  # upright it is 24 x 16 as the first
+    picture(tmp_path / "5.jpg", size=(16, 24), model="A", focal=5)
+    picture(tmp_path / "sub/6.jpg", model="A", focal=5)
+    photos = photos_of(tmp_path)
+    sizes = [photo.size for photo in photos]
+    assert camera_groups(photos, sizes, "auto") == [[0, 1, 4], [2], [3], [5], [6]]
+    assert camera_groups(photos, sizes, "each") == [[i] for i in range(7)]
+    with pytest.raises(
+        DataError, match=r"--cameras one needs photographs of one size, got 0.jpg 24x16 and 5.jpg 16x24"
+    ):
+        camera_groups(photos, sizes, "one")
+    assert camera_groups(photos[:4], sizes[:4], "one") == [[0, 1, 2, 3]]
+
+
+# -- which way is up ---------------------------------------------------------------------------------------------------
+def rotations(eyes: np.ndarray, target: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Level cameras at ``eyes`` that look at ``target``, in a world turned by ``world`` [3, 3]."""
+    up = np.array([0.0, 0.0, 1.0])
+    cameras = [look_at(eye, target, up, width=9, height=9, fx=9) for eye in eyes]
+    return np.stack([camera.rotation @ world.T for camera in cameras])
+
+
+def turned_world(seed: int) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return np.asarray(q * np.sign(np.linalg.det(q)))
+
+
+def test_up_is_found_from_a_half_ring_of_tilted_cameras() -> None:
+    """All look down by 45 degrees from one side: the mean of their up vectors leans by more than 20."""
+    angles = np.linspace(0, np.pi, 9)
+    eyes = np.stack([2 * np.cos(angles), 2 * np.sin(angles), np.full(9, 2.0)], axis=1)
+    world = turned_world(1)
+    views = rotations(eyes, np.zeros(3), world)
+    up, mean = up_direction(views), -views[:, 1].mean(axis=0)
+    assert up is not None
+    truth = world @ [0, 0, 1]
+    assert np.degrees(np.arccos(min(1.0, up @ truth))) < 0.5
+    assert np.degrees(np.arccos(mean @ truth / np.linalg.norm(mean))) > 20.0
+
+
+def test_up_is_found_from_a_walk_along_a_wall() -> None:
+    """All x axes are parallel: they say nothing, the mean of the up vectors decides."""
+    eyes = np.stack([np.linspace(-3, 3, 7), np.full(7, -4.0), np.zeros(7)], axis=1)
+    views = np.stack([rotations(eye[None], eye + np.array([0, 1.0, 0]), np.eye(3))[0] for eye in eyes])
+    np.testing.assert_allclose(up_direction(views), [0, 0, 1], atol=1e-9)
+
+
+def test_cameras_that_disagree_on_up_have_none() -> None:
+    quarter = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # of a turn about the optical axis
+    turned = np.stack([np.linalg.matrix_power(quarter, k) for k in range(4)])
+    assert up_direction(turned) is None
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.48, -0.6, 0.64)])
+def test_a_rotation_takes_up_to_z(up: tuple[float, float, float]) -> None:
+    R = rotation_to_z(np.array(up, float))
+    np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) > 0
+
+
+# -- which pairs are matched -------------------------------------------------------------------------------------------
+def test_each_photograph_is_paired_with_the_next_ones_and_with_far_ones() -> None:
+    """Overlap 3: the next 1, 2, 3 and those 2^0, 2^1, 2^2 on, i.e. 1, 2, 3, 4."""
+    assert neighbour_pairs(6, 3) == {(i, j) for i in range(6) for j in range(i + 1, 6) if j - i <= 4}
+
+
+def test_similar_photographs_are_paired_and_strangers_are_not() -> None:
+    """Six photographs of one thing and six of another, interleaved: each finds its own kind."""
+    rng = np.random.default_rng(0)
+    things = rng.integers(0, 255, (2, 200, 128))
+    photographs = [np.clip(things[i % 2] + rng.normal(0, 9, (200, 128)), 0, 255).astype(np.uint8) for i in range(12)]
+    pairs = similar_pairs(lambda i: photographs[i], 12, neighbours=3)
+    assert len(pairs) >= 12
+    assert all(i % 2 == j % 2 and i < j for i, j in pairs)
+    assert similar_pairs(lambda i: photographs[i], 12, neighbours=3) == pairs
+
+
+def test_photographs_without_features_have_no_similar_ones() -> None:
+    assert similar_pairs(lambda _: np.zeros((0, 128), np.uint8), 5, neighbours=3) == set()

@@ -1,0 +1,253 @@
+"""``gs2d poses`` from photographs to a capture: by COLMAP on a drawn room whose cameras are known, and on castles."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cli_runs import TINY, one_line
+from gs2d.camera import look_at
+from gs2d.cli import run
+from gs2d.data import load_scene
+from gs2d.data.colmap_model import read_images
+from gs2d.images import read_image
+from gs2d.pipeline.events import Event, Phase
+from gs2d.pipeline.poses import PosesOptions, find_poses
+from gs2d.sfm.workplace import workplace
+from room_photos import FOCAL, SIZE, UP, Room, room_picture, textures, write_room
+
+
+def poses(photos: Path, out: Path, *words: str) -> int:
+    return run(["poses", str(photos), "--out", str(out), "--threads", "2", *words])
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """scale, rotation, translation that take points [P, 3] to others with the least squares (Umeyama 1991)."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    d = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    R = (u * d) @ vt
+    scale = float((s * d).sum() / (a**2).sum())
+    return scale, R, target.mean(axis=0) - scale * R @ source.mean(axis=0)
+
+
+def pose_errors(mine: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> tuple[float, float, np.ndarray]:
+    """Of name -> T_cam_world: rms of centre distances over their spread; largest angle, degrees; rotation [3, 3]."""
+    names = sorted(mine.keys() & truth.keys())
+    centers, targets = (np.stack([-T[n][:3, :3].T @ T[n][:3, 3] for n in names]) for T in (mine, truth))
+    scale, R, t = similarity(centers, targets)
+    off = np.linalg.norm(scale * centers @ R.T + t - targets, axis=1)
+    spread = np.linalg.norm(targets - targets.mean(axis=0), axis=1).mean()
+    cosines = [(np.trace(mine[n][:3, :3] @ R.T @ truth[n][:3, :3].T) - 1) / 2 for n in names]
+    return float(np.sqrt((off**2).mean()) / spread), float(np.degrees(np.arccos(np.clip(min(cosines), -1, 1)))), R
+
+
+def poses_of(capture: Path) -> dict[str, np.ndarray]:
+    return {image.name: image.T_cam_world for image in read_images(capture / "sparse/0", "bin")}
+
+
+def test_the_cameras_of_a_drawn_room_are_found(room: Room) -> None:
+    """Turned photographs included. Measured: centres 0.06 % of their spread, 0.04 degrees, focal length 0.1 %."""
+    truth = {name: camera.T_cam_world for name, camera in room.cameras.items()}
+    mine = poses_of(room.capture)
+    assert mine.keys() == truth.keys()
+    centers, degrees, R = pose_errors(mine, truth)
+    assert centers < 0.005
+    assert degrees < 0.3
+    tilt = np.degrees(np.arccos(np.clip((R @ [0, 0, 1]) @ UP, -1, 1)))
+    assert tilt < 2.0  # the capture's +z is up
+    assert room.printed["cameras"][0]["focal_px"] == pytest.approx(FOCAL, rel=0.01)
+
+
+def test_the_capture_has_what_training_reads_and_nothing_else(room: Room) -> None:
+    assert sorted(path.name for path in room.capture.iterdir()) == ["images", "poses.json", "poses.png", "sparse"]
+    assert sorted(path.name for path in (room.capture / "sparse").iterdir()) == ["0"]
+    assert [path.name for path in room.capture.parent.iterdir()] == ["room"]  # no workplace is left
+    scene = load_scene(room.capture)
+    assert (scene.format, len(scene.train), len(scene.test)) == ("colmap", 10, 2)
+    assert scene.points is not None
+    assert len(scene.points) == room.printed["points"] > 500
+    assert any("undistorted on load" in note for note in scene.notes)  # 12 photographs share it: OPENCV
+    picture = read_image(room.capture / "poses.png")
+    assert picture.shape[0] > 300
+    assert (np.ptp(picture.astype(int), axis=2) > 60).sum() > 500  # red cameras
+
+
+def test_what_is_known_of_each_photograph_is_printed_and_written(room: Room) -> None:
+    written = json.loads((room.capture / "poses.json").read_text())
+    assert {**written, "capture": str(room.capture)} == room.printed
+    assert (written["count"], written["placed"], written["up"]) == (12, 12, "+z")
+    assert written["cameras"][0]["model"] == "OPENCV"
+    assert written["mean_error_px"] < 0.5
+    assert 20 < written["median_angle_degrees"] < 60  # the arc is 60 degrees wide
+    rows = {row["name"]: row for row in written["photographs"]}
+    assert {name for name, row in rows.items() if row["file"] == "turned"} == {"002.jpg", "005.jpg", "009.jpg"}
+    assert all(row["placed"] and row["features"] > 300 and "reason" not in row for row in rows.values())
+
+
+def test_the_photographs_are_only_read(room: Room) -> None:
+    assert len(list(room.photos.iterdir())) == 13
+    with Image.open(room.photos / "002.jpg") as file:
+        assert file.getexif()[274] == 6
+
+
+@pytest.mark.slow
+def test_the_capture_trains(room: Room, tmp_path: Path) -> None:
+    words = ["train", str(room.capture), "--out", str(tmp_path / "run"), "--downscale", "8", "--quiet", *TINY]
+    assert run(words) == 0
+    assert (tmp_path / "run" / "splats.ply").exists()
+
+
+def test_an_existing_capture_is_replaced_only_when_asked(
+    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "room"
+    shutil.copytree(room.capture, out)
+    assert poses(room.photos, out, "--quiet") == 2
+    assert "already holds a capture; replace it with --overwrite" in one_line(capsys.readouterr().err)
+    (out / "masks").mkdir()
+    assert poses(room.photos, out, "--overwrite", "--quiet") == 2
+    assert "holds other files (masks)" in one_line(capsys.readouterr().err)
+    assert poses_of(out).keys() == room.cameras.keys()
+
+
+def test_separate_pieces_and_photographs_without_a_place_are_named_and_the_same_seed_gives_the_same_bytes(
+    colmap: None, pieces: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "capture"
+    assert poses(pieces, out) == 0
+    text = capsys.readouterr()
+    assert "5 of 10 photographs have a place" in text.out
+    assert "no place: 010.jpg: in a separate piece (sparse/1)" in text.out
+    assert "no place: blank.jpg: 0 features: blurred, or nothing in it has texture" in text.out
+    assert "sparse/1 holds a separate piece: 4 photographs" in text.out
+    assert "only 5 of 10 photographs have a place" in text.err
+    assert load_scene(out).notes[0] == "only the model sparse/0 is read; others are there: 1"
+    models = {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))}
+    assert len(models) == 10  # cameras, images, points3D, rigs, frames, twice
+    assert poses(pieces, out, "--overwrite", "--quiet") == 0
+    assert {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))} == models
+
+
+def blank(root: Path) -> None:
+    for i in range(3):
+        Image.fromarray(np.full((128, 128, 3), 40 * i + 50, np.uint8)).save(root / f"{i}.png")
+
+
+def strangers(root: Path) -> None:
+    for i in range(3):
+        write_room(root, 1, seed=i, start=i)
+
+
+@pytest.mark.parametrize(
+    ("write", "expected"),
+    [
+        (blank, "must hold photographs with texture, got 0 features in the median photograph"),
+        (strangers, "must hold photographs that overlap, got no two that show the same points"),
+    ],
+)
+def test_photographs_that_give_no_cameras_say_why_and_leave_nothing(
+    colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], write: Callable[[Path], None], expected: str
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    write(photos)
+    assert poses(photos, tmp_path / "new" / "capture", "--quiet") == 2
+    assert re.search(expected, one_line(capsys.readouterr().err))
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """COLMAP finds a model all the same, of another focal length and 3 degrees between rays; the room's has 40."""
+    for i in range(4):
+        target = np.array([0.0, 0.9 - 0.25 * i, 0.9])
+        camera = look_at(np.array([2.5, 2.0, 1.2]), target, UP, width=SIZE, height=SIZE, fx=FOCAL)
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        Image.fromarray(room_picture(camera, textures())).save(tmp_path / "photos" / f"{i}.png")
+    assert poses(tmp_path / "photos", tmp_path / "capture") == 0
+    assert "the photographs were taken from nearly one place" in capsys.readouterr().err
+
+
+def test_an_interrupt_in_the_middle_leaves_nothing(room: Room, tmp_path: Path) -> None:
+    def interrupt(event: Event) -> None:
+        if isinstance(event, Phase) and event.name == "matching pairs":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        find_poses(PosesOptions(photos=room.photos, out=tmp_path / "new" / "capture", threads=2), interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["term", "kill"])
+def test_an_interrupted_command_leaves_no_capture_and_no_process(room: Room, tmp_path: Path, number: int) -> None:
+    """SIGTERM cleans up. SIGKILL cannot: its hidden folder goes with the next command, its worker with its stdin."""
+    words = [sys.executable, "-m", "gs2d", "poses", str(room.photos), "--out", str(tmp_path / "capture")]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    work = tmp_path / ".capture.poses"
+    deadline = time.monotonic() + 60
+    while not (work / "database.db").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, error = process.communicate(timeout=60)
+    if number == signal.SIGTERM:
+        assert process.returncode == 130
+        assert error.splitlines()[-1] == "interrupted"
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert [path.name for path in tmp_path.iterdir()] == [".capture.poses"]
+    while workers_of(work) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not workers_of(work)
+    if number == signal.SIGKILL:
+        with workplace(tmp_path / "capture"):
+            assert [path.name for path in work.iterdir()] == [".lock"]
+        assert not work.exists()
+
+
+def workers_of(work: Path) -> list[int]:
+    """Processes whose command line names a file of the workplace (Linux; elsewhere none is seen)."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if os.fsencode(work) in (entry / "cmdline").read_bytes():
+                found.append(int(entry.name))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "most_centers", "most_degrees"), [([], 0.004, 0.35), (["--camera-model", "SIMPLE_RADIAL"], 0.002, 0.1)]
+)
+def test_the_cameras_of_a_castle_agree_with_a_known_model(
+    colmap: None,
+    shared: Callable[[str], Path],
+    tmp_path: Path,
+    words: list[str],
+    most_centers: float,
+    most_degrees: float,
+) -> None:
+    """11 photographs with EXIF. The known model has a SIMPLE_RADIAL lens; measured 0.16 %, 0.18 degrees for OPENCV."""
+    root = shared("sceaux_castle")
+    assert poses(root / "images", tmp_path / "capture", "--quiet", *words) == 0
+    known = {image.name: image.T_cam_world for image in read_images(root / "sparse/0", "bin")}
+    mine = poses_of(tmp_path / "capture")
+    assert len(mine) == 11
+    centers, degrees, _ = pose_errors(mine, known)
+    assert centers < most_centers
+    assert degrees < most_degrees
