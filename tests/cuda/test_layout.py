@@ -1,0 +1,78 @@
+"""The structures of ``kernels/cuda/arguments.py`` lie in memory as NVRTC lays out those of the kernels, field by field.
+
+The emulator's compiler is another: what it agrees with Python about, NVRTC might not, and then a kernel would read a
+pointer from the middle of two.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+
+import pytest
+
+from gs2d.errors import BackendError
+from gs2d.kernels import fusion
+from gs2d.kernels.cuda import arguments, compile, nearest
+
+pytestmark = pytest.mark.timeout(120)
+KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)(<float>)? ')
+CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "cx", "cy")}  # of View
+
+
+def structures() -> dict[str, type[ctypes.Structure]]:
+    """By name."""
+    found = {}
+    for module in (arguments, nearest, fusion):
+        for name, value in vars(module).items():
+            if isinstance(value, type) and issubclass(value, ctypes.Structure):
+                found[name.lstrip("_")] = value
+    return found
+
+
+def assertions(name: str, structure: type[ctypes.Structure]) -> list[str]:
+    """What must hold in C++, for the structure and those inside it."""
+    bare = name.partition("<")[0]
+    lines = [f'static_assert(sizeof(gs2d::{name}) == {ctypes.sizeof(structure)}, "{bare}");']
+    for field, kind in structure._fields_:  # type: ignore[misc]
+        place, there = getattr(structure, field).offset, CAMERA.get(field, field) if bare == "View" else field
+        offset = f"__INTADDR__(&static_cast<gs2d::{name}*>(nullptr)->{there})"  # what NVRTC has for offsetof
+        lines.append(f'static_assert({offset} == {place}, "{bare}.{field}");')
+        inner = getattr(kind, "_type_", kind)
+        if isinstance(inner, type) and issubclass(inner, ctypes.Structure):
+            lines += assertions(inner.__name__.lstrip("_"), inner)
+    return lines
+
+
+@pytest.mark.parametrize("name", compile.source_names())
+def test_kernels_and_python_agree_where_every_field_lies(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    try:
+        compile.nvrtc_version()
+    except BackendError as error:
+        pytest.skip(str(error))
+    text = compile.sources()[name]
+    kinds = {kind + arguments for _, kind, arguments in KERNEL.findall(text)}
+    assert len(KERNEL.findall(text)) == len(compile.KERNEL.findall(text))
+    known = structures()
+    lines = [line for kind in sorted(kinds) for line in assertions(kind, known[kind.partition("<")[0]])]
+    assert len(lines) > 3
+    headers = {key: value for key, value in compile.sources().items() if key.endswith(".h")}
+    # the structures alone: kernels, and what only they use, are not wanted again
+    compile.compile_text(text + "\n" + "\n".join(lines), name, "compute_75", headers=headers)
+
+
+@pytest.mark.parametrize(
+    ("fields", "what"), [("int a, c; void* b;", "b is elsewhere"), ("int a; void* b; int d;", "it is larger")]
+)
+def test_a_field_in_another_place_or_one_too_many_is_found(fields: str, what: str) -> None:
+    class Known(ctypes.Structure):
+        _fields_ = (("b", ctypes.c_void_p), ("a", ctypes.c_int32)) if "else" in what else (
+            ("a", ctypes.c_int32), ("b", ctypes.c_void_p))  # fmt: skip
+
+    try:
+        compile.nvrtc_version()
+    except BackendError as error:
+        pytest.skip(str(error))
+    text = f"namespace gs2d {{ struct Known {{ {fields} }}; }}\n"
+    with pytest.raises(BackendError, match="static assertion failed"):
+        compile.compile_text(text + "\n".join(assertions("Known", Known)), "known.cu", "compute_75")
