@@ -30,6 +30,7 @@ BROKEN = Facts(
 )
 MENDING = (
     ({}, "torch 2.15.0+cpu is built without CUDA", "CUDA build of torch"),
+    ({"torch_cuda": (11, 8)}, "torch is built for CUDA 11.8, CUDA 12 or newer is needed", "for CUDA 12 or 13"),
     (
         {"torch_cuda": (13, 0)},
         "cuda.bindings is not here (No module named 'cuda')",

@@ -270,3 +270,14 @@ def test_an_empty_mesh_has_no_distances_and_a_reason() -> None:
 def test_an_empty_truth_is_a_data_error() -> None:
     with pytest.raises(DataError, match="finite points"):
         evaluate_surface(square(0.0), np.zeros((0, 3)))
+
+
+def test_arrays_that_may_not_be_written_to_are_scored_without_a_warning() -> None:
+    """Those of a file that is mapped into memory: torch warns of them, which is an error here."""
+    mesh, truth = square(0.1, cells=3), square(0.0, cells=3)
+    for array in (mesh.vertices, mesh.faces, truth.vertices, truth.faces):
+        array.flags.writeable = False
+    cameras = from_above(3)
+    assert evaluate_surface(mesh, truth, cameras=cameras, samples=50).chamfer == pytest.approx(0.1, rel=1e-3)
+    assert evaluate_surface(mesh, truth.vertices, cameras=cameras, samples=50).truth_points == 16
+    assert frustum_counts(truth.vertices, cameras).tolist() == [3] * 16

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.evaluate.neighbours import Cloud
+from gs2d.evaluate.neighbours import Cloud, tensor_on
 from gs2d.triangles import Mesh
 
 _CANDIDATES = 8  # triangles tried for each point
@@ -90,12 +90,12 @@ def distances_to_mesh(
 
 def _least_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray, device: str) -> np.ndarray:
     """Least distance [Q] of each query to some of the triangles [F, 3, 3], ``faces`` [Q, K]."""
-    corners = torch.from_numpy(np.ascontiguousarray(t)).to(device)
+    corners = tensor_on(device, t)
     best = np.empty(len(queries))
     for start in range(0, len(queries), _CHUNK):
         part = slice(start, start + _CHUNK)
-        p = torch.from_numpy(np.ascontiguousarray(queries[part], np.float64)).to(device)
-        columns = torch.from_numpy(faces[part]).to(device).unbind(dim=1)
+        p = tensor_on(device, queries[part])
+        columns = tensor_on(device, faces[part], np.int64).unbind(dim=1)
         found = [_triangle_distances(p, corners[column]) for column in columns]
         best[part] = torch.stack(found).amin(dim=0).cpu().numpy()
     return best
@@ -103,8 +103,7 @@ def _least_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray, devi
 
 def point_triangle_distances(p: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Distance [n] of points [n, 3] to triangles [n, 3, 3]: to the plane where the foot lies inside, else the edges."""
-    given = (torch.from_numpy(np.ascontiguousarray(array, np.float64)) for array in (p, t))
-    return np.asarray(_triangle_distances(*given).numpy())
+    return np.asarray(_triangle_distances(tensor_on("cpu", p), tensor_on("cpu", t)).numpy())
 
 
 def _triangle_distances(p: Tensor, t: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from gs2d.check import check_shapes
 from gs2d.errors import DataError
@@ -33,6 +34,11 @@ def _gpu(device: str) -> tuple[torch.device, Launcher]:
 def on_gpu(device: str) -> bool:
     """Whether a device is not the CPU."""
     return torch.device(device).type != "cpu"
+
+
+def tensor_on(device: torch.device | str, array: np.ndarray, dtype: type = np.float64) -> Tensor:
+    """An array as a tensor on a device; on the CPU the same memory where it has that type and may be written to."""
+    return torch.from_numpy(np.require(array, dtype, ["C", "W"])).to(device)  # torch warns of what may not
 
 
 def _checked(points: np.ndarray, name: str) -> np.ndarray:
@@ -71,7 +77,7 @@ class Cloud:
             from gs2d.kernels.cuda.nearest import build_tree
 
             self._device, self._launcher = _gpu(device)
-            self._tree = build_tree(torch.from_numpy(self.points).to(self._device))
+            self._tree = build_tree(tensor_on(self._device, self.points))
         else:
             self._scipy = cKDTree(self.points)
 
@@ -116,7 +122,7 @@ class Cloud:
             return np.asarray(found[0]), np.asarray(found[1])
         from gs2d.kernels.cuda.nearest import find_nearest
 
-        given = torch.from_numpy(queries).to(self._device)
+        given = tensor_on(self._device, queries)
         distances, index = find_nearest(self._tree, given, launcher=self._launcher, neighbours=neighbours, limit=limit)
         return distances.cpu().numpy(), index.cpu().numpy()
 
@@ -132,5 +138,5 @@ def first_of_neighbours(points: np.ndarray, radius: float, device: str) -> np.nd
     from gs2d.kernels.cuda.nearest import choose_spread
 
     where, launcher = _gpu(device)
-    given = torch.from_numpy(_checked(points, "points")).to(where)
+    given = tensor_on(where, _checked(points, "points"))
     return np.asarray(choose_spread(given, radius, launcher=launcher).cpu().numpy())

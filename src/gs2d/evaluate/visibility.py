@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gs2d.camera import Camera
-from gs2d.evaluate.neighbours import on_gpu
+from gs2d.evaluate.neighbours import on_gpu, tensor_on
 from gs2d.triangles import Mesh
 
 _PAIRS = 1 << 21  # pairs of face and pixel at a time
@@ -30,13 +30,12 @@ def depth_buffer(mesh: Mesh, camera: Camera, *, device: str = "cpu") -> np.ndarr
 
 def _tensors(mesh: Mesh, device: str) -> tuple[Tensor, Tensor]:
     """Vertices [P, 3] float64 and faces [F, 3] int64 on a device."""
-    vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
-    return torch.from_numpy(vertices).to(device), torch.from_numpy(faces).to(device)
+    return tensor_on(device, mesh.vertices), tensor_on(device, mesh.faces, np.int64)
 
 
 def _in_camera(points: Tensor, camera: Camera) -> Tensor:
     """Points [P, 3] in the camera's frame."""
-    T = torch.from_numpy(np.asarray(camera.T_cam_world, np.float64)).to(points.device)
+    T = tensor_on(points.device, camera.T_cam_world)
     return points @ T[:3, :3].T + T[:3, 3]
 
 
@@ -145,7 +144,7 @@ def visible_counts(
     ndarray [P] int64
     """
     vertices, faces = _tensors(mesh, device)
-    where = torch.from_numpy(np.asarray(points, np.float64)).to(device)
+    where = tensor_on(device, points)
 
     def visible(camera: Camera) -> Tensor:
         small = _shrunk(camera, max_side)
@@ -163,7 +162,7 @@ def visible_counts(
 
 def frustum_counts(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """In how many images each point [P, 3] lies, whatever is before it."""
-    where = torch.from_numpy(np.asarray(points, np.float64))
+    where = tensor_on("cpu", points)
     counts = torch.zeros(len(points), dtype=torch.int64)
     for camera in cameras:
         counts += _in_image(where, camera)[0]

@@ -18,6 +18,7 @@ from gs2d.kernels.cuda.driver import DRIVER_REMEDY, OLD_DRIVER, driver_version, 
 __all__ = ["Facts", "Missing", "describe", "gather", "missing"]
 
 ANYWAY = "or use --backend cpu"
+OLDEST_CUDA = (12, 0)  # the driver's functions that load kernels for every device at once are of that version
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,11 @@ def missing(facts: Facts) -> Missing | None:
         return Missing(
             f"torch {facts.torch_version} is built without CUDA",
             f"install a CUDA build of torch (on Linux plain `pip install torch` brings one), {ANYWAY}",
+        )
+    if facts.torch_cuda < OLDEST_CUDA:
+        return Missing(
+            f"torch is built for CUDA {_dotted(facts.torch_cuda)}, CUDA 12 or newer is needed",
+            f"install a torch build for CUDA 12 or 13, {ANYWAY}",
         )
     if facts.bindings_error:
         return Missing(
