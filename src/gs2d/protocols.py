@@ -76,7 +76,7 @@ class Protocol:
     near : float or None
         wu. None: 1 % of the scene's extent.
     crossing : str
-        "draw" or "cull": what the rasterizer does with splats that reach the camera plane (``RasterSettings``).
+        "draw", "cull" or "box": what the rasterizer does with splats that reach the camera plane (``RasterSettings``).
     downscale : int
         Hint: what the paper divides the image size by.
     test_every : int
@@ -135,7 +135,7 @@ DTU = Protocol(
     depth="median",  # [s] depth_ratio 1
     distortion_weight=1000.0,  # [s] lambda_dist 1000
     near=0.2,  # [c] rasterizer
-    crossing="cull",  # [c] what the rasterizer's box comes to
+    crossing="box",  # [c] forward.cu, compute_aabb
     downscale=2,  # [s] -r 2, [r]
     test_every=0,  # [s] all views train
     test_on="train",  # [r] "we evaluated PSNR on the training set"
@@ -148,7 +148,7 @@ TNT = Protocol(
     depth="median",  # [s] depth_ratio 1
     distortion_weight=100.0,  # [s] printed (not executed); [r] Table 1 "100"
     near=0.2,  # [c]
-    crossing="cull",  # [c]
+    crossing="box",  # [c]
     downscale=2,  # [s] -r 2, [r]
     test_every=8,  # [c] --eval; [r] its PSNR is of novel views
     use_mask_in_training=False,  # [c]
@@ -166,7 +166,7 @@ NERF_SYNTHETIC = Protocol(
     distortion_weight=1000.0,  # [2dgs] bounded scenes; the script uses none
     background=WHITE,  # [s] --white_background
     near=0.2,  # [c]
-    crossing="cull",  # [c] without it white sheets grow over a white background
+    crossing="box",  # [c] without it white sheets grow over a white background
     test_every=0,  # the data set has its own split
     use_mask_in_training=False,  # the images are composited on the background instead
     # [d] no script meshes this set: limits from the scene; some objects come in pieces; median is nearer the truth
@@ -177,7 +177,7 @@ MIP_NERF_360 = Protocol(
     depth="mean",  # [s] depth_ratio stays 0
     distortion_weight=100.0,  # [2dgs] unbounded scenes; the script uses none
     near=0.2,  # [c]
-    crossing="cull",  # [c]
+    crossing="box",  # [c]
     downscale=4,  # [s] images_4 outdoors (images_2 indoors)
     test_every=8,  # [c] --eval
     use_mask_in_training=False,  # [c]

@@ -27,7 +27,7 @@ _COMMON = {
     "name": _OURS,
     "background": f"{_CODE}: black unless asked for white",
     "near": f"{_CODE}: its rasterizer's 0.2",
-    "crossing": f"{_CODE}: what its box of a splat that reaches the camera plane comes to",
+    "crossing": f"{_CODE}: the box of an ellipse, also for a splat that reaches the camera plane",
     "use_mask_in_training": f"{_CODE}: the background is trained",
     "use_mask_in_fusion": f"{_CODE}: depth is cleared outside the alpha mask",
     "fusion.voxel": f"{_OURS}: from the depth maps",

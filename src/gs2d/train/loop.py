@@ -337,11 +337,11 @@ class Trainer:
     def _drop_unseen(self, stage: Stage) -> int:
         """Drop the splats that no training view sees; how many.
 
-        Where crossing splats are culled, one can grow until every training view culls it, and still hide a new view.
+        Where crossing splats are not drawn whole, one can grow until no training view sees it, and still hide a new view.
         No pixel of a training view changes.
         """
         frozen = {"means", "quats", "log_scales", "opacity_logits"}.isdisjoint(stage.train)
-        if frozen or self.protocol.crossing != "cull":
+        if frozen or self.protocol.crossing == "draw":
             return 0
         seen = seen_rows(self.state.splats, self.scene, self.settings, self.backend)
         unseen = int((~seen).sum())
