@@ -19,6 +19,7 @@ MIN_DENSIFICATIONS = 10
 PRUNE_GRACE = 100  # iterations after a reset in which nothing is pruned for opacity
 RESET_MARGIN = 200  # iterations of densification that a reset must leave
 MIN_INIT_POINTS = 10_000
+MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the keyboard
 
 
 def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
@@ -34,10 +35,10 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
     Raises
     ------
     RecipeError
-        A factor that is not a positive finite number.
+        A factor that is not in (0, ``MAX_SCALE``].
     """
-    if not (math.isfinite(factor) and factor > 0):
-        raise RecipeError(f"schedule scale must be a positive number, got {factor}")
+    if not 0 < factor <= MAX_SCALE:
+        raise RecipeError(f"schedule scale must be a positive number up to {MAX_SCALE:g}, got {factor}")
     if factor == 1:
         return recipe
     points = max(MIN_INIT_POINTS, round(recipe.init_points * math.sqrt(factor)))

@@ -32,6 +32,7 @@ from gs2d.render.types import RasterSettings
         ({"background": (0.0, 0.0)}, "background must be 3 numbers in"),
         ({"sh_degree": 4}, "sh_degree must be 0 to 3, got 4"),
         ({"lowpass_depth": "both"}, "lowpass_depth must be 'center' or 'plane'"),
+        ({"crossing": "yes"}, "crossing must be 'draw', 'cull' or 'box', got 'yes'"),
     ],
 )
 def test_settings_out_of_range_are_refused(change: dict[str, Any], message: str) -> None:
@@ -150,3 +151,15 @@ def test_missing_coefficients_count_as_zero() -> None:
     padded = replace(scene, shN=torch.zeros(1, 15, 3))
     a, b = (rasterize(s, front_camera(), backend="reference").color for s in (scene, padded))
     assert torch.equal(a, b)
+
+
+def test_arguments_of_other_types_or_in_another_order_are_named() -> None:
+    splats, camera = splat(), front_camera()
+    with pytest.raises(ShapeError, match="splats must be of type gs2d's Splats, got Camera"):
+        rasterize(camera, splats)  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="camera must be of type gs2d's Camera, got ndarray"):
+        rasterize(splats, camera.T_cam_world)  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="settings must be of type gs2d's RasterSettings, got str"):
+        rasterize(splats, camera, "cpu")  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="settings must be of type gs2d's RasterSettings, got Tensor"):
+        splat_errors(splats, camera, torch.zeros(9, 9, 3), torch.ones(9, 9))  # type: ignore[arg-type]

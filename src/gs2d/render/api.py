@@ -113,6 +113,7 @@ def rasterize(
     BackendError
         If the backend cannot run here, or not with these inputs.
     """
+    _check_types(splats, camera, settings)
     chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
     settings = _checked(splats, settings, chosen)
     if screen_probe is not None:
@@ -182,6 +183,7 @@ def splat_errors(
     ShapeError, BackendError
         As for :func:`rasterize`.
     """
+    _check_types(splats, camera, settings)
     chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
     settings = _checked(splats, settings, chosen)
     H, W = camera.height, camera.width
@@ -194,6 +196,17 @@ def splat_errors(
     if image.dtype != splats.dtype:
         raise ShapeError(f"image must be {splats.dtype} like the splats, in [0, 1], got {image.dtype}")
     return chosen.splat_errors(splats, camera, image, settings, mask, occlusion)
+
+
+def _check_types(splats: object, camera: object, settings: object) -> None:
+    """One line instead of an AttributeError from within; the order of the arguments is what people get wrong."""
+    for name, value, kind in (
+        ("splats", splats, Splats),
+        ("camera", camera, Camera),
+        ("settings", settings, RasterSettings),
+    ):
+        if not isinstance(value, kind):
+            raise ShapeError(f"{name} must be of type gs2d's {kind.__name__}, got {type(value).__name__}")
 
 
 def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> RasterSettings:
