@@ -148,11 +148,16 @@ def render(command: c.Render, console: Console) -> None:
         console.on_event,
         split=command.split,
         orbit=command.orbit,
+        flight=command.flight,
         out=command.out,
+        video=command.video,
+        fps=command.fps,
         threads=command.threads,
     )
     console.close()
     console.say(f"{result['images']} images in {result['folder']}")
+    if command.video is not None:
+        console.say(f"{result['video']}: {result['seconds']:.1f} s, {result['video_bytes'] / 1e6:.1f} MB")
     console.result(result)
 
 

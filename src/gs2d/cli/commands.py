@@ -158,7 +158,7 @@ class Mesh(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Common):
-    """Render a trained run to PNG files."""
+    """Render a trained run to PNG files, or to a film."""
 
     run: RunPath
     """Run folder."""
@@ -166,8 +166,14 @@ class Render(Common):
     """Which views."""
     orbit: int = 0
     """Instead of the views, so many frames of a circle around the scene."""
+    flight: int = 0
+    """Instead of the views, so many frames of a smooth flight along the photographs."""
     out: Path | None = None
-    """Folder for the pictures (default: renders/SPLIT in the run)."""
+    """Folder for the pictures (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
+    video: Annotated[Path | None, arg(metavar="FILE")] = None
+    """With --orbit or --flight: also a film of the frames, .mp4 (AV1) or .webp."""
+    fps: float = 30.0
+    """Frames a second of the film."""
     threads: int | None = None
     """CPU threads."""
 

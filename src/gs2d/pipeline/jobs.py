@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.camera import Camera, look_at
 from gs2d.data import View
+from gs2d.disk import disk_error
 from gs2d.errors import DataError, RunError
 from gs2d.evaluate.lpips import load_lpips
-from gs2d.geometry import focus_point
 from gs2d.images import write_image
 from gs2d.io.ply import read_mesh, read_splats, write_splats
 from gs2d.io.run import (
@@ -29,15 +28,17 @@ from gs2d.io.run import (
     open_run,
     remove_made,
 )
-from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
+from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.scoring import score_views, split_metrics
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
 
-MOST_FRAMES = 100_000  # of an orbit
+MOST_FRAMES = 100_000  # of an orbit or a flight
+FPS = 30.0
 
 
 def finished_splats(run: RunFolder) -> Splats:
@@ -129,22 +130,29 @@ def render_run(
     *,
     split: str = "test",
     orbit: int = 0,
+    flight: int = 0,
     out: Path | None = None,
+    video: Path | None = None,
+    fps: float = FPS,
     threads: int | None = None,
 ) -> dict[str, Any]:
-    """Render the views of a split, or ``orbit`` frames of a circle around the scene, to PNG files.
+    """Render the views of a split, ``orbit`` frames of a circle or ``flight`` frames past the photographs, as PNGs.
+
+    Frames of a circle or a flight can be made a film too: ``video`` names it, ``fps`` frames a second.
 
     Raises
     ------
-    RunError, DataError, DiskError
+    RunError, DataError, BackendError, DiskError
     """
+    from gs2d.io.video import write_video
+
+    moving = check_frames(orbit, flight, video, fps)
     run, job, splats = open_job(path, threads, on_event)
-    if not 0 <= orbit <= MOST_FRAMES:
-        raise RunError(f"--orbit must be a number of frames from 1 to {MOST_FRAMES}, got {orbit}")
     views: list[tuple[str, View]]
-    if orbit:
+    if moving:
         image = np.zeros((1, 1, 3), np.uint8)
-        cameras = orbit_cameras([view.camera for view in job.scene.train], orbit)
+        seen = [view.camera for view in job.scene.train]
+        cameras = orbit_cameras(seen, orbit) if orbit else flight_cameras(seen, flight)
         views = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, image)) for i, camera in enumerate(cameras)]
     else:
         chosen = job.scene.test if split == "test" else job.scene.train
@@ -153,9 +161,9 @@ def render_run(
         raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
     if out is not None:
         _spare_photographs(out, [name for name, _ in views], job)
-    folder = out or run.file(RENDERS) / ("orbit" if orbit else split)
+    folder = out or run.file(RENDERS) / (moving or split)
     made = make_folder(folder)
-    if orbit and out is None:  # the run's own folder: no frame of a longer circle stays among these
+    if moving and out is None:  # the run's own folder: no frame of a longer film stays among these
         for old in folder.glob("[0-9]*.png"):
             if old.stem.isdecimal():
                 old.unlink()
@@ -171,7 +179,38 @@ def render_run(
             picture.unlink(missing_ok=True)
         remove_made(made)
         raise
-    return {"folder": str(folder), "images": len(views)}
+    result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
+    if video is not None:
+        on_event(Phase("compressing the film", len(views)))
+        frames = [folder / f"{name}.png" for name, _ in views]
+        write_video(video, frames, fps=fps, threads=torch.get_num_threads(), on_frame=lambda done: on_event(Step(done)))
+        result |= {"video": str(video), "seconds": len(views) / fps, "video_bytes": video.stat().st_size}
+    return result
+
+
+def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> str:
+    """What moves: "orbit", "flight" or nothing; raises for what makes no film, before anything is loaded.
+
+    Raises
+    ------
+    RunError, DataError, BackendError
+    """
+    from gs2d.io.video import check_video
+
+    for name, frames in (("--orbit", orbit), ("--flight", flight)):
+        if not 0 <= frames <= MOST_FRAMES:
+            raise RunError(f"{name} must be a number of frames from 1 to {MOST_FRAMES}, got {frames}")
+    if orbit and flight:
+        raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; give one")
+    if video is None and fps != FPS:
+        raise RunError(f"--fps {fps:g} is of a film, and no --video was given; give both")
+    if video is not None:
+        if not (orbit or flight):
+            raise RunError("--video needs frames that move, got neither --orbit N nor --flight N; give one")
+        check_video(video, fps, orbit or flight)
+        if not video.parent.is_dir():
+            raise disk_error(video, FileNotFoundError(2, "No such file or directory"))
+    return "orbit" if orbit else "flight" if flight else ""
 
 
 def _spare_photographs(folder: Path, names: Sequence[str], job: Job) -> None:
@@ -180,29 +219,6 @@ def _spare_photographs(folder: Path, names: Sequence[str], job: Job) -> None:
     for name in names:
         if (folder / f"{name}.png").resolve() in photographs:
             raise RunError(f"--out {folder} holds the capture's photograph {name}.png; choose another folder")
-
-
-def orbit_cameras(cameras: list[Camera], frames: int) -> list[Camera]:
-    """A circle through the middle of where the cameras are, around the point they look at.
-
-    The axis is the mean of the cameras' up vectors; radius and height are those of the median camera.
-    """
-    focus = focus_point(cameras)
-    up = np.mean([-camera.rotation[1] for camera in cameras], axis=0)
-    up /= np.linalg.norm(up)
-    arms = np.array([camera.center for camera in cameras]) - focus  # [V, 3]
-    heights = arms @ up
-    radii = np.linalg.norm(arms - heights[:, None] * up, axis=1)
-    radius, height = float(np.median(radii)), float(np.median(heights))
-    side = arms[0] - heights[0] * up
-    side /= np.linalg.norm(side)
-    other = np.cross(up, side)
-    like = cameras[0]
-    circle = []
-    for angle in np.linspace(0, 2 * np.pi, frames, endpoint=False):
-        eye = focus + height * up + radius * (np.cos(angle) * side + np.sin(angle) * other)
-        circle.append(look_at(eye, focus, up, width=like.width, height=like.height, fx=like.fx, fy=like.fy))
-    return circle
 
 
 def evaluate_run(

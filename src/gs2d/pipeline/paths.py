@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import Akima1DInterpolator
 
-from gs2d.camera import Camera
+from gs2d.camera import Camera, look_at
+from gs2d.geometry import focus_point
 
 _SPREAD = 0.02  # of the cameras' horizontal axes, mean square, from which they tell what is up
+_MOST_IN_TOUR = 300  # cameras; more are passed by without being looked at
+_DETOUR = 1.6  # a way in the order of names may be so many times longer than a short one
+_FRAMES_A_STOP = 15  # of a flight: half a second from one photograph to the next
+_LEAST_STOPS = 4
+_AIMED = 0.5  # cosine between the axis of each camera and the way to what they look at
+_LEVEL = 0.1  # a level camera's x axis rises no more than this
+_STEEP = 0.98  # how far down a camera may look and still be kept level
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
@@ -26,3 +36,193 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
         up = -rotations[0, 1]
     up = up / np.linalg.norm(up)
     return np.asarray(up if up @ mean_up >= 0 else -up)
+
+
+def orbit_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A circle through the middle of where the cameras are, around the point they look at.
+
+    The axis is what is up; radius and height are those of the median camera.
+    """
+    focus = focus_point(cameras)
+    up = up_direction(cameras)
+    arms = np.array([camera.center for camera in cameras]) - focus  # [V, 3]
+    heights = arms @ up
+    radii = np.linalg.norm(arms - heights[:, None] * up, axis=1)
+    radius, height = float(np.median(radii)), float(np.median(heights))
+    side = arms[0] - heights[0] * up
+    side /= np.linalg.norm(side)
+    other = np.cross(up, side)
+    like = cameras[0]
+    circle = []
+    for angle in np.linspace(0, 2 * np.pi, frames, endpoint=False):
+        eye = focus + height * up + radius * (np.cos(angle) * side + np.sin(angle) * other)
+        circle.append(look_at(eye, focus, up, width=like.width, height=like.height, fx=like.fx, fy=like.fy))
+    return circle
+
+
+def flight_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """A smooth flight past the photographs, at an even pace (of place and of direction together).
+
+    Splines that hardly overshoot (Akima 1970) through some of the cameras: in the order of their names where that is a
+    way, else the most different ones, on a short tour. Where all cameras look at about one point, distance and
+    direction from there are interpolated, so that the flight goes round it; elsewhere places are. Cameras held level
+    stay level. The flight is closed if its ends meet; at the photographs on the way it is where they were taken.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        In the order of their names. Size and focal lengths are those of the first.
+    frames : int
+    """
+    if len(cameras) == 1:
+        return [cameras[0]] * frames
+    frame = _FlightFrame.of(cameras)
+    poses = frame.poses(cameras)
+    count = max(_LEAST_STOPS, frames // _FRAMES_A_STOP)
+    order = stops(poses, count)
+    steps = np.linalg.norm(np.diff(poses[order], axis=0), axis=1)
+    closed = len(order) > 3 and float(np.linalg.norm(poses[order[-1]] - poses[order[0]])) <= 1.5 * np.median(steps)
+    way = poses[[*order[-2:], *order, *order[:3]]] if closed else poses[order]
+    times = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(way, axis=0), axis=1), 1e-9))])
+    spline = Akima1DInterpolator(times, way)
+    first, last = (times[2], times[-3]) if closed else (times[0], times[-1])
+    dense = np.linspace(first, last, 50 * len(way))
+    seen = frame.seen(spline(dense))
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(seen, axis=0), axis=1))])
+    even = np.interp(np.linspace(0, gone[-1], frames, endpoint=not closed), gone, dense)
+    like, unit = cameras[0], frame.unit
+    return [
+        look_at(
+            unit * place, unit * (place + forward), up, width=like.width, height=like.height, fx=like.fx, fy=like.fy
+        )
+        for place, forward, up in frame.seen(spline(even)).reshape(-1, 3, 3)
+    ]
+
+
+@dataclass(frozen=True)
+class _FlightFrame:
+    """What a flight's poses are made of: a place (or a direction and a distance), where it looks, what is up.
+
+    Attributes
+    ----------
+    unit : float
+        The length that counts as much as a turn by a radian: the median distance to the focus, wu.
+    focus : ndarray [3] or None
+        What the flight goes round, in units; None if the cameras do not look at one point.
+    up : ndarray [3] or None
+        Up for all of it; None if the cameras were not held level.
+    """
+
+    unit: float
+    focus: np.ndarray | None
+    up: np.ndarray | None
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera]) -> _FlightFrame:
+        focus = focus_point(cameras)
+        arms = np.array([camera.center for camera in cameras]) - focus
+        distances = np.maximum(np.linalg.norm(arms, axis=1), 1e-12)
+        rotations = np.stack([camera.rotation for camera in cameras])
+        aims = -(arms * rotations[:, 2]).sum(axis=1) / distances
+        up = up_direction(cameras)
+        unit = float(np.median(distances))
+        round_it, level = float(aims.min()) > _AIMED, float(np.abs(rotations[:, 0] @ up).max()) < _LEVEL
+        # seen from straight above a level camera could turn about its axis at any moment
+        level = level and float(np.abs(rotations[:, 2] @ up).max()) < _STEEP
+        return cls(unit, focus / unit if round_it else None, up if level else None)
+
+    def poses(self, cameras: Sequence[Camera]) -> np.ndarray:
+        """Numbers [V, 11] that may be interpolated.
+
+        Place [3]; distance and rise, for flights round a focus, where the place is the direction from there; where the
+        camera looks [3], then as tangents aside and above the focus; what is up [3].
+        """
+        centers = np.array([camera.center for camera in cameras]) / self.unit
+        rotations = np.stack([camera.rotation for camera in cameras])
+        forward, up = rotations[:, 2], -rotations[:, 1]
+        distance, rise = np.ones((len(cameras), 1)), np.zeros((len(cameras), 1))
+        if self.focus is not None:
+            centers = centers - self.focus
+            distance = np.linalg.norm(centers, axis=1, keepdims=True)
+            centers = centers / distance
+            rise = rise if self.up is None else (centers @ self.up)[:, None]
+            aside, above = self._axes(-centers, up)
+            ahead = -(forward * centers).sum(1)
+            tangents = [(forward * axis).sum(1) / ahead for axis in (aside, above)]
+            forward = np.stack([*tangents, np.zeros(len(cameras))], axis=1)
+        return np.concatenate([centers, distance, rise, forward, up], axis=1)
+
+    def seen(self, poses: np.ndarray) -> np.ndarray:
+        """Places in units, unit directions, unit up vectors [n, 9] of interpolated poses."""
+        place, forward = poses[:, :3], poses[:, 5:8]
+        up = poses[:, 8:11] if self.up is None else np.broadcast_to(self.up, place.shape)
+        if self.focus is not None:
+            if self.up is not None:  # a great circle between two low places would go below both
+                rise = np.clip(poses[:, 4:5], -1, 1)
+                place = np.sqrt(1 - rise**2) * _unit_rows(place - (place @ self.up)[:, None] * self.up) + rise * self.up
+            place = _unit_rows(place)
+            aside, above = self._axes(-place, up)
+            forward = forward[:, :1] * aside + forward[:, 1:2] * above - place
+            place = self.focus + poses[:, 3:4] * place
+        forward = _unit_rows(forward)
+        return np.concatenate([place, forward, _unit_rows(up - (up * forward).sum(1, keepdims=True) * forward)], axis=1)
+
+    def _axes(self, ahead: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """To the right of and above unit directions [n, 3]."""
+        aside = _unit_rows(np.cross(ahead, up if self.up is None else self.up))
+        return aside, np.cross(aside, ahead)
+
+
+def _unit_rows(vectors: np.ndarray) -> np.ndarray:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+
+
+def stops(poses: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most ``count`` of the poses [V, C], in the order in which a flight passes them.
+
+    Evenly along the way from the first to the last where that is hardly longer than a tour (a walk, a film); else those
+    that are farthest from all chosen before, on a short tour from the first.
+    """
+    some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MOST_IN_TOUR)).round().astype(np.int64))
+    steps = np.linalg.norm(np.diff(poses[some], axis=0), axis=1)
+    short = tour(poses[some])
+    if steps.sum() <= _DETOUR * np.linalg.norm(np.diff(poses[some[short]], axis=0), axis=1).sum():
+        gone = np.concatenate([[0.0], np.cumsum(steps)])
+        wanted = np.linspace(0, gone[-1], min(count, len(gone)))
+        return np.asarray(some[np.unique(np.abs(gone[:, None] - wanted).argmin(axis=0))])
+    chosen, nearest = [0], np.linalg.norm(poses - poses[0], axis=1)
+    while len(chosen) < min(count, len(poses)):
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(poses - poses[chosen[-1]], axis=1))
+    return np.array(chosen)[tour(poses[chosen])]
+
+
+def tour(poses: np.ndarray) -> np.ndarray:
+    """A short order in which to pass by all poses [n, C], from the first: indices [n].
+
+    Always to the nearest that was not visited, and then uncrossed (2-opt: parts are reversed as long as that shortens).
+    """
+    distance = np.linalg.norm(poses[:, None] - poses[None], axis=2)  # [n, n]
+    n = len(poses)
+    left, way = np.ones(n, bool), [0]
+    left[0] = False
+    while left.any():
+        nearest = int(np.where(left, distance[way[-1]], np.inf).argmin())
+        way.append(nearest)
+        left[nearest] = False
+    order = np.array(way)
+    shorter = True
+    while shorter:
+        shorter = False
+        for i in range(n - 2):
+            ends, after = (
+                order[i + 2 :],
+                np.append(order[i + 3 :], -1),
+            )  # order[i + 1 ..] is reversed up to one of these
+            gain = distance[order[i], order[i + 1]] - distance[order[i], ends]
+            gain += np.where(after >= 0, distance[ends, after] - distance[order[i + 1], after], 0)
+            best = int(gain.argmax())
+            if gain[best] > 1e-9:
+                order[i + 1 : i + 3 + best] = order[i + 1 : i + 3 + best][::-1]
+                shorter = True
+    return order

@@ -1,0 +1,57 @@
+"""``gs2d render --orbit N | --flight N --video FILE``."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from cli_runs import one_line
+from gs2d.cli import run
+
+
+def test_a_flight_becomes_pictures_and_a_film(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy, film = tmp_path / "run", tmp_path / "film.webp"
+    shutil.copytree(trained, copy)
+    words = ["--flight", "5", "--video", str(film), "--fps", "10", "--threads", "1"]
+    assert run(["render", str(copy), *words]) == 0
+    out, err = capsys.readouterr()
+    assert "5 images in" in out
+    assert f"{film}: 0.5 s, 0.0 MB" in out
+    assert "compressing the film (5)" in err
+    assert len(list((copy / "renders" / "flight").glob("*.png"))) == 5
+    with Image.open(film) as pictures:
+        assert (pictures.size, pictures.n_frames) == ((20, 20), 5)
+    assert run(["render", str(copy), "--orbit", "2", "--video", str(film), "--json", "--threads", "1"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result == {
+        "folder": str(copy / "renders" / "orbit"),
+        "images": 2,
+        "video": str(film),
+        "seconds": pytest.approx(2 / 30),
+        "video_bytes": film.stat().st_size,
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--video", "a.webp"], "--video needs frames that move, got neither --orbit N nor --flight N"),
+        (["--orbit", "9", "--flight", "9"], "--orbit 9 and --flight 9 exclude each other"),
+        (["--flight", "-1"], "--flight must be a number of frames from 1 to 100000, got -1"),
+        (["--orbit", "9", "--fps", "25"], "--fps 25 is of a film, and no --video was given"),
+        (["--orbit", "9", "--video", "a.mov"], "--video must name a .mp4 or .webp file, got a.mov"),
+        (["--orbit", "1", "--video", "a.webp"], "--video needs at least 2 frames, got 1"),
+        (["--orbit", "9", "--video", "no/such/folder/a.webp"], "the folder does not exist"),
+    ],
+)
+def test_what_makes_no_film_is_one_line(
+    trained: Path, words: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["render", str(trained), *words]) == 2
+    assert named in one_line(capsys.readouterr().err)

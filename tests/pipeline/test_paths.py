@@ -1,0 +1,115 @@
+"""Flights along the photographs: where they pass, how evenly, what stays level."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from gs2d.camera import Camera, look_at
+from gs2d.pipeline.paths import flight_cameras, orbit_cameras, stops, tour
+from tiny import ball_cameras
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def looking(eye: tuple[float, float, float], target: tuple[float, float, float]) -> Camera:
+    return look_at(np.array(eye), np.array(target), UP, width=64, height=48, fx=60.0, fy=61.0)
+
+
+def ring(count: int, height: float = -0.4) -> list[Camera]:
+    """Level cameras on a circle, a little below what they look at."""
+    angles = 2 * np.pi * np.arange(count) / count
+    return [looking((3 * np.cos(a), 3 * np.sin(a), height), (0, 0, 0)) for a in angles]
+
+
+def corridor(count: int) -> list[Camera]:
+    """Level cameras in a row that look straight ahead."""
+    return [looking((0.3 * i, 0, 1), (0.3 * i, 5, 1)) for i in range(count)]
+
+
+def paces(flight: list[Camera]) -> np.ndarray:
+    return np.linalg.norm(np.diff([camera.center for camera in flight], axis=0), axis=1)
+
+
+def test_a_flight_along_a_ring_stays_on_it_and_is_closed() -> None:
+    flight = flight_cameras(ring(24), 90)
+    assert len(flight) == 90
+    centers = np.array([camera.center for camera in flight])
+    np.testing.assert_allclose(np.linalg.norm(centers, axis=1), np.hypot(3, 0.4), rtol=1e-3)
+    np.testing.assert_allclose(centers[:, 2], -0.4, atol=1e-3)  # a great circle between two would dip below
+    for camera in flight:
+        np.testing.assert_allclose(camera.forward, -camera.center / np.linalg.norm(camera.center), atol=5e-3)
+        assert abs(camera.rotation[0] @ UP) < 1e-9
+    steps = np.append(paces(flight), np.linalg.norm(centers[0] - centers[-1]))  # the last frame leads to the first
+    np.testing.assert_allclose(steps, 2 * np.pi * 3 / 90, rtol=0.1)
+
+
+def test_photographs_of_no_order_are_passed_on_a_short_tour() -> None:
+    cameras = ring(16)
+    shuffled = [cameras[i] for i in np.random.default_rng(0).permutation(16)]
+    flight = flight_cameras(shuffled, 240)
+    assert paces(flight).sum() < 1.1 * 2 * np.pi * 3  # once round, not to and fro
+    nearest = [np.linalg.norm([c.center - camera.center for c in flight], axis=1).min() for camera in cameras]
+    assert max(nearest) < 0.06  # by all of them
+
+
+def test_a_flight_along_a_walk_keeps_its_order_its_direction_and_its_ends() -> None:
+    walk = corridor(30)
+    flight = flight_cameras(walk, 60)
+    np.testing.assert_allclose(flight[0].T_cam_world, walk[0].T_cam_world, atol=1e-6)
+    np.testing.assert_allclose(flight[-1].T_cam_world, walk[-1].T_cam_world, atol=1e-6)
+    x = [camera.center[0] for camera in flight]
+    np.testing.assert_allclose(np.diff(x), 0.3 * 29 / 59, rtol=0.02)
+    assert (flight[7].width, flight[7].height, flight[7].fx, flight[7].fy) == (64, 48, 60.0, 61.0)
+
+
+def test_the_pace_is_even_over_places_and_turns() -> None:
+    # a walk, then on the spot a turn to the left: frames go to the turn, too
+    turning = [looking((2.7, 0, 1), (2.7 - np.sin(a), np.cos(a), 1)) for a in np.linspace(0, 1.5, 10)[1:]]
+    flight = flight_cameras([*corridor(10), *turning], 100)
+    angles = [np.arccos(np.clip(a.forward @ b.forward, -1, 1)) for a, b in itertools.pairwise(flight)]
+    together = np.array(angles) + paces(flight)
+    assert together.max() < 4 * together.min()
+    assert sum(angle > 0.01 for angle in angles) > 20
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_photographs_make_a_flight_too(count: int) -> None:
+    flight = flight_cameras(ball_cameras(6)[:count], 7)
+    assert len(flight) == 7
+    assert np.isfinite([camera.T_cam_world for camera in flight]).all()
+    np.testing.assert_allclose(flight[0].center, ball_cameras(6)[0].center, atol=1e-9)
+
+
+def test_two_photographs_from_the_same_place_do_not_stop_a_flight() -> None:
+    cameras = ring(6)
+    assert len(flight_cameras([*cameras, cameras[2], cameras[2]], 30)) == 30
+
+
+def test_a_tour_of_a_small_set_is_nearly_as_short_as_the_shortest() -> None:
+    for seed in range(5):
+        places = np.random.default_rng(seed).uniform(size=(7, 2))
+
+        def length(order: tuple[int, ...] | np.ndarray, places: np.ndarray = places) -> float:
+            return float(np.linalg.norm(np.diff(places[list(order)], axis=0), axis=1).sum())
+
+        found = tour(places)
+        assert sorted(found.tolist()) == list(range(7))
+        assert found[0] == 0
+        best = min(length((0, *rest)) for rest in itertools.permutations(range(1, 7)))
+        assert length(found) <= 1.25 * best
+
+
+def test_stops_of_a_walk_are_even_and_in_order_and_those_of_a_cloud_lie_far_apart() -> None:
+    walk = np.array([[0.0], [0.1], [0.2], [0.3], [3.0], [5.9], [6.0]])
+    assert stops(walk, 3).tolist() == [0, 4, 6]
+    cloud = np.array([[0.0, 0], [10, 10], [0, 0.1], [10, 0], [0.1, 0], [0, 10]])
+    assert sorted(stops(cloud, 4).tolist()) == [0, 1, 3, 5]
+
+
+def test_a_circle_lies_level_though_all_look_down_from_one_side() -> None:
+    circle = orbit_cameras(ball_cameras(40)[30:39:4], 8)
+    heights = [camera.center[2] for camera in circle]
+    np.testing.assert_allclose(heights, heights[0], atol=1e-6)
