@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from cli_runs import one_line
 from gs2d.cli import run
+from gs2d.cli.extras import EXTRAS
 from gs2d.data.colmap_model import ColmapCamera, ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run import RunFolder
@@ -217,3 +219,21 @@ def test_training_on_photographs_without_cameras_names_this_command(
     line = one_line(capsys.readouterr().err)
     assert f"got 3 photographs without any; find them first: gs2d poses {photos} --out CAPTURE" in line
     assert not (tmp_path / "run").exists()
+
+
+def test_the_doctor_says_whether_the_extra_is_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def version(name: str) -> str:
+        if name in ("pycolmap", "fast-simplification"):
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "1.2.3"
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    assert [extra.line() for extra in EXTRAS[:3]] == [
+        '  no   gs2d poses: pycolmap missing: pip install "2dgs-r[sfm]"',
+        '  no   gs2d mesh --texture: fast-simplification missing: pip install "2dgs-r[texture]"',
+        "  yes  gs2d paper --slurm: submitit 1.2.3",
+    ]
+    assert run(["doctor"]) == 0
+    assert "no   gs2d poses: pycolmap missing" in capsys.readouterr().out

@@ -164,7 +164,7 @@ def test_photographs_that_give_no_cameras_say_why_and_leave_nothing(
     photos = tmp_path / "photos"
     photos.mkdir()
     write(photos)
-    assert poses(photos, tmp_path / "new" / "capture", "--quiet") == 2
+    assert poses(photos, tmp_path / "new" / "capture", "--quiet", "--matching", "sequential") == 2
     assert re.search(expected, one_line(capsys.readouterr().err))
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
@@ -176,7 +176,7 @@ def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, caps
         camera = look_at(np.array([2.5, 2.0, 1.2]), target, UP, width=SIZE, height=SIZE, fx=FOCAL)
         (tmp_path / "photos").mkdir(exist_ok=True)
         Image.fromarray(room_picture(camera, textures())).save(tmp_path / "photos" / f"{i}.png")
-    assert poses(tmp_path / "photos", tmp_path / "capture") == 0
+    assert poses(tmp_path / "photos", tmp_path / "capture", "--matching", "similar", "--overlap", "1") == 0
     assert "the photographs were taken from nearly one place" in capsys.readouterr().err
 
 

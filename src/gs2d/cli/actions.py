@@ -241,6 +241,7 @@ def poses(command: c.Poses, console: Console) -> None:
 
 def doctor(_command: c.Doctor, console: Console) -> None:
     """``gs2d doctor``."""
+    from gs2d.cli.extras import EXTRAS
     from gs2d.io.run import machine, versions
     from gs2d.render.backend import backend_report
 
@@ -256,9 +257,12 @@ def doctor(_command: c.Doctor, console: Console) -> None:
                 console.say(f"         to get it: {status.remedy}")
     chosen = next((status.name for status in backends if status.available), "none")
     console.say(f"--backend auto takes: {chosen}")
+    for extra in EXTRAS:
+        console.say(extra.line())
     fields = ("name", "available", "reason", "remedy", "details")
     found = [{field: getattr(status, field) for field in fields} for status in backends]
-    console.result({"machine": host, "versions": installed, "backends": found, "auto": chosen})
+    extras = {extra.name: not extra.missing() for extra in EXTRAS}
+    console.result({"machine": host, "versions": installed, "backends": found, "auto": chosen, "extras": extras})
 
 
 def info(command: c.Info, console: Console) -> None:

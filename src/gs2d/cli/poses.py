@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 from gs2d.cli import commands as c
@@ -54,5 +55,5 @@ def poses_lines(result: dict[str, Any]) -> list[str]:
             f"{other['folder']} holds a separate piece: {len(other['photos'])} photographs, {other['points']:,} points"
         )
     capture = result["capture"]
-    lines.append(f"{capture}: look at {capture}/poses.png, then: gs2d train {capture} --out RUN")
+    lines.append(f"look at {capture}/poses.png, then: gs2d train {shlex.quote(capture)} --out RUN")
     return lines

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 from gs2d.data.capture import build_scene
@@ -44,7 +45,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     if photographs is not None and not lacking:
         raise DataError(
             f"{root} must hold cameras, got {_photographs(photographs)} photographs without any; find them first: "
-            f"gs2d poses {photographs} --out CAPTURE, then train CAPTURE"
+            f"gs2d poses {shlex.quote(str(photographs))} --out CAPTURE, then train CAPTURE"
         )
     raise DataError(
         f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import struct
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -134,10 +135,10 @@ def _not_a_folder(path: Path) -> str:
 
 
 def _frames_command(video: Path) -> str:
-    folder = video.stem
+    folder = shlex.quote(video.stem)
     return (
-        f"take frames from it: mkdir {folder}; ffmpeg -i {video.name} -vf fps=2 -q:v 2 {folder}/%05d.jpg; "
-        f"then gs2d poses {folder} --matching sequential"
+        f"take frames from it: mkdir {folder}; ffmpeg -i {shlex.quote(video.name)} -vf fps=2 -q:v 2 {folder}/%05d.jpg; "
+        f"then gs2d poses {folder} --out CAPTURE --matching sequential"
     )
 
 

@@ -29,7 +29,7 @@ def write_picture(path: Path, piece: Piece, title: str) -> None:
     centers = np.stack([-image.T_cam_world[:3, :3].T @ image.T_cam_world[:3, 3] for image in piece.images])
     points, colors = _thinned(piece)
     low, high = _limits(points, centers)
-    figure = Figure(figsize=(12, 6.4), dpi=110, layout="constrained")
+    figure = Figure(figsize=(12, 6.4), dpi=110, layout="compressed")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=11)
     for place, (name, across, upwards) in enumerate(_VIEWS, start=1):
