@@ -188,6 +188,7 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
 template <class V> struct Footprint {
     // |pixel - e| in the metric (a, b, c) is at most 1 inside the ellipse; slightly widened against rounding.
     V ex, ey, a, b, c;
+    V slope, half, inv_y2, y_right;  // the same ellipse by rows: see Chords in tile.h
     V disc2;                     // low-pass disc: radius^2, widened
     V x_min, y_min, x_max, y_max;  // exact box of both, px, not clipped
     mask_t<V> crosses;           // the disc reaches the camera plane: no ellipse, no box
@@ -251,6 +252,8 @@ GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S l
     const V inv = one / (det * V(S(1.004)));
     o.ex = r.cx + ex, o.ey = r.cy + ey;
     o.a = wyy * inv, o.b = -sxy * inv, o.c = wxx * inv;
+    o.slope = sxy / wyy, o.half = one / sqrt(o.a), o.inv_y2 = one / (wyy * V(S(1.004)));
+    o.y_right = sxy * sqrt(V(S(1.004)) / wxx);
     o.disc2 = fma(radius, radius * V(S(1.0002)), V(S(1e-3)));
     return o;
 }

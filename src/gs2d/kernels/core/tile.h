@@ -32,6 +32,27 @@ template <class V> GS2D_HD mask_t<V> reaches(const BoxTest<V>& s, V x0, V y0, V 
     return (f1 <= V(1)) | (f2 <= V(1)) | (fma(dx, dx, dy * dy) <= s.disc2);
 }
 
+// A footprint by rows: its ellipse holds x = ex + slope dy +- half sqrt(1 - inv_y2 dy^2) at the height ey + dy, and is
+// farthest to the right at dy = y_right, to the left at -y_right.
+template <class V> struct Chords {
+    V ex, ey, slope, half, inv_y2, y_right;
+    V cx, cy, disc2;  // low-pass disc
+};
+
+// What a footprint holds of the rows y0 to y1, from left to right; nothing where left > right. Both shapes hold (cx, cy), so
+// that this is one piece but where a far end of the ellipse comes back beside the disc.
+template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V& left, V& right) {
+    const V zero = V(0), far = V(1e30), a = y0 - s.ey, b = y1 - s.ey;
+    const V yr = min(max(s.y_right, a), b), yl = min(max(-s.y_right, a), b);
+    const V r2 = fnma(yr * s.inv_y2, yr, V(1)), l2 = fnma(yl * s.inv_y2, yl, V(1));
+    const auto in = r2 >= zero;
+    right = select(in, fma(s.half, sqrt(max(r2, zero)), fma(s.slope, yr, s.ex)), -far);
+    left = select(in, fnma(s.half, sqrt(max(l2, zero)), fma(s.slope, yl, s.ex)), far);
+    const V dy = min(max(s.cy, y0), y1) - s.cy, d2 = fnma(dy, dy, s.disc2), d = sqrt(max(d2, zero));
+    const auto near = d2 >= zero;
+    right = max(right, select(near, s.cx + d, -far)), left = min(left, select(near, s.cx - d, far));
+}
+
 // The exact box of a footprint, px, not clipped.
 template <class S> struct PixelBox {
     S x_min, y_min, x_max, y_max;

@@ -51,7 +51,7 @@ bool list_entries(Frame& f) {
 
 bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
     if (!load_target(f, image, mask)) return false;
-    const BlockBoxes boxes;
+    const BlockRows rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), lx = lane_x(0), ly = lane_y(0);
     parallel_ranges(f.count, 256, [&](int64_t begin, int64_t end) {
@@ -65,7 +65,7 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
                 for (int tx = r.x0; tx < r.x1; ++tx) {
                     const real x0 = real(tx * TILE), y0 = real(ty * TILE);
                     const real* target = &f.target[(size_t(ty) * f.tiles_x + tx) * PLANES * PIXELS];
-                    for (uint32_t left = blocks_touched(f.cull[i], boxes, x0, y0); left; left &= left - 1) {
+                    for (uint32_t left = blocks_touched(f, static_cast<uint32_t>(i), rows, x0, y0); left; left &= left - 1) {
                         const int b = __builtin_ctz(left);
                         const V x = lx + V(x0 + real(block_x(b))), y = ly + V(y0 + real(block_y(b)));
                         const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
@@ -80,7 +80,7 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
 
 bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
     if (!bin_splats(f) || !list_entries(f) || !load_target(f, image, mask) || !f.saved.reserve(f.tile_begin[f.tiles])) return false;
-    const BlockBoxes boxes;
+    const BlockRows rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff));
     parallel_for(f.tiles, [&](int64_t tile) {
@@ -93,7 +93,7 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
             const uint32_t splat = f.entries[e].splat;
             const Record<V> s = broadcast(&f.records[size_t(splat) * RECORD]);
             V total = V(0);
-            for (uint32_t left = blocks_touched(f.cull[splat], boxes, real(a.x0), real(a.y0)); left; left &= left - 1) {
+            for (uint32_t left = blocks_touched(f, splat, rows, real(a.x0), real(a.y0)); left; left &= left - 1) {
                 const int b = __builtin_ctz(left);
                 const V x = lx + V(real(block_x(b))), y = ly + V(real(block_y(b)));
                 const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);

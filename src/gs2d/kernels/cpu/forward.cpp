@@ -43,6 +43,7 @@ inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
 // Splats are first intersected BATCH at a time and then composited: the long chain of an intersection does not depend
 // on the pixel's state, and so many of them overlap; the state stays in registers while it is used.
 constexpr int BATCH = 8;
+constexpr int UNROLL = REGISTERS >= 32 ? BATCH : 1;  // gcc unrolls loops of 8 rounds: without registers, the state goes to memory each round
 
 // What the intersections leave: one row per splat.
 struct Batch {
@@ -58,9 +59,12 @@ inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b,
     };
     const auto add = [&](int i, V weight) { accumulate(broadcast(w.records[list[i]]), weight, load(batch.depth[i]), p); };
     if constexpr (REGISTERS >= 32) {
+#pragma GCC unroll UNROLL
         for (int i = 0; i < count; ++i) add(i, weigh(i));
     } else {  // the state of a pixel does not fit: first one half of it, then the other
+#pragma GCC unroll UNROLL
         for (int i = 0; i < count; ++i) store(batch.alpha[i], weigh(i));
+#pragma GCC unroll UNROLL
         for (int i = 0; i < count; ++i) add(i, load(batch.alpha[i]));
     }
 }
@@ -73,6 +77,7 @@ void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const Blen
     for (int j = 0; j < count; j += BATCH) {
         Batch batch;
         const int m = count - j < BATCH ? count - j : BATCH;
+#pragma GCC unroll UNROLL
         for (int i = 0; i < m; ++i) {
             const uint32_t e = w.list[j + i];
             const Record<V> s = broadcast(w.records[e]);
@@ -81,6 +86,7 @@ void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const Blen
             store(batch.depth[i], h.depth);
             store(batch.inverse_depth[i], V(w.inverse_zc[e]) * h.Q);
         }
+#pragma GCC unroll UNROLL
         for (int i = 0; i < m; ++i)  // a loop of its own: shorter chains, so that more of them overlap
             store(batch.alpha[i], alpha_of(V(w.records[w.list[j + i]][9]), load(batch.alpha[i]), load(batch.depth[i]), limits));
         if (any(p.live & ((p.alpha <= V(0)) | (p.T > V(real(0.5))))))
@@ -93,21 +99,28 @@ void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const Blen
 }
 
 // Entries of the chunk that reach a live block, with their records side by side.
-int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockBoxes& boxes, const TileArea& area) {
+int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockRows& boxes, const TileArea& area) {
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
     int m = 0;
     constexpr int AHEAD = 16;  // what a splat needs lies far apart: ask for it early
-    for (int i = 0; i < n; ++i) {
-        const uint32_t splat = entries[i].splat;
-        if (i + AHEAD < n) {
-            __builtin_prefetch(&f.cull[entries[i + AHEAD].splat]);
-            __builtin_prefetch(&f.records[size_t(entries[i + AHEAD].splat) * RECORD]);
+    constexpr int TOGETHER = BlockRows::SPLATS;
+    for (int i = 0; i < n; i += TOGETHER) {
+        uint32_t splats[TOGETHER], touched[TOGETHER];
+        for (int j = 0; j < TOGETHER; ++j) {
+            splats[j] = entries[i + j < n ? i + j : n - 1].splat;
+            if (i + j + AHEAD < n) {
+                __builtin_prefetch(&f.cull[entries[i + j + AHEAD].splat]);
+                __builtin_prefetch(&f.records[size_t(entries[i + j + AHEAD].splat) * RECORD]);
+            }
         }
-        const uint32_t touched = f.view.exact_masks ? blocks_touched(f.cull[splat], boxes, real(area.x0), real(area.y0)) : ALL_BLOCKS;
-        w.splats[m] = splat;
-        w.touched[m] = touched & wanted;
-        m += (touched & wanted) != 0;
+        blocks_touched(f, splats, boxes, real(area.x0), real(area.y0), touched);
+        for (int j = 0; j < TOGETHER && i + j < n; ++j) {
+            const uint32_t blocks = (f.view.exact_masks ? touched[j] : ALL_BLOCKS) & wanted;
+            w.splats[m] = splats[j];
+            w.touched[m] = blocks;
+            m += blocks != 0;
+        }
     }
     for (int i = 0; i < m; ++i) {
         memcpy(w.records[i], &f.records[size_t(w.splats[i]) * RECORD], sizeof w.records[i]);
@@ -157,7 +170,7 @@ RowLines images_written(const Frame& f, const Images& out) {
     return lines;
 }
 
-void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlockBoxes& boxes,
+void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlockRows& boxes,
                 const BlendLimits<V>& limits) {
     TileWork w;
     const TileArea area = tile_area(f, tile);
@@ -188,7 +201,7 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
 
 bool blend_tiles(Frame& f, const Images& out) {
     if (!f.tile_count.reserve(f.tiles) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
-    const BlockBoxes boxes;
+    const BlockRows boxes;
     const BlendLimits<V> limits = limits_of(f.view);
     const RowLines written = images_written(f, out);
     parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, written, boxes, limits); });

@@ -81,8 +81,8 @@ inline bool wants_geometry(const ParameterGradients& g) {
 
 // Box tests per (tile, splat), in pixels: see Footprint.
 struct CullRecord {
-    real ex, ey, a, b, c;
-    real cx, cy, disc2;  // disc2 < 0: unbounded, covers everything
+    real ex, ey, slope, half;
+    real inv_y2, y_right, disc2, unused;  // disc2 < 0: unbounded, covers everything
 };
 
 using TileRect = TileRectangle;

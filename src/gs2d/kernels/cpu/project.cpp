@@ -80,7 +80,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const V fields[RECORD] = {r.cx, r.cy, r.au, r.bu, r.av, r.bv, r.az, r.bz,
                                       r.zc, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
             store_rows<RECORD>(&f.records[i * RECORD], RECORD, lanes, fields);
-            const V cull[8] = {o.ex, o.ey, o.a, o.b, o.c, r.cx, r.cy, select(o.unbounded, V(-1), o.disc2)};
+            const V cull[8] = {o.ex, o.ey, o.slope, o.half, o.inv_y2, o.y_right, select(o.unbounded, V(-1), o.disc2), V(0)};
             store_rows<8>(reinterpret_cast<real*>(&f.cull[i]), 8, lanes, cull);
             alignas(64) real box[4][LANES];
             store(box[0], o.x_min), store(box[1], o.y_min), store(box[2], o.x_max), store(box[3], o.y_max);

@@ -78,6 +78,23 @@ GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* ou
 }
 #endif
 
+#if !defined(GS2D_OWN_SPREAD)
+// v[k] lane i = rows[i / 8][k], k < 4.
+GS2D_HD void spread(const real* const* rows, V* v) {
+    static_assert(LANES == 8);
+    for (int k = 0; k < 4; ++k) v[k] = V(rows[0][k]);
+}
+#endif
+#if !defined(GS2D_OWN_INTERLEAVE)
+// Bit 4 i + k is lane i of m[k], k < 4.
+GS2D_HD uint64_t interleave(const M* m) {
+    uint64_t all = 0;
+    for (int k = 0; k < 4; ++k)
+        for (uint64_t left = bits(m[k]); left; left &= left - 1) all |= uint64_t(1) << (4 * __builtin_ctzll(left) + k);
+    return all;
+}
+#endif
+
 #if !defined(GS2D_DOUBLE)
 // 2^x for x in [-126, 127]; relative error below 2e-7. Degree 5, minimax on [-1/2, 1/2].
 GS2D_HD V exp2_small(V x) {

@@ -95,6 +95,15 @@ GS2D_HD void transpose(V* v) {
     }
 }
 
+#define GS2D_OWN_INTERLEAVE
+// Bit 4 i + k is lane i of m[k], k < 4: byte k of that lane comes from m[k].
+GS2D_HD uint64_t interleave(const M* m) {
+    const __m256i even = _mm256_blend_epi16(_mm256_castps_si256(m[0].m), _mm256_castps_si256(m[2].m), 0xaa);
+    const __m256i odd = _mm256_blend_epi16(_mm256_castps_si256(m[1].m), _mm256_castps_si256(m[3].m), 0xaa);
+    const __m256i low = _mm256_set1_epi16(0xff);
+    return static_cast<uint32_t>(_mm256_movemask_epi8(_mm256_or_si256(_mm256_and_si256(low, even), _mm256_andnot_si256(low, odd))));
+}
+
 #define GS2D_OWN_INDICES
 // Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
 GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {

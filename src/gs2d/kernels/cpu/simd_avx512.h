@@ -84,6 +84,25 @@ GS2D_HD void transpose(V* v) {
     }
 }
 
+#define GS2D_OWN_SPREAD
+// v[k] lane i = rows[i / 4][k], k < 4.
+GS2D_HD void spread(const float* const* rows, V* v) {
+    __m512 r = _mm512_castps128_ps512(_mm_loadu_ps(rows[0]));
+    r = _mm512_insertf32x4(r, _mm_loadu_ps(rows[1]), 1);
+    r = _mm512_insertf32x4(r, _mm_loadu_ps(rows[2]), 2);
+    r = _mm512_insertf32x4(r, _mm_loadu_ps(rows[3]), 3);
+    v[0] = _mm512_permute_ps(r, 0x00), v[1] = _mm512_permute_ps(r, 0x55);
+    v[2] = _mm512_permute_ps(r, 0xaa), v[3] = _mm512_permute_ps(r, 0xff);
+}
+
+#define GS2D_OWN_INTERLEAVE
+// Bit 4 i + k is lane i of m[k], k < 4.
+GS2D_HD uint64_t interleave(const M* m) {
+    constexpr uint64_t every = 0x1111111111111111u;
+    return _pdep_u64(bits(m[0]), every) | _pdep_u64(bits(m[1]), every << 1) | _pdep_u64(bits(m[2]), every << 2) |
+           _pdep_u64(bits(m[3]), every << 3);
+}
+
 #define GS2D_OWN_INDICES
 // Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
 GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {

@@ -134,30 +134,45 @@ class RowsAhead {
     int left_ = 0, at_ = 0, each_ = 0;
 };
 
-// Corners of the pixel centres of all blocks, relative to the tile, LANES blocks (whole rows of them) per vector.
-struct BlockBoxes {
-    V x0, y0[BLOCKS / LANES];
-    BlockBoxes() {
-        static_assert(LANES % BLOCKS_X == 0);
-        alignas(64) real x[BLOCKS], y[BLOCKS];
-        for (int b = 0; b < BLOCKS; ++b) x[b] = real(block_x(b)) + real(0.5), y[b] = real(block_y(b)) + real(0.5);
-        x0 = load(x);
-        for (int i = 0; i < BLOCKS / LANES; ++i) y0[i] = load(y + i * LANES);
+// The rows of a tile's blocks: lane i is for row i % ROWS, of one of SPLATS splats that are tested at once.
+struct BlockRows {
+    static constexpr int ROWS = BLOCKS / BLOCKS_X, SPLATS = LANES / ROWS;
+    V first;  // pixel centres, relative to the tile
+    BlockRows() {
+        static_assert(LANES % ROWS == 0);
+        alignas(64) real y[LANES];
+        for (int i = 0; i < LANES; ++i) y[i] = real(i % ROWS * BLOCK_H) + real(0.5);
+        first = load(y);
     }
 };
 
-// Bit b: the splat's ellipse or low-pass disc reaches a pixel centre of block b, or nearly so.
-inline uint32_t blocks_touched(const CullRecord& s, const BlockBoxes& boxes, real tile_x, real tile_y) {
-    if (s.disc2 < 0) return ALL_BLOCKS;
-    const BoxTest<V> test = {V(s.ex - tile_x), V(s.ey - tile_y), V(s.a), V(s.b), V(s.c),
-                             V(s.cx - tile_x), V(s.cy - tile_y), V(s.disc2), V(-s.b / s.c), V(-s.b / s.a)};
-    uint32_t mask = 0;
-    const V x0 = boxes.x0, x1 = x0 + V(real(BLOCK_W - 1));
-    for (int i = 0; i < BLOCKS / LANES; ++i) {
-        const V y0 = boxes.y0[i], y1 = y0 + V(real(BLOCK_H - 1));
-        mask |= bits(reaches(test, x0, y0, x1, y1)) << (i * LANES % 32);
+// For SPLATS splats. Bit b: the splat's ellipse or low-pass disc reaches a pixel centre of block b, or nearly so.
+inline void blocks_touched(const Frame& f, const uint32_t* splats, const BlockRows& rows, real tile_x, real tile_y, uint32_t* masks) {
+    constexpr int N = BlockRows::SPLATS;
+    const real *shape[N], *more[N], *record[N];
+    for (int j = 0; j < N; ++j) {
+        shape[j] = &f.cull[splats[j]].ex, more[j] = shape[j] + 4;
+        record[j] = &f.records[size_t(splats[j]) * RECORD];
     }
-    return mask;
+    V a[4], b[4], c[4];
+    spread(shape, a), spread(more, b), spread(record, c);
+    const V x = V(tile_x), y = V(tile_y);
+    const Chords<V> chords = {a[0] - x, a[1] - y, a[2], a[3], b[0], b[1], c[0] - x, c[1] - y, b[2]};
+    V left, right;
+    reach_in_rows(chords, rows.first, rows.first + V(real(BLOCK_H - 1)), left, right);
+    M columns[BLOCKS_X];
+    for (int i = 0; i < BLOCKS_X; ++i)
+        columns[i] = (right >= V(real(i * BLOCK_W) + real(0.5))) & (left <= V(real(i * BLOCK_W + BLOCK_W - 1) + real(0.5)));
+    const uint64_t all = interleave(columns);
+    for (int j = 0; j < N; ++j) masks[j] = shape[j][6] < 0 ? ALL_BLOCKS : uint32_t(all >> (j * BLOCKS % 64)) & ALL_BLOCKS;
+}
+
+// For one splat.
+inline uint32_t blocks_touched(const Frame& f, uint32_t splat, const BlockRows& rows, real tile_x, real tile_y) {
+    uint32_t splats[BlockRows::SPLATS], masks[BlockRows::SPLATS];
+    for (uint32_t& s : splats) s = splat;
+    blocks_touched(f, splats, rows, tile_x, tile_y, masks);
+    return masks[0];
 }
 
 }  // namespace gs2d
