@@ -53,10 +53,16 @@ def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path
 
 
 def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: Path) -> None:
-    for name in ("a b.png", "a_b.png", "c.tif", "c.tif.png"):
+    for name in ("a b.png", "a_b.png", "c.tif", "c.tif.png", "d\udcff.png"):
         picture(tmp_path / name)
     names = {photo.label: photo.name for photo in photos_of(tmp_path)}
-    assert names == {"a b.png": "a_b.png", "a_b.png": "_a_b.png", "c.tif": "c.tif.png", "c.tif.png": "_c.tif.png"}
+    assert names == {
+        "a b.png": "a_b.png",
+        "a_b.png": "_a_b.png",
+        "c.tif": "c.tif.png",
+        "c.tif.png": "_c.tif.png",
+        "d\udcff.png": "d?.png",
+    }
 
 
 def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path) -> None:

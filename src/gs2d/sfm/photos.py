@@ -48,7 +48,7 @@ class Photo:
     label : str
         Its path below the user's folder, with ``/``: what messages call it.
     name : str
-        Its path below ``images/`` of the capture: no white space (COLMAP's lists have none), ``.png`` where converted.
+        Its path below ``images/`` of the capture: UTF-8 without white space, as COLMAP's lists; ``.png`` if converted.
     size : (int, int)
         Width and height as it is seen, px: after its EXIF orientation.
     orientation : int
@@ -188,11 +188,11 @@ def _exif(path: Path) -> tuple[int, tuple[str, ...]]:
 
 
 def _names(labels: Sequence[str]) -> list[str]:
-    """Names in the capture: white space becomes ``_``; made different again where that made two the same."""
+    """Names in the capture: white space becomes ``_``, what is not UTF-8 ``?``; names stay different."""
     names: list[str] = []
     taken = set()
     for label in labels:
-        name = "_".join(label.split())
+        name = "_".join(label.split()).encode("utf-8", "replace").decode("utf-8")
         if Path(name).suffix.lower() in CONVERTED:
             name += ".png"
         while name.lower() in taken:  # file systems that do not tell cases apart

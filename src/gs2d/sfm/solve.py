@@ -20,7 +20,9 @@ from gs2d.disk import atomic_write
 from gs2d.errors import BackendError, DataError
 
 OnProgress = Callable[[str, int, int], None]  # name of the phase, steps done, steps in all
-MISSING = 'structure from motion needs pycolmap, which is not installed: pip install "2dgs-r[sfm]"'
+MISSING = (
+    'structure from motion needs pycolmap, which is not installed: pip install "2dgs-r[sfm]", or pip install pycolmap'
+)
 POLL_SECONDS = 0.5
 _COUNTED = {"features": "keypoints", "matching": "two_view_geometries"}  # phase -> table that grows by one a step
 _PHASES = {
@@ -168,7 +170,7 @@ def _last_words(phase: str, code: int, log: Path) -> str:
     lines = [line.strip() for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
     how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
     said = lines[-1][:300] if lines else "it said nothing"
-    remedy = "give it less with --threads 2 or --feature-size 1000" if code < 0 else "see if the disk is full"
+    remedy = "give it less: --threads 2, --feature-size 1000" if code < 0 else "if the disk is not full, report it"
     return f"COLMAP {how} while {_PHASES.get(phase, 'it started')}: {said}; {remedy}"
 
 
