@@ -115,6 +115,24 @@ def test_sums_are_the_same_with_and_without_room_in_the_gradient_of_the_coeffici
     assert all(torch.equal(inside[name], outside[name]) for name in (*names, "probe"))
 
 
+def test_gradients_written_over_sums_are_the_same_for_any_number_of_coefficients(
+    native: Library, room: Workload
+) -> None:
+    # 45 and 24 reals a row over 16 of sums: row i is written where the sums of splats 2.8 i and 1.5 i were. 9: no room
+    splats, found = room.splats, {}
+    for stored in (15, 8, 3):
+        cut = Workload(room.name, replace(splats, shN=splats.shN[:, :stored].contiguous()), room.cameras)
+        passes = Passes(native, cut, 1, probe_columns=4)
+        output = passes.forward()
+        inputs = [*(t for _, t in passes.leaves.items()), passes.signal]
+        found[stored] = torch.autograd.grad((output.color**2).sum() + output.distortion.sum(), inputs)
+    for stored in (8, 3):
+        for of_all, gradient, tensor in zip(found[15], found[stored], inputs, strict=True):
+            part = of_all if of_all.shape == gradient.shape else of_all[:, :stored]
+            assert torch.equal(part, gradient), tensor.shape
+    assert not found[15][5][:, 3:].any()  # degree 1
+
+
 @pytest.mark.parametrize("name", ["reference", "cpu"])
 def test_every_backend_masks_rows(name: str) -> None:
     backend = get_backend(name)

@@ -125,6 +125,20 @@ __attribute__((noinline)) void pass_by(const real* record, uint32_t blocks, Plan
     }
 }
 
+// The sums over a splat's pixels that follow from weight and alpha alone.
+struct ColorSums {
+    real sums[7][LANES];
+    void put(const PairSums<V>& s) {
+        const V values[7] = {s.ln_alpha, s.red, s.green, s.blue, s.nx, s.ny, s.nz};
+        for (int k = 0; k < 7; ++k) store(sums[k], values[k]);
+    }
+    void get(PairSums<V>& s) const {
+        V* const values[7] = {&s.ln_alpha, &s.red, &s.green, &s.blue, &s.nx, &s.ny, &s.nz};
+        for (int k = 0; k < 7; ++k) *values[k] = load(sums[k]);
+    }
+};
+constexpr bool COLORS_FIT = REGISTERS >= 32;  // the registers hold them beside what moves T and S on
+
 // Pairs (splat, block) of some splats in a row. They are worked on in passes, each with a short chain of operations, so that
 // those of many pairs overlap, and with little enough to remember for the registers: the planes; alphas; what moves T and S
 // on; and the sums, splat by splat.
@@ -132,7 +146,9 @@ struct Batch {
     static constexpr int PAIRS = BLOCKS;  // as many as a splat may have; more would push the pixels out of the first cache
     alignas(64) real u[PAIRS][LANES], v[PAIRS][LANES], Q[PAIRS][LANES], rq[PAIRS][LANES], depth[PAIRS][LANES], rho[PAIRS][LANES];
     real alpha[PAIRS][LANES];               // in the end dL/d ln(alpha)
-    real w[PAIRS][LANES], z[PAIRS][LANES];  // weight, dL/dz
+    real z[PAIRS][LANES];                          // dL/dz
+    real w[COLORS_FIT ? 1 : PAIRS][LANES];         // weight
+    ColorSums colors[COLORS_FIT ? PAIRS : 1];      // of each splat
     M ray[PAIRS];
     uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch
     // Of each splat. Its pairs are those before `end`; filtered: the low-pass filter decided one of them.
@@ -187,14 +203,33 @@ template <bool WithQ> inline void find_hits(Batch& w, const Centres& centres, co
 }
 
 template <bool Geo, bool Dist> inline void weigh_pairs(Batch& w, Planes s, const BlendLimits<V>& limits) {
-    for (int i = 0; i < w.pairs; ++i) {
-        const int j = w.splat[i], at = w.block[i] * LANES;
+    const auto weigh = [&](int i, const Record<V>& splat, V inverse_zc, const PixelGradient<V>& g) {
+        const int at = w.block[i] * LANES;
         V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
         const V Q = Dist ? load(w.Q[i]) : V(0);
-        const PairGradient<V> p = weigh_vjp<Geo, Dist>(broadcast(w.record[j]), V(w.inverse_zc[j]), load(w.depth[i]), Q,
-                                                       load(w.alpha[i]), limits, load_gradient(s, w.block[i]), pixel_T, pixel_S);
+        const PairGradient<V> p =
+            weigh_vjp<Geo, Dist>(splat, inverse_zc, load(w.depth[i]), Q, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
         store(&s[T][at], pixel_T), store(&s[S][at], pixel_S);
-        store(w.w[i], p.w), store(w.alpha[i], p.ln_alpha), store(w.z[i], p.z);
+        store(w.alpha[i], p.ln_alpha), store(w.z[i], p.z);
+        return p;
+    };
+    if constexpr (COLORS_FIT) {  // splat by splat: what is added up needs the same pixels, and the splat stays in registers
+        for (int j = 0, i = 0; j < w.splats; ++j) {
+            const Record<V> splat = broadcast(w.record[j]);
+            const V inverse_zc = V(w.inverse_zc[j]), zero = V(0);
+            PairSums<V> sums;
+            sums.ln_alpha = sums.red = sums.green = sums.blue = sums.nx = sums.ny = sums.nz = zero;
+            do {
+                const PixelGradient<V> g = load_gradient(s, w.block[i]);
+                add_colors<Geo>(g, weigh(i, splat, inverse_zc, g), sums);
+            } while (++i < w.end[j]);
+            w.colors[j].put(sums);
+        }
+    } else {
+        for (int i = 0; i < w.pairs; ++i) {
+            const int j = w.splat[i];
+            store(w.w[i], weigh(i, broadcast(w.record[j]), V(w.inverse_zc[j]), load_gradient(s, w.block[i])).w);
+        }
     }
 }
 
@@ -202,7 +237,7 @@ template <bool Geo, bool Dist> inline void weigh_pairs(Batch& w, Planes s, const
 template <bool Geo, bool Abs, bool Filtered>
 inline void sum_pairs(const Batch& w, int first, int end, const Record<V>& splat, const Planes s, const Centres& centres,
                       PairSums<V>& sums) {
-    const auto pair = [&](int i) -> PairGradient<V> { return {load(w.w[i]), load(w.alpha[i]), load(w.z[i])}; };
+    const auto pair = [&](int i) -> PairGradient<V> { return {COLORS_FIT ? V(0) : load(w.w[COLORS_FIT ? 0 : i]), load(w.alpha[i]), load(w.z[i])}; };
     const auto geometry = [&](int i) {
         const int b = w.block[i];
         Hit<V> h;
@@ -211,13 +246,9 @@ inline void sum_pairs(const Batch& w, int first, int end, const Record<V>& splat
         if constexpr (Filtered) h.ray = w.ray[i];
         add_geometry<Geo, Abs, Filtered, false>(splat, centres.at_x(b) - splat.cx, centres.at_y(b) - splat.cy, h, pair(i), sums);
     };
-    const auto colors = [&](int i) { add_colors<Geo>(load_gradient(s, w.block[i]), pair(i), sums); };
-    if constexpr (REGISTERS >= 32) {
-        for (int i = first; i < end; ++i) geometry(i), colors(i);
-    } else {  // the sums do not fit: first one half of them, then the other
-        for (int i = first; i < end; ++i) geometry(i);
-        for (int i = first; i < end; ++i) colors(i);
-    }
+    for (int i = first; i < end; ++i) geometry(i);
+    if constexpr (!COLORS_FIT)
+        for (int i = first; i < end; ++i) add_colors<Geo>(load_gradient(s, w.block[i]), pair(i), sums);
 }
 
 template <bool Abs>
@@ -242,6 +273,7 @@ __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const
         const V zero = V(0);
         PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
                             zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+        if constexpr (COLORS_FIT) w.colors[j].get(sums);
         const Record<V> splat = broadcast(w.record[j]);
         if (w.filtered[j])
             sum_pairs<Geo, Abs, true>(w, first, w.end[j], splat, s, centres, sums);

@@ -112,12 +112,14 @@ struct GradientChunk {
     std::atomic<int64_t> tasks_left, sums_left;  // tasks that blend it, and that add its slots to the sums
 };
 
-// Sums of the gradients of each splat's record over the tiles: GRADIENT reals, then `extras` of GRADIENT_EXTRA.
+// Sums of the gradients of each splat's record over the tiles.
 struct Sums {
-    real* data;
-    int64_t stride;  // in reals
-    int extras;      // 0, or 2 or 4 where the densification signal is wanted
-    real* row(int64_t splat) const { return data + splat * stride; }
+    real* data;     // [N, GRADIENT]
+    real* extras;   // [N, columns]: those of GRADIENT_EXTRA that the densification signal wants, where its gradient will be
+    int columns;    // 0, 2 or 4
+    int64_t coefficient_row;  // 0, or `data` is the beginning of shN's gradient, whose rows have this many reals
+    real* row(int64_t splat) const { return data + splat * GRADIENT; }
+    real* extra(int64_t splat) const { return extras + splat * columns; }
 };
 
 // Bytes of the arrays of a forward pass over n splats.

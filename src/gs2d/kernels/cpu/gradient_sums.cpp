@@ -6,11 +6,8 @@ namespace {
 constexpr int64_t LEAST_SLOTS = 4096;  // of a chunk, where there are as many
 constexpr int BATCH = 256;             // entries looked at before their slots are added
 
-// Reals of sums of each splat.
-int sums_width(const ParameterGradients& out) { return GRADIENT + (out.probe ? static_cast<int>(out.probe_columns) : 0); }
-
-// The row of a splat's coefficients' gradients is written last, and read by nobody else: the sums wait there.
-bool fits_in_coefficients(const ParameterGradients& out, int64_t sh_rest) { return out.shN && 3 * sh_rest >= sums_width(out); }
+// The gradients of the coefficients are written last, and read by nobody else: the sums wait there, side by side.
+bool fits_in_coefficients(const ParameterGradients& out, int64_t sh_rest) { return out.shN && 3 * sh_rest >= GRADIENT; }
 
 constexpr size_t slot_bytes(bool extras) { return GRADIENT * sizeof(real) + (extras ? GRADIENT_EXTRA * sizeof(real) + 1 : 0); }
 
@@ -38,14 +35,14 @@ bool GradientSums::prepare() {
     const int64_t most = f.slot_begin[f.tiles] / (LEAST_SLOTS / 2);
     if (!f.chunks.reserve((most < f.tiles ? most : f.tiles) + 3)) return false;
     cut_into_chunks();
-    f.sums = {out_.shN, 3 * sh_rest_, sums_width(out_) - GRADIENT};
+    f.sums = {out_.shN, out_.probe, out_.probe ? static_cast<int>(out_.probe_columns) : 0, 3 * sh_rest_};
     if (!fits_in_coefficients(out_, sh_rest_)) {
-        f.sums.stride = sums_width(out_);
-        if (!f.own_sums.reserve(f.count * f.sums.stride)) return false;
-        f.sums.data = f.own_sums.data;
+        if (!f.own_sums.reserve(f.count * GRADIENT)) return false;
+        f.sums.data = f.own_sums.data, f.sums.coefficient_row = 0;
     }
-    parallel_ranges(f.count, 1024, [&](int64_t first, int64_t last) {
-        for (int64_t i = first; i < last; ++i) memset(f.sums.row(i), 0, sums_width(out_) * sizeof(real));
+    parallel_ranges(f.count, 2048, [&](int64_t first, int64_t last) {
+        memset(f.sums.row(first), 0, (last - first) * GRADIENT * sizeof(real));
+        if (f.sums.columns) memset(f.sums.extra(first), 0, (last - first) * f.sums.columns * sizeof(real));
     });
     return f.scratch.reserve(2 * chunk_bytes(f.largest_chunk, out_.probe));
 }
@@ -109,7 +106,7 @@ void GradientSums::add(int64_t c, uint32_t part) const {
                 const Slots s = from.from(slots[i]);
                 for (int k = 0; k < VECTORS; ++k) store(row + k * LANES, load(row + k * LANES) + load(s.gradients + k * LANES));
                 if (s.extras && *s.has_extra)
-                    for (int k = 0; k < f.sums.extras; ++k) row[GRADIENT + k] += s.extras[k];
+                    for (int k = 0; k < f.sums.columns; ++k) f.sums.extra(splats[i])[k] += s.extras[k];
             }
         }
     }

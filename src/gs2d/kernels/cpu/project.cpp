@@ -64,6 +64,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
     parallel_ranges(n, 64 * LANES, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i += LANES) {
             const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
+            if (i + 2 * LANES <= n) ask_for(s.shN + (i + LANES) * 3 * s.sh_rest, LANES * 3 * s.sh_rest);
             Group g = project_group(f, s, i, lanes, blending);
             const M reaches = reaches_camera_plane(g.frame, error_k2);
             if (f.view.crossing == CROSSING_CULL) g.alive = g.alive & invert(reaches);
@@ -102,10 +103,10 @@ namespace {
 
 // Sums of LANES splats; extras of no densification signal are 0.
 inline void load_sums(const Sums& sums, int64_t first, int lanes, V* fields, V* extras) {
-    load_rows<GRADIENT>(sums.row(first), sums.stride, lanes, fields);
+    load_rows<GRADIENT>(sums.row(first), GRADIENT, lanes, fields);
     for (int k = 0; k < GRADIENT_EXTRA; ++k) extras[k] = V(0);
-    if (sums.extras == 2) load_rows<2>(sums.row(first) + GRADIENT, sums.stride, lanes, extras);
-    if (sums.extras == 4) load_rows<4>(sums.row(first) + GRADIENT, sums.stride, lanes, extras);
+    if (sums.columns == 2) load_rows<2>(sums.extra(first), 2, lanes, extras);
+    if (sums.columns == 4) load_rows<4>(sums.extra(first), 4, lanes, extras);
 }
 
 // Whether a sum is not 0 (NaN counts): else no pixel saw the splat, or all of its gradients are 0.
@@ -116,59 +117,76 @@ inline M not_all_zero(const V* fields, const V* extras) {
     return ~(size <= V(0));
 }
 
+void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradients& out, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; i += LANES) {
+        const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
+        if (i + 2 * LANES <= s.count) {
+            ask_for(s.shN + (i + LANES) * 3 * s.sh_rest, LANES * 3 * s.sh_rest);
+            if (out.shN) ask_for(out.shN + (i + LANES) * 3 * s.sh_rest, LANES * 3 * s.sh_rest);
+        }
+        V g[GRADIENT], e[GRADIENT_EXTRA];
+        load_sums(f.sums, i, lanes, g, e);  // before anything is written: they may lie in the rows of out.shN
+        const M seen = not_all_zero(g, e) & first(lanes);
+        if (!any(seen)) {
+            zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes), zero_rows(out.log_scales, i, 2, lanes);
+            zero_rows(out.opacity_logits, i, 1, lanes), zero_rows(out.sh0, i, 3, lanes);
+            zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes);
+            continue;
+        }
+        const RecordGradient<V> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8],  g[9],
+                                      g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
+        const SplatParameters<V> p = load_parameters(s, i, lanes);
+        const Frame3<V> frame = frame_of(p, f.camera);
+        const Record<V> r = project(p, frame, f.camera);
+
+        V sh[3 * SH_MAX], basis[SH_MAX], along[SH_MAX];
+        const int degree = f.view.sh_degree;
+        load_sh(s, i, lanes, degree, sh);
+        sh_basis(frame.to_splat, degree, basis);
+        const Vec3<V> c = sh_color(sh, basis, degree);
+        const Vec3<V> g_color = {keep((c.x > V(0)) & seen, gr.red), keep((c.y > V(0)) & seen, gr.green),
+                                 keep((c.z > V(0)) & seen, gr.blue)};
+        for (int k = 0; k < sh_count(degree); ++k) {
+            basis[k] = keep(seen, basis[k]);
+            along[k] = fma(g_color.x, sh[3 * k], fma(g_color.y, sh[3 * k + 1], g_color.z * sh[3 * k + 2]));
+        }
+        write_sh(degree, s.sh_rest, out, i, lanes, g_color, basis);
+        if (!wants_geometry(out)) continue;
+
+        const ParameterGradient<V> d = project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
+        const auto write = [&]<int K>(real* to, V (&values)[K]) {
+            if (!to) return;
+            for (V& v : values) v = keep(seen, v);
+            store_rows<K>(to + K * i, K, lanes, values);
+        };
+        V means[] = {d.mean.x, d.mean.y, d.mean.z}, quats[] = {d.qw, d.qx, d.qy, d.qz};
+        V scales[] = {d.log_su, d.log_sv}, logit[] = {d.logit};
+        write(out.means, means), write(out.quats, quats), write(out.log_scales, scales), write(out.opacity_logits, logit);
+        const V half_w = V(real(f.view.width / 2.0)), half_h = V(real(f.view.height / 2.0));
+        V probe[] = {d.probe_x * half_w, d.probe_y * half_h, gr.abs_x * half_w, gr.abs_y * half_h};
+        V probe2[] = {probe[0], probe[1]};
+        if (out.probe_columns == 4)
+            write(out.probe, probe);
+        else
+            write(out.probe, probe2);
+    }
+}
+
 }  // namespace
 
+// Where the sums are the beginning of shN's gradient, row i is written over the sums of splats behind i. So the last splats come
+// first, and as many at a time as write over nothing that is still to be read; of at most LANES splats everything is read
+// before anything is written.
 void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out) {
-    parallel_ranges(s.count, 16 * LANES, [&](int64_t begin, int64_t end) {
-        for (int64_t i = begin; i < end; i += LANES) {
-            const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
-            V g[GRADIENT], e[GRADIENT_EXTRA];
-            load_sums(f.sums, i, lanes, g, e);  // before anything is written: they may lie in the rows of out.shN
-            const M seen = not_all_zero(g, e) & first(lanes);
-            if (!any(seen)) {
-                zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes), zero_rows(out.log_scales, i, 2, lanes);
-                zero_rows(out.opacity_logits, i, 1, lanes), zero_rows(out.sh0, i, 3, lanes);
-                zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes);
-                continue;
-            }
-            const RecordGradient<V> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8],  g[9],
-                                          g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
-            const SplatParameters<V> p = load_parameters(s, i, lanes);
-            const Frame3<V> frame = frame_of(p, f.camera);
-            const Record<V> r = project(p, frame, f.camera);
-
-            V sh[3 * SH_MAX], basis[SH_MAX], along[SH_MAX];
-            const int degree = f.view.sh_degree;
-            load_sh(s, i, lanes, degree, sh);
-            sh_basis(frame.to_splat, degree, basis);
-            const Vec3<V> c = sh_color(sh, basis, degree);
-            const Vec3<V> g_color = {keep((c.x > V(0)) & seen, gr.red), keep((c.y > V(0)) & seen, gr.green),
-                                     keep((c.z > V(0)) & seen, gr.blue)};
-            for (int k = 0; k < sh_count(degree); ++k) {
-                basis[k] = keep(seen, basis[k]);
-                along[k] = fma(g_color.x, sh[3 * k], fma(g_color.y, sh[3 * k + 1], g_color.z * sh[3 * k + 2]));
-            }
-            write_sh(degree, s.sh_rest, out, i, lanes, g_color, basis);
-            if (!wants_geometry(out)) continue;
-
-            const ParameterGradient<V> d = project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
-            const auto write = [&]<int K>(real* to, V (&values)[K]) {
-                if (!to) return;
-                for (V& v : values) v = keep(seen, v);
-                store_rows<K>(to + K * i, K, lanes, values);
-            };
-            V means[] = {d.mean.x, d.mean.y, d.mean.z}, quats[] = {d.qw, d.qx, d.qy, d.qz};
-            V scales[] = {d.log_su, d.log_sv}, logit[] = {d.logit};
-            write(out.means, means), write(out.quats, quats), write(out.log_scales, scales), write(out.opacity_logits, logit);
-            const V half_w = V(real(f.view.width / 2.0)), half_h = V(real(f.view.height / 2.0));
-            V probe[] = {d.probe_x * half_w, d.probe_y * half_h, gr.abs_x * half_w, gr.abs_y * half_h};
-            V probe2[] = {probe[0], probe[1]};
-            if (out.probe_columns == 4)
-                write(out.probe, probe);
-            else
-                write(out.probe, probe2);
+    for (int64_t end = s.count, first = 0; end > 0; end = first) {
+        first = 0;
+        if (f.sums.coefficient_row) {
+            const int64_t free = (GRADIENT * end + f.sums.coefficient_row - 1) / f.sums.coefficient_row, last_group = (end - 1) / LANES * LANES;
+            first = (free + LANES - 1) / LANES * LANES;
+            if (first > last_group) first = last_group;
         }
-    });
+        parallel_ranges(end - first, 16 * LANES, [&](int64_t a, int64_t b) { project_range_vjp(f, s, out, first + a, first + b); });
+    }
 }
 
 }  // namespace gs2d

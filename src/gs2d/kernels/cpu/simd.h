@@ -23,6 +23,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <utility>
 
 #include "core/base.h"
 
@@ -77,6 +78,38 @@ GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* ou
     return count;
 }
 #endif
+
+// Rows of K < LANES reals, one after the other, to K vectors and back, LANES rows at a time: K - 1 shuffles a vector.
+template <int K, int I, int S> constexpr int packed_source(int lane) {  // element of (what there is so far, vector S) for vector I
+    const int e = lane * K + I, vector = e / LANES, at = e % LANES;
+    return vector == S ? LANES + at : S > 1 ? lane : vector == 0 ? at : 0;
+}
+template <int K, int I, int S> constexpr int packed_target(int lane) {
+    const int e = I * LANES + lane, vector = e % K, at = e / K;
+    return vector == S ? LANES + at : S > 1 ? lane : vector == 0 ? at : 0;
+}
+template <int K, int I, int S, bool Load, int... L> GS2D_HD V merge_packed(V a, V b, std::integer_sequence<int, L...>) {
+    return __builtin_shufflevector(a.v, b.v, (Load ? packed_source<K, I, S>(L) : packed_target<K, I, S>(L))...);
+}
+template <int K, int I, bool Load, int S = 1> GS2D_HD V gather_packed(const V* v, V sofar) {
+    if constexpr (S == K)
+        return sofar;
+    else
+        return gather_packed<K, I, Load, S + 1>(v, merge_packed<K, I, S, Load>(sofar, v[S], std::make_integer_sequence<int, LANES>()));
+}
+template <int K, bool Load, int... I> GS2D_HD void repack(const V* from, V* to, std::integer_sequence<int, I...>) {
+    ((to[I] = gather_packed<K, I, Load>(from, from[0])), ...);
+}
+template <int K> GS2D_HD void load_packed(const real* p, V* v) {
+    V rows[K];
+    for (int k = 0; k < K; ++k) rows[k] = load(p + k * LANES);
+    repack<K, true>(rows, v, std::make_integer_sequence<int, K>());
+}
+template <int K> GS2D_HD void store_packed(real* p, const V* v) {
+    V rows[K];
+    repack<K, false>(v, rows, std::make_integer_sequence<int, K>());
+    for (int k = 0; k < K; ++k) store(p + k * LANES, rows[k]);
+}
 
 #if !defined(GS2D_OWN_SPREAD)
 // v[k] lane i = rows[i / 8][k], k < 4.

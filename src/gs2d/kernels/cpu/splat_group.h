@@ -15,6 +15,8 @@ template <int K> inline void load_rows(const real* p, int64_t stride, int lanes,
             transpose(part);
             for (int j = 0; j < LANES; ++j) v[from + j] = part[j];
         }
+    } else if (stride == K && lanes == LANES) {
+        load_packed<K>(p, v);
     } else {
         alignas(64) real t[K][LANES];
         for (int i = 0; i < LANES; ++i) {
@@ -34,6 +36,8 @@ template <int K> inline void store_rows(real* p, int64_t stride, int lanes, cons
             transpose(part);
             for (int i = 0; i < lanes; ++i) store(p + i * stride + from, part[i]);
         }
+    } else if (stride == K && lanes == LANES) {
+        store_packed<K>(p, v);
     } else {
         alignas(64) real t[K][LANES];
         for (int k = 0; k < K; ++k) store(t[k], v[k]);
@@ -59,6 +63,11 @@ inline void load_sh(const Parameters& s, int64_t first, int lanes, int degree, V
     if (degree == 1) load_rows<9>(rest, stride, lanes, sh + 3);
     if (degree == 2) load_rows<24>(rest, stride, lanes, sh + 3);
     if (degree == 3) load_rows<45>(rest, stride, lanes, sh + 3);
+}
+
+// The cache lines of `count` reals from p on: asked for while other work is done.
+inline __attribute__((always_inline)) void ask_for(const real* p, int64_t count) {
+    for (int64_t i = 0; i < count; i += LINE / sizeof(real)) __builtin_prefetch(p + i, 0, 3);
 }
 
 inline M is_finite(V a) { return abs(a) < V(__builtin_inff()); }  // false for NaN
