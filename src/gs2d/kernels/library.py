@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from gs2d.errors import BackendError
+from gs2d.kernels.recycle import Recycler
 
 ABI_VERSION = 5
 VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
@@ -39,6 +40,8 @@ class Library:
         Of the arrays its functions take.
     lanes : int
         Pixels per vector.
+    recycler : Recycler
+        Where large results come from.
     """
 
     def __init__(self, path: Path, variant: str) -> None:
@@ -51,6 +54,7 @@ class Library:
             raise BackendError(f"the CPU kernels {path.name} have version {version}, expected {ABI_VERSION}; {REMEDY}")
         self.path = path
         self.variant = variant
+        self.recycler = Recycler()
         self.lanes = int(self._dll.gs2d_lanes())
         self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32
 

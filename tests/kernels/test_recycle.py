@@ -1,0 +1,91 @@
+"""Memory of large tensors is used again, and only when nobody holds it."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.workload import room_workload
+
+from gs2d.kernels.library import Library
+from gs2d.kernels.recycle import LINE, Recycler
+from gs2d.render.cpu import IMAGES, rasterize_with
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+FLOAT = torch.float32
+
+
+def test_memory_comes_back_when_the_last_view_of_a_tensor_is_gone() -> None:
+    recycler = Recycler(least_bytes=64)
+    tensor = recycler.empty((10, 3), FLOAT)
+    first, row = tensor.data_ptr(), tensor[4]
+    assert tensor.is_contiguous()
+    assert tensor.shape == (10, 3)
+    assert first % LINE == 0
+    del tensor
+    assert recycler.free_bytes == 0  # the row is still there
+    other = recycler.empty((10, 3), FLOAT)
+    assert other.data_ptr() != first
+    del row
+    assert recycler.free_bytes > 0
+    assert recycler.empty((9, 3), FLOAT).data_ptr() == first  # 27 of 30 reals
+
+
+def test_tensors_that_the_c_library_keeps_itself_are_its_own() -> None:
+    recycler = Recycler(least_bytes=64)
+    tensor = recycler.empty((15,), FLOAT)  # 60 bytes
+    del tensor
+    assert recycler.free_bytes == 0
+
+
+def test_a_block_that_splats_have_outgrown_is_given_up() -> None:
+    recycler = Recycler(least_bytes=64)
+    tensor = recycler.empty((1000,), FLOAT)
+    del tensor
+    assert recycler.free_bytes == (4000 + LINE) * 17 // 16
+    larger = recycler.empty((1200,), FLOAT)  # the block holds 1079 reals behind the first cache line
+    assert recycler.free_bytes == 0
+    del larger
+
+
+def test_blocks_of_other_sizes_wait_for_their_next_request_but_not_for_ever() -> None:
+    recycler = Recycler(least_bytes=64)
+    kept, small = recycler.empty((100_000,), FLOAT), (100,)
+    del kept
+    for _ in range(64):
+        recycler.empty(small, FLOAT)
+        assert recycler.free_bytes > 400_000
+    recycler.empty(small, FLOAT)
+    assert recycler.free_bytes < 1000
+
+
+def test_images_and_gradients_in_used_memory_have_the_same_bits(native: Library) -> None:
+    recycling = copy.copy(native)
+    recycling.recycler = Recycler(least_bytes=1)
+    room = room_workload(300, 40, 33)
+
+    def differentiated(library: Library) -> list[torch.Tensor]:
+        leaves = Splats(**{name: t.clone().requires_grad_() for name, t in room.splats.items()})
+        output = rasterize_with(library, leaves, room.cameras[0], RasterSettings())
+        images = [getattr(output, name) for name in IMAGES]
+        total = torch.stack([(image * image).sum() for image in images]).sum()
+        found = torch.autograd.grad(total, [t for _, t in leaves.items()])
+        return [*(image.detach() for image in images), output.radii, *found]
+
+    expected, first = differentiated(native), differentiated(recycling)
+    assert recycling.recycler.free_bytes == 0
+    held = first[0].data_ptr()
+    for tensor in first[1:]:
+        tensor.fill_(float("nan"))
+    del first[1:], tensor
+    assert recycling.recycler.free_bytes > 0
+    second = differentiated(recycling)
+    assert held not in {t.data_ptr() for t in second}
+    for a, b in zip(expected, second, strict=True):
+        assert torch.equal(a, b)
