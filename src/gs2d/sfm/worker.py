@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -28,6 +29,7 @@ SMALLEST_MODEL = 3  # photographs: smaller pieces are nothing that could be trai
 
 def main(request_path: str) -> None:
     """Find features, match, map; then the models, the largest first, in ``output/0``, ``output/1`` ..."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     say = _messages()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     request = json.loads(Path(request_path).read_text(encoding="utf-8"))
