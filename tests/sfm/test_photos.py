@@ -197,11 +197,29 @@ def test_a_photograph_that_exif_turns_is_stored_upright_and_keeps_its_focal_leng
         with Image.open(root / name) as theirs, Image.open(tmp_path / "images" / name) as ours:
             assert ours.size == size
             assert ExifTags.Base.Orientation not in ours.getexif()
+            assert ours.info.get("icc_profile") == theirs.info.get("icc_profile")
             upright = np.asarray(ImageOps.exif_transpose(theirs), float)
             assert np.abs(np.asarray(ours, float) - upright).mean() < 1.0  # JPEG once more, quality 95
             if name == "0.jpg":
                 assert ours.getexif()[ExifTags.Base.Model] == "phone"
                 assert float(ours.getexif().get_ifd(DETAILS)[ExifTags.Base.FocalLength]) == 4.25
+
+
+def test_the_profile_of_inks_is_not_kept_where_the_pixels_become_rgb(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    for i in range(3):
+        picture(root / f"{i}.jpg")
+    for name, mode in (("0.jpg", "CMYK"), ("1.jpg", "RGB")):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = 3
+        with Image.open(root / name) as file:
+            file.convert(mode).save(root / name, icc_profile=b"profile", exif=exif)
+    assert stage(root, tmp_path / "images") == ["turned", "turned", "copied"]
+    profiles = []
+    for name in ("0.jpg", "1.jpg"):
+        with Image.open(tmp_path / "images" / name) as file:
+            profiles.append((file.mode, file.info.get("icc_profile")))
+    assert profiles == [("RGB", None), ("RGB", b"profile")]
 
 
 def test_max_size_bounds_the_longer_side_and_leaves_small_photographs_alone(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ _KINDS = {
 }
 FEWEST = 3  # two photographs give no point that a third confirms
 _MASKS = "masks"
+DAMAGED_EXIF = (OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, struct.error)  # in Pillow
 _ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -182,7 +183,7 @@ def _exif(path: Path) -> tuple[int, tuple[str, ...]]:
             tags = [exif.get(base.Make), exif.get(base.Model)]
             tags += [details.get(tag) for tag in (base.LensModel, base.FocalLength, base.FocalLengthIn35mmFilm)]
             made_by = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
-    except (OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, struct.error):
+    except DAMAGED_EXIF:
         return 1, ("",) * 5
     return orientation if orientation in _ORIENTATIONS else 1, made_by
 

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image
 from gs2d.disk import atomic_write, disk_error
 from gs2d.errors import DataError
 from gs2d.images import read_image
-from gs2d.sfm.photos import JPEG, Photo, turn
+from gs2d.sfm.photos import DAMAGED_EXIF, JPEG, Photo, turn
 
 QUALITY = 95  # of JPEG files that had to be written again, without chroma subsampling
 
@@ -49,7 +49,7 @@ def _stage(photo: Photo, target: Path, max_size: int | None, link: bool) -> str:
     if size == photo.size and photo.orientation == 1 and not photo.is_converted:
         if link:
             with contextlib.suppress(OSError):
-                os.link(photo.source, target)
+                os.link(photo.source.resolve(), target)
                 return "linked"
         return _copy(photo.source, target)
     return _rewrite(photo, target, size)
@@ -71,15 +71,24 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> str:
     if image.size != size:
         premultiplied = image.convert("RGBa") if image.mode == "RGBA" else image
         image = premultiplied.resize(size, Image.Resampling.LANCZOS).convert(image.mode)
-    with Image.open(photo.source) as file:
-        exif, profile = file.getexif(), file.info.get("icc_profile")
-    exif.pop(ExifTags.Base.Orientation, None)
-    keep = {"icc_profile": profile} if profile else {}
+    kept = _kept(photo.source)
     with atomic_write(target) as out:
         if target.suffix.lower() in JPEG:
-            image.save(out, "JPEG", quality=QUALITY, subsampling=0, exif=exif, **keep)
+            image.save(out, "JPEG", quality=QUALITY, subsampling=0, **kept)
         else:
-            image.save(out, "PNG", **keep)
+            image.save(out, "PNG", **kept)
     if size != photo.size:
         return "resized"
     return "turned" if photo.orientation != 1 else "converted"
+
+
+def _kept(source: Path) -> dict[str, bytes]:
+    """What Pillow's ``save`` takes of a picture's colour profile (of RGB only: pixels are RGB now) and EXIF block."""
+    with Image.open(source) as file:
+        profile = file.info.get("icc_profile") if file.mode in ("RGB", "RGBA") else None
+        kept = {"icc_profile": profile} if profile else {}
+        with contextlib.suppress(*DAMAGED_EXIF):
+            exif = file.getexif()
+            exif.pop(ExifTags.Base.Orientation, None)
+            kept["exif"] = exif.tobytes()
+    return kept
