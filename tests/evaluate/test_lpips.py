@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -119,3 +121,38 @@ def test_both_lpips_figures_are_of_the_8_bit_image_and_named(vgg_file: Path) -> 
     assert row["lpips"] == row["lpips_signed"] == 0.0
     assert row["psnr"] is None  # equal after quantisation
     assert row["psnr_float"] is not None
+
+
+@pytest.mark.parametrize("torch_is_old", [False, True])
+def test_convolutions_keep_all_digits_on_a_gpu_and_the_users_setting_comes_back(
+    vgg_file: Path, monkeypatch: pytest.MonkeyPatch, torch_is_old: bool
+) -> None:
+    """TF32 is torch's default for convolutions on a GPU. Before 2.9 it had one setting for all of cuDNN."""
+    cudnn = torch.backends.cudnn
+    if torch_is_old:
+        owner, name, full = SimpleNamespace(allow_tf32=True), "allow_tf32", False
+        monkeypatch.setattr(torch.backends, "cudnn", owner)
+    elif hasattr(cudnn, "conv"):
+        owner, name, full = cudnn.conv, "fp32_precision", "ieee"
+    else:
+        pytest.skip("this torch has the old setting only")
+    before, found, conv2d = getattr(owner, name), [], torch.nn.functional.conv2d
+
+    def convolve(*args: Any, **kwargs: Any) -> Tensor:
+        found.append(getattr(owner, name))
+        if len(found) > 18:
+            raise RuntimeError("out of memory")
+        return conv2d(*args, **kwargs)
+
+    monkeypatch.setattr(torch.nn.functional, "conv2d", convolve)
+    torch.save(head_state(), heads := vgg_file.with_name("heads.pth"))
+    network = load_lpips([vgg_file, heads])
+    images = torch.rand(2, 32, 32, 3)
+    network(*images)
+    assert found == [full] * 18  # 13 layers, 5 heads
+    assert getattr(owner, name) == before
+    with pytest.raises(RuntimeError, match="out of memory"):
+        network(*images)
+    assert getattr(owner, name) == before
+    if not torch_is_old:
+        assert cudnn.allow_tf32 in (True, False)  # and asking the old way still works

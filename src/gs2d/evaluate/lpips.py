@@ -9,7 +9,8 @@ the ``lpips`` package, version 0.1 (keys ``lin0.model.1.weight`` ...).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -54,7 +55,7 @@ class Lpips:
         return Lpips({name: weight.to(device) for name, weight in self.weights.items()})
 
     def __call__(self, image: Tensor, target: Tensor, *, convention: str = "0..1") -> Tensor:
-        """Distance [] of two images [H, W, 3] with values in [0, 1].
+        """Distance [] of two images [H, W, 3] with values in [0, 1], in float32 on every device.
 
         Raises
         ------
@@ -73,7 +74,12 @@ class Lpips:
             pair = 2 * pair - 1
         shift, scale = (pair.new_tensor(v).view(1, 3, 1, 1) for v in (SHIFT, SCALE))
         x = (pair - shift) / scale
-        total = pair.new_zeros(())
+        with _full_precision():
+            return self._distance(x)
+
+    def _distance(self, x: Tensor) -> Tensor:
+        """Of a pair [2, 3, H, W], normalised."""
+        total = x.new_zeros(())
         for block, layers in enumerate(BLOCKS):
             if block > 0:
                 x = F.max_pool2d(x, 2)
@@ -84,6 +90,22 @@ class Lpips:
             difference = (unit[:1] - unit[1:]).square()
             total = total + F.conv2d(difference, self.weights[f"lin{block}.model.1.weight"]).mean()
         return total
+
+
+@contextmanager
+def _full_precision() -> Iterator[None]:
+    """Without it torch convolves on a GPU with 10 bits of mantissa (TF32), and the metric is another than on a CPU."""
+    cudnn = torch.backends.cudnn
+    # torch 2.9 has a setting for each operation, and asking the old one fails where somebody has used the new
+    owner, name, full = (
+        (cudnn.conv, "fp32_precision", "ieee") if hasattr(cudnn, "conv") else (cudnn, "allow_tf32", False)
+    )
+    before = getattr(owner, name)
+    setattr(owner, name, full)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
 
 
 def _expected() -> dict[str, tuple[int, ...]]:
