@@ -1,0 +1,35 @@
+"""The guides keep their word: the program of docs/guides/python.md runs, and what the guides link to is there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tiny import write_capture
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGES = sorted([*DOCS.rglob("*.md"), DOCS.parent / "README.md"])
+
+
+def test_the_program_of_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / "capture")
+    page = DOCS / "guides" / "python.md"
+    blocks = list(re.finditer(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S))
+    assert len(blocks) >= 7
+    names: dict[str, object] = {}
+    for block in blocks:
+        lines = block.string[: block.start()].count("\n") + 1
+        exec(compile("\n" * lines + block.group(1), str(page), "exec"), names)  # line numbers are those of the page
+    assert (tmp_path / "runs/mine/mesh.ply").is_file()
+    assert (tmp_path / "runs/mine/for_viewers.ply").is_file()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_links_to_files_of_the_repository_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
