@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "render"))  # render_scenes
 
 import emulate
+import fake_gpu
 import kernel_cases
 
 
@@ -24,3 +28,19 @@ def emulator(tmp_path_factory: pytest.TempPathFactory) -> emulate.Emulator:
 def clear_cases() -> list[kernel_cases.Case]:
     """Small scenes in which no decision is within 1e-4 of its threshold."""
     return kernel_cases.cases_with_margins()
+
+
+@pytest.fixture(scope="session")
+def guard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a torch without CUDA needs to know of its devices: for processes of tests, because it stays."""
+    root = Path(torch.__file__).parent
+    if torch.version.cuda is not None:
+        pytest.skip("torch is built with CUDA here: tests/gpu")
+    if shutil.which("g++") is None or not (root / "include" / "c10").is_dir():
+        pytest.skip("no g++ here, or this torch has no headers")
+    library = tmp_path_factory.mktemp("guard") / "guard.so"
+    source = library.with_suffix(".cpp")
+    source.write_text(fake_gpu.GUARD)
+    command = ["g++", "-std=c++20", "-O0", "-fPIC", "-shared", "-w", f"-I{root / 'include'}", str(source)]
+    subprocess.run([*command, "-o", str(library), f"-L{root / 'lib'}", "-lc10"], check=True, timeout=90)
+    return library

@@ -97,10 +97,12 @@ def build(
 class Emulator:
     """A launcher (``gs2d.kernels.cuda.launch``) that runs the package's kernels on tensors in host memory.
 
-    A source file is compiled, into ``folder``, when one of its kernels is first wanted.
+    A source file is compiled, into ``folder``, when one of its kernels is first wanted; with ``reuse`` what is there
+    already, from another process of the same tests, is taken.
     """
 
     folder: Path
+    reuse: bool = False
     descending: bool = False
     seed: int = 0
     approximate: bool = False
@@ -113,7 +115,11 @@ class Emulator:
             return
         if name not in self._built:
             source = next(s for s in sorted((KERNELS / "cuda").glob("*.cu")) if name in KERNEL.findall(s.read_text()))
-            options = {"approximate": self.approximate, "addresses": self.addresses}
-            built = build([source], KERNELS, self.folder, source.stem, **options)
+            there = self.folder / f"{source.stem}.so"
+            if self.reuse and there.exists():
+                built = EmulatedKernels(there)
+            else:
+                options = {"approximate": self.approximate, "addresses": self.addresses}
+                built = build([source], KERNELS, self.folder, source.stem, **options)
             self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
         self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending, seed=self.seed)

@@ -154,8 +154,8 @@ def visible_counts(
         return inside & (z <= deepest[pixel] + tolerance)
 
     counts = torch.zeros(len(points), dtype=torch.int64, device=device)
-    with ThreadPoolExecutor(1 if on_gpu(device) else workers or os.cpu_count() or 1) as pool:
-        for seen in pool.map(visible, cameras):
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+        for seen in (map if on_gpu(device) else pool.map)(visible, cameras):
             counts += seen
     return np.asarray(counts.cpu().numpy())
 

@@ -1,0 +1,128 @@
+"""All of training, meshing and scoring with tensors on "cuda", with their values: nothing is mixed with the host's.
+
+``fake_gpu.py`` has what torch takes for a GPU, the emulator runs the kernels. ``test_devices.py`` sees one iteration,
+and that nothing waits; here densification, ranking, cloning, checkpoints, fusion and scores look at values too.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import emulate
+import pytest
+
+pytestmark = pytest.mark.timeout(280)
+
+COMMON = """
+import sys
+from pathlib import Path
+
+guard, kernels, tests, folder = sys.argv[1], *map(Path, sys.argv[2:])
+sys.path[:0] = [str(tests / name) for name in ("cuda", "render", "train", ".")]
+import fake_gpu
+import torch
+from emulate import Emulator
+
+emulator = Emulator(kernels, reuse=True)
+"""
+
+RULES = """
+fake_gpu.install(guard, emulator)
+there, here = torch.arange(4.0, device="cuda"), torch.ones(4)
+assert (there.device, there.is_cuda, there.device == torch.device("cuda")) == (torch.device("cuda:0"), True, False)
+for mixed in (lambda: there + here, lambda: torch.cat([there, here]), lambda: here[there.long()]):
+    try:
+        mixed()
+        print("mixed")
+    except RuntimeError as error:
+        assert "of the host and of the device are mixed" in str(error), error
+try:
+    there.numpy()
+    print("seen by numpy")
+except TypeError as error:
+    print(str(error).partition(":")[0])
+assert not (there + torch.tensor(2.0)).cpu().is_cuda and there.sum().item() == 6
+leaf = there.clone().requires_grad_()
+((leaf * leaf).sum() + 3 * leaf[1:].max()).backward()  # 2 x, and 3 at the last
+print(leaf.grad.tolist())
+"""
+
+TRAINING = """
+import train_toys
+from gs2d.render import cuda
+from gs2d.render.backend import Backend, get_backend
+from gs2d.kernels.cuda import launch
+
+def trained(backend):
+    return train_toys.train(train_toys.make_scene(), train_toys.short(), backend=backend)[0]
+
+before, launch.launcher_for = launch.launcher_for, lambda device: emulator
+plain = trained(Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize))  # on the host
+launch.launcher_for = before
+launched = fake_gpu.install(guard, emulator)
+trainer = trained(get_backend("cuda"))
+assert str(trainer.splats.device) == "cuda:0"
+for name, tensor in trainer.splats.items():
+    print(name, len(tensor), torch.equal(tensor.cpu(), getattr(plain.splats, name)))
+saved = trainer.state.state_dict()
+assert not any(t.is_cuda for t in saved["splats"].values())
+assert {"adam_step", "splat_errors", "blend_vjp_learning"} <= set(launched)
+"""
+
+WHOLE_PATH = """
+from functools import partial
+from gs2d.evaluate.surface import evaluate_surface
+from gs2d.pipeline import truth
+from gs2d.pipeline.jobs import evaluate_run, mesh_run, render_run
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.train import train
+import tiny
+
+launched = fake_gpu.install(guard, emulator)
+truth.evaluate_surface = partial(evaluate_surface, samples=300)
+capture = tiny.write_capture(folder / "ball")
+tiny.write_ball_mesh(capture / "mesh_gt.ply")
+few = ("init_points=60", "surface.densify.max_splats=90")
+options = TrainOptions(scene=capture, out=folder / "run", backend="cuda", schedule_scale=0.0005, overrides=few)
+last = train(options, lambda event: None).metrics()["stages"][-1]
+print(last["test"]["psnr"] > 5, last["peak_gpu_memory_bytes"] > 0)
+launched.clear()
+print(mesh_run(folder / "run")["fused_by"], launched["fuse_voxels"] > 0)
+print(evaluate_run(folder / "run")["surface"]["chamfer"] > 0, launched["nearest_8"] == 2)
+print(render_run(folder / "run", orbit=1)["images"])
+"""
+
+
+def said(script: str, guard: Path, emulator: emulate.Emulator, folder: Path) -> list[str]:
+    """What a script prints in a process of its own; kernels that these tests have compiled already are taken."""
+    given = [str(guard), str(emulator.folder), str(Path(__file__).resolve().parents[1]), str(folder)]
+    command = [sys.executable, "-c", COMMON + script, *given]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=270, check=False, env=dict(os.environ))
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout.splitlines()
+
+
+def test_the_fake_gpu_refuses_what_a_gpu_refuses(guard: Path, emulator: emulate.Emulator, tmp_path: Path) -> None:
+    words, gradient = said(RULES, guard, emulator, tmp_path)
+    assert words == "can't convert cuda"
+    assert gradient == "[0.0, 2.0, 4.0, 9.0]"
+
+
+@pytest.mark.slow
+def test_three_stages_train_on_the_device_to_the_same_bits(
+    guard: Path, emulator: emulate.Emulator, tmp_path: Path
+) -> None:
+    lines = [line.split() for line in said(TRAINING, guard, emulator, tmp_path)]
+    assert len(lines) == 6
+    assert all(same == "True" for _, _, same in lines), lines
+    assert int(lines[0][1]) > 60  # some were added
+
+
+@pytest.mark.slow
+def test_a_run_is_trained_meshed_scored_and_rendered_on_the_device(
+    guard: Path, emulator: emulate.Emulator, tmp_path: Path
+) -> None:
+    assert said(WHOLE_PATH, guard, emulator, tmp_path) == ["True True", "cuda True", "True True", "1"]
