@@ -120,7 +120,7 @@ def parse(argv: Sequence[str]) -> Common:
             command = tyro.cli(
                 Command,
                 prog="gs2d",
-                description="Posed photographs in; a surface mesh and a scene of 2D Gaussian splats out.",
+                description="Photographs in; a surface mesh and a scene of 2D Gaussian splats out.",
                 args=list(argv),
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
