@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -24,6 +26,7 @@ from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import KERNEL, compile_text
 
 ROOT = Path(__file__).resolve().parents[1]
+BIN = Path(sys.executable).parent
 pytestmark = [
     pytest.mark.timeout(280),
     pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here, which runs the CUDA kernels on the CPU"),
@@ -228,3 +231,44 @@ def test_without_git_the_commit_is_what_the_environment_says(monkeypatch: pytest
     assert bench_module.commit().startswith("not known")
     monkeypatch.setenv("GS2D_COMMIT", "abc123")
     assert bench_module.commit() == "abc123"
+
+
+def lent(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """The script for machines that are lent by the minute, in another folder than the checkout."""
+    command = ["bash", str(ROOT / "benchmarks" / "gpu" / "lent.sh"), *arguments]
+    settings = {**os.environ, **environment}
+    return subprocess.run(command, env=settings, cwd="/", capture_output=True, text=True, timeout=200, check=False)
+
+
+def test_the_script_for_lent_machines_says_how_to_call_it(tmp_path: Path) -> None:
+    for arguments, word in (
+        ((), "lent.sh 3 OUT CAPTURE"),
+        (("4", str(tmp_path)), "lent.sh 1 OUT"),
+        (("1",), "a folder"),
+    ):
+        done = lent(*arguments)
+        assert done.returncode == 2
+        assert word in done.stderr
+
+
+@pytest.mark.slow
+def test_the_script_for_lent_machines_leaves_its_results_in_the_folder_it_is_given(tmp_path: Path) -> None:
+    """No minute of time: every part says so, in the files that a GPU would fill."""
+    out = tmp_path / "a folder"
+    for part, files in (("1", ["gpu_correctness.json"]), ("3", ["gpu_training_0.1.json", "gpu_training.json"])):
+        done = lent(part, str(out), DRY="--dry-run", MINUTES="0", GS2D_COMMIT="abc", PATH=f"{BIN}:{os.environ['PATH']}")
+        assert done.returncode == 0, done.stderr
+        for name in files:
+            document = json.loads((out / name).read_text())
+            assert document["commit"] == "abc"
+            assert all(part == {"skipped": "out of time (--minutes)"} for part in document["results"].values())
+    assert "cuda" in (out / "doctor.txt").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.version.cuda is not None, reason="torch is built with CUDA here")
+def test_a_python_without_a_gpus_torch_is_not_taken_and_the_reason_is_said(tmp_path: Path) -> None:
+    done = lent("2", str(tmp_path), PATH=f"{BIN}:/usr/bin:/bin")
+    assert done.returncode == 2
+    assert "is built without CUDA" in done.stderr
+    assert "error: lent.sh: no Python fits" in done.stderr

@@ -126,8 +126,8 @@ def counts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
     frame = cuda_passes.forward(bench.launcher, cuda_passes.view_of(scene.cameras[0], SETTINGS), parameters(scene))
     seen = frame.seen.cpu().numpy().view(np.uint32)  # [words, 8]
     below = [(warp >> 1) * 4 + (warp & 1) for warp in range(4)]  # the upper half of a warp; the lower is two further
-    visits = sum(int(np.bitwise_count(seen[:, b] | seen[:, b + 2]).sum()) for b in below)
-    halves = int(np.bitwise_count(seen).sum())
+    visits = sum(_bits(seen[:, b] | seen[:, b + 2]) for b in below)
+    halves = _bits(seen)
     drawn = int((frame.radii > 0).sum())
     by_kernel = {name: visits * a + halves * b for name, (a, b) in INSTRUCTIONS.items()}
     return {
@@ -137,6 +137,11 @@ def counts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
         "halves": halves,
         "warp_instructions_model": by_kernel,
     }
+
+
+def _bits(words: np.ndarray) -> int:
+    """How many are set (numpy has a function for it from 2.0 on)."""
+    return int(np.unpackbits(np.ascontiguousarray(words).view(np.uint8)).sum(dtype=np.int64))
 
 
 def kernels(bench: Bench, scene: GpuScene) -> dict[str, float]:
