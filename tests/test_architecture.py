@@ -44,6 +44,7 @@ FLOORS = {
     "sfm": 6,
     "mesh": 6,
     "report": 6,
+    "view": 6,
     "pipeline": 7,
     "cli": 8,
 }

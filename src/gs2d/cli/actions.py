@@ -19,6 +19,7 @@ def execute(command: c.Common, console: Console) -> None:
         c.Train: train,
         c.Mesh: mesh,
         c.Render: render,
+        c.View: view,
         c.Evaluate: evaluate,
         c.Export: export,
         c.Report: report,
@@ -159,6 +160,22 @@ def render(command: c.Render, console: Console) -> None:
     if command.video is not None:
         console.say(f"{result['video']}: {result['seconds']:.1f} s, {result['video_bytes'] / 1e6:.1f} MB")
     console.result(result)
+
+
+def view(command: c.View, console: Console) -> None:
+    """``gs2d view``: until Ctrl-C."""
+    from gs2d.pipeline.view import ViewOptions, open_viewer, serve
+
+    options = ViewOptions(host=command.host, port=command.port, threads=command.threads)
+    viewer = open_viewer(command.path, options, console.on_event)
+    try:
+        console.close()
+        console.say(f"{viewer.url}  (Ctrl-C ends it)")
+        console.result({"url": viewer.url, "port": viewer.port, "shown": sorted(viewer.nodes)})
+        console.flush()
+        serve(viewer, console.on_event)
+    finally:
+        viewer.close()
 
 
 def evaluate(command: c.Evaluate, console: Console) -> None:

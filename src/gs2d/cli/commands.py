@@ -179,6 +179,20 @@ class Render(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class View(Common):
+    """Look at a trained run in the browser: splats, mesh and cameras, served from this machine only."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder, or a PLY file of splats."""
+    port: int | None = None
+    """Port of the page (default: the first free one from 8080 on)."""
+    host: str = "127.0.0.1"
+    """Address that is listened on; 0.0.0.0 lets other machines in, and there is no password."""
+    threads: int | None = None
+    """CPU threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evaluate(Common):
     """Score a trained run: PSNR, SSIM, LPIPS; with a ground truth also Chamfer distance and F-score of the mesh."""
 
@@ -298,7 +312,7 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Poses, Train, Mesh, Render, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
+    Demo, Poses, Train, Mesh, Render, View, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
@@ -306,6 +320,7 @@ Command = (
     | Annotated[Train, subcommand("train")]
     | Annotated[Mesh, subcommand("mesh")]
     | Annotated[Render, subcommand("render")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Report, subcommand("report")]

@@ -13,12 +13,14 @@ from PIL import Image
 
 from gs2d.disk import atomic_write
 from gs2d.errors import DataError
-from gs2d.triangles import TexturedMesh
+from gs2d.triangles import Mesh, TexturedMesh
 
 SUFFIXES = (".glb", ".obj")
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON", "BIN\0"
-_FLOAT, _UINT = 5126, 5125  # component types
+_FLOAT, _UINT, _USHORT = 5126, 5125, 5123  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
+_SRGB = np.arange(256) / 255
+_LINEAR_U16 = np.rint(65535 * np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)).astype("<u2")
 _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987  # CLAMP_TO_EDGE, LINEAR, LINEAR_MIPMAP_LINEAR
 
 
@@ -64,58 +66,88 @@ def write_textured(path: str | Path, mesh: TexturedMesh, *, up: np.ndarray | Non
 
 
 def write_glb(path: Path, mesh: TexturedMesh, *, up: np.ndarray | None = None) -> None:
-    """Write glTF 2.0 in one file: positions, normals, texture coordinates, triangles and the texture as PNG.
+    """Write glTF 2.0 in one file."""
+    data = glb_bytes(mesh, up=up)
+    with atomic_write(path) as file:
+        file.write(data)
+
+
+def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> bytes:
+    """A mesh with its texture (PNG) or its vertex colours as the bytes of a glTF 2.0 binary file.
 
     The material is unlit (KHR_materials_unlit), because the light of the photographs is in their colours; viewers that
-    do not know the extension shade a rough, non-metallic surface instead.
+    do not know the extension shade a rough, non-metallic surface instead. Vertex colours are linear in glTF (3.7.2.1),
+    of 16 bits here.
     """
     vertices = np.ascontiguousarray(mesh.vertices, "<f4")
-    blobs = [
-        vertices.tobytes(),
-        np.ascontiguousarray(mesh.normals, "<f4").tobytes(),
-        np.ascontiguousarray(mesh.uv, "<f4").tobytes(),
-        np.ascontiguousarray(mesh.faces, "<u4").tobytes(),
-        png_bytes(mesh.texture),
-    ]
-    views: list[dict[str, Any]] = []
-    offset = 0
-    for blob, target in zip(blobs, [_VERTICES] * 3 + [_INDICES, None], strict=True):
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": len(blob)}
-        views.append(view if target is None else {**view, "target": target})
-        offset += len(blob) + -len(blob) % 4
     count = len(vertices)
-    bounds = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
-    surface = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    document = {
-        "asset": {"version": "2.0", "generator": "gs2d"},
+    bounds = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()} if count else {}
+    parts: list[tuple[str, bytes, dict[str, Any]]] = [
+        ("POSITION", vertices.tobytes(), {"componentType": _FLOAT, "type": "VEC3", **bounds})
+    ]
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material: dict[str, Any] = {"pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}}
+    document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "gs2d"}, "materials": [material]}
+    png = b""
+    if isinstance(mesh, TexturedMesh):
+        normals, uv = np.ascontiguousarray(mesh.normals, "<f4"), np.ascontiguousarray(mesh.uv, "<f4")
+        parts.append(("NORMAL", normals.tobytes(), {"componentType": _FLOAT, "type": "VEC3"}))
+        parts.append(("TEXCOORD_0", uv.tobytes(), {"componentType": _FLOAT, "type": "VEC2"}))
+        surface["baseColorTexture"] = {"index": 0}
+        document["textures"] = [{"source": 0, "sampler": 0}]
+        document["images"] = [{"bufferView": len(parts) + 1, "mimeType": "image/png"}]
+        document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}]
+        png = png_bytes(mesh.texture)
+    elif mesh.colors is not None:
+        linear = np.ones((count, 4), "<u2")  # with the fourth, vertices are aligned to 4 bytes
+        linear[:, :3], linear[:, 3] = _LINEAR_U16[mesh.colors], 65535
+        parts.append(("COLOR_0", linear.tobytes(), {"componentType": _USHORT, "type": "VEC4", "normalized": True}))
+    indices = np.ascontiguousarray(mesh.faces, "<u4").tobytes()
+    blobs = [*(blob for _, blob, _ in parts), indices, *([png] if png else [])]
+    views, offset = [], 0
+    for i, blob in enumerate(blobs):
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": len(blob)}
+        target = _VERTICES if i < len(parts) else _INDICES
+        views.append(view if i > len(parts) else {**view, "target": target})
+        offset += len(blob) + -len(blob) % 4
+    accessors = [{"bufferView": i, "count": count, **kind} for i, (_, _, kind) in enumerate(parts)]
+    accessors.append({"bufferView": len(parts), "componentType": _UINT, "count": mesh.faces.size, "type": "SCALAR"})
+    attributes = {name: i for i, (name, _, _) in enumerate(parts)}
+    document |= {
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0} if up is None else {"mesh": 0, "rotation": turn_to_y(up)}],
-        "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0}]}
-        ],
-        "materials": [{"pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}}],
-        "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"bufferView": 4, "mimeType": "image/png"}],
-        "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
-        "accessors": [
-            {"bufferView": 0, "componentType": _FLOAT, "count": count, "type": "VEC3", **bounds},
-            {"bufferView": 1, "componentType": _FLOAT, "count": count, "type": "VEC3"},
-            {"bufferView": 2, "componentType": _FLOAT, "count": count, "type": "VEC2"},
-            {"bufferView": 3, "componentType": _UINT, "count": mesh.faces.size, "type": "SCALAR"},
-        ],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": len(parts), "material": 0}]}],
+        "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
     }
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    with atomic_write(path) as file:
-        file.write(struct.pack("<III", _MAGIC, 2, 12 + 8 + len(text) + 8 + offset))
-        file.write(struct.pack("<II", len(text), _JSON) + text)
-        file.write(struct.pack("<II", offset, _BIN))
-        for blob in blobs:
-            file.write(blob + b"\0" * (-len(blob) % 4))
+    head = struct.pack("<IIIII", _MAGIC, 2, 12 + 8 + len(text) + 8 + offset, len(text), _JSON)
+    body = b"".join(blob + b"\0" * (-len(blob) % 4) for blob in blobs)
+    return head + text + struct.pack("<II", offset, _BIN) + body
+
+
+def glb_turn(data: bytes) -> list[float]:
+    """The rotation x, y, z, w that a .glb file written here gives its mesh.
+
+    Raises
+    ------
+    DataError
+        It is no such file.
+    """
+    try:
+        magic, _, _, length, kind = struct.unpack("<IIIII", data[:20])
+        if (magic, kind) != (_MAGIC, _JSON):
+            raise ValueError("another kind of file")
+        node = json.loads(data[20 : 20 + length])["nodes"][0]
+        return [float(q) for q in node.get("rotation", (0.0, 0.0, 0.0, 1.0))]
+    except (ValueError, KeyError, IndexError, TypeError, struct.error) as error:
+        raise DataError(
+            f"a .glb file as `gs2d mesh --texture` writes it was expected, got another ({error})"
+        ) from error
 
 
 def turn_to_y(up: np.ndarray) -> list[float]:

@@ -1,0 +1,284 @@
+"""A viewer in the browser, served from this machine (extra ``view``: viser): splats, mesh, cameras, exact renderings.
+
+Nothing is fetched from elsewhere: the page is a part of viser, and what it shows comes from here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gs2d.camera import Camera
+from gs2d.errors import BackendError
+from gs2d.geometry import focus_point
+from gs2d.view_exact import ExactPictures, Frame, Render
+from gs2d.view_splats import Preview
+
+DEFAULT_PORT = 8080
+PICTURES = ("preview", "exact", "normals", "depth")  # what is drawn of the splats
+THUMBNAIL = 160  # px, longer side
+NEAREST = 1e-3  # of the scene's size: what is nearer to the eye is not drawn
+STEP_BACK = 2.0  # times as far from the middle as a photograph
+_TRIED_PORTS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A photograph to stand in the scene.
+
+    Attributes
+    ----------
+    name : str
+    camera : Camera
+    thumbnail : ndarray [h, w, 3] uint8
+    """
+
+    name: str
+    camera: Camera
+    thumbnail: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Splats at some point of training, made when they are asked for."""
+
+    preview: Callable[[], Preview]
+    render: Callable[[], Render]
+
+
+def required_viser() -> Any:
+    """The package viser.
+
+    Raises
+    ------
+    BackendError
+        It is not installed.
+    """
+    try:
+        return importlib.import_module("viser")
+    except ModuleNotFoundError as error:
+        raise BackendError(
+            f"`gs2d view` needs {error.name}, which is not installed; pip install '2dgs-r[view]'"
+        ) from error
+
+
+def free_port(host: str, port: int | None) -> int:
+    """``port`` if nobody listens there; without one the first free one from 8080 on.
+
+    Raises
+    ------
+    BackendError
+        Taken, or no address of this machine.
+    """
+    wanted = [port] if port is not None else list(range(DEFAULT_PORT, DEFAULT_PORT + _TRIED_PORTS))
+    reason = ""
+    for number in wanted:
+        if not 1 <= number <= 65535:
+            raise BackendError(f"--port must be 1 to 65535, got {number}")
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+                return number
+        except OSError as error:
+            reason = error.strerror or str(error)
+    tried = f"port {port}" if port is not None else f"ports {wanted[0]} to {wanted[-1]}"
+    raise BackendError(f"a free port on {host} was expected, {tried}: {reason}; choose another --port or --host")
+
+
+def thumbnail(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
+    """A photograph [H, W, 3 or 4] uint8, small and without alpha."""
+    picture = Image.fromarray(image)
+    picture.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+    if picture.mode == "RGBA":
+        behind = Image.new("RGBA", picture.size, tuple(round(255 * channel) for channel in background))
+        picture = Image.alpha_composite(behind, picture)
+    return np.asarray(picture.convert("RGB"))
+
+
+class Viewer:
+    """A server with one scene; every browser that opens its page sees it.
+
+    Parameters
+    ----------
+    title : str
+    host : str
+    port : int or None
+        None: the first free one from 8080 on.
+    frame : Frame
+        Which part of the world is the viewer's: its camera, its depths and its numbers are made for scenes of size 1.
+    up : ndarray [3]
+    """
+
+    def __init__(self, *, title: str, host: str, port: int | None, frame: Frame, up: np.ndarray) -> None:
+        viser = required_viser()
+        self._frame = frame
+        self.host, self.port = host, free_port(host, port)
+        with contextlib.redirect_stdout(io.StringIO()):  # it shows its addresses, whatever `verbose` says
+            self._server = viser.ViserServer(host=host, port=self.port, label=title, verbose=False)
+        self._server.gui.configure_theme(show_share_button=False, show_logo=False)  # nothing leaves this machine
+        self._server.scene.set_up_direction(tuple(up))
+        self._nodes: dict[str, list[Any]] = {}
+        self._splats: Any = None
+        self._exact: ExactPictures | None = None
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.host, self.host)
+        return f"http://{f'[{shown}]' if ':' in shown and shown[0] != '[' else shown}:{self.port}"
+
+    @property
+    def nodes(self) -> Mapping[str, Sequence[Any]]:
+        """What is in the scene, by kind: "splats", "mesh", "cameras"."""
+        return {**self._nodes, **({} if self._splats is None else {"splats": [self._splats]})}
+
+    def look_from(self, camera: Camera, target: np.ndarray) -> None:
+        """Where a browser looks from when it opens the page: from behind a camera, so that the camera is seen too."""
+        start, behind = self._server.initial_camera, target + STEP_BACK * (camera.center - target)
+        start.position, start.look_at = self._frame.inside(behind), self._frame.inside(target)
+        start.fov = field_of_view(camera)
+        start.near = NEAREST
+
+    def add_stages(self, stages: Mapping[str, Stage]) -> None:
+        """Splats to choose from; the last ones are shown first."""
+        gui, names = self._server.gui, list(stages)
+        chosen = gui.add_dropdown("stage", names, initial_value=names[-1], visible=len(names) > 1)
+        drawn = gui.add_dropdown("splats", [*PICTURES, "none"], initial_value="preview")
+        self._exact = ExactPictures(self._server, self._frame, stages[names[-1]].render)
+
+        def show(load: bool) -> None:
+            stage = stages[chosen.value]
+            if load:
+                self._show_splats(stage.preview())
+                assert self._exact is not None
+                self._exact.scene(stage.render)
+            if self._splats is not None:
+                self._splats.visible = drawn.value == "preview"
+            assert self._exact is not None
+            self._exact.draw(drawn.value if drawn.value in PICTURES[1:] else None)
+
+        show(load=True)
+        chosen.on_update(lambda _: show(load=True))
+        drawn.on_update(lambda _: show(load=False))
+
+    def _show_splats(self, splats: Preview) -> None:
+        with self._server.atomic():
+            if self._splats is not None:
+                self._splats.remove()
+            self._splats = self._server.scene.add_gaussian_splats(
+                "/splats",
+                centers=splats.centers,
+                covariances=splats.covariances,
+                rgbs=splats.colors,
+                opacities=splats.opacities,
+                scale=splats.scale / self._frame.unit,
+                position=self._frame.inside(np.zeros(3)),
+            )
+
+    def add_mesh(self, glb: bytes, turn: Sequence[float]) -> None:
+        """A mesh as a .glb file, whose own ``turn`` (x, y, z, w) is undone: the scene is in the capture's frame."""
+        x, y, z, w = turn
+        node = self._server.scene.add_glb(
+            "/mesh",
+            glb,
+            scale=1 / self._frame.unit,
+            wxyz=(w, -x, -y, -z),
+            position=self._frame.inside(np.zeros(3)),
+            visible=False,
+        )
+        self._nodes["mesh"] = [node]
+        box = self._server.gui.add_checkbox("mesh", initial_value=False)
+        box.on_update(lambda _: setattr(node, "visible", box.value))
+
+    def add_cameras(self, shots: Sequence[Shot]) -> None:
+        """Photographs where they were taken; a click goes there."""
+        if not shots:
+            return
+        cameras = [shot.camera for shot in shots]
+        side = 0.25 * _spacing(np.array([self._frame.inside(camera.center) for camera in cameras]))
+        self._nodes["cameras"] = [self._frustum(f"/cameras/{i:05d}", shot, side) for i, shot in enumerate(shots)]
+        box = self._server.gui.add_checkbox("cameras", initial_value=True)
+        size = self._server.gui.add_slider("camera size", min=0.1, max=4.0, step=0.05, initial_value=1.0)
+
+        def update(_: Any) -> None:
+            with self._server.atomic():
+                for node in self._nodes["cameras"]:
+                    node.visible, node.scale = box.value, side * size.value
+
+        box.on_update(update)
+        size.on_update(update)
+
+    def _frustum(self, name: str, shot: Shot, side: float) -> Any:
+        camera = shot.camera
+        node = self._server.scene.add_camera_frustum(
+            name,
+            fov=field_of_view(camera),
+            aspect=camera.width / camera.fx * camera.fy / camera.height,
+            scale=side,
+            thickness=1.5,
+            thickness_units="screen",
+            image=shot.thumbnail,
+            wxyz=quaternion(camera.rotation.T),
+            position=self._frame.inside(camera.center),
+        )
+
+        def go(event: Any) -> None:
+            client = event.client
+            if client is not None:
+                with client.atomic():
+                    client.camera.position = self._frame.inside(camera.center)
+                    client.camera.wxyz = quaternion(camera.rotation.T)
+
+        node.on_click(go)
+        return node
+
+    @property
+    def failure(self) -> Exception | None:
+        """Why no more exact pictures are drawn, if none are."""
+        return None if self._exact is None else self._exact.failure
+
+    def close(self) -> None:
+        """Stop serving."""
+        if self._exact is not None:
+            self._exact.close()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+
+def _spacing(centers: np.ndarray) -> float:
+    """A typical distance between neighbours [V, 3]; of one camera 1."""
+    if len(centers) < 2:
+        return 1.0
+    distance = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    return max(float(np.median(distance.min(axis=1))), float(np.ptp(centers, axis=0).max()) * 0.01, 1e-9)
+
+
+def field_of_view(camera: Camera) -> float:
+    """The vertical angle, radians."""
+    return float(2 * np.arctan(camera.height / 2 / camera.fy))
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """A rotation matrix [3, 3] as w, x, y, z."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([w, x, y, z])
+
+
+def middle_of(cameras: Sequence[Camera], centers: np.ndarray) -> np.ndarray:
+    """What to look at first: what the cameras look at, else the middle of the splats' centres [N, 3]."""
+    if len(cameras) > 1:
+        return focus_point(list(cameras))
+    return np.asarray(np.median(centers, axis=0) if len(centers) else np.zeros(3), np.float64)
