@@ -202,7 +202,7 @@ template <bool WithQ> inline void find_hits(Batch& w, const Centres& centres, co
     }
 }
 
-template <bool Geo, bool Dist> inline void weigh_pairs(Batch& w, Planes s, const BlendLimits<V>& limits) {
+template <bool Geo, bool Dist> inline __attribute__((always_inline)) void weigh_pairs(Batch& w, Planes s, const BlendLimits<V>& limits) {
     const auto weigh = [&](int i, const Record<V>& splat, V inverse_zc, const PixelGradient<V>& g) {
         const int at = w.block[i] * LANES;
         V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);

@@ -43,7 +43,7 @@ inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
 // Splats are first intersected BATCH at a time and then composited: the long chain of an intersection does not depend
 // on the pixel's state, and so many of them overlap; the state stays in registers while it is used.
 constexpr int BATCH = 8;
-constexpr int UNROLL = REGISTERS >= 32 ? BATCH : 1;  // gcc unrolls loops of 8 rounds: without registers, the state goes to memory each round
+constexpr int UNROLL = REGISTERS >= 32 ? 2 : 1;  // gcc would unroll all 8 rounds: with 16 registers the state goes to memory in each
 
 // What the intersections leave: one row per splat.
 struct Batch {
