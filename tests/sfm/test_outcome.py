@@ -116,6 +116,17 @@ def test_a_worker_that_dies_is_one_line_with_its_last_words(tmp_path: Path, code
     assert "\n" not in str(caught.value)
 
 
+def test_the_worker_looks_for_modules_where_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not in the folder one is in, which ``-m`` puts first: a random.py there would be numpy's."""
+    (tmp_path / "random.py").write_text("raise ImportError('mine')")
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / "pycolmap.py").write_text("raise RuntimeError('the one that is on my path')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path / "first")
+    with pytest.raises(DataError, match="the one that is on my path"):
+        solve(request(tmp_path), lambda *_step: None)
+
+
 def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,6 +173,14 @@ def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="must be a folder"):
         check_out(tmp_path / "file", tmp_path / "photos", overwrite=True)
+
+
+def test_a_disk_that_is_mounted_there_is_said_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "disk").mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda self: self == tmp_path / "disk")
+    check_out(tmp_path / "disk" / "capture", tmp_path / "photos", overwrite=False)
+    with pytest.raises(RunError, match="where a disk is mounted, and cannot be renamed; choose a folder in it"):
+        check_out(tmp_path / "disk", tmp_path / "photos", overwrite=False)
 
 
 def test_the_folder_one_is_in_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

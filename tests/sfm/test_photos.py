@@ -52,6 +52,20 @@ def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path
     assert notes == ()
 
 
+def test_folders_that_are_linked_are_read_once_and_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    root.mkdir()
+    (tmp_path / "disk").mkdir()
+    for i in range(3):
+        picture(tmp_path / "disk" / f"{i}.png")
+    (root / "monday").symlink_to(tmp_path / "disk")
+    (root / "again").symlink_to(root)  # a way that does not end
+    os.mkfifo(root / "pipe.jpg")
+    found, notes = find_photos(root)
+    assert [path.relative_to(root).as_posix() for path in found] == ["monday/0.png", "monday/1.png", "monday/2.png"]
+    assert notes == ("pipe.jpg was not read: no photographs",)
+
+
 def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: Path) -> None:
     for name in ("a b.png", "a_b.png", "c.tif", "c.tif.png", "d\udcff.png"):
         picture(tmp_path / name)

@@ -22,6 +22,7 @@ from gs2d.camera import look_at
 from gs2d.cli import run
 from gs2d.data import load_scene
 from gs2d.data.colmap_model import read_images
+from gs2d.errors import RunError
 from gs2d.images import read_image
 from gs2d.pipeline.events import Event, Phase
 from gs2d.pipeline.poses import PosesOptions, find_poses
@@ -139,6 +140,20 @@ def test_separate_pieces_and_photographs_without_a_place_are_named_and_the_same_
     assert len(models) == 10  # cameras, images, points3D, rigs, frames, twice
     assert poses(pieces, out, "--overwrite", "--quiet") == 0
     assert {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))} == models
+
+
+def test_what_appears_in_the_folder_while_colmap_works_is_not_replaced(colmap: None, tmp_path: Path) -> None:
+    write_room(tmp_path / "photos", 4)
+    masks = tmp_path / "capture" / "masks"
+
+    def put(event: Event) -> None:
+        if isinstance(event, Phase) and event.name == "placing cameras":
+            masks.mkdir(parents=True)
+
+    with pytest.raises(RunError, match=r"holds other files \(masks\)"):
+        find_poses(PosesOptions(photos=tmp_path / "photos", out=tmp_path / "capture", threads=1), put)
+    assert masks.is_dir()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "photos"]
 
 
 def blank(root: Path) -> None:

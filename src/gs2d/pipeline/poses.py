@@ -5,6 +5,7 @@ The finished capture is read back by the loader that training uses before it get
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections import Counter
@@ -101,6 +102,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     made = make_folder(out.parent)
     try:
         with workplace(out) as work:
+            check_out(options.out, options.photos, overwrite=options.overwrite)  # a killed command's capture is back
             capture = work / "capture"
             staged = _stage(photos, capture / IMAGES, options, threads, on_event)
             request = _request(options, work, photos, sizes, groups, threads)
@@ -114,6 +116,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             write_picture(capture / POSES_PNG, pieces[0], _title(result))
             write_json(capture / POSES_JSON, result)
             load_scene(capture, format="colmap")
+            check_out(options.out, options.photos, overwrite=options.overwrite)  # hours later it may hold something
             put_in_place(capture, out, work)
     except BaseException:
         remove_made(made)
@@ -154,7 +157,8 @@ def _cores() -> int:
 def _stage(photos: Sequence[Photo], folder: Path, options: PosesOptions, threads: int, on_event: OnEvent) -> list[str]:
     """Put the photographs into the capture; what was done to each."""
     copying = stage_photos(photos, folder, max_size=options.max_size, link=options.link, threads=threads)
-    staged = list(counted(copying, "copying photographs", len(photos), on_event))
+    with contextlib.closing(copying):  # after Ctrl-C nothing is written any more
+        staged = list(counted(copying, "copying photographs", len(photos), on_event))
     counts = Counter(staged)
     if options.link and counts["copied"]:
         on_event(Notice(f"{counts['copied']} photographs were copied: --out is on a disk that cannot link to theirs"))

@@ -26,6 +26,7 @@ _KINDS = {
 }
 FEWEST = 3  # two photographs give no point that a third confirms
 _MASKS = "masks"
+_HIDDEN = (".", "__MACOSX")
 DAMAGED_EXIF = (OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, struct.error)  # in Pillow
 _ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -93,8 +94,10 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
         raise DataError(f"{root} must be a folder of photographs, got no such folder")
     sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "raw": [], "mask": [], "other": []}
     for path in _files(root):
-        is_mask = _MASKS in path.relative_to(root).parts[:-1]
-        sorted_out["mask" if is_mask else _KINDS.get(path.suffix.lower(), "other")].append(path)
+        kind = _KINDS.get(path.suffix.lower(), "other")
+        if path.exists() and not path.is_file():  # a pipe, which would be waited for
+            kind = "other"
+        sorted_out["mask" if _MASKS in path.relative_to(root).parts[:-1] else kind].append(path)
     photos, videos, raws, masks, others = sorted_out.values()
     notes = [f"{_some(raws, root)} not read: {_raw_remedy(raws[0])}"] if raws else []
     if videos:
@@ -116,9 +119,13 @@ def _files(root: Path) -> Iterator[Path]:
     def refuse(error: OSError) -> None:
         raise DataError(f"cannot read the folder {error.filename}: {error.strerror}") from error
 
-    found = []
-    for folder, folders, names in os.walk(root, onerror=refuse):
-        folders[:] = [name for name in folders if not name.startswith((".", "__MACOSX"))]
+    found, entered = [], {os.path.realpath(root)}
+    for folder, folders, names in os.walk(root, onerror=refuse, followlinks=True):
+        visible = {
+            name: os.path.realpath(os.path.join(folder, name)) for name in folders if not name.startswith(_HIDDEN)
+        }
+        folders[:] = [name for name, place in visible.items() if place not in entered]  # a link to above would not end
+        entered.update(visible.values())
         found += [Path(folder, name) for name in names if not name.startswith(".")]
     yield from sorted(found, key=lambda path: natural_key(path.relative_to(root).as_posix()))
 

@@ -24,6 +24,8 @@ MISSING = (
     'structure from motion needs pycolmap, which is not installed: pip install "2dgs-r[sfm]", or pip install pycolmap'
 )
 POLL_SECONDS = 0.5
+# Modules are looked for where this process does: `-m` would first take a random.py of the folder one is in.
+_WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.worker import main; main(sys.argv[1])"
 _COUNTED = {"features": "keypoints", "matching": "two_view_geometries"}  # phase -> table that grows by one a step
 _PHASES = {
     "features": "finding features",
@@ -98,7 +100,7 @@ def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] =
     work = Path(request.database).parent
     with atomic_write(work / "request.json", "w") as file:
         json.dump(asdict(request), file)
-    words = [*(command or (sys.executable, "-m", "gs2d.sfm.worker")), str(work / "request.json")]
+    words = [*(command or (sys.executable, "-c", _WORKER)), str(work / "request.json"), *sys.path]
     # Passive waiting: cores are often shared, and spinning threads of one library then stop those of another.
     environment = {"OMP_WAIT_POLICY": "PASSIVE", **os.environ}
     with open(work / "worker.log", "wb") as log:

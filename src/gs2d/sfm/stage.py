@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -21,7 +21,7 @@ QUALITY = 95  # of JPEG files that had to be written again, without chroma subsa
 
 def stage_photos(
     photos: Sequence[Photo], folder: Path, *, max_size: int | None, link: bool, threads: int
-) -> Iterator[str]:
+) -> Generator[str, None, None]:
     """Put the photographs into ``folder``; yields for each what was done: "copied", "linked", "turned", "resized".
 
     Parameters

@@ -42,6 +42,8 @@ def check_out(given: Path, photographs: Path, *, overwrite: bool) -> None:
         raise RunError(f"--out must be a folder, {given} is a file or lies below one") from error
     except OSError as error:
         raise disk_error(out, error) from error
+    if out.is_mount():
+        raise RunError(f"--out {given} is where a disk is mounted, and cannot be renamed; choose a folder in it")
     others = sorted(entries - set(OURS))
     if POSES_JSON in entries and not others:
         if not overwrite:
