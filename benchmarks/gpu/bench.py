@@ -22,6 +22,7 @@ import torch
 from benchmarks.timing import machine
 from gs2d.kernels.cuda import diagnose, launch
 from gs2d.kernels.cuda.launch import Launcher
+from gs2d.mesh import integrate
 from gs2d.render import backend as backends
 from gs2d.render import cuda
 from gs2d.render.backend import Backend, get_backend
@@ -188,13 +189,14 @@ def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
     with tempfile.TemporaryDirectory() as folder:
         emulator = Emulator(Path(folder))
         backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize)
-        before = launch.launcher_for, backends._LOADERS["cuda"]
+        before = launch.launcher_for, backends._LOADERS["cuda"], integrate.gpu_device
         launch.launcher_for = lambda device: emulator
         backends._LOADERS["cuda"] = lambda: backend
+        integrate.gpu_device = lambda: torch.device("cpu")
         try:
             yield Bench(backend, emulator, True, end)
         finally:
-            launch.launcher_for, backends._LOADERS["cuda"] = before
+            launch.launcher_for, backends._LOADERS["cuda"], integrate.gpu_device = before
 
 
 def facts(bench: Bench) -> dict[str, Any]:

@@ -112,6 +112,7 @@ def backward(self: Tensor, gradient: Tensor | None = None) -> None:
                 if after is None:
                     continue
                 if gradient_of is not None:
+                    gradient_of = gradient_of.sum_to_size(after._input_metadata[number].shape)  # of what was expanded
                     sums = given.setdefault(after, {})
                     sums[number] = sums[number] + gradient_of if number in sums else gradient_of
                 waiting[after] -= 1

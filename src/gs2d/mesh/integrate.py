@@ -72,12 +72,17 @@ def integrator(volumes: Sequence[Volume], backend: str, threads: int | None = No
         from gs2d.kernels.library import load
 
         return add_natively(volumes, load(), threads)
-    import torch
-
     from gs2d.kernels.cuda.launch import launcher_for
 
-    device = torch.device("cuda")
+    device = gpu_device()
     return add_on_gpu(volumes, launcher_for(device), device)
+
+
+def gpu_device() -> torch.device:
+    """The GPU that fuses: torch's current one."""
+    import torch
+
+    return torch.device("cuda")
 
 
 @dataclass(frozen=True, eq=False)
