@@ -7,6 +7,7 @@ import errno
 import io
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -100,6 +101,22 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
             raise disk_error(target, failure) from error
         raise
     _sync_folder(target.parent)
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Raise now what ``atomic_write`` would raise at the end of a long work: no such folder, no permission, a folder.
+
+    Raises
+    ------
+    DiskError
+    """
+    target = Path(path)
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        tempfile.TemporaryFile(dir=target.parent).close()
+    except OSError as error:
+        raise disk_error(target, error) from error
 
 
 def _sync_folder(folder: Path) -> None:

@@ -48,6 +48,7 @@ def test_a_flight_becomes_pictures_and_a_film(
         (["--orbit", "9", "--video", "a.mov"], "--video must name a .mp4 or .webp file, got a.mov"),
         (["--orbit", "1", "--video", "a.webp"], "--video needs at least 2 frames, got 1"),
         (["--orbit", "9", "--video", "no/such/folder/a.webp"], "the folder does not exist"),
+        (["--orbit", "9", "--video", f"{'a' * 300}.webp"], "choose a shorter name"),
     ],
 )
 def test_what_makes_no_film_is_one_line(
@@ -55,3 +56,26 @@ def test_what_makes_no_film_is_one_line(
 ) -> None:
     assert run(["render", str(trained), *words]) == 2
     assert named in one_line(capsys.readouterr().err)
+
+
+def test_a_film_that_cannot_be_written_is_said_before_the_pictures_are_rendered(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "film.webp").mkdir()
+    frames = tmp_path / "frames"
+    assert (
+        run(["render", str(trained), "--orbit", "9", "--video", str(tmp_path / "film.webp"), "--out", str(frames)]) == 2
+    )
+    assert "a folder has this name" in one_line(capsys.readouterr().err)
+    assert not frames.exists()
+
+
+def test_a_film_is_not_written_over_a_photograph(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = Path(json.loads((trained / "run.json").read_text())["scene"]["path"])
+    film = tmp_path / "film.webp"  # captures may hold pictures of this kind; the ones here are PNG
+    film.symlink_to(next(capture.glob("train/*.png")))
+    assert run(["render", str(trained), "--orbit", "2", "--video", str(film), "--out", str(tmp_path), "--quiet"]) == 2
+    assert "--video would write over the capture's photograph" in one_line(capsys.readouterr().err)
+    assert film.is_symlink()

@@ -231,7 +231,7 @@ def test_a_rendering_is_not_written_over_a_photograph(
     monkeypatch.setattr("gs2d.pipeline.jobs.file_names", plain)
     photograph = capture / "test" / "r_0.png"
     before = photograph.read_bytes()
-    with pytest.raises(RunError, match=r"holds the capture's photograph r_0\.png"):
+    with pytest.raises(RunError, match=r"--out would write over the capture's photograph .*r_0\.png"):
         render_run(undisturbed.path, out=capture / "test", threads=1)
     assert photograph.read_bytes() == before
     assert render_run(undisturbed.path, out=tmp_path / "out", threads=1)["images"] == 2

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from gs2d.data import View
-from gs2d.disk import disk_error
+from gs2d.disk import check_writable
 from gs2d.errors import DataError, RunError
 from gs2d.evaluate.lpips import load_lpips
 from gs2d.images import write_image
@@ -160,7 +160,9 @@ def render_run(
     if not views:
         raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
     if out is not None:
-        _spare_photographs(out, [name for name, _ in views], job)
+        _spare_photographs([out / f"{name}.png" for name, _ in views], "--out", job)
+    if video is not None:
+        _spare_photographs([video], "--video", job)
     folder = out or run.file(RENDERS) / (moving or split)
     made = make_folder(folder)
     if moving and out is None:  # the run's own folder: no frame of a longer film stays among these
@@ -208,17 +210,16 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> str
         if not (orbit or flight):
             raise RunError("--video needs frames that move, got neither --orbit N nor --flight N; give one")
         check_video(video, fps, orbit or flight)
-        if not video.parent.is_dir():
-            raise disk_error(video, FileNotFoundError(2, "No such file or directory"))
+        check_writable(video)
     return "orbit" if orbit else "flight" if flight else ""
 
 
-def _spare_photographs(folder: Path, names: Sequence[str], job: Job) -> None:
+def _spare_photographs(files: Sequence[Path], option: str, job: Job) -> None:
     """Raise rather than write a rendering over a photograph of the capture."""
     photographs = {view.path.resolve() for view in job.scene.views if view.path is not None}
-    for name in names:
-        if (folder / f"{name}.png").resolve() in photographs:
-            raise RunError(f"--out {folder} holds the capture's photograph {name}.png; choose another folder")
+    for file in files:
+        if file.resolve() in photographs:
+            raise RunError(f"{option} would write over the capture's photograph {file}; choose another name")
 
 
 def evaluate_run(
