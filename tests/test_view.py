@@ -115,7 +115,7 @@ class FakeServer:
         self.connected.append(call)
 
     def on_client_disconnect(self, call: Callable[[Any], None]) -> None:
-        pass
+        self.gone = call
 
     def get_clients(self) -> dict[int, Any]:
         return self.clients
@@ -184,6 +184,27 @@ def test_a_picture_that_cannot_be_drawn_is_not_silent() -> None:
     exact.draw("depth")
     wait_for(lambda: exact.failure is not None)
     assert str(exact.failure) == "no such picture"
+    exact.close()
+
+
+def test_a_browser_that_is_closed_while_it_is_drawn_for_stops_nobody() -> None:
+    server, drawn = FakeServer(), []
+
+    def leave(camera: Camera, _kind: str) -> Drawn:
+        drawn.append(camera.width)
+        if len(drawn) == 1:
+            server.gone(server.clients.pop(1))
+            raise ConnectionError("nobody there")
+        return flat(camera, _kind)
+
+    exact = ExactPictures(server, WORLD, lambda: leave)
+    server.connect(1)
+    exact.draw("exact")
+    wait_for(lambda: len(drawn) == 1)
+    server.connect(2)
+    wait_for(lambda: len(server.pictures) == 2)
+    assert {number for number, _, _ in server.pictures} == {2}
+    assert exact.failure is None
     exact.close()
 
 

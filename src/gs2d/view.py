@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.camera import Camera
-from gs2d.errors import BackendError
+from gs2d.errors import BackendError, Gs2dError
 from gs2d.geometry import focus_point
 from gs2d.view_exact import ExactPictures, Frame, Render
 from gs2d.view_splats import Preview
@@ -167,8 +167,15 @@ class Viewer:
             assert self._exact is not None
             self._exact.draw(drawn.value if drawn.value in PICTURES[1:] else None)
 
+        def choose(_: Any) -> None:
+            try:
+                show(load=True)
+            except Gs2dError as error:  # a checkpoint that cannot be read: what was shown stays
+                for client in self._server.get_clients().values():
+                    client.add_notification("This stage cannot be shown", str(error), color="red")
+
         show(load=True)
-        chosen.on_update(lambda _: show(load=True))
+        chosen.on_update(choose)
         drawn.on_update(lambda _: show(load=False))
 
     def _show_splats(self, splats: Preview) -> None:

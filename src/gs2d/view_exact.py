@@ -79,7 +79,7 @@ class ExactPictures:
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="gs2d view", daemon=True)
         server.on_client_connect(self._connected)
-        server.on_client_disconnect(lambda client: self._wishes.pop(client.client_id, None))
+        server.on_client_disconnect(self._left)
         self._thread.start()
 
     def _connected(self, client: Any) -> None:
@@ -90,6 +90,10 @@ class ExactPictures:
         with self._changed:
             self._wishes[client.client_id] = _Wish(client)
             self._changed.notify()
+
+    def _left(self, client: Any) -> None:
+        with self._changed:
+            self._wishes.pop(client.client_id, None)
 
     def scene(self, render: Callable[[], Render]) -> None:
         """Draw other splats from now on."""
@@ -143,8 +147,10 @@ class ExactPictures:
                 wish.client.scene.set_background_image(
                     drawn.image, format="jpeg", jpeg_quality=90 if sharp else 60, depth=depth
                 )
-            except Exception as error:  # told by the main thread, which this one cannot raise in
-                self.failure = error
+            except Exception as error:
+                if wish.client.client_id not in self._server.get_clients():
+                    continue  # its browser went away while it was drawn for
+                self.failure = error  # told by the main thread, in which this one cannot raise
                 return
 
 

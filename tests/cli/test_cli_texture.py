@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks import texture
 
 from cli_runs import one_line
 from gs2d.cli import run
+from gs2d.io.ply import read_mesh, write_mesh
 from gs2d.pipeline.paths import up_direction
+from gs2d.triangles import Mesh
 from tiny import RADIUS, ball_cameras, write_ball_mesh
 
 pytest.importorskip("xatlas", reason="xatlas is not installed (extra `texture`)")
@@ -58,6 +61,21 @@ def test_the_options_reach_the_texture(ball: Path, tmp_path: Path, capsys: pytes
     assert [Path(name).name for name in result["files"]] == ["small.obj", "small.mtl", "small.png"]
     assert result["bytes"] == sum(Path(name).stat().st_size for name in result["files"])
     assert not (ball / "mesh.glb").exists()
+
+
+def test_the_benchmark_compares_textures_with_vertex_colours(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = read_mesh(ball / "mesh.ply")
+    write_mesh(ball / "mesh.ply", Mesh(mesh.vertices, mesh.faces, np.full(mesh.vertices.shape, 128, np.uint8)))
+    words = [str(ball), "--size", "64", "--downscale", "2", "--pictures", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["texture", *words])
+    texture.main()
+    lines = [line for line in capsys.readouterr().out.splitlines() if "both cover" in line]
+    figures = {line.split(":")[0].strip(): float(line.split(",")[1].split()[0]) for line in lines}
+    assert list(figures) == ["vertex colours", "from photographs", "from renders"]
+    assert figures["from photographs"] > figures["vertex colours"] + 5  # grey
+    assert len(list(tmp_path.glob("000-*.png"))) == 4
 
 
 def test_a_mesh_extracted_anew_takes_the_old_texture_with_it(ball: Path, capsys: pytest.CaptureFixture[str]) -> None:

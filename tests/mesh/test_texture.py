@@ -46,7 +46,7 @@ def test_a_checkered_box_is_drawn_from_its_texture_as_its_photographs_show_it() 
     pytest.importorskip("xatlas")
     mesh = box()
     photographs = [photograph(mesh, camera, checkers) for camera in ring(14)]
-    baked = bake(unwrap(mesh), photographs, 256, threads=1)
+    baked = bake(unwrap(mesh, 256), photographs, 256, threads=1)
     assert baked.unseen < 10  # of 60 000: at the corners
     colors = np.rint(255 * np.clip(checkers(mesh.vertices), 0, 1)).astype(np.uint8)
     by_vertex, by_texture = [], []
@@ -198,7 +198,7 @@ def test_no_texel_of_the_texture_is_without_a_colour_of_its_nearest_chart() -> N
 def test_texels_know_their_place_on_the_surface() -> None:
     pytest.importorskip("xatlas")
     mesh = box(3)
-    atlas = unwrap(mesh)
+    atlas = unwrap(mesh, 128)
     assert np.array_equal(atlas.source[atlas.faces], mesh.faces)
     for size in (64, 100):
         texels = texels_of(atlas, size)
@@ -230,7 +230,7 @@ def test_a_simplified_mesh_has_so_many_faces_and_the_same_shape() -> None:
 
 
 def test_the_size_of_a_texture_follows_the_pixels() -> None:
-    # 2 x 2 wu at 64 px per wu: 128 px, 256 half pixels, / sqrt(0.7) = 306: 512. From twice as near: 612: 1024.
+    # 2 x 2 wu at 64 px per wu: 128 px, 256 half pixels, / sqrt(0.55) = 345: 512. From twice as near: 690: 1024.
     assert texture_size(grid_plane(), [above(1.0, 256, 64.0), above(2.0, 256, 64.0)]) == 512
     assert texture_size(grid_plane(), [above(0.5, 256, 64.0)]) == 1024
     assert texture_size(grid_plane(), [above(-1.0, 256, 64.0)]) == 256  # nobody sees it: the least

@@ -12,9 +12,8 @@ from gs2d.data.toy_rays import cast_camera
 from gs2d.errors import BackendError, ProtocolError
 from gs2d.triangles import Mesh
 
-PADDING = 4  # texels between charts, at the resolution that they are packed for
+PADDING = 4  # texels between charts: two smaller copies of the texture do not mix them
 _BAND = 1 << 20  # texels that are drawn at a time
-_PACKED_FOR = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +110,8 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     return Mesh((points.astype(np.float64) * size + middle).astype(mesh.vertices.dtype), triangles.astype(np.int32))
 
 
-def unwrap(mesh: Mesh) -> Atlas:
-    """Cut a mesh into charts and pack them into the unit square.
+def unwrap(mesh: Mesh, size: int) -> Atlas:
+    """Cut a mesh into charts and pack them into the unit square, ``PADDING`` texels of a texture of ``size`` apart.
 
     Raises
     ------
@@ -125,7 +124,7 @@ def unwrap(mesh: Mesh) -> Atlas:
     if not len(mesh.faces):
         raise ProtocolError("a texture needs a mesh with faces, got none; extract it with other limits")
     atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
-    pack.resolution, pack.padding, pack.bilinear = _PACKED_FOR, PADDING, True
+    pack.resolution, pack.padding, pack.bilinear = size, PADDING, True
     vertices = mesh.vertices.astype(np.float64)
     vertices = (vertices - vertices.mean(axis=0)) / (float(np.ptp(vertices, axis=0).max()) or 1.0)
     atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))

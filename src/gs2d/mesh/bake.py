@@ -36,7 +36,7 @@ JUMP = 3.0  # bend of the depth between pixels that is an outline, in footprints
 MAX_SIDE = 1600  # px, of the depth maps that decide what is hidden
 MIN_SIZE, MAX_SIZE, MAX_AUTO_SIZE = 64, 8192, 4096
 _CHUNK = 1 << 17  # texels
-_TYPICAL_USE = 0.7  # part of the atlas that charts cover
+_TYPICAL_USE = 0.55  # part of the atlas that charts cover
 _FINER = 2.0  # texels in the length of a pixel: a picture drawn twice over keeps its edges
 _SAMPLES = 5000  # faces that choose the size
 

@@ -86,10 +86,11 @@ def textured_mesh(job: Job, splats: Splats, mesh: Mesh, options: TextureOptions,
     BackendError, DataError, ProtocolError
     """
     on_event(Phase("cutting the surface into charts", 0))
-    atlas = unwrap(simplified(mesh, options.faces))
-    views = _views(job, options, on_event)
-    size = options.size or texture_size(atlas.mesh, [view.camera for view in views])
-    return bake(atlas, _photographs(job, views, splats, options, on_event), size, threads=torch.get_num_threads())
+    views, small = _views(job, options, on_event), simplified(mesh, options.faces)
+    size = options.size or texture_size(small, [view.camera for view in views])
+    return bake(
+        unwrap(small, size), _photographs(job, views, splats, options, on_event), size, threads=torch.get_num_threads()
+    )
 
 
 def check_texture_options(options: TextureOptions) -> None:
