@@ -2,7 +2,7 @@
 
 A kernel runs on the stream that is current in torch for its device, in torch's (the primary) context of that device,
 so launches fit in between torch's own operations, under ``torch.cuda.stream``, on several devices, in the threads of
-the backward pass and in a captured graph. Nothing here waits for the device.
+the backward pass and, once a kernel has been launched before, in a captured graph. Nothing here waits for the device.
 """
 
 from __future__ import annotations
