@@ -2,7 +2,7 @@
 
 The tree is balanced whatever the points are: far outliers, clusters and duplicates cost no more than a plane does. A
 search takes time that grows with the logarithm of the number of points, and memory for its result only; the tree takes
-some 50 bytes a point, its making three times that for a moment.
+45 to 90 bytes a point, its making some three times that for a moment.
 """
 
 from __future__ import annotations
