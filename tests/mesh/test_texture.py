@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import struct
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from benchmarks.texture import picture, psnr
 from texture_shapes import above, box, checkers, flat_atlas, grid_plane, join, photograph, ring
 
-from gs2d.errors import BackendError, DataError, ProtocolError
+from gs2d.errors import BackendError, DataError, DiskError, ProtocolError
 from gs2d.io.obj import read_obj
 from gs2d.io.textured import turn_to_y, write_textured
 from gs2d.mesh import atlas as atlas_module
@@ -316,8 +317,26 @@ def test_an_obj_file_is_not_torn_at_the_seams_of_its_texture(tmp_path: Path) -> 
     assert "map_Kd a.png" in (tmp_path / "a.mtl").read_text()
 
 
+def test_an_obj_file_its_material_and_its_texture_are_replaced_all_three_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("gs2d.io.textured._lines", full)
+    with pytest.raises(DiskError, match="No space left"):
+        write_textured(tmp_path / "a.obj", textured())
+    assert list(tmp_path.iterdir()) == []
+    for name in ("a.obj", "a.mtl", "a.png"):
+        (tmp_path / name).write_text("mine")
+    with pytest.raises(DiskError, match="No space left"):
+        write_textured(tmp_path / "a.obj", textured())
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"] * 3
+
+
 def test_names_that_no_viewer_could_open_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"\.glb or \.obj"):
         write_textured(tmp_path / "a.ply", textured())
-    with pytest.raises(DataError, match="without spaces"):
-        write_textured(tmp_path / "a b.obj", textured())
+    for name in ("a b.obj", " a.obj", "a\n.obj"):
+        with pytest.raises(DataError, match="without spaces"):
+            write_textured(tmp_path / name, textured())

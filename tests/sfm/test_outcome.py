@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -114,6 +116,15 @@ def test_a_worker_that_dies_is_one_line_with_its_last_words(tmp_path: Path, code
     with pytest.raises(DataError, match=expected) as caught:
         follow(tmp_path, code)
     assert "\n" not in str(caught.value)
+
+
+def test_a_worker_that_dies_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP aborts, and what it says to a file on the same disk is lost."""
+    monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=2_000_000))
+    with pytest.raises(
+        DataError, match="signal 6 while finding features: .*; 2 MB are free on the disk of --out: free"
+    ):
+        follow(tmp_path, "say(phase='features', total=3); os.abort()")
 
 
 def test_the_worker_looks_for_modules_where_the_command_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

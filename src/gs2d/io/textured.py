@@ -37,7 +37,7 @@ def written_files(path: Path) -> tuple[Path, ...]:
         raise DataError(f"a textured mesh is written as .glb or .obj, got {path}; choose such a name")
     if suffix == ".glb":
         return (path,)
-    if len(path.name.split()) > 1:
+    if any(letter.isspace() for letter in path.name):
         raise DataError(f"an OBJ file names its texture without spaces, got {path.name!r}; choose such a name, or .glb")
     return path, path.with_suffix(".mtl"), path.with_suffix(".png")
 
@@ -162,22 +162,21 @@ def turn_to_y(up: np.ndarray) -> list[float]:
 def write_obj(path: Path, mesh: TexturedMesh) -> None:
     """Write ``path``, and beside it the material and the texture under the same name; positions are not split at seams.
 
-    The texture and the material go first: an OBJ file that is there is complete.
+    All three or none; the texture and the material get their names first: an OBJ file that is there is complete.
     """
     obj, mtl, png = written_files(path)
     positions, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
     place = place.reshape(-1)[mesh.faces] + 1  # [F, 3]; the format counts from 1
     corner = mesh.faces + 1
-    with atomic_write(png) as file:
-        file.write(png_bytes(mesh.texture))
-    with atomic_write(mtl, "w") as file:
-        file.write(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {png.name}\n")
-    with atomic_write(obj, "w") as file:
+    with atomic_write(obj, "w") as file, atomic_write(mtl, "w") as material, atomic_write(png) as texture:
+        texture.write(png_bytes(mesh.texture))
+        material.write(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {png.name}\n")
         file.write(f"mtllib {mtl.name}\nusemtl texture\n")
         _lines(file, "v %.9g %.9g %.9g\n", positions)
         _lines(file, "vt %.7g %.7g\n", np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], axis=1))  # from the lower left
         _lines(file, "vn %.5g %.5g %.5g\n", mesh.normals)
         _lines(file, "f %d/%d/%d %d/%d/%d %d/%d/%d\n", np.stack([place, corner, corner], axis=2).reshape(-1, 9))
+        file.flush()  # a full disk is heard of while all three still have their temporary names
 
 
 def _lines(file: Any, template: str, rows: np.ndarray, chunk: int = 10_000) -> None:

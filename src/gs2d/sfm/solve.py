@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import queue
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -24,6 +25,7 @@ MISSING = (
     'structure from motion needs pycolmap, which is not installed: pip install "2dgs-r[sfm]", or pip install pycolmap'
 )
 POLL_SECONDS = 0.5
+_LITTLE_SPACE = 64 << 20  # bytes; what SQLite could not write is given back when it gives up
 # Modules are looked for where this process does: `-m` would first take a random.py of the folder one is in.
 _WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.worker import main; main(sys.argv[1])"
 _COUNTED = {"features": "keypoints", "matching": "two_view_geometries"}  # phase -> table that grows by one a step
@@ -173,6 +175,8 @@ def _last_words(phase: str, code: int, log: Path) -> str:
     how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
     said = lines[-1][:300] if lines else "it said nothing"
     remedy = "give it less: --threads 2, --feature-size 1000" if code < 0 else "if the disk is not full, report it"
+    if (free := shutil.disk_usage(log.parent).free) < _LITTLE_SPACE:  # its last words may not have fitted either
+        remedy = f"{free / 1e6:.0f} MB are free on the disk of --out: free some space or choose another folder"
     return f"COLMAP {how} while {_PHASES.get(phase, 'it started')}: {said}; {remedy}"
 
 
