@@ -39,6 +39,7 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
         "registers": lambda: registers(bench),
         "parity": lambda: parity(bench, 2 if bench.dry else 60),
         "determinism": lambda: determinism(bench),
+        "neighbours": lambda: neighbours(bench, 500 if bench.dry else 5_000_000),
         "tests": lambda: gpu_tests(bench),
         **{tool: lambda tool=tool: sanitize(bench, tool) for tool in TOOLS},
     }
@@ -214,6 +215,23 @@ def determinism(bench: Bench) -> dict[str, Any]:
     judge = reference.rasterize(splats.to("cpu", torch.float64), camera, SETTINGS)
     covered = float(judge.alpha.mean())
     return {"images_are_the_same_bits": same, "relative_change_of_gradients": change, "mean_alpha": covered}
+
+
+def neighbours(bench: Bench, count: int) -> dict[str, Any]:
+    """Milliseconds of what surface scores spend most on: a tree of points on a sphere, a search for as many others."""
+    generator = torch.Generator().manual_seed(0)
+    points, queries = (torch.randn(count, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    points, queries = ((x / x.norm(dim=1, keepdim=True)).to(bench.device) for x in (points, queries))
+    launcher, tree = launch.launcher_for(bench.device), build_tree(points)
+    found: dict[str, Any] = {"points": count}
+    found["build_ms"] = bench.times(lambda _: build_tree(points), repeats=3, warmup=1)
+    for k in NEIGHBOURS:
+
+        def search(_: int, k: int = k) -> object:
+            return find_nearest(tree, queries, launcher=launcher, neighbours=k)
+
+        found[f"nearest_{k}_ms"] = bench.times(search, repeats=3, warmup=1)
+    return found
 
 
 def gpu_tests(bench: Bench) -> dict[str, Any]:
