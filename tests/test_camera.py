@@ -70,3 +70,17 @@ def test_downscaling_cuts_leftover_pixels_and_keeps_rays() -> None:
 def test_impossible_cameras_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ShapeError, match=message):
         replace(Camera(4, 4, 5.0, 5.0, 2.0, 2.0, EYE4), **change)  # type: ignore[arg-type]
+
+
+def test_an_eye_at_its_target_or_an_up_along_the_view_is_said(recwarn: pytest.WarningsRecorder) -> None:
+    for eye in ((0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (np.nan, 0.0, 2.0)):
+        with pytest.raises(ShapeError, match="look_at needs an eye away from its target and an up that is not"):
+            look_at(np.array(eye), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=6, height=4, fx=5)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("width", [9.5, 9.0, float("nan"), "9"])
+def test_sizes_are_whole_numbers_of_pixels(width: object) -> None:
+    with pytest.raises(ShapeError, match="width and height must be whole numbers of pixels, got"):
+        Camera(width, 4, 5.0, 5.0, 3.0, 2.0, EYE4)  # type: ignore[arg-type]
+    assert Camera(np.int64(9), 4, 5.0, 5.0, 3.0, 2.0, EYE4).width == 9  # type: ignore[arg-type]

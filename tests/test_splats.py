@@ -63,3 +63,4 @@ def test_rows_are_picked_by_mask_or_index() -> None:
 
 def test_dtype_moves_all_attributes() -> None:
     assert {tensor.dtype for _, tensor in make().to(dtype=torch.float64).items()} == {torch.float64}
+    assert {tensor.dtype for _, tensor in make().to(torch.float64).items()} == {torch.float64}  # as of a tensor

@@ -50,6 +50,8 @@ class Camera:
             )
         if not np.isfinite((self.fx, self.fy, self.cx, self.cy)).all():
             raise ShapeError(f"fx, fy, cx, cy must be finite, got {self.fx}, {self.fy}, {self.cx}, {self.cy}")
+        if not all(isinstance(side, int | np.integer) for side in (self.width, self.height)):
+            raise ShapeError(f"width and height must be whole numbers of pixels, got {self.width!r}x{self.height!r}")
         if self.width < 1 or self.height < 1 or not (self.fx > 0 and self.fy > 0):
             raise ShapeError(
                 f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
@@ -119,8 +121,20 @@ class Camera:
 def look_at(
     eye: np.ndarray, target: np.ndarray, up: np.ndarray, *, width: int, height: int, fx: float, fy: float | None = None
 ) -> Camera:
-    """A camera at ``eye`` [3] that looks at ``target`` [3], ``up`` [3] towards the top of the image."""
+    """A camera at ``eye`` [3] that looks at ``target`` [3], ``up`` [3] towards the top of the image.
+
+    Raises
+    ------
+    ShapeError
+        ``eye`` is at ``target``, or looks straight along ``up``: the image could be turned in any way.
+    """
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+    right = np.cross(target - eye, up)
+    if not np.linalg.norm(right) > 0:
+        raise ShapeError(
+            f"look_at needs an eye away from its target and an up that is not the way it looks, got eye "
+            f"{eye.tolist()}, target {target.tolist()}, up {up.tolist()}; choose another up"
+        )
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

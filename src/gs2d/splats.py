@@ -96,8 +96,10 @@ class Splats:
         """A deep, detached copy."""
         return Splats(**{name: tensor.detach().clone() for name, tensor in self.items()})
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Splats:
-        """A copy on another device or in another dtype."""
+    def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Splats:
+        """A copy on another device or in another dtype; ``to(torch.float64)`` is ``to(dtype=torch.float64)``."""
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
         return Splats(**{name: tensor.to(device=device, dtype=dtype) for name, tensor in self.items()})
 
     def rows(self, index: Tensor) -> Splats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from render_scenes import front_camera, splat
@@ -163,3 +164,9 @@ def test_arguments_of_other_types_or_in_another_order_are_named() -> None:
         rasterize(splats, camera, "cpu")  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="settings must be of type gs2d's RasterSettings, got Tensor"):
         splat_errors(splats, camera, torch.zeros(9, 9, 3), torch.ones(9, 9))  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="means must be a torch tensor, got ndarray; use torch.as_tensor"):
+        rasterize(replace(splats, means=np.zeros((1, 3), np.float32)), camera)
+    with pytest.raises(ShapeError, match="gradient_rows must be a torch tensor, got ndarray"):
+        rasterize(splats, camera, gradient_rows=np.ones(1, bool))  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="image must be a torch tensor, got ndarray"):
+        splat_errors(splats, camera, np.zeros((9, 9, 3), np.float32))  # type: ignore[arg-type]

@@ -113,7 +113,7 @@ def rasterize(
     BackendError
         If the backend cannot run here, or not with these inputs.
     """
-    _check_types(splats, camera, settings)
+    _check_types(splats, camera, settings, screen_probe=screen_probe, gradient_rows=gradient_rows)
     chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
     settings = _checked(splats, settings, chosen)
     if screen_probe is not None:
@@ -183,7 +183,7 @@ def splat_errors(
     ShapeError, BackendError
         As for :func:`rasterize`.
     """
-    _check_types(splats, camera, settings)
+    _check_types(splats, camera, settings, image=image, mask=mask)
     chosen = backend if isinstance(backend, Backend) else get_backend(backend, splats.device.type)
     settings = _checked(splats, settings, chosen)
     H, W = camera.height, camera.width
@@ -198,7 +198,7 @@ def splat_errors(
     return chosen.splat_errors(splats, camera, image, settings, mask, occlusion)
 
 
-def _check_types(splats: object, camera: object, settings: object) -> None:
+def _check_types(splats: object, camera: object, settings: object, **tensors: object) -> None:
     """One line instead of an AttributeError from within; the order of the arguments is what people get wrong."""
     for name, value, kind in (
         ("splats", splats, Splats),
@@ -207,6 +207,9 @@ def _check_types(splats: object, camera: object, settings: object) -> None:
     ):
         if not isinstance(value, kind):
             raise ShapeError(f"{name} must be of type gs2d's {kind.__name__}, got {type(value).__name__}")
+    for name, tensor in {**vars(splats), **tensors}.items():
+        if not isinstance(tensor, Tensor) and tensor is not None:
+            raise ShapeError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
 
 
 def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> RasterSettings:
