@@ -88,3 +88,32 @@ def test_lists_of_entries_hold_exactly_those_with_the_bit_in_order(any_native: L
     for bit in (0, 5, 31):
         count = compress(masks.ctypes.data, n, bit, out.ctypes.data)
         assert out[:count].tolist() == [i for i in range(n) if masks[i] >> bit & 1]
+
+
+@pytest.mark.parametrize("k", [2, 3, 4])
+def test_packed_rows_become_vectors_and_rows_again(any_native: Library, k: int) -> None:
+    n = any_native.lanes
+    rows = np.arange(n * k, dtype=real(any_native)).reshape(n, k)
+    vectors, back = np.empty((k, n), rows.dtype), np.empty_like(rows)
+    function = any_native.function("gs2d_selftest_packed", None, [ctypes.c_int] + [ctypes.c_void_p] * 3)
+    function(k, rows.ctypes.data, vectors.ctypes.data, back.ctypes.data)
+    assert np.array_equal(vectors, rows.T)
+    assert np.array_equal(back, rows)
+
+
+def test_interleaving_takes_a_bit_of_each_mask_in_turn(any_native: Library) -> None:
+    n = any_native.lanes
+    masks = np.random.default_rng(0).integers(0, 1 << n, size=(50, 4), dtype=np.uint32)
+    function = any_native.function("gs2d_selftest_interleave", ctypes.c_uint64, [ctypes.c_void_p])
+    for row in masks:
+        bits = [int(row[i % 4]) >> (i // 4) & 1 for i in range(4 * n)]
+        assert function(np.ascontiguousarray(row).ctypes.data) == sum(bit << i for i, bit in enumerate(bits))
+
+
+def test_spreading_repeats_each_row_for_the_rows_of_blocks_of_a_tile(any_native: Library) -> None:
+    n = any_native.lanes
+    block_rows = {16: 4, 8: 8}[n]  # of 4 and of 2 pixels, in a tile of 16
+    rows = np.arange(16, dtype=real(any_native)).reshape(4, 4)
+    out = np.empty((4, n), rows.dtype)
+    any_native.function("gs2d_selftest_spread", None, [ctypes.c_void_p] * 2)(rows.ctypes.data, out.ctypes.data)
+    assert np.array_equal(out, np.repeat(rows[: n // block_rows], block_rows, axis=0).T)

@@ -19,6 +19,9 @@
 //   REGISTERS                 how many vectors the processor holds
 //   transpose(v)              in place, LANES vectors
 //   transpose_reduce<K>(v, p) p[k] = sum(v[k]), K = 16 or 4, fixed order
+//   spread(rows, v)           a few rows of 4 reals to 4 vectors, each row's reals repeated
+//   interleave(m)             four masks to one number, a bit of each in turn
+//   load_packed<K>(p, v)      LANES rows of K reals to K vectors, and store_packed<K> back
 #pragma once
 
 #include <cstddef>
