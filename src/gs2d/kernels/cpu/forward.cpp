@@ -99,7 +99,7 @@ void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const Blen
 }
 
 // Entries of the chunk that reach a live block, with their records side by side.
-int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockRows& boxes, const TileArea& area) {
+int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockRows& block_rows, const TileArea& area) {
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
     int m = 0;
@@ -114,7 +114,7 @@ int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const Block
                 __builtin_prefetch(&f.records[size_t(entries[i + j + AHEAD].splat) * RECORD]);
             }
         }
-        blocks_touched(f, splats, boxes, real(area.x0), real(area.y0), touched);
+        blocks_touched(f, splats, block_rows, real(area.x0), real(area.y0), touched);
         for (int j = 0; j < TOGETHER && i + j < n; ++j) {
             const uint32_t blocks = (f.view.exact_masks ? touched[j] : ALL_BLOCKS) & wanted;
             w.splats[m] = splats[j];
@@ -170,7 +170,7 @@ RowLines images_written(const Frame& f, const Images& out) {
     return lines;
 }
 
-void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlockRows& boxes,
+void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlockRows& block_rows,
                 const BlendLimits<V>& limits) {
     TileWork w;
     const TileArea area = tile_area(f, tile);
@@ -180,7 +180,7 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
     Entry* const end = &f.entries[f.tile_begin[tile + 1]];
     Entry* kept = begin;
     for (Entry* e = begin; e < end; e += CHUNK) {
-        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, boxes, area);
+        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, block_rows, area);
         bool live = false;
         for (int b = 0; b < BLOCKS; ++b) {
             rows.ask();
@@ -201,10 +201,10 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
 
 bool blend_tiles(Frame& f, const Images& out) {
     if (!f.tile_count.reserve(f.tiles) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
-    const BlockRows boxes;
+    const BlockRows block_rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const RowLines written = images_written(f, out);
-    parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, written, boxes, limits); });
+    parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, written, block_rows, limits); });
     return true;
 }
 
