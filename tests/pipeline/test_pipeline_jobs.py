@@ -13,13 +13,13 @@ import pytest
 
 from ball_runs import Stop, options
 from gs2d.data import View
-from gs2d.errors import DataError, DiskError, ProtocolError, RunError
+from gs2d.errors import DataError, DiskError, ProtocolError, RecipeError, RunError
 from gs2d.images import read_image
 from gs2d.io.ply import read_mesh, read_splats, write_mesh, write_splats
 from gs2d.io.run import RunFolder, open_run
 from gs2d.pipeline.events import Event, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
-from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
 from gs2d.pipeline.pictures import file_name, file_names
 from gs2d.pipeline.train import train
 from gs2d.splats import Splats
@@ -160,6 +160,20 @@ def test_exporting_writes_the_layout_that_viewers_open(undisturbed: RunFolder, t
     head = (tmp_path / "out.ply").read_bytes()[:2000].decode("latin1")
     assert "property float scale_2" in head
     assert result["splats"] == len(read_splats(undisturbed.file("splats.ply")))
+
+
+def test_strings_are_paths_too(undisturbed: RunFolder, tmp_path: Path) -> None:
+    run: Any = str(undisturbed.path)
+    result = export_run(run, str(tmp_path / "a.ply"), "3dgs")  # type: ignore[arg-type]
+    assert result["file"] == str(tmp_path / "a.ply")
+    film, frames = str(tmp_path / "a.webp"), str(tmp_path / "frames")
+    assert render_run(run, orbit=2, video=film, out=frames)["images"] == 2  # type: ignore[arg-type]
+    assert EvaluateOptions(ground_truth=film).ground_truth == tmp_path / "a.webp"  # type: ignore[arg-type]
+    given = TrainOptions(scene="capture", out="run", cache="cache")  # type: ignore[arg-type]
+    assert (given.scene, given.out, given.cache) == (Path("capture"), Path("run"), Path("cache"))
+    assert given.start_from is None
+    with pytest.raises(RecipeError, match="must be a name that `gs2d recipes` lists or a Recipe, got NoneType"):
+        train(TrainOptions(scene="capture", out="run", recipe=None))  # type: ignore[arg-type]
 
 
 def test_an_unfinished_run_cannot_be_exported(capture: Path, tmp_path: Path) -> None:

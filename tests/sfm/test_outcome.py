@@ -18,6 +18,7 @@ from gs2d.cli.extras import EXTRAS
 from gs2d.data.colmap_model import ColmapCamera, ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run import RunFolder
+from gs2d.pipeline.poses import PosesOptions, find_poses
 from gs2d.sfm.outcome import Piece, camera_line, check_any, why_not_placed
 from gs2d.sfm.solve import Facts, Group, Request, check_installed, solve
 from gs2d.sfm.workplace import check_out, put_in_place, workplace
@@ -184,6 +185,12 @@ def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RunError, match="must be a folder"):
         check_out(tmp_path / "file", tmp_path / "photos", overwrite=True)
+
+
+def test_options_of_python_are_checked_like_those_of_the_command(colmap: None) -> None:
+    assert PosesOptions(photos="a", out="b").photos == Path("a")  # type: ignore[arg-type]
+    with pytest.raises(RunError, match=r"--threads must be a whole number from 1 to 1024, got 1.5"):
+        find_poses(PosesOptions(photos=Path("a"), out=Path("b"), threads=1.5))  # type: ignore[arg-type]
 
 
 def test_a_disk_that_is_mounted_there_is_said_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,7 @@ def checked_output(path: Path, out: Path) -> Path:
     ------
     RunError
     """
+    path, out = Path(path), Path(out)
     if out.suffix.lower() != ".ply":
         raise RunError(f"--out must name a .ply file, which is what is written, got {out}")
     if out.resolve() == (path / SPLATS).resolve():
@@ -107,7 +108,7 @@ def mesh_run(
     ------
     RunError, DataError, ProtocolError, DiskError
     """
-    out = None if out is None else checked_output(path, out)
+    path, out = Path(path), None if out is None else checked_output(path, out)
     run, job, splats = open_job(path, threads, on_event)
     if out is not None and out.resolve() != run.file(MESH).resolve():
         return extract_mesh(job, splats, options, out, on_event)
@@ -146,6 +147,7 @@ def render_run(
     """
     from gs2d.io.video import write_video
 
+    path, out, video = Path(path), None if out is None else Path(out), None if video is None else Path(video)
     moving = check_frames(orbit, flight, video, fps)
     run, job, splats = open_job(path, threads, on_event)
     views: list[tuple[str, View]]
@@ -200,7 +202,7 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> str
     from gs2d.io.video import check_video
 
     for name, frames in (("--orbit", orbit), ("--flight", flight)):
-        if not 0 <= frames <= MOST_FRAMES:
+        if not (isinstance(frames, int) and 0 <= frames <= MOST_FRAMES):
             raise RunError(f"{name} must be a number of frames from 1 to {MOST_FRAMES}, got {frames}")
     if orbit and flight:
         raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; give one")
@@ -238,7 +240,7 @@ def evaluate_run(
     from gs2d.pipeline.truth import OfficialTruth, Truth, check_thresholds, choose_truth, read_truth, score_surface
 
     check_thresholds(options.thresholds)
-    given = options.ground_truth
+    path, given = Path(path), options.ground_truth
     truth: Truth | OfficialTruth | None = None if given is None or given.is_dir() else read_truth(given)
     lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
     run, job, splats = open_job(path, threads, on_event)
@@ -275,7 +277,7 @@ def export_run(path: Path, out: Path, layout: str) -> dict[str, Any]:
     ------
     RunError, DiskError
     """
-    out = checked_output(path, out)
+    path, out = Path(path), checked_output(path, out)
     if out.resolve() == (path / MESH).resolve():
         raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
     splats = finished_splats(open_run(path))
@@ -292,7 +294,7 @@ def report_run(path: Path) -> Path:
     """
     from gs2d.report import write_report
 
-    run = open_run(path)
+    run = open_run(Path(path))
     write_report(run.path, cameras=shown_cameras(run))
     return run.file(REPORT)
 

@@ -9,6 +9,13 @@ from gs2d.protocols import Protocol
 from gs2d.recipe import Recipe
 
 
+def paths_of(options: object, *names: str) -> None:
+    """Turn the fields of these names that are strings into paths: in Python people write both."""
+    for name in names:
+        if isinstance(value := getattr(options, name), str):
+            object.__setattr__(options, name, Path(value))
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     """One training run.
@@ -73,6 +80,9 @@ class TrainOptions:
     title: str | None = None
     shown_views: int = 3
     allowed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        paths_of(self, "scene", "out", "start_from", "cache")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,3 +154,6 @@ class EvaluateOptions:
     ground_truth: Path | None = None
     thresholds: tuple[float, ...] = field(default=())
     lpips_weights: Path | None = None
+
+    def __post_init__(self) -> None:
+        paths_of(self, "ground_truth", "lpips_weights")

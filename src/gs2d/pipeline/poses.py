@@ -19,6 +19,7 @@ from gs2d.errors import RunError
 from gs2d.io.files import write_json
 from gs2d.io.run import make_folder, now, remove_made
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
+from gs2d.pipeline.options import paths_of
 from gs2d.sfm.outcome import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
 from gs2d.sfm.photos import Photo, camera_groups, find_photos, read_photos
 from gs2d.sfm.picture import write_picture
@@ -75,6 +76,9 @@ class PosesOptions:
     threads: int | None = None
     seed: int = 0
     overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        paths_of(self, "photos", "out")
 
 
 def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, Any]:
@@ -146,8 +150,8 @@ def _check(options: PosesOptions) -> None:
     )
     for name, least, most in numbers:
         value = getattr(options, name)
-        if value is not None and not least <= value <= most:
-            raise RunError(f"--{name.replace('_', '-')} must be from {least} to {most}, got {value}")
+        if value is not None and not (isinstance(value, int) and least <= value <= most):
+            raise RunError(f"--{name.replace('_', '-')} must be a whole number from {least} to {most}, got {value}")
 
 
 def _cores() -> int:

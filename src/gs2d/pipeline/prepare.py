@@ -109,6 +109,8 @@ def build_recipe(recipe: str | Recipe, *, schedule_scale: float, seed: int, over
     RecipeError
     """
     value = get_recipe(recipe) if isinstance(recipe, str) else recipe
+    if not isinstance(value, Recipe):
+        raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
     return validate(apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides))
 
 
