@@ -40,7 +40,7 @@ ABSGS_DEFAULT = GradDensify(
     reset_at_start_on_white=False,  # stage 3 starts from a trained scene, not from random points
 )
 # "A": "more sensitive thresholds for size and positional gradient"; the paper gives no numbers. Half of D's for the
-# gradient is what the sweep chose on lego (`python -m benchmarks.absgs`, docs/results.md); the size decided nothing there.
+# gradient is what the sweep chose on lego (`python -m benchmarks.absgs`, docs/results.md); size decided nothing there.
 ABSGS_ADJUSTED = replace(ABSGS_DEFAULT, grad_threshold=1e-4, abs_threshold=2e-4, percent_dense=0.0005)
 
 

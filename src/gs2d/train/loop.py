@@ -337,7 +337,7 @@ class Trainer:
     def _drop_unseen(self, stage: Stage) -> int:
         """Drop the splats that no training view sees; how many.
 
-        Where crossing splats are not drawn whole, one can grow until no training view sees it, and still hide a new view.
+        Where crossing splats are not drawn whole, one can grow until no training view sees it, and hide a new view.
         No pixel of a training view changes.
         """
         frozen = {"means", "quats", "log_scales", "opacity_logits"}.isdisjoint(stage.train)
