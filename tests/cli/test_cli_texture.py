@@ -104,6 +104,23 @@ def test_what_makes_no_texture_is_one_line(
     assert named in one_line(capsys.readouterr().err)
 
 
+def test_a_file_that_cannot_be_written_is_said_before_the_work(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.png").mkdir()
+    assert run(["mesh", str(ball), "--texture", "--out", str(tmp_path / "a.obj")]) == 2
+    assert "a.png: Is a directory; a folder has this name" in one_line(capsys.readouterr().err)
+
+
+def test_a_mesh_that_cannot_be_simplified_so_far_is_said(
+    ball: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As one of many pieces, of which each keeps some triangles."""
+    monkeypatch.setattr("gs2d.pipeline.texture.simplified", lambda mesh, _faces: mesh)
+    assert run(["mesh", str(ball), "--texture", "--faces", "4", "--texture-size", "64", "--threads", "1"]) == 0
+    assert "note simplified to 2,304 triangles, as near as it comes to --faces 4" in capsys.readouterr().err
+
+
 def test_no_photograph_is_written_over(ball: Path, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["mesh", str(ball), "--texture", "--out", str(capture / "train" / "r_0.obj")]) == 2
     assert "would write over the photograph" in one_line(capsys.readouterr().err.splitlines()[-1])

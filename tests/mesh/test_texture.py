@@ -230,6 +230,14 @@ def test_a_simplified_mesh_has_so_many_faces_and_the_same_shape() -> None:
         simplified(mesh, 3)
 
 
+def test_faces_without_area_have_finite_places_in_the_texture() -> None:
+    pytest.importorskip("xatlas")
+    point = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32), np.array([[0, 0, 0]], np.int32))
+    atlas = unwrap(point, 64)
+    assert np.isfinite(atlas.uv).all()
+    assert len(texels_of(atlas, 64).index) == 0
+
+
 def test_the_size_of_a_texture_follows_the_pixels() -> None:
     # 2 x 2 wu at 64 px per wu: 128 px, 256 half pixels, / sqrt(0.55) = 345: 512. From twice as near: 690: 1024.
     assert texture_size(grid_plane(), [above(1.0, 256, 64.0), above(2.0, 256, 64.0)]) == 512

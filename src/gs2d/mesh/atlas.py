@@ -130,7 +130,8 @@ def unwrap(mesh: Mesh, size: int) -> Atlas:
     atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
     atlas.generate(xatlas.ChartOptions(), pack, False)
     source, faces, uv = atlas[0]
-    return Atlas(mesh, source.astype(np.int64), faces.astype(np.int32), uv.astype(np.float32), int(atlas.chart_count))
+    uv = np.nan_to_num(uv.astype(np.float32))  # faces without area have no place in it
+    return Atlas(mesh, source.astype(np.int64), faces.astype(np.int32), uv, int(atlas.chart_count))
 
 
 def texels_of(atlas: Atlas, size: int) -> Texels:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from gs2d.data import View
+from gs2d.disk import check_writable
 from gs2d.errors import ProtocolError, RunError
 from gs2d.images import to_uint8
 from gs2d.io.ply import read_mesh
@@ -18,7 +19,7 @@ from gs2d.io.run import MESH, TEXTURED, RunFolder
 from gs2d.io.textured import write_textured, written_files
 from gs2d.mesh.atlas import required, simplified, unwrap
 from gs2d.mesh.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
-from gs2d.pipeline.events import OnEvent, Phase, counted, ignore
+from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.jobs import mesh_run, open_job
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.paths import up_direction
@@ -50,10 +51,14 @@ def texture_run(
     check_texture_options(options)
     for package in ("xatlas", "fast_simplification"):
         required(package)  # before minutes are spent
-    target = path / TEXTURED if out is None else out
+    path = Path(path)
+    target = path / TEXTURED if out is None else Path(out)
     files = written_files(target)
     if not target.parent.is_dir() and out is not None:
         raise RunError(f"--out {out} must be in a folder that exists; make {target.parent} first")
+    if out is not None:
+        for file in files:
+            check_writable(file)
     if out is None and (mesh_options != MeshOptions() or not (path / MESH).exists()):
         mesh_run(path, mesh_options, on_event, threads=threads)
         mesh_options = MeshOptions()
@@ -87,6 +92,10 @@ def textured_mesh(job: Job, splats: Splats, mesh: Mesh, options: TextureOptions,
     """
     on_event(Phase("cutting the surface into charts", 0))
     views, small = _views(job, options, on_event), simplified(mesh, options.faces)
+    if len(small.faces) > options.faces:
+        on_event(
+            Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
+        )
     size = options.size or texture_size(small, [view.camera for view in views])
     return bake(
         unwrap(small, size), _photographs(job, views, splats, options, on_event), size, threads=torch.get_num_threads()
