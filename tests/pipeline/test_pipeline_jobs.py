@@ -118,6 +118,20 @@ def test_a_shorter_orbit_leaves_no_frame_of_a_longer_one(undisturbed: RunFolder,
     assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 2
 
 
+def test_two_commands_do_not_render_into_the_same_folder_of_a_run(undisturbed: RunFolder, tmp_path: Path) -> None:
+    """The second would delete the frames of the first, which it then could not make a film of."""
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    render_run(copy, orbit=3, threads=1)
+    with (
+        RunFolder(copy / "renders" / "orbit").locked(),
+        pytest.raises(RunError, match="orbit is written by another process; wait for it or choose another --out"),
+    ):
+        render_run(copy, orbit=2, threads=1)
+    assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 3
+    render_run(copy, orbit=2, threads=1)
+    assert len(list((copy / "renders" / "orbit").glob("*.png"))) == 2
+
+
 def test_rendering_writes_one_png_for_each_view(undisturbed: RunFolder, tmp_path: Path) -> None:
     assert render_run(undisturbed.path, split="train", out=tmp_path / "train")["images"] == 6
     assert len(list((tmp_path / "train").glob("*.png"))) == 6

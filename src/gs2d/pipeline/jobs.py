@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from gs2d.evaluate.lpips import load_lpips
 from gs2d.images import write_image
 from gs2d.io.ply import read_mesh, read_splats, write_splats
 from gs2d.io.run import (
+    LOCK,
     MESH,
     RENDERS,
     REPORT,
@@ -167,29 +169,45 @@ def render_run(
         _spare_photographs([video], "--video", job)
     folder = out or run.file(RENDERS) / (moving or split)
     made = make_folder(folder)
-    if moving and out is None:  # the run's own folder: no frame of a longer film stays among these
-        for old in folder.glob("[0-9]*.png"):
-            if old.stem.isdecimal():
-                old.unlink()
-    written: list[Path] = []
-    try:
-        for name, view in counted(views, "rendering", len(views), on_event):
-            color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
-            is_new = not (folder / f"{name}.png").exists()
-            write_image(folder / f"{name}.png", color.cpu().numpy())
-            written += [folder / f"{name}.png"] if is_new else []
-    except BaseException:  # a full disk, Ctrl-C: half of the pictures would look like all of them
-        for picture in written:
-            picture.unlink(missing_ok=True)
-        remove_made(made)
-        raise
-    result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
-    if video is not None:
-        on_event(Phase("compressing the film", len(views)))
-        frames = [folder / f"{name}.png" for name, _ in views]
-        write_video(video, frames, fps=fps, threads=torch.get_num_threads(), on_frame=lambda done: on_event(Step(done)))
-        result |= {"video": str(video), "seconds": len(views) / fps, "video_bytes": video.stat().st_size}
-    return result
+    with _alone_in(folder) if out is None else contextlib.nullcontext():
+        if moving and out is None:  # the run's own folder: no frame of a longer film stays among these
+            for old in folder.glob("[0-9]*.png"):
+                if old.stem.isdecimal():
+                    old.unlink()
+        written: list[Path] = []
+        try:
+            for name, view in counted(views, "rendering", len(views), on_event):
+                color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
+                is_new = not (folder / f"{name}.png").exists()
+                write_image(folder / f"{name}.png", color.cpu().numpy())
+                written += [folder / f"{name}.png"] if is_new else []
+        except BaseException:  # a full disk, Ctrl-C: half of the pictures would look like all of them
+            for picture in written:
+                picture.unlink(missing_ok=True)
+            if made and out is None:
+                (folder / LOCK).unlink(missing_ok=True)
+            remove_made(made)
+            raise
+        result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
+        if video is not None:
+            on_event(Phase("compressing the film", len(views)))
+            frames = [folder / f"{name}.png" for name, _ in views]
+            write_video(
+                video, frames, fps=fps, threads=torch.get_num_threads(), on_frame=lambda done: on_event(Step(done))
+            )
+            result |= {"video": str(video), "seconds": len(views) / fps, "video_bytes": video.stat().st_size}
+        return result
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold a folder of the run, whose older frames go, against another command that renders into it."""
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(RunFolder(folder).locked())
+        except RunError as error:
+            raise RunError(f"{folder} is written by another process; wait for it or choose another --out") from error
+        yield
 
 
 def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> str:
