@@ -52,6 +52,7 @@ _TNT = {
 }
 _OWN: dict[str, dict[str, str]] = {
     "dtu": {
+        "crossing": f"{_OURS}: an object; the official box lets sheets grow",
         "depth": f"{_DTU_SCRIPT}: depth_ratio 1",
         "distortion_weight": f"{_DTU_SCRIPT}: lambda_dist 1000",
         "downscale": f"{_DTU_SCRIPT}: -r 2; {_PAPER}",
@@ -63,6 +64,7 @@ _OWN: dict[str, dict[str, str]] = {
     "tnt": _TNT,
     "tnt-large": _TNT,
     "nerf-synthetic": {
+        "crossing": f"{_OURS}: an object; the official box lets white sheets grow over white",
         "depth": f"{_NERF_SCRIPT}: depth_ratio stays 0",
         "distortion_weight": f"{_2DGS}: 1000 in bounded scenes; {_NERF_SCRIPT} uses none",
         "background": f"{_NERF_SCRIPT}: --white_background",

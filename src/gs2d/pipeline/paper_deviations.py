@@ -73,6 +73,11 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
         "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
         "the low-pass filter wins: docs/decisions.md, Rasterizer"
     )
+    if any(scene.protocol.crossing == "cull" for scene in scenes):
+        yield (
+            "splats that reach the camera plane are left out of that view, where the official rasterizer draws a part "
+            "of them: docs/decisions.md, Rasterizer"
+        )
     if any(scene.protocol.crossing != "draw" for scene in scenes):
         yield "splats that no training view sees are dropped at the end of a stage: docs/decisions.md, Rasterizer"
     if any(scene.data_set == DTU for scene in scenes):
