@@ -22,6 +22,7 @@ FLAGS = (
     "-O1",
     "-fPIC",
     "-shared",
+    "-fno-gnu-unique",  # no shared memory in common with another library
     "-ffp-contract=off",
     "-fno-math-errno",
     "-Wall",

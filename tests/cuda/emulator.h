@@ -7,6 +7,7 @@
 // as barriers let them. A missing barrier changes the result of one of these. Races between collectives are not found.
 #pragma once
 
+#include <link.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -19,7 +20,7 @@
 #define __host__
 #define __forceinline__ inline __attribute__((always_inline))
 #define __launch_bounds__(...)
-#define __shared__ static __attribute__((section("gs2d_shared")))
+#define __shared__ static thread_local  // not a section of its own: g++ < 14 ignores one in a template, later ones refuse it
 
 struct dim3 {
     unsigned x, y, z;
@@ -28,11 +29,6 @@ struct alignas(16) float4 {
     float x, y, z, w;
 };
 inline dim3 threadIdx, blockIdx, blockDim, gridDim;
-
-extern "C" {
-extern char __start_gs2d_shared[] __attribute__((weak, visibility("hidden")));
-extern char __stop_gs2d_shared[] __attribute__((weak, visibility("hidden")));
-}
 
 namespace emulator {
 
@@ -145,6 +141,32 @@ inline void shuffle(unsigned* items, unsigned n) {
     }
 }
 
+// All shared memory: what this library keeps for each thread of the machine, of which one runs all fibers.
+struct Shared {
+    char* begin;
+    size_t bytes;
+};
+inline Shared find_shared() {
+    __shared__ char one;  // memory of a thread is made when it is first asked for
+    struct Search {
+        const char* one;
+        Shared found;
+    } search = {&one, {nullptr, 0}};
+    dl_iterate_phdr(
+        [](dl_phdr_info* library, size_t, void* data) {
+            Search& s = *static_cast<Search*>(data);
+            for (int i = 0; i < library->dlpi_phnum; ++i) {
+                const auto& segment = library->dlpi_phdr[i];
+                char* const begin = static_cast<char*>(library->dlpi_tls_data);
+                if (segment.p_type == PT_TLS && begin && begin <= s.one && s.one < begin + segment.p_memsz)
+                    return s.found = {begin, segment.p_memsz}, 1;
+            }
+            return 0;
+        },
+        &search);
+    return search.found;
+}
+
 // The threads in the order in which they run until they meet at collectives; returns how many do.
 inline unsigned choose_threads(int order, unsigned* chosen) {
     if (order == ASCENDING || order == DESCENDING) {
@@ -159,9 +181,9 @@ inline unsigned choose_threads(int order, unsigned* chosen) {
     return n;
 }
 
-inline void run_block(int order) {
+inline void run_block(int order, Shared shared) {
     unsigned chosen[MOST_THREADS];
-    if (__start_gs2d_shared) memset(__start_gs2d_shared, 0xff, size_t(__stop_gs2d_shared - __start_gs2d_shared));
+    memset(shared.begin, 0xff, shared.bytes);
     for (unsigned i = 0; i < threads; ++i) {
         Fiber& f = fibers[i];
         if (!f.stack) f.stack = malloc(STACK);
@@ -189,6 +211,8 @@ const char* launch(void (*kernel)(A), unsigned grid_x, unsigned grid_y, unsigned
     body = [](const void* a) { the_kernel(*static_cast<const A*>(a)); };
     body_argument = arguments;
     threads = block_x, failed = false;
+    const Shared shared = find_shared();
+    if (!shared.begin) return "the emulator does not find its shared memory";
     if (block_x % WARP || block_x > MOST_THREADS) return "the block must be whole warps, at most 1024 threads";
     gridDim = {grid_x, grid_y, 1}, blockDim = {block_x, 1, 1};
     const unsigned blocks = grid_x * grid_y;
@@ -197,7 +221,7 @@ const char* launch(void (*kernel)(A), unsigned grid_x, unsigned grid_y, unsigned
     if (order != ASCENDING && order != DESCENDING) random_state = uint32_t(order), shuffle(turns, blocks);
     for (unsigned i = 0; i < blocks && !failed; ++i) {
         blockIdx = {turns[i] % grid_x, turns[i] / grid_x, 0};
-        run_block(order);
+        run_block(order, shared);
     }
     free(turns);
     return failed ? message : nullptr;

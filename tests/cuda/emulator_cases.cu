@@ -52,6 +52,19 @@ extern "C" __global__ void read_unwritten_shared(Floats a) {
     values[threadIdx.x] = a.in[threadIdx.x];
 }
 
+template <int N> __device__ __forceinline__ void leave_unwritten_shared(Floats a) {
+    __shared__ float values[N];
+    a.out[threadIdx.x] = values[threadIdx.x];
+    __syncwarp();
+    values[threadIdx.x] = a.in[threadIdx.x];
+}
+extern "C" __global__ void read_unwritten_shared_of_a_template(Floats a) {
+    __shared__ float values[32];  // beside the template's own
+    values[threadIdx.x] = 0.f;
+    leave_unwritten_shared<32>(a);
+    a.out[threadIdx.x] += values[threadIdx.x];
+}
+
 extern "C" __global__ void collective_in_a_branch(Ints a) {
     if (threadIdx.x % 2) a.out[threadIdx.x] = __any_sync(0xffffffffu, a.in[threadIdx.x]);
 }

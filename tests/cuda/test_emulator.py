@@ -92,9 +92,10 @@ def test_atomics_count(cases: emulate.EmulatedKernels) -> None:
     assert out.tolist() == [16, 32, 16]
 
 
-def test_unwritten_shared_memory_is_nan_in_every_block(cases: emulate.EmulatedKernels) -> None:
+@pytest.mark.parametrize("kernel", ["read_unwritten_shared", "read_unwritten_shared_of_a_template"])
+def test_unwritten_shared_memory_is_nan_in_every_block(cases: emulate.EmulatedKernels, kernel: str) -> None:
     for _ in range(2):
-        assert bool(run(cases, "read_unwritten_shared", torch.zeros(32), torch.zeros(32)).isnan().all())
+        assert bool(run(cases, kernel, torch.zeros(64), torch.zeros(32), blocks=2).isnan().all())
 
 
 @pytest.mark.parametrize(
