@@ -1,32 +1,35 @@
-"""Floating-point operations of one splat at one pixel, counted by hand from ``kernels/core/blend.h``.
+"""Floating-point operations of one splat at one pixel, counted by hand.
+
+Two counts. ``USEFUL``, 69 forward and 119 backward, is what the formulas of docs/math.md take when each pixel is worked
+out by itself: the plane from its six coefficients, the low-pass filter, a polynomial of degree 5 for 2^x, 1 / z and z;
+it was what the loops executed until November 2026. ``EXECUTED`` is what they execute now, for the same images, from
+``kernels/core/blend.h``: a loop that leaves work out does not get slower by it, so both are reported.
 
 A fused multiply-add counts 2, any other addition, subtraction, multiplication, division or rounding 1; comparisons,
-selects, minima, maxima, loads and the exponent's integer arithmetic count nothing. Operations that the compiler
-shares (z = z_c / Q) count once. The distance to the pixel centre counts (2).
+selects, minima, maxima, loads and the exponent's integer arithmetic count nothing. Executed, with AVX-512, for a pair
+whose splat is plain (``is_plain``), as nearly all are:
 
-    intersect                              composite                 composite_vjp<Geo, Dist, no Abs>
-      dx, dy                     2           1/z = Q / z_c     1       T after, w                         3
-      Q, 1/Q                     5           T after, w        3       along: colours, alpha              6
-      u, v                       8           q, w q            2       along: normals, depth              8
-      rho of plane and filter    7           distortion        7       dL/dz: depth, median               2
-      log2 alpha                 2           M1, M2            3       distortion: 1/z, q, lever          4
-      exp2 (round 1, f 1, f^2 1, 13          alpha             1         along                            5
-        5 fused)                             colour, normal   12         dL/dz                            6
-      z = z_c / Q                1           depth             2       S, dL/d ln alpha                   7
-                               ---                           ---       sums: alpha, colour, normal       13
-                                38                            31       t, tu, tv, gQ                      4
-                                                                       z: gz/Q, sum, gQ                   4
-                                                                       X, Y, Q and their moments         15
-                                                                       filter's centre                    4
+    meet, alpha                            composite                 weigh_vjp, add_colors, add_geometry
+      X, Y, I: lane + block      3           T after, w        3       T after, w                         3
+      z = 1 / I                  1           q, w q            2       along: colours, alpha              6
+      u, v                       2           distortion        6       along: normals, depth              8
+      rho of the plane           3           M1, M2            4       dL/dz: depth, median               2
+      log2 alpha                 2           alpha             1       dL/dI of it: z^2, product          2
+      2^x: to the table and      3           colour, normal   12       distortion: q, along, dL/dI        9
+        back, degree 2           4           depth             2       S                                  2
+        product                  1                           ---       1 / (1 - alpha), dL/d ln alpha     6
+                               ---                            30       sums: alpha, colour, normal       13
+                                19                                     X and Y again, dx, dy              4
+                                                                       t, t z, tu, tv, gI                 6
+                                                                       X, Y, I and their moments         15
                                                                                                         ---
-                                                                                                         81
+                                                                                                         76
 """
 
 from __future__ import annotations
 
-INTERSECT, COMPOSITE, COMPOSITE_VJP = 38, 31, 81
-FORWARD = INTERSECT + COMPOSITE  # 69
-BACKWARD = INTERSECT + COMPOSITE_VJP  # 119: the forward pass's intersection is computed again
+USEFUL = {"forward": 69, "backward": 119}
+EXECUTED = {"forward": 19 + 30, "backward": 19 + 76}  # the backward pass computes the intersection again
 
 
 def fraction(flops_per_pair: int, pairs: int, milliseconds: float, fma_gflops: float) -> float:

@@ -3,11 +3,11 @@
 N splats, E entries (tile, splat) that the binning lists, C slots (entries some pixel saw) of the largest chunk of
 tiles, P pixels, t tiles; float32, a densification signal of two columns::
 
-    bytes = 64 N + max(56 N, 162 C) + 8 E + 16 P + 84 t + a constant below 2 kB
+    bytes = 64 N + max(56 N, 162 C) + 8 E + 16 P + 84.25 t + a constant below 2 kB
 
 64 N: records. 56 N: cull record 32, tile rectangle 8, sort 16; the backward pass puts the slots of two chunks there,
-each gradients 64, extra 16 and its flag 1. A chunk takes N / 3 slots where no single tile has more, at least 4096, so
-from 12,000 splats on the maximum is 56 N. 16 P: T, M1, M2, 1/z of the first pair. The sums of gradients lie in the
+each gradients 64, extra 16 and its flag 1. A chunk takes N / 3 slots where no four tiles in a row have more, at least
+4096, so from 12,000 splats on the maximum is 56 N. 16 P: T, M1, M2, 1/z of the first pair. The sums of gradients lie in the
 gradient of shN; where that is not wanted or has fewer than 6 coefficients, they take 64 N more. Buffers that
 grow for a later view take 1/16 more than asked.
 """
@@ -19,6 +19,7 @@ from dataclasses import dataclass
 CHUNKS = 16  # of bin.cpp
 LEAST_SLOTS = 4096  # of gradient_sums.cpp
 TILE, LINE = 16, 64
+GROUP = 4  # of frame.h
 SLOT = 64 + 16 + 1  # bytes
 FORWARD_SCRATCH = 32 + 8 + 2 * 8  # bytes per splat
 
@@ -61,6 +62,7 @@ def view_bytes(work: ViewWork) -> int:
         (t + 1, 8),  # tile_begin
         (work.entries, 8),
         (t, 4),  # tile_count
+        (-(-t // GROUP), 1),  # taken
         (4 * work.width * work.height, 4),  # saved
         (CHUNKS * t, 4),  # histogram
         (t + 1, 8),  # slot_begin

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.flops import BACKWARD, FORWARD, fraction
+from benchmarks.flops import EXECUTED, USEFUL, fraction
 from benchmarks.iteration import iteration_times
 from benchmarks.memory import view_bytes
 from benchmarks.stages import measure_stages
@@ -33,6 +33,11 @@ def workload_result(library: Library, workload: Workload, seconds: float, least:
     repeats = max(least, min(30, round(1e3 * seconds / max(steps["raster_backward"].median * 2, 1.0))))
     iterations = iteration_times(workload, library, repeats)
     stages = {f"stage{index + 1}": row.timing for index, row in enumerate(iterations.values())}
+
+    def share_of_peak(flops: dict[str, int]) -> dict[str, float]:
+        best = {name: steps[f"blend_{name}"].best for name in flops}
+        return {n: rounded(fraction(flops[n], work.pairs, best[n], peak.fma_gflops)) for n in flops}
+
     return {
         "splats": work.splats,
         "width": work.width,
@@ -48,10 +53,8 @@ def workload_result(library: Library, workload: Workload, seconds: float, least:
             f"stage{index + 1}": rounded(row.fma_gflops) for index, row in enumerate(iterations.values())
         },
         "stage2_fill_ms_by_view": rounded(iterations["appearance"].extra_ms_of_first_by_view),
-        "fma_fraction": {
-            "forward": rounded(fraction(FORWARD, work.pairs, steps["blend_forward"].best, peak.fma_gflops)),
-            "backward": rounded(fraction(BACKWARD, work.pairs, steps["blend_backward"].best, peak.fma_gflops)),
-        },
+        "fma_fraction": share_of_peak(USEFUL),
+        "fma_fraction_executed": share_of_peak(EXECUTED),
         "probe": {name: rounded(value) for name, value in asdict(peak).items()},
         "bytes_per_splat": rounded(measured.frame_bytes / work.splats),
         "memory": {"frame_bytes": measured.frame_bytes, "predicted_bytes": view_bytes(work)},
@@ -85,7 +88,8 @@ def run_suite(
             "format": FORMAT,
             "date": time.strftime("%Y-%m-%d"),
             "machine": machine() | {"variant": library.variant, "lanes": library.lanes, "threads": threads},
-            "flops_per_visible_pair": {"forward": FORWARD, "backward": BACKWARD},
+            "flops_per_visible_pair": USEFUL,
+            "flops_executed_per_visible_pair": EXECUTED,
             "workloads": {},
         }
         for make in workloads:

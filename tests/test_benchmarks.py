@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import __main__ as suite_command
 from benchmarks.compare import NotComparable, compare
-from benchmarks.flops import BACKWARD, FORWARD, fraction
+from benchmarks.flops import EXECUTED, USEFUL, fraction
 from benchmarks.memory import view_bytes
 from benchmarks.stages import Passes, count_work, frame_bytes, stage_times, trim
 from benchmarks.timing import summary
@@ -142,7 +142,8 @@ def test_files_of_different_things_are_not_compared() -> None:
 def test_the_fraction_counts_the_flops_of_visible_pairs() -> None:
     # 69 flops x 4 million pairs in 5 ms are 55.2 GFLOP/s: a tenth of 552
     assert fraction(69, 4_000_000, 5.0, 552.0) == pytest.approx(0.1)
-    assert (FORWARD, BACKWARD) == (69, 119)
+    assert USEFUL == {"forward": 69, "backward": 119}
+    assert EXECUTED == {"forward": 49, "backward": 95}
 
 
 def test_a_summary_holds_median_minimum_and_the_distance_of_the_quartiles() -> None:
@@ -163,7 +164,7 @@ def test_the_memory_of_a_view_is_what_the_formula_of_the_docs_says(count: int, w
     assert frame_bytes(library, output) == view_bytes(work)
     tiles = -(-width // 16) * -(-height // 16)
     scratch = max(56 * count, 162 * work.largest_chunk * 17 / 16)  # it grew for the slots of two chunks
-    rough = 64 * count + scratch + 8 * work.entries + 16 * width * height + 84 * tiles
+    rough = 64 * count + scratch + 8 * work.entries + 16 * width * height + 84.25 * tiles
     assert 0 < view_bytes(work) - rough < 2_000
 
 

@@ -14,42 +14,77 @@ template <class V> struct BlendLimits {
     V alpha_max, transmittance_min;
 };
 
-// A splat at a pixel. Filtered pairs (the low-pass filter decides) have u = v = 0 and Q = 1 / Q = 1, so that their depth is
-// z_c; skipped pairs have alpha = 0. Nothing in here is NaN or infinite.
+// A splat's plane at a pixel: u / z, v / z and 1 / z, affine in the pixel.
+template <class V> struct PlaneAt {
+    V X, Y, I;
+};
+
+// dx, dy: pixel centre - projected splat centre, px.
+template <class V> GS2D_HD PlaneAt<V> plane_at(const Record<V>& s, V dx, V dy) {
+    return {fma(s.au, dx, s.bu * dy), fma(s.av, dx, s.bv * dy), fma(s.ai, dx, fma(s.bi, dy, s.iz))};
+}
+
+// A splat at a pixel. Where the low-pass filter decides, u = v = 0 and the depth is z_c; skipped pairs have alpha = 0.
 template <class V> struct Hit {
     V u, v;      // plane coordinates
-    V Q, rq;     // z_c / depth, and its inverse
-    V depth;
+    V depth, inverse_depth;
     V rho;
     V alpha;     // not yet limited to alpha_max
     mask_t<V> ray;  // the plane decides
 };
 
-// All of a hit but its alpha. dx, dy: pixel centre - projected splat centre, px.
-template <class V> GS2D_HD Hit<V> meet(const Record<V>& s, V dx, V dy, const BlendLimits<V>& k) {
+// All of a hit but its alpha where the plane is known to decide (see `is_plain`); `ray` is left out.
+template <class V> GS2D_HD Hit<V> meet_plane(const PlaneAt<V>& p) {
     Hit<V> h;
-    const V Q = fma(s.az, dx, fma(s.bz, dy, V(1))), rq = reciprocal(Q);
-    const V u = fma(s.au, dx, s.bu * dy) * rq, v = fma(s.av, dx, s.bv * dy) * rq;
-    const V rho3d = fma(u, u, v * v), rho2d = fma(dx, dx, dy * dy) * k.inv_lowpass2;
-    h.ray = (Q > V(0)) & (rho3d <= rho2d);
-    h.rho = select(h.ray, rho3d, rho2d);
-    h.u = keep(h.ray, u), h.v = keep(h.ray, v);
-    h.Q = select(h.ray, Q, V(1)), h.rq = select(h.ray, rq, V(1));
-    h.depth = s.zc * h.rq;
+    h.inverse_depth = p.I, h.depth = reciprocal(p.I);
+    h.u = p.X * h.depth, h.v = p.Y * h.depth;
+    h.rho = fma(h.u, h.u, h.v * h.v);
     return h;
 }
 
-// The alpha of a hit (not yet limited to alpha_max), 0 where it is skipped.
-template <class V> GS2D_HD V alpha_of(V log2_opacity, V rho, V depth, const BlendLimits<V>& k) {
+// The same wherever it is; nothing in it is NaN or infinite. zc = 1 / iz.
+template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V dy, const BlendLimits<V>& k) {
+    Hit<V> h = meet_plane(p);
+    const V rho2d = fma(dx, dx, dy * dy) * k.inv_lowpass2;
+    h.ray = (p.I > V(0)) & (h.rho <= rho2d);
+    h.rho = select(h.ray, h.rho, rho2d);
+    h.u = keep(h.ray, h.u), h.v = keep(h.ray, h.v);
+    h.inverse_depth = select(h.ray, h.inverse_depth, iz), h.depth = select(h.ray, h.depth, zc);
+    return h;
+}
+
+// Least 1 / z where the plane decides, whatever the pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d inv_lowpass2 where
+// the largest eigenvalue of A is at most inv_lowpass2 / z^2. A little more, against rounding.
+template <class V> GS2D_HD V plain_from(const Record<V>& s, const BlendLimits<V>& k) {
+    const V xx = fma(s.au, s.au, s.av * s.av), yy = fma(s.bu, s.bu, s.bv * s.bv), xy = fma(s.au, s.bu, s.av * s.bv);
+    const V half = V(0.5), d = half * (xx - yy);
+    return V(1.001) * sqrt((half * (xx + yy) + sqrt(fma(d, d, xy * xy))) / k.inv_lowpass2);
+}
+
+// Whether neither the low-pass filter nor `near` can decide anything at pixels up to `half_side` in x and y from the one at
+// (dx, dy) from the projected centre. False for NaN.
+template <class V> GS2D_HD mask_t<V> is_plain(V dx, V dy, V ai, V bi, V iz, V plain_from, V near, V half_side) {
+    const V middle = fma(ai, dx, fma(bi, dy, iz)), range = half_side * (abs(ai) + abs(bi));
+    return (middle - range >= plain_from) & ((middle + range) * near < V(0.9999f));
+}
+
+// The alpha of a hit (not yet limited to alpha_max), 0 where it is skipped. Of a plain splat all depths are beyond `near`.
+template <class V> GS2D_HD V plain_alpha_of(V log2_opacity, V rho, const BlendLimits<V>& k) {
     const V log2_alpha = fma(V(-0.5 * LOG2E), rho, log2_opacity);
-    return keep((log2_alpha >= k.log2_alpha_min) & (depth >= k.near), exp2_small(log2_alpha));
+    return keep(log2_alpha >= k.log2_alpha_min, exp2_small(log2_alpha));
+}
+template <class V> GS2D_HD V alpha_of(V log2_opacity, V rho, V depth, const BlendLimits<V>& k) {
+    return keep(depth >= k.near, plain_alpha_of(log2_opacity, rho, k));
 }
 
 // Both.
-template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V dx, V dy, const BlendLimits<V>& k) {
-    Hit<V> h = meet(s, dx, dy, k);
+template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, const PlaneAt<V>& p, V zc, V dx, V dy, const BlendLimits<V>& k) {
+    Hit<V> h = meet(p, s.iz, zc, dx, dy, k);
     h.alpha = alpha_of(s.log2_opacity, h.rho, h.depth, k);
     return h;
+}
+template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V zc, V dx, V dy, const BlendLimits<V>& k) {
+    return intersect(s, plane_at(s, dx, dy), zc, dx, dy, k);
 }
 
 // A pixel on its way from front to back. The distortion works with q = 1/z - 1/z of the first pair: the mapped depth is
@@ -59,7 +94,7 @@ template <class V> struct Pixel {
     V alpha, red, green, blue, nx, ny, nz;
     V depth;  // sum w z
     V median;
-    V inverse_depth0, M1, M2, distortion;  // sum w q, sum w q^2
+    V inverse_depth0, minus_2M1, M2, distortion;  // M1 = sum w q, M2 = sum w q^2
     mask_t<V> live;
 };
 
@@ -76,8 +111,8 @@ GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLim
         p.median = select((w > V(0)) & (p.T > V(0.5)), depth, p.median);
     }
     const V q = inverse_depth - p.inverse_depth0, wq = w * q;
-    p.distortion = fma(wq, fma(q, p.alpha, V(-2) * p.M1), fma(w, p.M2, p.distortion));
-    p.M1 = p.M1 + wq;
+    p.distortion = fma(wq, fma(q, p.alpha, p.minus_2M1), fma(w, p.M2, p.distortion));
+    p.minus_2M1 = p.minus_2M1 - (wq + wq);  // exact: additions instead of a product
     p.M2 = fma(wq, q, p.M2);
     p.T = select(p.live, after, p.T);
     p.alpha = p.alpha + w;
@@ -109,12 +144,20 @@ template <class V> struct PixelGradient {
     V depth;   // of sum w z
     V median;
     V median_below;  // the median pair is the one that brings T from above 1/2 to this: max(1/2, T_final)
-    V distortion, total, M1, M2, inverse_depth0;  // total = sum w
+    // The distortion's part of s: g (q^2 sum w - 2 q M1 + M2) with g its gradient. The last term is folded into alpha.
+    V distortion2, distortion1;  // g sum w, -2 g M1
+    V inverse_depth0;
 };
+
+// What the distortion adds to the gradient of a pixel: total = sum w.
+template <class V> GS2D_HD void add_distortion(V g, V total, V M1, V M2, PixelGradient<V>& p) {
+    p.distortion2 = g * total, p.distortion1 = V(-2) * g * M1;
+    p.alpha = fma(g, M2, p.alpha);
+}
 
 // What one splat gathers over its pixels; `finish` turns it into a RecordGradient.
 template <class V> struct PairSums {
-    V X, Xx, Xy, Y, Yx, Yy, Q, Qx, Qy, zc, ln_alpha;
+    V X, Xx, Xy, Y, Yx, Yy, I, Ix, Iy, iz, ln_alpha;  // I: where the plane decides; iz: where the filter does
     V red, green, blue, nx, ny, nz;
     V lowpass_x, lowpass_y;
     V abs_x, abs_y;
@@ -124,37 +167,36 @@ template <class V> struct PairSums {
 template <class V> struct PairGradient {
     V w;         // weight of the splat
     V ln_alpha;  // dL/d ln(alpha)
-    V z;         // dL/d depth
+    V I;         // dL/d(1 / depth), alpha held
 };
 
 // One splat at one pixel, front to back. T is 0 where the pixel has stopped (or does not exist).
 // Geo: normal or depth images have gradients. Dist: the distortion has.
 template <bool Geo, bool Dist, class V>
-GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V inverse_zc, V depth, V Q, V raw_alpha, const BlendLimits<V>& k,
+GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, V raw_alpha, const BlendLimits<V>& k,
                                   const PixelGradient<V>& g, V& T, V& S) {
     const V alpha = min(raw_alpha, k.alpha_max);
     const V after = fnma(alpha, T, T);
     const auto goes_on = after >= k.transmittance_min;
     const V w = keep(goes_on, alpha * T);
     V along = fma(s.red, g.red, fma(s.green, g.green, fma(s.blue, g.blue, g.alpha)));  // s = dL/dw, transmittance held
-    V gz = V(0);
+    V gI = V(0);
     if constexpr (Geo) {
-        along = fma(s.nx, g.nx, fma(s.ny, g.ny, fma(s.nz, g.nz, along)));
-        along = fma(depth, g.depth, along);
+        along = along + fma(s.nx, g.nx, fma(s.ny, g.ny, fma(s.nz, g.nz, depth * g.depth)));
         // T is above median_below exactly before the median pair, and w > 0 where it falls
-        gz = fma(w, g.depth, keep(goes_on & (T > g.median_below) & (after <= g.median_below), g.median));
+        const V gz = fma(w, g.depth, keep(goes_on & (T > g.median_below) & (after <= g.median_below), g.median));
+        gI = -(gz * (depth * depth));
     }
     if constexpr (Dist) {
-        const V inverse_depth = inverse_zc * Q;
-        const V q = inverse_depth - g.inverse_depth0, lever = fma(q, g.total, -g.M1);
-        along = fma(g.distortion, fma(q, lever - g.M1, g.M2), along);
-        gz = fnma(V(2) * w * g.distortion * lever, inverse_depth * inverse_depth, gz);
+        const V q = inverse_depth - g.inverse_depth0, slope = fma(q, g.distortion2, g.distortion1);
+        along = fma(q, slope, along);
+        gI = fma(w, fma(q, g.distortion2, slope), gI);
     }
     S = fnma(w, along, S);
     // d alpha / d ln(alpha) = the unclamped alpha: the ceiling passes gradients
-    const V gl = keep(goes_on, fma(T, along, -quotient(S, V(1) - alpha)) * raw_alpha);
+    const V gl = keep(goes_on, fnma(S, reciprocal(V(1) - alpha), T * along) * raw_alpha);
     T = keep(goes_on, after);
-    return {w, gl, gz};
+    return {w, gl, gI};
 }
 
 // Adds that pair to the sums: first what follows from the weight and from alpha alone, then the geometry.
@@ -166,29 +208,28 @@ template <bool Geo, class V> GS2D_HD void add_colors(const PixelGradient<V>& g, 
 
 // Abs: the AbsGS signal is wanted. Filtered: the low-pass filter may have decided one of the pairs (if not: the same sums).
 // Column: dx is the same in all calls of these sums; finish_column multiplies by it once instead.
+// tu, tv are -dL/dX, -dL/dY, 0 where the filter decides: rho = (X^2 + Y^2) z^2, z = 1 / I.
 template <bool Geo, bool Abs, bool Filtered, bool Column, class V>
-GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, const Hit<V>& h, const PairGradient<V>& p, PairSums<V>& sums) {
-    // Plane branch: rho = (X^2 + Y^2) / Q^2, z = z_c / Q. Filtered pairs: only zc and the filter's centre.
-    const V t = p.ln_alpha * h.rq, tu = t * h.u, tv = t * h.v;  // -dL/dX, -dL/dY
-    V gQ = t * h.rho;
+GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, V t, V tu, V tv, V rho, V inverse_depth, mask_t<V> ray,
+                          const PairGradient<V>& p, PairSums<V>& sums) {
+    V gI = t * rho;
     if constexpr (Geo) {
-        const V gzc = p.z * h.rq;
-        sums.zc = sums.zc + gzc;
-        gQ = fnma(gzc, h.depth, gQ);
+        gI = fma(t, rho, p.I);
+        if constexpr (Filtered) sums.iz = sums.iz + select(ray, V(0), p.I);
     }
-    if constexpr (Filtered) gQ = keep(h.ray, gQ);
+    if constexpr (Filtered) gI = keep(ray, gI);
     const auto along_x = [&](V g, V& sum) {
         if constexpr (!Column) sum = fma(g, dx, sum);
     };
     sums.X = sums.X + tu, along_x(tu, sums.Xx), sums.Xy = fma(tu, dy, sums.Xy);
     sums.Y = sums.Y + tv, along_x(tv, sums.Yx), sums.Yy = fma(tv, dy, sums.Yy);
-    sums.Q = sums.Q + gQ, along_x(gQ, sums.Qx), sums.Qy = fma(gQ, dy, sums.Qy);
+    sums.I = sums.I + gI, along_x(gI, sums.Ix), sums.Iy = fma(gI, dy, sums.Iy);
     if constexpr (Abs) {
-        const V px = fma(s.au, tu, fma(s.av, tv, -(s.az * gQ))), py = fma(s.bu, tu, fma(s.bv, tv, -(s.bz * gQ)));
-        sums.abs_x = sums.abs_x + abs(h.Q * px), sums.abs_y = sums.abs_y + abs(h.Q * py);
+        const V px = fma(s.au, tu, fma(s.av, tv, -(s.ai * gI))), py = fma(s.bu, tu, fma(s.bv, tv, -(s.bi * gI)));
+        sums.abs_x = sums.abs_x + abs(inverse_depth * px), sums.abs_y = sums.abs_y + abs(inverse_depth * py);
     }
     if constexpr (Filtered) {
-        const V filtered = select(h.ray, V(0), p.ln_alpha);
+        const V filtered = select(ray, V(0), p.ln_alpha);
         sums.lowpass_x = Column ? sums.lowpass_x + filtered : fma(filtered, dx, sums.lowpass_x);
         sums.lowpass_y = fma(filtered, dy, sums.lowpass_y);
     }
@@ -196,11 +237,12 @@ GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, const Hit<V>& h, const
 
 // All of it.
 template <bool Geo, bool Dist, bool Abs, bool Column = false, class V>
-GS2D_HD void composite_vjp(const Record<V>& s, V inverse_zc, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
+GS2D_HD void composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
                            const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
-    const PairGradient<V> p = weigh_vjp<Geo, Dist>(s, inverse_zc, h.depth, h.Q, h.alpha, k, g, T, S);
+    const PairGradient<V> p = weigh_vjp<Geo, Dist>(s, h.depth, h.inverse_depth, h.alpha, k, g, T, S);
     add_colors<Geo>(g, p, sums);
-    add_geometry<Geo, Abs, true, Column>(s, dx, dy, h, p, sums);
+    const V t = p.ln_alpha * h.depth;
+    add_geometry<Geo, Abs, true, Column>(s, dx, dy, t, t * h.u, t * h.v, h.rho, h.inverse_depth, h.ray, p, sums);
 }
 
 // The part of it that reaches the splat's colour: all that is needed while everything else is frozen.
@@ -214,20 +256,20 @@ GS2D_HD void composite_color_vjp(const Hit<V>& h, const BlendLimits<V>& k, Vec3<
 
 // For sums of `Column` calls: what they have left out.
 template <class V> GS2D_HD void finish_column(V dx, PairSums<V>& a) {
-    a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Qx = dx * a.Q, a.lowpass_x = dx * a.lowpass_x;
+    a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Ix = dx * a.I, a.lowpass_x = dx * a.lowpass_x;
 }
 
-// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller).
+// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz.
 template <class V>
-GS2D_HD RecordGradient<V> finish(const Record<V>& s, const PairSums<V>& a, const BlendLimits<V>& k) {
+GS2D_HD RecordGradient<V> finish(const Record<V>& s, V zc, const PairSums<V>& a, const BlendLimits<V>& k) {
     RecordGradient<V> g;
-    g.cx = fma(s.au, a.X, fma(s.av, a.Y, -(s.az * a.Q)));
-    g.cy = fma(s.bu, a.X, fma(s.bv, a.Y, -(s.bz * a.Q)));
-    g.au = -a.Xx, g.bu = -a.Xy, g.av = -a.Yx, g.bv = -a.Yy, g.az = a.Qx, g.bz = a.Qy;
-    g.zc = a.zc, g.ln_opacity = a.ln_alpha;
+    g.cx = fma(s.au, a.X, fma(s.av, a.Y, -(s.ai * a.I)));
+    g.cy = fma(s.bu, a.X, fma(s.bv, a.Y, -(s.bi * a.I)));
+    g.au = -a.Xx, g.bu = -a.Xy, g.av = -a.Yx, g.bv = -a.Yy, g.ai = a.Ix, g.bi = a.Iy;
+    g.iz = a.I + a.iz, g.ln_opacity = a.ln_alpha;
     g.red = a.red, g.green = a.green, g.blue = a.blue, g.nx = a.nx, g.ny = a.ny, g.nz = a.nz;
     g.lowpass_cx = k.inv_lowpass2 * a.lowpass_x, g.lowpass_cy = k.inv_lowpass2 * a.lowpass_y;
-    g.abs_x = a.abs_x, g.abs_y = a.abs_y;
+    g.abs_x = zc * a.abs_x, g.abs_y = zc * a.abs_y;
     return g;
 }
 

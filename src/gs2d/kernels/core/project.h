@@ -1,9 +1,9 @@
 // From a splat's parameters to its screen record, and back (docs/math.md, "Projection").
 //
 // With P = [s_u t_u, s_v t_v, p] in the camera frame, a pixel ray r = ((x - cx)/fx, (y - cy)/fy, 1) meets the plane at
-// (u, v, 1) = z P^-1 r. The record holds P^-1 centred on the projected splat and scaled by z_c, so that float32 keeps
-// its digits: with d the pixel's offset from the projected centre,
-//     X = au dx + bu dy,  Y = av dx + bv dy,  Q = 1 + az dx + bz dy,  u = X / Q,  v = Y / Q,  z = z_c / Q.
+// (u, v, 1) = z P^-1 r. The record holds P^-1 per pixel, centred on the projected splat, so that float32 keeps its
+// digits: with d the pixel's offset from the projected centre,
+//     X = au dx + bu dy,  Y = av dx + bv dy,  I = iz + ai dx + bi dy,  z = 1 / I,  u = X z,  v = Y z,  iz = 1 / z_c.
 // The rows of P^-1 are (t_v x p) / (s_u n.p), (p x t_u) / (s_v n.p), n / (n.p), with n = t_u x t_v.
 #pragma once
 
@@ -29,7 +29,7 @@ template <class V> struct SplatParameters {
 
 // The screen record: 16 reals, one cache line in float. Field order is the memory order.
 template <class V> struct Record {
-    V cx, cy, au, bu, av, bv, az, bz, zc;
+    V cx, cy, au, bu, av, bv, ai, bi, iz;
     V log2_opacity;
     V red, green, blue;
     V nx, ny, nz;  // world, facing the camera
@@ -39,7 +39,7 @@ constexpr int RECORD = 16;
 // Gradients of a record, summed over pixels. `center` counts pairs that hit the plane, `lowpass` the filtered ones:
 // the densification signal excludes the latter.
 template <class V> struct RecordGradient {
-    V cx, cy, au, bu, av, bv, az, bz, zc;
+    V cx, cy, au, bu, av, bv, ai, bi, iz;
     V ln_opacity;
     V red, green, blue;
     V nx, ny, nz;
@@ -118,13 +118,13 @@ template <class V> GS2D_HD V parameter_size(const SplatParameters<V>& p, const F
 template <class V, class S>
 GS2D_HD Record<V> project(const SplatParameters<V>& s, const Frame3<V>& f, const PinholeCamera<S>& cam) {
     Record<V> r;
-    const V zc = f.p.z, kx = zc * V(S(1) / cam.fx), ky = zc * V(S(1) / cam.fy);
-    r.cx = fma(V(cam.fx), f.p.x / zc, V(cam.cx));
-    r.cy = fma(V(cam.fy), f.p.y / zc, V(cam.cy));
+    const V kx = V(S(1) / cam.fx), ky = V(S(1) / cam.fy);
+    r.cx = fma(V(cam.fx), f.p.x / f.p.z, V(cam.cx));
+    r.cy = fma(V(cam.fy), f.p.y / f.p.z, V(cam.cy));
     r.au = kx * f.row0.x, r.bu = ky * f.row0.y;
     r.av = kx * f.row1.x, r.bv = ky * f.row1.y;
-    r.az = kx * f.row2.x, r.bz = ky * f.row2.y;
-    r.zc = zc;
+    r.ai = kx * f.row2.x, r.bi = ky * f.row2.y;
+    r.iz = V(S(1)) / f.p.z;
     r.log2_opacity = -log2(V(S(1)) + exp(-s.logit));  // log2 of the sigmoid
     r.nx = f.sign * f.n_world.x, r.ny = f.sign * f.n_world.y, r.nz = f.sign * f.n_world.z;
     return r;
@@ -141,26 +141,24 @@ template <class V, class S>
 GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Frame3<V>& f, const Record<V>& r,
                                          const RecordGradient<V>& g, Vec3<V> g_direction, const PinholeCamera<S>& cam) {
     ParameterGradient<V> out;
-    const V zc = f.p.z, inv_z = V(S(1)) / zc, two = V(S(2));
-    const V kx = zc * V(S(1) / cam.fx), ky = zc * V(S(1) / cam.fy);
+    const V two = V(S(2)), kx = V(S(1) / cam.fx), ky = V(S(1) / cam.fy);
     // dL/dP = -R^T G R^T with R = P^-1, G = dL/dR (its third column is 0).
-    const V g00 = kx * g.au, g01 = ky * g.bu, g10 = kx * g.av, g11 = ky * g.bv, g20 = kx * g.az, g21 = ky * g.bz;
+    const V g00 = kx * g.au, g01 = ky * g.bu, g10 = kx * g.av, g11 = ky * g.bv, g20 = kx * g.ai, g21 = ky * g.bi;
     const auto column = [&](Vec3<V> row) {  // of dL/dP, for the column that belongs to this row of R
         const V x0 = fma(g00, row.x, g01 * row.y), x1 = fma(g10, row.x, g11 * row.y), x2 = fma(g20, row.x, g21 * row.y);
         return -x0 * f.row0 + -x1 * f.row1 + -x2 * f.row2;
     };
     const Vec3<V> ga = column(f.row0), gb = column(f.row1);
     Vec3<V> gp = column(f.row2);
-    const V scaled = fma(r.au, g.au, fma(r.bu, g.bu, fma(r.av, g.av, fma(r.bv, g.bv, fma(r.az, g.az, r.bz * g.bz)))));
-    const V fx_z = V(cam.fx) * inv_z, fy_z = V(cam.fy) * inv_z;
+    const V fx_z = V(cam.fx) * r.iz, fy_z = V(cam.fy) * r.iz;
     gp.x = fma(fx_z, g.cx, gp.x);
     gp.y = fma(fy_z, g.cy, gp.y);
-    out.probe_x = gp.x * kx;
-    out.probe_y = gp.y * ky;
+    out.probe_x = gp.x * (f.p.z * kx);
+    out.probe_y = gp.y * (f.p.z * ky);
     gp.x = fma(fx_z, g.lowpass_cx, gp.x);
     gp.y = fma(fy_z, g.lowpass_cy, gp.y);
     const V slide = fma(fx_z * f.p.x, g.cx + g.lowpass_cx, fy_z * f.p.y * (g.cy + g.lowpass_cy));
-    gp.z = gp.z + g.zc + (scaled - slide) * inv_z;
+    gp.z = fnma(r.iz, fma(r.iz, g.iz, slide), gp.z);  // iz = 1 / z_c
 
     out.log_su = dot(ga, f.a);
     out.log_sv = dot(gb, f.b);

@@ -14,7 +14,7 @@ int free_count = 0;
 constexpr int KEEP = 2;  // frames whose memory is kept for the next view
 
 template <class F> void for_each_buffer(Frame& f, F&& visit) {
-    visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.saved), visit(f.scratch);
+    visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.taken), visit(f.saved), visit(f.scratch);
     visit(f.histogram), visit(f.slot_begin), visit(f.chunks), visit(f.own_sums);
     visit(f.target), visit(f.splat_begin), visit(f.splat_slots);
 }

@@ -2,23 +2,23 @@
 // Every (tile, splat) has its own slot of gradients (gradient_sums.h), so nothing depends on the order of the tiles.
 #include "cpu/frame.h"
 #include "cpu/gradient_sums.h"
+#include "cpu/planes.h"
 #include "cpu/stages.h"
 #include "cpu/threads.h"
-#include "cpu/tile.h"
 
 namespace gs2d {
 namespace {
 
 // Per pixel of the tile, in block order: state, then what PixelGradient<V> holds.
 enum Plane {
-    T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST, TOTAL, M1, M2, DEPTH0, PLANES
+    T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST2, DIST1, DEPTH0, PLANES
 };
 using Planes = real (*)[PIXELS];
 
 inline PixelGradient<V> load_gradient(const Planes s, int b) {
     const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
     return {at(RED), at(GREEN), at(BLUE), at(ALPHA), at(NX), at(NY), at(NZ), at(DEPTH), at(MEDIAN), at(MEDIAN_BELOW),
-            at(DIST), at(TOTAL), at(M1), at(M2), at(DEPTH0)};
+            at(DIST2), at(DIST1), at(DEPTH0)};
 }
 
 // Upstream gradients as PixelGradient wants them, and S = the sum over all splats of w s, from the image's totals.
@@ -26,7 +26,7 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     const View& v = f.view;
     const int W = v.width;
     const int64_t pixels = int64_t(W) * v.height;
-    alignas(64) real total[7][PIXELS], g_dist[PIXELS];
+    alignas(64) real total[8][PIXELS], dist[4][PIXELS];  // dist: upstream, image, M1, M2
     read_planes<3>(g.color, W, a, s[RED]);
     read_planes<3>(g.normal, W, a, s[NX]);
     read_planes<3>(images.color, W, a, total[0]);
@@ -34,14 +34,14 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     read_planes<1>(g.alpha, W, a, s[ALPHA]);
     read_planes<1>(g.depth_mean, W, a, s[DEPTH]);
     read_planes<1>(g.depth_median, W, a, s[MEDIAN]);
-    read_planes<1>(g.distortion, W, a, g_dist);
     read_planes<1>(g.depth_mean ? images.depth_mean : nullptr, W, a, total[6]);
-    read_planes<1>(images.alpha, W, a, s[TOTAL]);
+    read_planes<1>(images.alpha, W, a, total[7]);
     read_planes<1>(&f.saved[0], W, a, s[T]);
     if (g.distortion) {
-        read_planes<1>(images.distortion, W, a, s[DIST]);
-        read_planes<1>(&f.saved[pixels], W, a, s[M1]);
-        read_planes<1>(&f.saved[2 * pixels], W, a, s[M2]);
+        read_planes<1>(g.distortion, W, a, dist[0]);
+        read_planes<1>(images.distortion, W, a, dist[1]);
+        read_planes<1>(&f.saved[pixels], W, a, dist[2]);
+        read_planes<1>(&f.saved[2 * pixels], W, a, dist[3]);
         read_planes<1>(&f.saved[3 * pixels], W, a, s[DEPTH0]);
     }
     const V bg[3] = {V(real(v.background[0])), V(real(v.background[1])), V(real(v.background[2]))};
@@ -49,7 +49,7 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
     for (int b = 0; b < BLOCKS; ++b) {
         const auto at = [&](real* plane) { return load(plane + b * LANES); };
         const auto put = [&](real* plane, V value) { store(plane + b * LANES, value); };
-        const V final_T = at(s[T]), alpha = at(s[TOTAL]), mean = at(total[6]);
+        const V final_T = at(s[T]), alpha = at(total[7]), mean = at(total[6]);
         V ga = at(s[ALPHA]), sum = V(0);
         for (int c = 0; c < 3; ++c) {
             const V gc = at(s[RED + c]);
@@ -62,12 +62,16 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
         ga = fnma(gd, mean, ga);
         sum = fma(ga, alpha, fma(gd, mean * alpha, sum));
         put(s[DEPTH], gd);
-        put(s[ALPHA], ga);
         if (g.distortion) {
-            const V gx = at(g_dist);
-            sum = fma(V(2) * gx, at(s[DIST]), sum);  // each pair counts for both of its splats
-            put(s[DIST], gx * V(real(lever * lever)));
+            const V gx = at(dist[0]);
+            sum = fma(V(2) * gx, at(dist[1]), sum);  // each pair counts for both of its splats
+            PixelGradient<V> p;
+            p.alpha = ga;
+            add_distortion(gx * V(real(lever * lever)), alpha, at(dist[2]), at(dist[3]), p);
+            ga = p.alpha;
+            put(s[DIST2], p.distortion2), put(s[DIST1], p.distortion1);
         }
+        put(s[ALPHA], ga);
         put(s[S], sum);
         put(s[MEDIAN_BELOW], max(final_T, V(real(0.5))));
         const M inside = lanes_inside(block_x(b), block_y(b), a.width, a.height);
@@ -97,7 +101,7 @@ struct Interest {
         if (!rows) return;
         blocks = 0;
         for (int32_t i = 0; i < count; ++i) {
-            if (!rows[entries[i].splat]) continue;
+            if (!rows[entries[i].splat()]) continue;
             blocks |= entries[i].blocks;
             for (uint32_t left = entries[i].blocks; left; left &= left - 1) last[__builtin_ctz(left)] = i;
         }
@@ -109,17 +113,17 @@ struct Interest {
 
 // A splat without gradients: only T and S move on. The same arithmetic as below, so the splats behind it get the same bits.
 template <bool Geo, bool Dist>
-__attribute__((noinline)) void pass_by(const real* record, uint32_t blocks, Planes s, V lx, V ly, const BlendLimits<V>& limits) {
+__attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t blocks, Planes s, const Centres& centres,
+                                       const BlendLimits<V>& limits) {
     const Record<V> splat = broadcast(record);
-    const V inverse_zc = V(real(1) / record[8]), zero = V(0);
+    const V zc = reciprocal(splat.iz);
+    SplatPlanes planes;
+    planes.set(record, centres);
     for (; blocks; blocks &= blocks - 1) {
         const int b = __builtin_ctz(blocks);
-        const V dx = lx + V(real(block_x(b))) - splat.cx, dy = ly + V(real(block_y(b))) - splat.cy;
-        const Hit<V> h = intersect(splat, dx, dy, limits);
+        const Hit<V> h = hit_at(splat, zc, planes, plain, centres, b, limits);
         V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
-        PairSums<V> nobody = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
-                              zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};  // the compiler drops them
-        composite_vjp<Geo, Dist, false>(splat, inverse_zc, dx, dy, h, limits, load_gradient(s, b), pixel_T, pixel_S, nobody);
+        weigh_vjp<Geo, Dist>(splat, h.depth, h.inverse_depth, h.alpha, limits, load_gradient(s, b), pixel_T, pixel_S);
         store(&s[T][b * LANES], pixel_T);
         store(&s[S][b * LANES], pixel_S);
     }
@@ -144,22 +148,23 @@ constexpr bool COLORS_FIT = REGISTERS >= 32;  // the registers hold them beside 
 // on; and the sums, splat by splat.
 struct Batch {
     static constexpr int PAIRS = BLOCKS;  // as many as a splat may have; more would push the pixels out of the first cache
-    alignas(64) real u[PAIRS][LANES], v[PAIRS][LANES], Q[PAIRS][LANES], rq[PAIRS][LANES], depth[PAIRS][LANES], rho[PAIRS][LANES];
-    real alpha[PAIRS][LANES];               // in the end dL/d ln(alpha)
-    real z[PAIRS][LANES];                          // dL/dz
+    alignas(64) real depth[PAIRS][LANES], inverse_depth[PAIRS][LANES], rho[PAIRS][LANES];
+    real alpha[PAIRS][LANES];                      // in the end dL/d ln(alpha)
+    real I[PAIRS][LANES];                          // dL/d(1 / z)
     real w[COLORS_FIT ? 1 : PAIRS][LANES];         // weight
     ColorSums colors[COLORS_FIT ? PAIRS : 1];      // of each splat
-    M ray[PAIRS];
+    M ray[PAIRS];                                  // of splats that are not plain
     uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch
     // Of each splat. Its pairs are those before `end`; filtered: the low-pass filter decided one of them.
+    SplatPlanes planes[PAIRS];
     const real* record[PAIRS];
-    real inverse_zc[PAIRS];
     uint8_t end[PAIRS], filtered[PAIRS];
+    uint32_t others = 0;                           // a bit for each splat that is not plain
     int pairs = 0, splats = 0;
 
     bool has_room(uint32_t blocks) const { return pairs + __builtin_popcount(blocks) <= PAIRS; }
 
-    void add(const real* splat_record, uint32_t blocks) {  // no branch depends on `blocks`: none could be foreseen
+    void add(const real* splat_record, bool plain, uint32_t blocks, const Centres& centres) {  // no branch depends on `blocks`: none could be foreseen
         memset(&splat[pairs], splats, BLOCKS);
         for (int first = 0; first < BLOCKS; first += 8) {
             const uint32_t byte = blocks >> first & 255u;
@@ -169,82 +174,87 @@ struct Batch {
             memcpy(&block[pairs], &numbers, sizeof numbers);
             pairs += __builtin_popcount(byte);
         }
-        record[splats] = splat_record, inverse_zc[splats] = real(1) / splat_record[8], filtered[splats] = 0;
+        planes[splats].set(splat_record, centres);
+        record[splats] = splat_record, filtered[splats] = 0;
+        others |= uint32_t(!plain) << splats;
         end[splats++] = uint8_t(pairs);
     }
 };
 
-// Pixel centres of the columns and rows of a tile's blocks.
-struct Centres {
-    alignas(64) real x[BLOCKS_X][LANES], y[BLOCKS / BLOCKS_X][LANES];
-    explicit Centres(const TileArea& a) {
-        for (int i = 0; i < BLOCKS_X; ++i) store(x[i], lane_x(a.x0) + V(real(i * BLOCK_W)));
-        for (int i = 0; i < BLOCKS / BLOCKS_X; ++i) store(y[i], lane_y(a.y0) + V(real(i * BLOCK_H)));
-    }
-    V at_x(int b) const { return load(x[b % BLOCKS_X]); }
-    V at_y(int b) const { return load(y[b / BLOCKS_X]); }
-};
-
-template <bool WithQ> inline void find_hits(Batch& w, const Centres& centres, const BlendLimits<V>& limits) {
-    for (int i = 0; i < w.pairs; ++i) {
-        const int b = w.block[i];
-        const Record<V> s = broadcast(w.record[w.splat[i]]);
-        const Hit<V> h = meet(s, centres.at_x(b) - s.cx, centres.at_y(b) - s.cy, limits);
-        store(w.u[i], h.u), store(w.v[i], h.v), store(w.rq[i], h.rq), store(w.depth[i], h.depth), store(w.rho[i], h.rho);
-        if constexpr (WithQ) store(w.Q[i], h.Q);
-        w.ray[i] = h.ray;
-    }
-    for (int i = 0; i < w.pairs; ++i) {
-        const int j = w.splat[i];
-        const V alpha = alpha_of(V(w.record[j][9]), load(w.rho[i]), load(w.depth[i]), limits);
-        store(w.alpha[i], alpha);
-        w.filtered[j] |= any(and_not(alpha > V(0), w.ray[i]));
+// All of them as if they were plain, which most are; then those that are not once more.
+template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centres, const BlendLimits<V>& limits) {
+    const auto put = [&](int i, const Hit<V>& h) {
+        store(w.depth[i], h.depth), store(w.rho[i], h.rho);
+        if constexpr (WithInverse) store(w.inverse_depth[i], h.inverse_depth);
+    };
+    for (int i = 0; i < w.pairs; ++i) put(i, meet_plane(w.planes[w.splat[i]].at(w.block[i])));
+    for (int i = 0; i < w.pairs; ++i)
+        store(w.alpha[i], plain_alpha_of(V(w.record[w.splat[i]][9]), load(w.rho[i]), limits));
+    for (uint32_t left = w.others; left; left &= left - 1) {
+        const int j = __builtin_ctz(left);
+        const Record<V> s = broadcast(w.record[j]);
+        const V zc = reciprocal(s.iz);
+        M filtered = V(1) < V(0);
+        for (int i = j ? w.end[j - 1] : 0; i < w.end[j]; ++i) {
+            const Hit<V> h = hit_at(s, zc, w.planes[j], false, centres, w.block[i], limits);
+            put(i, h);
+            store(w.alpha[i], h.alpha);
+            w.ray[i] = h.ray;
+            filtered = filtered | and_not(h.alpha > V(0), h.ray);
+        }
+        w.filtered[j] = any(filtered);
     }
 }
 
 template <bool Geo, bool Dist> inline __attribute__((always_inline)) void weigh_pairs(Batch& w, Planes s, const BlendLimits<V>& limits) {
-    const auto weigh = [&](int i, const Record<V>& splat, V inverse_zc, const PixelGradient<V>& g) {
+    const auto weigh = [&](int i, const Record<V>& splat, const PixelGradient<V>& g) {
         const int at = w.block[i] * LANES;
         V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
-        const V Q = Dist ? load(w.Q[i]) : V(0);
+        const V inverse_depth = Dist ? load(w.inverse_depth[i]) : V(0);
         const PairGradient<V> p =
-            weigh_vjp<Geo, Dist>(splat, inverse_zc, load(w.depth[i]), Q, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
+            weigh_vjp<Geo, Dist>(splat, load(w.depth[i]), inverse_depth, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
         store(&s[T][at], pixel_T), store(&s[S][at], pixel_S);
-        store(w.alpha[i], p.ln_alpha), store(w.z[i], p.z);
+        store(w.alpha[i], p.ln_alpha);
+        if constexpr (Geo) store(w.I[i], p.I);
         return p;
     };
     if constexpr (COLORS_FIT) {  // splat by splat: what is added up needs the same pixels, and the splat stays in registers
         for (int j = 0, i = 0; j < w.splats; ++j) {
             const Record<V> splat = broadcast(w.record[j]);
-            const V inverse_zc = V(w.inverse_zc[j]), zero = V(0);
+            const V zero = V(0);
             PairSums<V> sums;
             sums.ln_alpha = sums.red = sums.green = sums.blue = sums.nx = sums.ny = sums.nz = zero;
             do {
                 const PixelGradient<V> g = load_gradient(s, w.block[i]);
-                add_colors<Geo>(g, weigh(i, splat, inverse_zc, g), sums);
+                add_colors<Geo>(g, weigh(i, splat, g), sums);
             } while (++i < w.end[j]);
             w.colors[j].put(sums);
         }
     } else {
         for (int i = 0; i < w.pairs; ++i) {
             const int j = w.splat[i];
-            store(w.w[i], weigh(i, broadcast(w.record[j]), V(w.inverse_zc[j]), load_gradient(s, w.block[i])).w);
+            store(w.w[i], weigh(i, broadcast(w.record[j]), load_gradient(s, w.block[i])).w);
         }
     }
 }
 
 // Of one splat, whose pairs these are.
 template <bool Geo, bool Abs, bool Filtered>
-inline void sum_pairs(const Batch& w, int first, int end, const Record<V>& splat, const Planes s, const Centres& centres,
+inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>& splat, const Planes s, const Centres& centres,
                       PairSums<V>& sums) {
-    const auto pair = [&](int i) -> PairGradient<V> { return {COLORS_FIT ? V(0) : load(w.w[COLORS_FIT ? 0 : i]), load(w.alpha[i]), load(w.z[i])}; };
+    const auto pair = [&](int i) -> PairGradient<V> {
+        return {COLORS_FIT ? V(0) : load(w.w[COLORS_FIT ? 0 : i]), load(w.alpha[i]), Geo ? load(w.I[i]) : V(0)};
+    };
     const auto geometry = [&](int i) {
         const int b = w.block[i];
-        Hit<V> h;
-        h.u = load(w.u[i]), h.v = load(w.v[i]), h.rq = load(w.rq[i]), h.depth = load(w.depth[i]), h.rho = load(w.rho[i]);
-        if constexpr (Abs) h.Q = load(w.Q[i]);
-        if constexpr (Filtered) h.ray = w.ray[i];
-        add_geometry<Geo, Abs, Filtered, false>(splat, centres.at_x(b) - splat.cx, centres.at_y(b) - splat.cy, h, pair(i), sums);
+        const PairGradient<V> p = pair(i);
+        const PlaneAt<V> plane = w.planes[j].at(b);  // again: cheaper than to remember u and v
+        const V depth = load(w.depth[i]), t = p.ln_alpha * depth, tz = t * depth;
+        V tu = tz * plane.X, tv = tz * plane.Y;
+        M ray;
+        if constexpr (Filtered) ray = w.ray[i], tu = keep(ray, tu), tv = keep(ray, tv);
+        add_geometry<Geo, Abs, Filtered, false>(splat, centres.at_x(b) - splat.cx, centres.at_y(b) - splat.cy, t, tu, tv,
+                                                load(w.rho[i]), Abs ? load(w.inverse_depth[i]) : V(0), ray, p, sums);
     };
     for (int i = first; i < end; ++i) geometry(i);
     if constexpr (!COLORS_FIT)
@@ -253,10 +263,10 @@ inline void sum_pairs(const Batch& w, int first, int end, const Record<V>& splat
 
 template <bool Abs>
 inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool filtered, const Slots& to, const BlendLimits<V>& limits) {
-    RecordGradient<V> g = finish(splat, sums, limits);
+    RecordGradient<V> g = finish(splat, reciprocal(splat.iz), sums, limits);
     if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
-    const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz,
-                          g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
+    const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.ai, g.bi,
+                          g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
     transpose_reduce<GRADIENT>(fields, to.gradients);
     if (!to.extras) return;
     *to.has_extra = Abs || filtered;
@@ -276,12 +286,12 @@ __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const
         if constexpr (COLORS_FIT) w.colors[j].get(sums);
         const Record<V> splat = broadcast(w.record[j]);
         if (w.filtered[j])
-            sum_pairs<Geo, Abs, true>(w, first, w.end[j], splat, s, centres, sums);
+            sum_pairs<Geo, Abs, true>(w, j, first, w.end[j], splat, s, centres, sums);
         else
-            sum_pairs<Geo, Abs, false>(w, first, w.end[j], splat, s, centres, sums);
+            sum_pairs<Geo, Abs, false>(w, j, first, w.end[j], splat, s, centres, sums);
         write_slot<Abs>(splat, sums, w.filtered[j], to, limits);
     }
-    w.pairs = w.splats = 0;
+    w.pairs = w.splats = 0, w.others = 0;
     return to;
 }
 
@@ -289,24 +299,23 @@ template <bool Geo, bool Dist, bool Abs>
 void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
               const BlendLimits<V>& limits, RowsAhead next) {
     const Centres centres(area);
-    const V lx = lane_x(area.x0), ly = lane_y(area.y0);
     Batch batch;
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
     Interest interest(entry, count, rows);
     for (int32_t at = 0; at < count && interest.blocks; ++at, ++entry) {
         next.ask();
-        if (at + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
-        const real* record = &f.records[size_t(entry->splat) * RECORD];
-        const bool learns = !rows || rows[entry->splat];
+        if (at + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat()) * RECORD]);
+        const real* record = &f.records[size_t(entry->splat()) * RECORD];
+        const bool learns = !rows || rows[entry->splat()];
         if (batch.splats && !(learns && batch.has_room(entry->blocks)))
             to = finish_batch<Geo, Dist, Abs>(batch, to, s, centres, limits);
         if (!learns) {
-            pass_by<Geo, Dist>(record, entry->blocks & interest.blocks, s, lx, ly, limits);
+            pass_by<Geo, Dist>(record, entry->plain(), entry->blocks & interest.blocks, s, centres, limits);
             continue;
         }
         if (rows) interest.passed(*entry, at);
-        batch.add(record, entry->blocks);
+        batch.add(record, entry->plain(), entry->blocks, centres);
     }
     if (batch.splats) finish_batch<Geo, Dist, Abs>(batch, to, s, centres, limits);
 }
@@ -314,22 +323,25 @@ void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Plane
 // Only the colours' gradients: no geometry, no opacity.
 void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
                     const BlendLimits<V>& limits, RowsAhead next) {
-    const V lx = lane_x(area.x0), ly = lane_y(area.y0);
+    const Centres centres(area);
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     const int32_t count = f.tile_count[tile];
     Interest interest(entry, count, rows);
     for (int32_t i = 0; i < count && interest.blocks; ++i, ++entry) {
         next.ask();
-        if (i + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat) * RECORD]);
-        const Record<V> splat = broadcast(&f.records[size_t(entry->splat) * RECORD]);
-        const bool wanted = !rows || rows[entry->splat];
+        if (i + AHEAD < count) __builtin_prefetch(&f.records[size_t(entry[AHEAD].splat()) * RECORD]);
+        const real* const record = &f.records[size_t(entry->splat()) * RECORD];
+        const Record<V> splat = broadcast(record);
+        const V zc = reciprocal(splat.iz);
+        SplatPlanes planes;
+        planes.set(record, centres);
+        const bool wanted = !rows || rows[entry->splat()];
         Vec3<V> sum = {V(0), V(0), V(0)};
         for (uint32_t blocks = entry->blocks & interest.blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks);
             const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
-            const V dx = lx + V(real(block_x(b))) - splat.cx, dy = ly + V(real(block_y(b))) - splat.cy;
             V pixel_T = at(T);
-            composite_color_vjp(intersect(splat, dx, dy, limits), limits, {at(RED), at(GREEN), at(BLUE)}, pixel_T, sum);
+            composite_color_vjp(hit_at(splat, zc, planes, entry->plain(), centres, b, limits), limits, {at(RED), at(GREEN), at(BLUE)}, pixel_T, sum);
             store(&s[T][b * LANES], pixel_T);
         }
         if (!wanted) continue;

@@ -37,9 +37,8 @@ void sort_by_depth(Frame& f) {
     DepthItem* const items = f.order;
     int64_t n = 0;
     for (int64_t i = 0; i < f.count; ++i) {
-        const real z = f.records[i * RECORD + 8];
         const TileRect r = f.rects[i];
-        memcpy(&items[n].key, &z, sizeof z);
+        items[n].key = items[i].key;
         items[n].splat = static_cast<uint32_t>(i);
         n += r.x1 > r.x0;
     }
@@ -93,7 +92,7 @@ bool bin_splats(Frame& f) {
             for (int y = r.y0; y < r.y1; ++y)
                 for (int x = r.x0; x < r.x1; ++x) {
                     const int64_t t = int64_t(y) * f.tiles_x + x;
-                    f.entries[f.tile_begin[t] + h[t]++].splat = splat;
+                    f.entries[f.tile_begin[t] + h[t]++].word = splat;
                 }
         }
     });

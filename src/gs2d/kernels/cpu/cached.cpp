@@ -5,9 +5,9 @@
 // Weights lie by tile, splat (front to back) and block, LANES reals each: read in the order in which they are written.
 #include "cpu/export.h"
 #include "cpu/frame.h"
+#include "cpu/planes.h"
 #include "cpu/splat_group.h"
 #include "cpu/threads.h"
-#include "cpu/tile.h"
 
 namespace gs2d {
 
@@ -44,21 +44,24 @@ void fill_tile(const Frame& f, int64_t tile, const int32_t* row_of, const Cached
     memset(frozen, 0, sizeof(real) * 3 * PIXELS);
     for (int b = 0; b < BLOCKS; ++b)
         store(T + b * LANES, keep(lanes_inside(block_x(b), block_y(b), area.width, area.height), V(1)));
-    const V lx = lane_x(area.x0), ly = lane_y(area.y0);
+    const Centres centres(area);
     int64_t to = c.tile_entries[tile];
     real* weights = c.weights + c.tile_blocks[tile] * LANES;
     const Entry* const begin = &f.entries[f.tile_begin[tile]];
     for (const Entry* entry = begin; entry < begin + f.tile_count[tile]; ++entry) {
-        const Record<V> splat = broadcast(&f.records[size_t(entry->splat) * RECORD]);
-        const int32_t row = row_of[entry->splat];
+        const real* const record = &f.records[size_t(entry->splat()) * RECORD];
+        const Record<V> splat = broadcast(record);
+        const V zc = reciprocal(splat.iz);
+        SplatPlanes planes;
+        planes.set(record, centres);
+        const int32_t row = row_of[entry->splat()];
         if (row >= 0) {
             c.entry_row[to] = row;
             c.entry_blocks[to++] = static_cast<int32_t>(entry->blocks);
         }
         for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks), at = b * LANES;
-            const V dx = lx + V(real(block_x(b))) - splat.cx, dy = ly + V(real(block_y(b))) - splat.cy;
-            const Hit<V> hit = intersect(splat, dx, dy, limits);
+            const Hit<V> hit = hit_at(splat, zc, planes, entry->plain(), centres, b, limits);
             V pixel_T = load(T + at);
             if (row >= 0) {
                 Vec3<V> sum = {V(0), V(0), V(0)};
@@ -150,7 +153,7 @@ GS2D_EXPORT void gs2d_cached_measure(const Frame* frame, const int32_t* row_of, 
             const Entry* const begin = &f.entries[f.tile_begin[tile]];
             int64_t entries = 0, blocks = 0;
             for (const Entry* e = begin; e < begin + f.tile_count[tile]; ++e) {
-                if (row_of[e->splat] < 0) continue;
+                if (row_of[e->splat()] < 0) continue;
                 ++entries;
                 blocks += __builtin_popcount(e->blocks);
             }

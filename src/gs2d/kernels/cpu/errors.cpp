@@ -31,8 +31,8 @@ inline V difference(const Record<V>& s, const real* target, int b) {
 }
 
 // Pixels of block b that count for the splat.
-inline M counts(const Record<V>& s, const Hit<V>& h, const BlendLimits<V>& limits, V cutoff2, const real* target, int b) {
-    return (h.rho <= cutoff2) & (s.zc * h.rq >= limits.near) & (load(target + COUNTS * PIXELS + b * LANES) > V(0));
+inline M counts(const Hit<V>& h, const BlendLimits<V>& limits, V cutoff2, const real* target, int b) {
+    return (h.rho <= cutoff2) & (h.depth >= limits.near) & (load(target + COUNTS * PIXELS + b * LANES) > V(0));
 }
 
 // Entries of every splat, in tile order.
@@ -41,9 +41,9 @@ bool list_entries(Frame& f) {
     if (!f.splat_slots.reserve(entries) || !f.splat_begin.reserve(f.count + 2)) return false;
     int64_t* begin = f.splat_begin.data;
     memset(begin, 0, (f.count + 2) * sizeof(int64_t));
-    for (int64_t e = 0; e < entries; ++e) ++begin[f.entries[e].splat + 2];
+    for (int64_t e = 0; e < entries; ++e) ++begin[f.entries[e].splat() + 2];
     for (int64_t i = 0; i < f.count; ++i) begin[i + 2] += begin[i + 1];
-    for (int64_t e = 0; e < entries; ++e) f.splat_slots[begin[f.entries[e].splat + 1]++] = static_cast<uint32_t>(e);
+    for (int64_t e = 0; e < entries; ++e) f.splat_slots[begin[f.entries[e].splat() + 1]++] = static_cast<uint32_t>(e);
     return true;  // filling has moved every begin to its end, which is the next one's begin: begin[i] is right again
 }
 
@@ -60,6 +60,7 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
             errors[i] = 0;
             if (r.x1 <= r.x0) continue;
             const Record<V> s = broadcast(&f.records[i * RECORD]);
+            const V zc = reciprocal(s.iz);
             V total = V(0);
             for (int ty = r.y0; ty < r.y1; ++ty)
                 for (int tx = r.x0; tx < r.x1; ++tx) {
@@ -68,8 +69,8 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
                     for (uint32_t left = blocks_touched(f, static_cast<uint32_t>(i), rows, x0, y0); left; left &= left - 1) {
                         const int b = __builtin_ctz(left);
                         const V x = lx + V(x0 + real(block_x(b))), y = ly + V(y0 + real(block_y(b)));
-                        const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
-                        total = total + keep(counts(s, h, limits, cutoff2, target, b), difference(s, target, b));
+                        const Hit<V> h = intersect(s, zc, x - s.cx, y - s.cy, limits);
+                        total = total + keep(counts(h, limits, cutoff2, target, b), difference(s, target, b));
                     }
                 }
             errors[i] = sum(total);
@@ -90,18 +91,19 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
         alignas(64) real T[PIXELS];
         for (real& t : T) t = 1;
         for (int64_t e = f.tile_begin[tile]; e < f.tile_begin[tile + 1]; ++e) {
-            const uint32_t splat = f.entries[e].splat;
+            const uint32_t splat = f.entries[e].splat();
             const Record<V> s = broadcast(&f.records[size_t(splat) * RECORD]);
+            const V zc = reciprocal(s.iz);
             V total = V(0);
             for (uint32_t left = blocks_touched(f, splat, rows, real(a.x0), real(a.y0)); left; left &= left - 1) {
                 const int b = __builtin_ctz(left);
                 const V x = lx + V(real(block_x(b))), y = ly + V(real(block_y(b)));
-                const Hit<V> h = intersect(s, x - s.cx, y - s.cy, limits);
+                const Hit<V> h = intersect(s, zc, x - s.cx, y - s.cy, limits);
                 const V t = load(&T[b * LANES]), alpha = min(h.alpha, limits.alpha_max);
                 const V after = fnma(alpha, t, t);
                 const M open = after >= limits.transmittance_min;
                 store(&T[b * LANES], keep(open, after));  // stopped pixels stay at 0
-                total = total + keep(counts(s, h, limits, cutoff2, target, b) & open, difference(s, target, b));
+                total = total + keep(counts(h, limits, cutoff2, target, b) & open, difference(s, target, b));
             }
             f.saved[e] = sum(total);
         }

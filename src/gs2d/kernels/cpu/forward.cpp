@@ -1,15 +1,15 @@
 // Blending, front to back, one tile per task: block by block, with the pixels' state in registers.
 #include "cpu/frame.h"
+#include "cpu/planes.h"
 #include "cpu/threads.h"
-#include "cpu/tile.h"
 
 namespace gs2d {
 namespace {
 
-constexpr int CHUNK = 256;  // entries looked at before asking again whether any pixel of the tile is still live
+constexpr int CHUNK = 256;  // entries looked at together: what is kept of them stays in the first cache
 
 // What Pixel<V> holds, in memory between chunks.
-enum Plane { RED, GREEN, BLUE, NX, NY, NZ, ALPHA, DEPTH, MEDIAN, DISTORTION, T, M1, M2, DEPTH0, PLANES };
+enum Plane { RED, GREEN, BLUE, NX, NY, NZ, ALPHA, DEPTH, MEDIAN, DISTORTION, T, MINUS_2M1, M2, DEPTH0, PLANES };
 
 struct TileState {
     alignas(64) real planes[PLANES][PIXELS];
@@ -19,8 +19,9 @@ struct TileState {
 
 struct TileWork {
     alignas(64) real records[CHUNK][RECORD];
-    real inverse_zc[CHUNK];
+    SplatPlanes planes[CHUNK];
     uint32_t splats[CHUNK], seen[CHUNK];
+    uint8_t plain[CHUNK];
     uint32_t touched[CHUNK + LANES], list[CHUNK + LANES];  // read and written a vector at a time
     TileState state;
 };
@@ -28,13 +29,13 @@ struct TileWork {
 inline Pixel<V> load_pixel(const TileState& s, int b) {
     const auto at = [&](Plane p) { return load(&s.planes[p][b * LANES]); };
     return {at(T), at(ALPHA), at(RED), at(GREEN), at(BLUE), at(NX), at(NY), at(NZ), at(DEPTH), at(MEDIAN),
-            at(DEPTH0), at(M1), at(M2), at(DISTORTION), s.live[b]};
+            at(DEPTH0), at(MINUS_2M1), at(M2), at(DISTORTION), s.live[b]};
 }
 
 inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
     const auto at = [&](Plane k, V v) { store(&s.planes[k][b * LANES], v); };
     at(T, p.T), at(ALPHA, p.alpha), at(RED, p.red), at(GREEN, p.green), at(BLUE, p.blue), at(NX, p.nx), at(NY, p.ny);
-    at(NZ, p.nz), at(DEPTH, p.depth), at(MEDIAN, p.median), at(DEPTH0, p.inverse_depth0), at(M1, p.M1), at(M2, p.M2);
+    at(NZ, p.nz), at(DEPTH, p.depth), at(MEDIAN, p.median), at(DEPTH0, p.inverse_depth0), at(MINUS_2M1, p.minus_2M1), at(M2, p.M2);
     at(DISTORTION, p.distortion);
     s.live[b] = p.live;
     s.finished[b] = !any(p.live);
@@ -47,7 +48,7 @@ constexpr int UNROLL = REGISTERS >= 32 ? 2 : 1;  // gcc would unroll all 8 round
 
 // What the intersections leave: one row per splat.
 struct Batch {
-    alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];  // `alpha` holds rho at first
+    alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
 };
 
 template <bool Early>
@@ -69,26 +70,33 @@ inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b,
     }
 }
 
-void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const BlendLimits<V>& limits) {
+// All of them as if they were plain, which most are; then those that are not once more.
+inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, int b, const Centres& centres, Batch& batch,
+                            const BlendLimits<V>& limits) {
+    uint32_t others = 0;
+#pragma GCC unroll UNROLL
+    for (int i = 0; i < count; ++i) {
+        const Hit<V> h = meet_plane(w.planes[list[i]].at(b));
+        store(batch.alpha[i], plain_alpha_of(V(w.records[list[i]][9]), h.rho, limits));
+        store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
+        others |= uint32_t(!w.plain[list[i]]) << i;
+    }
+    for (; others; others &= others - 1) {
+        const int i = __builtin_ctz(others);
+        const Record<V> s = broadcast(w.records[list[i]]);
+        const Hit<V> h = hit_at(s, reciprocal(s.iz), w.planes[list[i]], false, centres, b, limits);
+        store(batch.alpha[i], h.alpha), store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
+    }
+}
+
+void blend_block(TileWork& w, int b, int n, const Centres& centres, const BlendLimits<V>& limits) {
     const int count = indices_with_bit(w.touched, n, b, w.list);
     if (count == 0) return;
-    const V x = lane_x(0) + V(tile_x + real(block_x(b))), y = lane_y(0) + V(tile_y + real(block_y(b)));
     Pixel<V> p = load_pixel(w.state, b);
     for (int j = 0; j < count; j += BATCH) {
         Batch batch;
         const int m = count - j < BATCH ? count - j : BATCH;
-#pragma GCC unroll UNROLL
-        for (int i = 0; i < m; ++i) {
-            const uint32_t e = w.list[j + i];
-            const Record<V> s = broadcast(w.records[e]);
-            const Hit<V> h = meet(s, x - s.cx, y - s.cy, limits);
-            store(batch.alpha[i], h.rho);
-            store(batch.depth[i], h.depth);
-            store(batch.inverse_depth[i], V(w.inverse_zc[e]) * h.Q);
-        }
-#pragma GCC unroll UNROLL
-        for (int i = 0; i < m; ++i)  // a loop of its own: shorter chains, so that more of them overlap
-            store(batch.alpha[i], alpha_of(V(w.records[w.list[j + i]][9]), load(batch.alpha[i]), load(batch.depth[i]), limits));
+        intersect_batch(w, w.list + j, m, b, centres, batch, limits);
         if (any(p.live & ((p.alpha <= V(0)) | (p.T > V(real(0.5))))))
             composite_batch<true>(w, w.list + j, m, b, batch, limits, p);
         else
@@ -99,7 +107,8 @@ void blend_block(TileWork& w, int b, int n, real tile_x, real tile_y, const Blen
 }
 
 // Entries of the chunk that reach a live block, with their records side by side.
-int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockRows& block_rows, const TileArea& area) {
+int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockRows& block_rows, const TileArea& area,
+           const Centres& centres) {
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
     int m = 0;
@@ -108,23 +117,26 @@ int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const Block
     for (int i = 0; i < n; i += TOGETHER) {
         uint32_t splats[TOGETHER], touched[TOGETHER];
         for (int j = 0; j < TOGETHER; ++j) {
-            splats[j] = entries[i + j < n ? i + j : n - 1].splat;
+            splats[j] = entries[i + j < n ? i + j : n - 1].splat();
             if (i + j + AHEAD < n) {
-                __builtin_prefetch(&f.cull[entries[i + j + AHEAD].splat]);
-                __builtin_prefetch(&f.records[size_t(entries[i + j + AHEAD].splat) * RECORD]);
+                __builtin_prefetch(&f.cull[entries[i + j + AHEAD].splat()]);
+                __builtin_prefetch(&f.records[size_t(entries[i + j + AHEAD].splat()) * RECORD]);
             }
         }
         blocks_touched(f, splats, block_rows, real(area.x0), real(area.y0), touched);
+        const uint32_t plain = bits(plain_over_tile(f, splats, real(area.x0), real(area.y0)));
         for (int j = 0; j < TOGETHER && i + j < n; ++j) {
             const uint32_t blocks = (f.view.exact_masks ? touched[j] : ALL_BLOCKS) & wanted;
             w.splats[m] = splats[j];
+            w.plain[m] = plain >> (j * BlockRows::ROWS) & 1;
             w.touched[m] = blocks;
             m += blocks != 0;
         }
     }
     for (int i = 0; i < m; ++i) {
-        memcpy(w.records[i], &f.records[size_t(w.splats[i]) * RECORD], sizeof w.records[i]);
-        w.inverse_zc[i] = real(1) / w.records[i][8];
+        const real* const record = &f.records[size_t(w.splats[i]) * RECORD];
+        for (int k = 0; k < RECORD; k += LANES) store(w.records[i] + k, load(record + k));
+        w.planes[i].set(record, centres);
         w.seen[i] = 0;
     }
     return m;
@@ -149,6 +161,7 @@ void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
         const V depth = load(&s.planes[DEPTH][i]) / select(alpha > V(0), alpha, V(1));
         store(&s.planes[DEPTH][i], depth);
         store(&s.planes[DISTORTION][i], load(&s.planes[DISTORTION][i]) * V(real(lever * lever)));
+        store(&s.planes[MINUS_2M1][i], load(&s.planes[MINUS_2M1][i]) * V(real(-0.5)));  // M1
     }
     const int64_t pixels = int64_t(v.width) * v.height;
     write_planes<3>(s.planes[RED], out.color, v.width, a);
@@ -157,7 +170,7 @@ void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
     write_planes<1>(s.planes[DEPTH], out.depth_mean, v.width, a);
     write_planes<1>(s.planes[MEDIAN], out.depth_median, v.width, a);
     write_planes<1>(s.planes[DISTORTION], out.distortion, v.width, a);
-    const Plane saved[4] = {T, M1, M2, DEPTH0};
+    const Plane saved[4] = {T, MINUS_2M1, M2, DEPTH0};
     for (int k = 0; k < 4; ++k) write_planes<1>(s.planes[saved[k]], &f.saved[k * pixels], v.width, a);
 }
 
@@ -174,21 +187,22 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
                 const BlendLimits<V>& limits) {
     TileWork w;
     const TileArea area = tile_area(f, tile);
+    const Centres centres(area);
     start(w.state, area);
     RowsAhead rows(f, written, tile, BLOCKS);
     Entry* const begin = &f.entries[f.tile_begin[tile]];
     Entry* const end = &f.entries[f.tile_begin[tile + 1]];
     Entry* kept = begin;
     for (Entry* e = begin; e < end; e += CHUNK) {
-        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, block_rows, area);
+        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, block_rows, area, centres);
         bool live = false;
         for (int b = 0; b < BLOCKS; ++b) {
             rows.ask();
-            if (!w.state.finished[b]) blend_block(w, b, n, real(area.x0), real(area.y0), limits);
+            if (!w.state.finished[b]) blend_block(w, b, n, centres, limits);
             live |= !w.state.finished[b];
         }
         for (int i = 0; i < n; ++i) {
-            *kept = {w.splats[i], w.seen[i]};
+            *kept = {w.splats[i] | uint32_t(w.plain[i]) << 31, w.seen[i]};
             kept += w.seen[i] != 0;
         }
         if (!live) break;
@@ -200,11 +214,17 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
 }  // namespace
 
 bool blend_tiles(Frame& f, const Images& out) {
-    if (!f.tile_count.reserve(f.tiles) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
+    if (!f.tile_count.reserve(f.tiles) || !f.taken.reserve(f.groups()) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
     const BlockRows block_rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const RowLines written = images_written(f, out);
-    parallel_for(f.tiles, [&](int64_t tile) { blend_tile(f, tile, out, written, block_rows, limits); });
+    memset(static_cast<void*>(f.taken.data), 0, f.groups());
+    parallel_for(get_threads(), [&](int64_t) {
+        share_out(0, f.groups(), f.taken.data, [&](int64_t group) {
+            for (int64_t tile = group * GROUP; tile < (group + 1) * GROUP && tile < f.tiles; ++tile)
+                blend_tile(f, tile, out, written, block_rows, limits);
+        });
+    });
     return true;
 }
 

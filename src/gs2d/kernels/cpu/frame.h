@@ -82,16 +82,19 @@ inline bool wants_geometry(const ParameterGradients& g) {
 // Box tests per (tile, splat), in pixels: see Footprint.
 struct CullRecord {
     real ex, ey, slope, half;
-    real inv_y2, y_right, disc2, unused;  // disc2 < 0: unbounded, covers everything
+    real inv_y2, y_right, disc2, plain_from;  // disc2 < 0: unbounded, covers everything; plain_from: see is_plain
 };
 
 using TileRect = TileRectangle;
 
 constexpr uint32_t ALL_BLOCKS = BLOCKS == 32 ? 0xffffffffu : (1u << (BLOCKS % 32)) - 1u;
 
-struct Entry {  // one splat in one tile
-    uint32_t splat;
+// One splat in one tile.
+struct Entry {
+    uint32_t word;    // the splat; the highest bit, after the forward pass: it is plain there (is_plain in core/blend.h)
     uint32_t blocks;  // bit b: some live pixel of block b saw the splat (before the forward pass: undefined)
+    uint32_t splat() const { return word & 0x7fffffffu; }
+    bool plain() const { return word >> 31; }
 };
 
 #if defined(GS2D_DOUBLE)
@@ -107,9 +110,9 @@ struct DepthItem {
 // Consecutive tiles whose gradients are in memory at the same time.
 struct GradientChunk {
     int64_t first_tile;
-    int64_t first_task;  // of those that blend it
     int64_t first_slot;
-    std::atomic<int64_t> tasks_left, sums_left;  // tasks that blend it, and that add its slots to the sums
+    std::atomic<int64_t> groups_left, sums_left;  // groups of tiles to blend; parts of its slots to add to the sums
+    std::atomic<int64_t> next_part;               // of the latter, that nobody adds yet
 };
 
 // Sums of the gradients of each splat's record over the tiles.
@@ -127,6 +130,8 @@ inline size_t forward_scratch(int64_t n) {
     return static_cast<size_t>(n) * (sizeof(CullRecord) + sizeof(TileRect) + 2 * sizeof(DepthItem));
 }
 
+constexpr int64_t GROUP = 4;  // tiles that one thread blends in a row
+
 struct Frame {
     View view;
     PinholeCamera<real> camera;
@@ -138,15 +143,17 @@ struct Frame {
     Buffer<real> records;        // [N, RECORD]
     Buffer<int64_t> tile_begin;  // [tiles + 1]
     Buffer<Entry> entries;
+    Buffer<std::atomic<uint8_t>> taken;  // [groups]: whether somebody blends these tiles (share_out)
     Buffer<int32_t> tile_count;  // entries that survive the forward pass; they are moved to the front of their tile
     Buffer<real> saved;          // [4, H W]: T_final, M1, M2, inverse_depth0
     int64_t visible = 0;
+    int64_t groups() const { return (tiles + GROUP - 1) / GROUP; }
 
     // One piece of memory for what a single pass needs: in the forward pass the arrays below, in the backward pass slots.
     Buffer<char> scratch;
     CullRecord* cull = nullptr;       // [N]
     TileRect* rects = nullptr;        // [N]
-    DepthItem* order = nullptr;       // [visible], by depth
+    DepthItem* order = nullptr;       // [visible], by depth; projection leaves the keys of all
     TileRect* ordered_rects = nullptr;  // [visible], like order
     Buffer<uint32_t> histogram;       // [chunks, tiles]
 

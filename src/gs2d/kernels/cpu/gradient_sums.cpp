@@ -24,7 +24,7 @@ bool GradientSums::prepare() {
             if (out_.rows) {
                 const Entry* const entries = &f.entries[f.tile_begin[t]];
                 slots = 0;
-                for (int32_t i = 0; i < f.tile_count[t]; ++i) slots += out_.rows[entries[i].splat] != 0;
+                for (int32_t i = 0; i < f.tile_count[t]; ++i) slots += out_.rows[entries[i].splat()] != 0;
             }
             f.slot_begin[t + 1] = slots;
         }
@@ -53,11 +53,12 @@ void GradientSums::cut_into_chunks() {
     Frame& f = f_;
     const int64_t room = static_cast<int64_t>(forward_scratch(f.count) / (2 * slot_bytes(out_.probe)));
     const int64_t limit = room > LEAST_SLOTS ? room : LEAST_SLOTS;
-    f.largest_chunk = chunks_ = tasks_ = 0;
+    f.largest_chunk = chunks_ = 0;
     f.chunks[0].first_tile = f.chunks[0].first_slot = 0;
-    for (int64_t t = 1; t <= f.tiles; ++t) {
+    for (int64_t g = 1; g <= f.groups(); ++g) {
+        const int64_t t = g * GROUP < f.tiles ? g * GROUP : f.tiles, next = t + GROUP < f.tiles ? t + GROUP : f.tiles;
         const int64_t slots = f.slot_begin[t] - f.chunks[chunks_].first_slot;
-        if (t < f.tiles && f.slot_begin[t + 1] - f.chunks[chunks_].first_slot <= limit) continue;
+        if (t < f.tiles && f.slot_begin[next] - f.chunks[chunks_].first_slot <= limit) continue;
         if (slots > f.largest_chunk) f.largest_chunk = slots;
         ++chunks_;
         f.chunks[chunks_].first_tile = t, f.chunks[chunks_].first_slot = f.slot_begin[t];
@@ -66,11 +67,11 @@ void GradientSums::cut_into_chunks() {
     for (parts_ = 1; parts_ < static_cast<uint32_t>(threads_) && parts_ < 16;) parts_ *= 2;
     for (int64_t c = 0; c <= chunks_; ++c) {
         GradientChunk& chunk = f.chunks[c];
-        chunk.first_task = tasks_;
-        chunk.tasks_left.store(blend_tasks(c), std::memory_order_relaxed);
+        chunk.groups_left.store(c < chunks_ ? first_group(c + 1) - first_group(c) : 0, std::memory_order_relaxed);
         chunk.sums_left.store(parts_, std::memory_order_relaxed);
-        tasks_ += blend_tasks(c) + (c > 0 ? parts_ : 0);
+        chunk.next_part.store(0, std::memory_order_relaxed);
     }
+    memset(static_cast<void*>(f.taken.data), 0, f.groups());
 }
 
 Slots GradientSums::slots(int64_t c) const {
@@ -94,7 +95,7 @@ void GradientSums::add(int64_t c, uint32_t part) const {
             const int32_t end = begin + BATCH < f.tile_count[tile] ? begin + BATCH : f.tile_count[tile];
             int count = 0;
             for (int32_t i = begin; i < end; ++i) {
-                const uint32_t splat = entries[i].splat;
+                const uint32_t splat = entries[i].splat();
                 const bool has_slot = !out_.rows || out_.rows[splat];
                 splats[count] = splat, slots[count] = slot;
                 count += has_slot && (splat >> 4 & (parts_ - 1)) == part;

@@ -29,50 +29,49 @@ class GradientSums {
 
     // Calls blend(tile, next, slots) for each tile with slots, on all threads, and adds the slots to f.sums. `next` is the
     // tile that this thread will probably blend then; there may be none of that number.
-    // Tasks are handed out in order: those that blend chunk 0, chunk 1, those that add chunk 0, those that blend chunk 2 ...
-    // Each waits only for tasks before it, which somebody is already working on.
+    // Every thread goes through the chunks: it blends groups of chunk c until somebody has each, then it adds parts of chunk
+    // c - 1, until somebody has each. It waits only for what somebody is already working on.
     template <class F> void for_each_tile(F&& blend) {
-        parallel_for(tasks_, [&](int64_t task) {
-            int64_t c = 0;
-            for (int64_t step = chunks_; step > 0; step /= 2)  // the last chunk whose first task is not behind this one
-                while (c + step <= chunks_ && f_.chunks[c + step].first_task <= task) c += step;
-            const int64_t k = task - f_.chunks[c].first_task, blends = blend_tasks(c);
-            if (k >= blends) {
-                GradientChunk& chunk = f_.chunks[c - 1];
-                wait_for(chunk.tasks_left);
-                if (c >= 2) wait_for(f_.chunks[c - 2].sums_left);  // a splat's slots are added in order
-                add(c - 1, static_cast<uint32_t>(k - blends));
-                chunk.sums_left.fetch_sub(1, std::memory_order_release);
-                return;
+        parallel_for(threads_, [&](int64_t) {
+            for (int64_t c = 0; c <= chunks_; ++c) {
+                if (c < chunks_) share_out(first_group(c), first_group(c + 1), f_.taken.data, [&](int64_t group) { blend_group(c, group, blend); });
+                if (c > 0) add_parts(c - 1);
             }
-            if (c >= 2) wait_for(f_.chunks[c - 2].sums_left);  // its slots' memory is used again
-            const int64_t end = f_.chunks[c + 1].first_tile, first = f_.chunks[c].first_tile + k * TILES_PER_TASK;
-            for (int64_t tile = first; tile < first + TILES_PER_TASK && tile < end; ++tile) {
-                const bool last = tile + 1 == first + TILES_PER_TASK;
-                const int64_t next = last ? tile + 1 + (threads_ - 1) * TILES_PER_TASK : tile + 1;
-                if (tile_slots(tile) > 0) blend(tile, next, slots(c).from(f_.slot_begin[tile] - f_.chunks[c].first_slot));
-            }
-            f_.chunks[c].tasks_left.fetch_sub(1, std::memory_order_release);
         });
     }
 
   private:
-    static constexpr int64_t TILES_PER_TASK = 4;
     Frame& f_;
     const ParameterGradients& out_;
     const int64_t sh_rest_;
-    int64_t chunks_ = 0, tasks_ = 0;
-    int64_t threads_ = 1;
-    uint32_t parts_ = 1;  // tasks that add a chunk, each some of the splats; a power of two
+    int64_t chunks_ = 0, threads_ = 1;
+    uint32_t parts_ = 1;  // pieces in which a chunk is added, each some of the splats; a power of two
 
-    int64_t blend_tasks(int64_t c) const {
-        if (c == chunks_) return 0;
-        return (f_.chunks[c + 1].first_tile - f_.chunks[c].first_tile + TILES_PER_TASK - 1) / TILES_PER_TASK;
-    }
+    int64_t first_group(int64_t c) const { return (f_.chunks[c].first_tile + GROUP - 1) / GROUP; }  // chunks hold whole groups
     int64_t tile_slots(int64_t tile) const { return f_.slot_begin[tile + 1] - f_.slot_begin[tile]; }
     void cut_into_chunks();
     Slots slots(int64_t c) const;
     void add(int64_t c, uint32_t part) const;
+
+    template <class F> void blend_group(int64_t c, int64_t group, F&& blend) {
+        if (c >= 2) wait_for(f_.chunks[c - 2].sums_left);  // its slots' memory is used again
+        const int64_t first = group * GROUP, last = first + GROUP - 1;
+        for (int64_t tile = first; tile <= last && tile < f_.tiles; ++tile) {
+            const int64_t next = tile == last ? tile + 1 + (threads_ - 1) * GROUP : tile + 1;
+            if (tile_slots(tile) > 0) blend(tile, next, slots(c).from(f_.slot_begin[tile] - f_.chunks[c].first_slot));
+        }
+        f_.chunks[c].groups_left.fetch_sub(1, std::memory_order_release);
+    }
+
+    void add_parts(int64_t c) {
+        GradientChunk& chunk = f_.chunks[c];
+        for (int64_t part; (part = chunk.next_part.fetch_add(1, std::memory_order_relaxed)) < parts_;) {
+            wait_for(chunk.groups_left);
+            if (c >= 1) wait_for(f_.chunks[c - 1].sums_left);  // a splat's slots are added in order
+            add(c, static_cast<uint32_t>(part));
+            chunk.sums_left.fetch_sub(1, std::memory_order_release);
+        }
+    }
 
     static void wait_for(const std::atomic<int64_t>& left) {
         for (int n = 0; left.load(std::memory_order_acquire) != 0; ++n) {

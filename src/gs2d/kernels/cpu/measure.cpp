@@ -4,9 +4,9 @@
 
 #include "cpu/export.h"
 #include "cpu/frame.h"
+#include "cpu/planes.h"
 #include "cpu/stages.h"
 #include "cpu/threads.h"
-#include "cpu/tile.h"
 
 namespace gs2d {
 
@@ -24,14 +24,18 @@ PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits
     const TileArea area = tile_area(f, tile);
     for (int b = 0; b < BLOCKS; ++b)
         store(T[b], keep(lanes_inside(block_x(b), block_y(b), area.width, area.height), V(1)));
+    const Centres centres(area);
     PairCounts counts = {0, 0};
     const Entry* entry = &f.entries[f.tile_begin[tile]];
     for (int32_t i = 0; i < f.tile_count[tile]; ++i, ++entry) {
-        const Record<V> s = broadcast(&f.records[size_t(entry->splat) * RECORD]);
+        const real* const record = &f.records[size_t(entry->splat()) * RECORD];
+        const Record<V> s = broadcast(record);
+        const V zc = reciprocal(s.iz);
+        SplatPlanes planes;
+        planes.set(record, centres);
         for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks);
-            const V dx = lane_x(area.x0 + block_x(b)) - s.cx, dy = lane_y(area.y0 + block_y(b)) - s.cy;
-            const Hit<V> h = intersect(s, dx, dy, limits);
+            const Hit<V> h = hit_at(s, zc, planes, entry->plain(), centres, b, limits);
             const V before = load(T[b]), after = fnma(min(h.alpha, limits.alpha_max), before, before);
             counts.visible += __builtin_popcount(bits((h.alpha > V(0)) & (before > V(0))));
             counts.lanes += LANES;

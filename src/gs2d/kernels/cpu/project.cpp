@@ -19,7 +19,7 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     g.parameters = load_parameters(s, i, lanes);
     g.frame = frame_of(g.parameters, f.camera);
     g.record = project(g.parameters, g.frame, f.camera);
-    g.alive = is_finite(parameter_size(g.parameters, g.frame)) & (g.record.zc > V(real(f.view.near))) & first(lanes);
+    g.alive = is_finite(parameter_size(g.parameters, g.frame)) & (g.frame.p.z > V(real(f.view.near))) & first(lanes);
     if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
     return g;
 }
@@ -59,6 +59,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
     f.cull = reinterpret_cast<CullRecord*>(f.scratch.data);
     f.rects = reinterpret_cast<TileRect*>(f.cull + n);
     f.order = reinterpret_cast<DepthItem*>(f.rects + n);
+    const BlendLimits<V> limits = limits_of(f.view);
     const bool blending = reach == Reach::BLEND;
     const V error_k2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), log2_alpha_min = V(real(log2(f.view.alpha_min)));
     parallel_ranges(n, 64 * LANES, [&](int64_t begin, int64_t end) {
@@ -78,12 +79,14 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const V blend_k2 = V(real(2 * LN2)) * (r.log2_opacity - log2_alpha_min);
             const V k2 = blending ? max(blend_k2, V(0)) : reach == Reach::ERRORS ? error_k2 : max(blend_k2, error_k2);
             const Footprint<V> o = footprint(g.frame, r, k2, real(f.view.lowpass_px), f.camera);
-            const V fields[RECORD] = {r.cx, r.cy, r.au, r.bu, r.av, r.bv, r.az, r.bz,
-                                      r.zc, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
+            const V fields[RECORD] = {r.cx, r.cy, r.au, r.bu, r.av, r.bv, r.ai, r.bi,
+                                      r.iz, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
             store_rows<RECORD>(&f.records[i * RECORD], RECORD, lanes, fields);
-            const V cull[8] = {o.ex, o.ey, o.slope, o.half, o.inv_y2, o.y_right, select(o.unbounded, V(-1), o.disc2), V(0)};
+            const V cull[8] = {o.ex, o.ey, o.slope, o.half, o.inv_y2, o.y_right, select(o.unbounded, V(-1), o.disc2), plain_from(r, limits)};
             store_rows<8>(reinterpret_cast<real*>(&f.cull[i]), 8, lanes, cull);
-            alignas(64) real box[4][LANES];
+            alignas(64) real box[4][LANES], depth[LANES];
+            store(depth, g.frame.p.z);
+            for (int l = 0; l < lanes; ++l) memcpy(&f.order[i + l].key, &depth[l], sizeof(real));
             store(box[0], o.x_min), store(box[1], o.y_min), store(box[2], o.x_max), store(box[3], o.y_max);
             const uint32_t unbounded = bits(o.unbounded), crosses = bits(o.crosses);
             const uint32_t boxed = f.view.crossing == CROSSING_BOX ? alive & bits(reaches) : 0;

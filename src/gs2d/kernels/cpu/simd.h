@@ -43,6 +43,23 @@ struct BitNumbers {
 };
 constexpr BitNumbers BIT_NUMBERS;
 
+// For 2^x = 2^(n + k / N) 2^f: the bits of 2^(k / N), less those that shifting the whole number N n + k to the exponent
+// leaves in the mantissa. Adding `ROUND` to x leaves that number in the lowest bits.
+template <int LOG_N> struct Exp2Table {
+    static constexpr int N = 1 << LOG_N, SHIFT = 23 - LOG_N;
+    static constexpr float ROUND = 1.5f * float(1 << SHIFT);
+    alignas(64) uint32_t of[N] = {};
+    constexpr Exp2Table() {
+        double root = 2, power = 1;
+        for (int i = 0; i < LOG_N; ++i) {  // root = sqrt(root), by Newton
+            double r = root;
+            for (int n = 0; n < 40; ++n) r = 0.5 * (r + root / r);
+            root = r;
+        }
+        for (int k = 0; k < N; ++k, power *= root) of[k] = __builtin_bit_cast(uint32_t, float(power)) - (uint32_t(k) << SHIFT);
+    }
+};
+
 }  // namespace gs2d
 
 #if defined(GS2D_DOUBLE)
@@ -133,6 +150,7 @@ GS2D_HD uint64_t interleave(const M* m) {
 
 #if !defined(GS2D_DOUBLE)
 // 2^x for x in [-126, 127]; relative error below 2e-7. Degree 5, minimax on [-1/2, 1/2].
+#if !defined(GS2D_OWN_EXP2)
 GS2D_HD V exp2_small(V x) {
     const V n = round(x), f = x - n;
     const V f2 = f * f;
@@ -140,6 +158,7 @@ GS2D_HD V exp2_small(V x) {
     const V p45 = fma(V(0.0013276472f), f, V(0.0096755413f));
     return scale2(fma(fma(p45, f2, p23), f2, p01), n);
 }
+#endif
 GS2D_HD V exp2(V x) { return exp2_small(min(max(x, V(-126.f)), V(127.f))); }
 
 // e^x, relative error below 4e-7 where the result is a normal number; saturates outside.

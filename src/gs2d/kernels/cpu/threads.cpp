@@ -30,6 +30,7 @@ struct Pool {
 
 Pool pool;
 thread_local bool inside = false;
+thread_local int number = 0;
 
 // A thread sleeps only after it has looked for this long: jobs follow each other within microseconds, and to wake a thread
 // takes tens of them. Not longer: torch's threads want the cores too.
@@ -51,8 +52,9 @@ void work(Task task, void* context, int64_t count) {
     for (int64_t i; (i = pool.next.fetch_add(1, std::memory_order_relaxed)) < count;) task(context, i);
 }
 
-void* thread_main(void*) {
+void* thread_main(void* started) {
     inside = true;
+    number = static_cast<int>(reinterpret_cast<intptr_t>(started));
     uint64_t seen = 0;
     pthread_mutex_lock(&pool.lock);
     for (;;) {
@@ -83,6 +85,7 @@ void after_fork() {
     pool.started = pool.seats = 0;
     pool.busy = 0;
     inside = false;
+    number = 0;
 }
 
 void start_missing(int needed) {  // with pool.lock held
@@ -93,7 +96,7 @@ void start_missing(int needed) {  // with pool.lock held
     }
     for (; pool.started < needed; ++pool.started) {
         pthread_t thread;
-        if (pthread_create(&thread, nullptr, thread_main, nullptr) != 0) break;  // fewer threads, same result
+        if (pthread_create(&thread, nullptr, thread_main, reinterpret_cast<void*>(intptr_t(pool.started + 1))) != 0) break;  // fewer threads, same result
         pthread_detach(thread);
     }
 }
@@ -112,6 +115,8 @@ int get_threads() {
     pthread_mutex_unlock(&pool.lock);
     return n;
 }
+
+int thread_number() { return number; }
 
 void run_tasks(int64_t n, Task task, void* context) {
     const int helpers = static_cast<int>(n - 1 < get_threads() - 1 ? n - 1 : get_threads() - 1);

@@ -5,12 +5,14 @@
 // either, let piece i write only what belongs to i, and reduce in order afterwards.
 #pragma once
 
+#include <atomic>
 #include <cstdint>
 
 namespace gs2d {
 
 void set_threads(int n);  // at least 1; the calling thread is one of them
 int get_threads();
+int thread_number();  // of the calling thread, as long as it lives: 1, 2, ... in the pool, 0 for all others
 
 using Task = void (*)(void* context, int64_t i);
 void run_tasks(int64_t n, Task task, void* context);
@@ -25,6 +27,23 @@ template <class F> void parallel_ranges(int64_t n, int64_t grain, F&& f) {
         const int64_t begin = i * grain, end = begin + grain < n ? begin + grain : n;
         f(begin, end);
     });
+}
+
+// Called on every thread of a parallel_for: shares out the pieces [first, end), whose flags are 0. Piece i goes to thread
+// i % get_threads() as long as that thread keeps up: what a thread has written to memory for a piece in one pass is still
+// near it in the next, where cores do not share a cache. Who has finished helps the others, from behind.
+template <class F> void share_out(int64_t first, int64_t end, std::atomic<uint8_t>* taken, F&& f) {
+    const int64_t threads = get_threads(), me = thread_number() % threads;
+    const auto take = [&](int64_t i) {
+        if (!taken[i].load(std::memory_order_relaxed) && !taken[i].exchange(1, std::memory_order_relaxed)) f(i);
+    };
+    const auto first_of = [&](int64_t thread) { return first + (thread + threads - first % threads) % threads; };
+    for (int64_t i = first_of(me); i < end; i += threads) take(i);
+    for (int64_t k = 1; k < threads; ++k) {
+        const int64_t begin = first_of((me + k) % threads);
+        if (begin >= end) continue;
+        for (int64_t i = begin + (end - 1 - begin) / threads * threads; i >= begin; i -= threads) take(i);
+    }
 }
 
 }  // namespace gs2d

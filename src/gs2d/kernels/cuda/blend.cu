@@ -32,7 +32,7 @@ __device__ __forceinline__ void write_pixel(const BlendArguments& a, int x, int 
     a.depth_median[at] = p.median;
     if constexpr (DIST) {
         a.distortion[at] = p.distortion * v.distortion_scale;
-        a.moments[3 * at] = p.M1, a.moments[3 * at + 1] = p.M2, a.moments[3 * at + 2] = p.inverse_depth0;
+        a.moments[3 * at] = -0.5f * p.minus_2M1, a.moments[3 * at + 1] = p.M2, a.moments[3 * at + 2] = p.inverse_depth0;
     }
 }
 
@@ -64,12 +64,12 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
             const int j = __ffs(int(todo)) - 1;
             const uint bit = todo & (0u - todo);
             const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
-            const float inverse_zc = DIST ? reciprocal(s.zc) : 0.f;
+            const float zc = reciprocal(s.iz);
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;  // the same for all lanes
-                const Hit<float> hit = intersect(s, x - s.cx, y + float(4 * h) - s.cy, limits);
-                const bool saw = composite(s, hit.alpha, s.zc * hit.rq, inverse_zc * hit.Q, limits, p[h]);
+                const Hit<float> hit = intersect(s, zc, x - s.cx, y + float(4 * h) - s.cy, limits);
+                const bool saw = composite(s, hit.alpha, hit.depth, hit.inverse_depth, limits, p[h]);
                 seen[h] |= saw ? bit : 0u;
             }
         }

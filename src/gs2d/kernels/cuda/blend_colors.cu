@@ -72,11 +72,12 @@ extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendCol
             const int j = __ffs(int(todo)) - 1;
             const uint bit = todo & (0u - todo);
             const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
+            const float zc = reciprocal(s.iz);
             Vec3<float> sum = {0.f, 0.f, 0.f};
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;
-                const Hit<float> hit = intersect(s, x - s.cx, y + float(4 * h) - s.cy, limits);
+                const Hit<float> hit = intersect(s, zc, x - s.cx, y + float(4 * h) - s.cy, limits);
                 composite_color_vjp(hit, limits, g[h], T[h], sum);
             }
             if (!(learn & bit)) continue;  // the same for all lanes

@@ -50,8 +50,8 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
     S = fma(g.alpha, alpha, S);
     if constexpr (DIST) {
         S = fma(2.f * a.g_distortion[i], a.distortion[i], S);  // each pair counts for both of its splats
-        g.distortion = a.g_distortion[i] * a.view.distortion_scale, g.total = alpha;
-        g.M1 = a.moments[3 * i], g.M2 = a.moments[3 * i + 1], g.inverse_depth0 = a.moments[3 * i + 2];
+        add_distortion(a.g_distortion[i] * a.view.distortion_scale, alpha, a.moments[3 * i], a.moments[3 * i + 1], g);
+        g.inverse_depth0 = a.moments[3 * i + 2];
     }
     return g;
 }
@@ -59,7 +59,7 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
 // `row` is the splat's, or with slots the one of this entry and warp.
 template <bool ABS>
 __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 row, const RecordGradient<float>& g, int lane) {
-    float v[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.az, g.bz, g.zc, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
+    float v[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.ai, g.bi, g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
     const float sum = transpose_reduce<16>(v, lane);
     if (!(lane & 1)) atomicAdd(a.gradients + 16 * row + (lane >> 1), sum);
     if constexpr (ABS) {
@@ -132,19 +132,19 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
             const uint bit = todo & (0u - todo);
             const auto& r = staged.records;
             const Record<float> s = record_of(r[0][j], r[1][j], r[2][j], r[3][j]);
-            const float inverse_zc = DIST ? reciprocal(s.zc) : 0.f, dx = x - s.cx;
+            const float zc = reciprocal(s.iz), dx = x - s.cx;
             PairSums<float> sums = {};
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;
                 const float dy = y + float(4 * h) - s.cy;
-                const Hit<float> hit = intersect(s, dx, dy, limits);
+                const Hit<float> hit = intersect(s, zc, dx, dy, limits);
                 upstream.get(h, g[h]);
-                composite_vjp<GEO, DIST, ABS, true>(s, inverse_zc, dx, dy, hit, limits, g[h], T[h], S[h], sums);
+                composite_vjp<GEO, DIST, ABS, true>(s, dx, dy, hit, limits, g[h], T[h], S[h], sums);
             }
             if (!(learning & bit)) continue;  // the same for all lanes
             finish_column(dx, sums);
-            add_gradient<ABS>(a, staged.rows[j], finish(s, sums, limits), at.lane);
+            add_gradient<ABS>(a, staged.rows[j], finish(s, zc, sums, limits), at.lane);
         }
         __syncwarp();  // before the records are overwritten
     }

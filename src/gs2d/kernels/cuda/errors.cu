@@ -27,6 +27,7 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors(ErrorArguments a)
         const BlendLimits<float> limits = limits_of(v);
         const float4* from = reinterpret_cast<const float4*>(a.records + RECORD * splat);
         const Record<float> s = record_of(from[0], from[1], from[2], from[3]);
+        const float zc = reciprocal(s.iz);
         const ushort* rect = a.rects + 4 * splat;
         const int x0 = rect[0], y0 = rect[1], columns = rect[2] - x0;
         for (int t = 0; t < tiles; ++t) {
@@ -39,8 +40,8 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors(ErrorArguments a)
                 if (x >= v.width || y >= v.height) continue;
                 const int64 at = int64(y) * v.width + x;
                 if (a.mask && !a.mask[at]) continue;
-                const Hit<float> h = intersect(s, float(x) + 0.5f - s.cx, float(y) + 0.5f - s.cy, limits);
-                if (!(h.rho <= v.error_k2 && s.zc * h.rq >= v.near)) continue;
+                const Hit<float> h = intersect(s, zc, float(x) + 0.5f - s.cx, float(y) + 0.5f - s.cy, limits);
+                if (!(h.rho <= v.error_k2 && h.depth >= v.near)) continue;
                 const float* c = a.image + 3 * at;
                 total = total + (abs(s.red - c[0]) + abs(s.green - c[1]) + abs(s.blue - c[2]));
             }

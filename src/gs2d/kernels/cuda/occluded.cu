@@ -60,15 +60,16 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors_occluded(Occluded
             const int j = __ffs(int(todo)) - 1;
             const uint bit = todo & (0u - todo);
             const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
+            const float zc = reciprocal(s.iz);
             float error = 0.f;
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;
-                const Hit<float> hit = intersect(s, x - s.cx, y + float(4 * h) - s.cy, limits);
+                const Hit<float> hit = intersect(s, zc, x - s.cx, y + float(4 * h) - s.cy, limits);
                 const float alpha = min(hit.alpha, limits.alpha_max), after = fnma(alpha, T[h], T[h]);
                 const bool open = after >= limits.transmittance_min;
                 T[h] = keep(open, after);  // stopped pixels stay at 0
-                const bool covered = counts[h] && open && hit.rho <= v.error_k2 && s.zc * hit.rq >= v.near;
+                const bool covered = counts[h] && open && hit.rho <= v.error_k2 && hit.depth >= v.near;
                 const Vec3<float> d = {abs(s.red - target[h].x), abs(s.green - target[h].y), abs(s.blue - target[h].z)};
                 error = error + keep(covered, d.x + d.y + d.z);
             }

@@ -30,7 +30,7 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     const SplatParameters<float> p = load_parameters(a, i);
     const Frame3<float> frame = frame_of(p, v.camera);
     Record<float> r = project(p, frame, v.camera);
-    if (!is_finite(parameter_size(p, frame)) || !(r.zc > v.near)) return;
+    if (!is_finite(parameter_size(p, frame)) || !(frame.p.z > v.near)) return;
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
     const bool crossing = v.crossing != CROSSING_DRAW && reaches_camera_plane(frame, v.error_k2);
     if (crossing && v.crossing == CROSSING_CULL) return;
@@ -55,13 +55,13 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     const int tiles = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
     if (tiles == 0) return;
     float4* to = reinterpret_cast<float4*>(a.records + RECORD * i);
-    to[0] = {r.cx, r.cy, r.au, r.bu}, to[1] = {r.av, r.bv, r.az, r.bz};
-    to[2] = {r.zc, r.log2_opacity, r.red, r.green}, to[3] = {r.blue, r.nx, r.ny, r.nz};
+    to[0] = {r.cx, r.cy, r.au, r.bu}, to[1] = {r.av, r.bv, r.ai, r.bi};
+    to[2] = {r.iz, r.log2_opacity, r.red, r.green}, to[3] = {r.blue, r.nx, r.ny, r.nz};
     float4* cull = reinterpret_cast<float4*>(a.cull + 8 * i);
     cull[0] = {o.ex, o.ey, o.a, o.b}, cull[1] = {o.c, r.cx, r.cy, o.unbounded ? -1.f : o.disc2};
     ushort* rows = a.rects + 4 * i;
     rows[0] = rect.x0, rows[1] = rect.y0, rows[2] = rect.x1, rows[3] = rect.y1;
-    a.depth_keys[i] = __float_as_int(r.zc), a.tile_counts[i] = tiles;
+    a.depth_keys[i] = __float_as_int(frame.p.z), a.tile_counts[i] = tiles;
 }
 
 }  // namespace gs2d
