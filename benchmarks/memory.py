@@ -7,8 +7,8 @@ tiles, P pixels, t tiles; float32, a densification signal of two columns::
 
 64 N: records. 56 N: cull record 32, tile rectangle 8, sort 16; the backward pass puts the slots of two chunks there,
 each gradients 64, extra 16 and its flag 1. A chunk takes N / 3 slots where no four tiles in a row have more, at least
-4096, so from 12,000 splats on the maximum is 56 N. 16 P: T, M1, M2, 1/z of the first pair. The sums of gradients lie in the
-gradient of shN; where that is not wanted or has fewer than 6 coefficients, they take 64 N more. Buffers that
+4096, so from 12,000 splats on the maximum is 56 N. 16 P: T, M1, M2, 1/z of the first pair. The sums of gradients lie
+in the gradient of shN; where that is not wanted or has fewer than 6 coefficients, they take 64 N more. Buffers that
 grow for a later view take 1/16 more than asked.
 """
 
