@@ -88,7 +88,8 @@ def _view(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
     if max(camera.width, camera.height) > 1 << 19:
         raise BackendError(f"the cpu backend renders up to 524288 px a side, got {camera.width}x{camera.height}")
     a, b, c, _ = camera.T_cam_world.tolist()
-    doubles = (*a[:3], *b[:3], *c[:3], a[3], b[3], c[3], *camera.center.tolist())
+    center = (-(a[i] * a[3] + b[i] * b[3] + c[i] * c[3]) for i in range(3))  # camera.center without numpy: 40 us less
+    doubles = (*a[:3], *b[:3], *c[:3], a[3], b[3], c[3], *center)
     doubles += (camera.fx, camera.fy, camera.cx, camera.cy, *_constants(settings), *settings.background)
     integers = (camera.width, camera.height, settings.sh_degree, exact_masks, CROSSING.index(settings.crossing))
     return _View.from_buffer_copy(VIEW_LAYOUT.pack(*doubles, *integers))  # a field at a time takes four times as long

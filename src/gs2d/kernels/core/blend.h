@@ -53,12 +53,12 @@ template <class V> GS2D_HD Hit<V> meet(const PlaneAt<V>& p, V iz, V zc, V dx, V 
     return h;
 }
 
-// Least 1 / z where the plane decides, whatever the pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d inv_lowpass2 where
-// the largest eigenvalue of A is at most inv_lowpass2 / z^2. A little more, against rounding.
-template <class V> GS2D_HD V plain_from(const Record<V>& s, const BlendLimits<V>& k) {
+// Least 1 / z where the plane decides, whatever the pixel: rho3d = d^T A d z^2 is at most rho2d = d^T d / lowpass_px^2 where
+// the largest eigenvalue of A is at most (1 / z / lowpass_px)^2. A little more, against rounding.
+template <class V> GS2D_HD V plain_from(const Record<V>& s, V lowpass_px) {
     const V xx = fma(s.au, s.au, s.av * s.av), yy = fma(s.bu, s.bu, s.bv * s.bv), xy = fma(s.au, s.bu, s.av * s.bv);
     const V half = V(0.5), d = half * (xx - yy);
-    return V(1.001) * sqrt((half * (xx + yy) + sqrt(fma(d, d, xy * xy))) / k.inv_lowpass2);
+    return V(1.001f) * lowpass_px * sqrt(half * (xx + yy) + sqrt(fma(d, d, xy * xy)));
 }
 
 // Whether neither the low-pass filter nor `near` can decide anything at pixels up to `half_side` in x and y from the one at

@@ -121,7 +121,7 @@ __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t 
     planes.set(record, centres);
     for (; blocks; blocks &= blocks - 1) {
         const int b = __builtin_ctz(blocks);
-        const Hit<V> h = hit_at(splat, zc, planes, plain, centres, b, limits);
+        const Hit<V> h = hit_at(splat, zc, planes.at(b), plain, centres, b, limits);
         V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
         weigh_vjp<Geo, Dist>(splat, h.depth, h.inverse_depth, h.alpha, limits, load_gradient(s, b), pixel_T, pixel_S);
         store(&s[T][b * LANES], pixel_T);
@@ -196,7 +196,7 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
         const V zc = reciprocal(s.iz);
         M filtered = V(1) < V(0);
         for (int i = j ? w.end[j - 1] : 0; i < w.end[j]; ++i) {
-            const Hit<V> h = hit_at(s, zc, w.planes[j], false, centres, w.block[i], limits);
+            const Hit<V> h = hit_at(s, zc, w.planes[j].at(w.block[i]), false, centres, w.block[i], limits);
             put(i, h);
             store(w.alpha[i], h.alpha);
             w.ray[i] = h.ray;
@@ -341,7 +341,8 @@ void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows,
             const int b = __builtin_ctz(blocks);
             const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
             V pixel_T = at(T);
-            composite_color_vjp(hit_at(splat, zc, planes, entry->plain(), centres, b, limits), limits, {at(RED), at(GREEN), at(BLUE)}, pixel_T, sum);
+            const Hit<V> hit = hit_at(splat, zc, planes.at(b), entry->plain(), centres, b, limits);
+            composite_color_vjp(hit, limits, {at(RED), at(GREEN), at(BLUE)}, pixel_T, sum);
             store(&s[T][b * LANES], pixel_T);
         }
         if (!wanted) continue;

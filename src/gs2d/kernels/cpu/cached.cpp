@@ -61,7 +61,7 @@ void fill_tile(const Frame& f, int64_t tile, const int32_t* row_of, const Cached
         }
         for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks), at = b * LANES;
-            const Hit<V> hit = hit_at(splat, zc, planes, entry->plain(), centres, b, limits);
+            const Hit<V> hit = hit_at(splat, zc, planes.at(b), entry->plain(), centres, b, limits);
             V pixel_T = load(T + at);
             if (row >= 0) {
                 Vec3<V> sum = {V(0), V(0), V(0)};

@@ -84,7 +84,7 @@ inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, 
     for (; others; others &= others - 1) {
         const int i = __builtin_ctz(others);
         const Record<V> s = broadcast(w.records[list[i]]);
-        const Hit<V> h = hit_at(s, reciprocal(s.iz), w.planes[list[i]], false, centres, b, limits);
+        const Hit<V> h = hit_at(s, reciprocal(s.iz), w.planes[list[i]].at(b), false, centres, b, limits);
         store(batch.alpha[i], h.alpha), store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
     }
 }
@@ -214,7 +214,8 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
 }  // namespace
 
 bool blend_tiles(Frame& f, const Images& out) {
-    if (!f.tile_count.reserve(f.tiles) || !f.taken.reserve(f.groups()) || !f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
+    if (!f.tile_count.reserve(f.tiles) || !f.taken.reserve(f.groups())) return false;
+    if (!f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
     const BlockRows block_rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const RowLines written = images_written(f, out);

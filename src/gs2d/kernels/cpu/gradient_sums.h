@@ -34,7 +34,8 @@ class GradientSums {
     template <class F> void for_each_tile(F&& blend) {
         parallel_for(threads_, [&](int64_t) {
             for (int64_t c = 0; c <= chunks_; ++c) {
-                if (c < chunks_) share_out(first_group(c), first_group(c + 1), f_.taken.data, [&](int64_t group) { blend_group(c, group, blend); });
+                if (c < chunks_)
+                    share_out(first_group(c), first_group(c + 1), f_.taken.data, [&](int64_t group) { blend_group(c, group, blend); });
                 if (c > 0) add_parts(c - 1);
             }
         });

@@ -35,7 +35,7 @@ PairCounts count_tile(const Frame& f, int64_t tile, const BlendLimits<V>& limits
         planes.set(record, centres);
         for (uint32_t blocks = entry->blocks; blocks; blocks &= blocks - 1) {
             const int b = __builtin_ctz(blocks);
-            const Hit<V> h = hit_at(s, zc, planes, entry->plain(), centres, b, limits);
+            const Hit<V> h = hit_at(s, zc, planes.at(b), entry->plain(), centres, b, limits);
             const V before = load(T[b]), after = fnma(min(h.alpha, limits.alpha_max), before, before);
             counts.visible += __builtin_popcount(bits((h.alpha > V(0)) & (before > V(0))));
             counts.lanes += LANES;

@@ -20,7 +20,8 @@ struct Centres {
 };
 
 struct SplatPlanes {
-    alignas(64) real lane[3][LANES], block[3][BLOCKS];  // of X, Y, I
+    // Of X, Y, I. Aligned to a vector, not more: many of them a power of two apart would share few sets of the first cache.
+    alignas(LANES * sizeof(real)) real lane[3][LANES], block[3][BLOCKS];
 
     inline __attribute__((always_inline)) void set(const real* record, const Centres& centres) {
         const V cx = V(record[0]), cy = V(record[1]), zero = V(0), constant[3] = {zero, zero, V(record[8])};
@@ -52,10 +53,11 @@ inline M plain_over_tile(const Frame& f, const uint32_t* splats, real tile_x, re
     return is_plain(dx, dy, b[0], b[1], b[2], c[3], V(real(f.view.near)), V(real(TILE / 2)));  // half a pixel to spare
 }
 
-// A splat at block b. Plain: as `Entry` says.
-inline Hit<V> hit_at(const Record<V>& s, V zc, const SplatPlanes& planes, bool plain, const Centres& centres, int b, const BlendLimits<V>& k) {
-    if (!plain) return intersect(s, planes.at(b), zc, centres.at_x(b) - s.cx, centres.at_y(b) - s.cy, k);
-    Hit<V> h = meet_plane(planes.at(b));
+// A splat at block b, where its plane is `plane`. Plain: as `Entry` says.
+inline Hit<V> hit_at(const Record<V>& s, V zc, const PlaneAt<V>& plane, bool plain, const Centres& centres, int b,
+                     const BlendLimits<V>& k) {
+    if (!plain) return intersect(s, plane, zc, centres.at_x(b) - s.cx, centres.at_y(b) - s.cy, k);
+    Hit<V> h = meet_plane(plane);
     h.alpha = plain_alpha_of(s.log2_opacity, h.rho, k);
     h.ray = h.alpha >= V(0);
     return h;

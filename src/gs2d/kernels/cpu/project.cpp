@@ -59,7 +59,6 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
     f.cull = reinterpret_cast<CullRecord*>(f.scratch.data);
     f.rects = reinterpret_cast<TileRect*>(f.cull + n);
     f.order = reinterpret_cast<DepthItem*>(f.rects + n);
-    const BlendLimits<V> limits = limits_of(f.view);
     const bool blending = reach == Reach::BLEND;
     const V error_k2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), log2_alpha_min = V(real(log2(f.view.alpha_min)));
     parallel_ranges(n, 64 * LANES, [&](int64_t begin, int64_t end) {
@@ -82,7 +81,7 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const V fields[RECORD] = {r.cx, r.cy, r.au, r.bu, r.av, r.bv, r.ai, r.bi,
                                       r.iz, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
             store_rows<RECORD>(&f.records[i * RECORD], RECORD, lanes, fields);
-            const V cull[8] = {o.ex, o.ey, o.slope, o.half, o.inv_y2, o.y_right, select(o.unbounded, V(-1), o.disc2), plain_from(r, limits)};
+            const V cull[8] = {o.ex, o.ey, o.slope, o.half, o.inv_y2, o.y_right, select(o.unbounded, V(-1), o.disc2), plain_from(r, V(real(f.view.lowpass_px)))};
             store_rows<8>(reinterpret_cast<real*>(&f.cull[i]), 8, lanes, cull);
             alignas(64) real box[4][LANES], depth[LANES];
             store(depth, g.frame.p.z);

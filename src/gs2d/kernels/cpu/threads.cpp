@@ -96,7 +96,8 @@ void start_missing(int needed) {  // with pool.lock held
     }
     for (; pool.started < needed; ++pool.started) {
         pthread_t thread;
-        if (pthread_create(&thread, nullptr, thread_main, reinterpret_cast<void*>(intptr_t(pool.started + 1))) != 0) break;  // fewer threads, same result
+        void* const its_number = reinterpret_cast<void*>(intptr_t(pool.started + 1));
+        if (pthread_create(&thread, nullptr, thread_main, its_number) != 0) break;  // fewer threads, same result
         pthread_detach(thread);
     }
 }
