@@ -12,6 +12,7 @@ from gs2d.errors import RecipeError
 from gs2d.recipe import (
     ALPHA,
     CloneInPlace,
+    Exposure,
     GradDensify,
     LossTerm,
     RankByError,
@@ -124,6 +125,25 @@ def test_validate_names_the_stage_and_what_exists(recipe: Recipe, message: str) 
         validate(recipe)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("rate", 0.0, "recipe 'r': exposure.rate must be positive, got 0.0 (exposure=null leaves exposures alone)"),
+        ("rate_final", -1.0, "exposure.rate_final must be a finite number >= 0"),
+        ("prior", float("nan"), "exposure.prior must be a finite number"),
+        ("beta1", 1.0, "exposure.beta1 and recipe 'r': exposure.beta2 must be below 1"),
+        ("horizon", 0, "exposure.horizon must be an integer >= 1"),
+        ("start", -1, "exposure.start must be an integer >= 0"),
+    ],
+)
+def test_exposures_are_checked_like_the_stages(field: str, value: float, message: str) -> None:
+    recipe = replace(one(), exposure=replace(Exposure(), **{field: value}))
+    with pytest.raises(RecipeError) as caught:
+        validate(recipe)
+    assert message in str(caught.value)
+    assert validate(replace(one(), exposure=Exposure()))
 
 
 def test_a_group_may_be_written_by_an_action_of_the_same_stage() -> None:

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from gs2d.errors import RecipeError
-from gs2d.recipe import CloneInPlace, GradDensify, Recipe
+from gs2d.recipe import CloneInPlace, Exposure, GradDensify, Recipe
 from gs2d.recipe_json import apply_overrides, from_json, to_json
 from gs2d.recipes import RECIPES, get_recipe
 from gs2d.schedule import scale_schedule
@@ -81,6 +81,13 @@ def test_overrides_that_are_not_named_stay_as_they_were() -> None:
     assert changed("refine.iterations=5").stages[:2] == get_recipe("2dgs-r").stages[:2]
 
 
+def test_exposures_can_be_switched_on_changed_and_off() -> None:
+    assert changed("exposure={}").exposure == Exposure()
+    learning = get_recipe("2dgs-r-exposure")
+    assert apply_overrides(learning, ["exposure.rate=0.01"]).exposure == Exposure(rate=0.01)
+    assert apply_overrides(learning, ["exposure=null"]).exposure is None
+
+
 def test_densification_can_be_switched_off() -> None:
     assert changed("surface.densify=null").stages[0].densify is None
 
@@ -92,7 +99,7 @@ def test_densification_can_be_switched_off() -> None:
         ("=3", "an override is stage.field=value"),
         (
             "polish.iterations=3",
-            "stages are surface, appearance, refine; fields are name, seed, sh_degree, init_points",
+            "stages are surface, appearance, refine; fields are name, seed, sh_degree, init_points, exposure",
         ),
         ("refine=3", "name a field of the stage: name, iterations"),
         ("refine.iteration=3", "no field 'iteration'; there is name, iterations"),

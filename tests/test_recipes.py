@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from gs2d.errors import RecipeError
-from gs2d.recipe import ALL, CloneInPlace, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
+from gs2d.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
 from gs2d.recipes import RECIPES, TABLES, get_recipe
 
 
@@ -160,3 +162,17 @@ def test_silhouettes_are_kept_wherever_opacity_or_geometry_learns() -> None:
     assert weights(surface) == weights(plain[0]) | {"silhouette": (0.1, 0)}
     assert appearance == plain[1]  # colours alone: alpha cannot change, and views can be cached
     assert weights(refine) == weights(plain[2]) | {"silhouette": (0.1, 0)}
+
+
+@pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
+def test_only_the_recipes_that_say_so_learn_exposures_and_view_dependence_then_comes_later(base: str) -> None:
+    plain, learning = get_recipe(base), get_recipe(f"{base}-exposure")
+    assert plain.exposure is None
+    assert learning.exposure == Exposure()
+    assert [stage.sh_interval for stage in learning.stages] == [3 * stage.sh_interval for stage in plain.stages]
+    intervals = [stage.sh_interval for stage in plain.stages]
+    stages = (replace(s, sh_interval=k) for s, k in zip(learning.stages, intervals, strict=True))
+    assert replace(learning, name=base, exposure=None, stages=tuple(stages)) == plain
+    assert [name for name in RECIPES if get_recipe(name).exposure] == [
+        f"{x}-exposure" for x in ("2dgs", "2dgs-60k", "2dgs-r")
+    ]

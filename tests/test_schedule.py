@@ -92,3 +92,17 @@ def test_every_recipe_scales_to_something_valid_with_the_same_stages(name: str, 
 def test_a_factor_must_be_positive_and_finite(factor: float) -> None:
     with pytest.raises(RecipeError, match="schedule scale"):
         scale_schedule(get_recipe("2dgs"), factor)
+
+
+def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
+    recipe = get_recipe("2dgs-exposure")
+    # start: 500 of 30,000; a tenth of the schedule waits 200, not 50; at most a sixth of its 3000, 1200 or 300.
+    facts = {factor: scale_schedule(recipe, factor).exposure for factor in (1.0, 0.5, 0.1, 0.04, 0.01)}
+    assert {f: (e.horizon, e.start) for f, e in facts.items() if e is not None} == {
+        1.0: (30_000, 500),
+        0.5: (15_000, 250),
+        0.1: (3_000, 200),
+        0.04: (1_200, 200),
+        0.01: (300, 50),
+    }
+    assert all(e is not None and (e.rate, e.rate_final, e.prior) == (0.05, 0.001, 0.001) for e in facts.values())

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 
-from gs2d.errors import RecipeError
+from gs2d.recipe_checks import group, integer, number, one_of, require
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
@@ -221,10 +221,43 @@ class Stage:
 
 
 @dataclass(frozen=True)
+class Exposure:
+    """One affine colour transform for each training photograph, learned with the splats (``train/exposure.py``).
+
+    Attributes
+    ----------
+    rate, rate_final, horizon : float, float, int
+        Adam's rate decays log-linearly from ``rate`` to ``rate_final`` over ``horizon`` iterations of the run, all
+        stages counted; a transform is updated when its photograph has its turn.
+    start : int
+        Learned when iteration of the run > start: colours need some to leave the grey that random points begin with.
+    prior : float
+        Weight of the summed squares of what a transform differs from the identity by.
+    beta1, beta2, eps : float
+        Adam's.
+    """
+
+    rate: float = 0.05
+    rate_final: float = 0.001
+    horizon: int = 30_000
+    start: int = 500
+    prior: float = 0.001
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+
+    def rate_at(self, iteration: int) -> float:
+        """Rate at an iteration of the run (1-based): log-linear, then constant."""
+        t = min(max(iteration / self.horizon, 0.0), 1.0)
+        return math.exp((1.0 - t) * math.log(self.rate) + t * math.log(self.rate_final))
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Stages in order, the seed of every random choice, and the start.
 
-    ``init_points`` is how many random points training starts from when the scene has none.
+    ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
+    photographs are taken to have one exposure.
     """
 
     name: str
@@ -232,6 +265,7 @@ class Recipe:
     seed: int = 0
     sh_degree: int = 3
     init_points: int = 100_000
+    exposure: Exposure | None = None
 
     @property
     def iterations(self) -> int:
@@ -248,17 +282,19 @@ def validate(recipe: Recipe) -> Recipe:
         Names the stage, what was found and what exists.
     """
     where = f"recipe {recipe.name!r}"
-    _require(bool(recipe.stages), f"{where}: expected at least one stage, got none")
-    _require(recipe.name != "", "a recipe must have a name, got an empty one")
-    _integer(f"{where}: seed", recipe.seed, low=0)
-    _require(recipe.seed <= LARGEST_SEED, f"{where}: seed must be at most 2^63 - 1, got {recipe.seed}")
-    _require(recipe.sh_degree in (0, 1, 2, 3), f"{where}: sh_degree must be 0, 1, 2 or 3, got {recipe.sh_degree!r}")
-    _integer(f"{where}: init_points", recipe.init_points, low=1)
-    _require(recipe.init_points < 2**31, f"{where}: init_points must be at most 2^31 - 1, got {recipe.init_points}")
+    require(bool(recipe.stages), f"{where}: expected at least one stage, got none")
+    require(recipe.name != "", "a recipe must have a name, got an empty one")
+    integer(f"{where}: seed", recipe.seed, low=0)
+    require(recipe.seed <= LARGEST_SEED, f"{where}: seed must be at most 2^63 - 1, got {recipe.seed}")
+    require(recipe.sh_degree in (0, 1, 2, 3), f"{where}: sh_degree must be 0, 1, 2 or 3, got {recipe.sh_degree!r}")
+    integer(f"{where}: init_points", recipe.init_points, low=1)
+    require(recipe.init_points < 2**31, f"{where}: init_points must be at most 2^31 - 1, got {recipe.init_points}")
+    if recipe.exposure is not None:
+        _check_exposure(f"{where}: exposure", recipe.exposure)
     names = [stage.name for stage in recipe.stages]
     for name in names:
-        _require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")
-        _require(
+        require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")
+        require(
             name.replace("-", "_").isidentifier(), f"{where}: a stage name is letters, digits, '-', '_'; got {name!r}"
         )
     groups: list[str] = []
@@ -267,33 +303,44 @@ def validate(recipe: Recipe) -> Recipe:
     return recipe
 
 
+def _check_exposure(where: str, exposure: Exposure) -> None:
+    for name in ("rate", "rate_final", "eps"):
+        value = number(f"{where}.{name}", getattr(exposure, name), low=0.0)
+        require(value > 0, f"{where}.{name} must be positive, got {value} (exposure=null leaves exposures alone)")
+    for name in ("prior", "beta1", "beta2"):
+        number(f"{where}.{name}", getattr(exposure, name), low=0.0)
+    require(max(exposure.beta1, exposure.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
+    integer(f"{where}.horizon", exposure.horizon, low=1)
+    integer(f"{where}.start", exposure.start, low=0)
+
+
 def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
     """Check one stage; ``groups`` are the row groups written so far, and is extended."""
-    _integer(f"{where}: iterations", stage.iterations, low=0)
-    _integer(f"{where}: sh_interval", stage.sh_interval, low=0)
-    _one_of(f"{where}: moments", stage.moments, ("fresh", "kept"))
+    integer(f"{where}: iterations", stage.iterations, low=0)
+    integer(f"{where}: sh_interval", stage.sh_interval, low=0)
+    one_of(f"{where}: moments", stage.moments, ("fresh", "kept"))
     for action in stage.on_enter:
         if isinstance(action, RankByError):
-            percent = _number(f"{where}: RankByError.top_percent", action.top_percent, low=0.0)
-            _require(0 < percent <= 100, f"{where}: RankByError.top_percent must be in (0, 100], got {percent}")
+            percent = number(f"{where}: RankByError.top_percent", action.top_percent, low=0.0)
+            require(0 < percent <= 100, f"{where}: RankByError.top_percent must be in (0, 100], got {percent}")
         else:
-            _one_of(f"{where}: CloneInPlace.opacity", action.opacity, ("copy", "preserve"))
-            _group(f"{where}: CloneInPlace.rows", action.rows, groups)
-        _require(action.writes not in ("", "all"), f"{where}: a row group cannot be called {action.writes!r}")
+            one_of(f"{where}: CloneInPlace.opacity", action.opacity, ("copy", "preserve"))
+            group(f"{where}: CloneInPlace.rows", action.rows, groups)
+        require(action.writes not in ("", "all"), f"{where}: a row group cannot be called {action.writes!r}")
         groups.append(action.writes)
     for attribute, rows in stage.train.items():
-        _one_of(f"{where}: train", attribute, ALL)
+        one_of(f"{where}: train", attribute, ALL)
         if rows != "all":
-            _group(f"{where}: train[{attribute!r}]", rows, groups)
+            group(f"{where}: train[{attribute!r}]", rows, groups)
     _check_losses(where, stage)
     for entry in fields(Rates):
-        _number(f"{where}: rates.{entry.name}", getattr(stage.rates, entry.name), low=0.0)
-    _require(
+        number(f"{where}: rates.{entry.name}", getattr(stage.rates, entry.name), low=0.0)
+    require(
         stage.rates.means > 0 and stage.rates.means_final > 0 and stage.rates.eps > 0,
         f"{where}: rates.means, rates.means_final and rates.eps must be positive (to freeze, leave out of train)",
     )
-    _integer(f"{where}: rates.means_horizon", stage.rates.means_horizon, low=1)
-    _require(max(stage.rates.beta1, stage.rates.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
+    integer(f"{where}: rates.means_horizon", stage.rates.means_horizon, low=1)
+    require(max(stage.rates.beta1, stage.rates.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
     if stage.densify is not None:
         _check_densify(f"{where}: densify", stage.densify, stage)
 
@@ -301,71 +348,45 @@ def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
 def _check_losses(where: str, stage: Stage) -> None:
     kinds = [term.kind for term in stage.losses]
     for term in stage.losses:
-        _one_of(f"{where}: loss", term.kind, LOSS_KINDS)
-        _require(kinds.count(term.kind) == 1, f"{where}: loss {term.kind!r} is there twice; add up the weights")
+        one_of(f"{where}: loss", term.kind, LOSS_KINDS)
+        require(kinds.count(term.kind) == 1, f"{where}: loss {term.kind!r} is there twice; add up the weights")
         if term.weight is None:
-            _require(
+            require(
                 term.kind == "distortion",
                 f"{where}: loss {term.kind!r} needs a weight; only distortion may leave it to the protocol",
             )
         else:
-            _number(f"{where}: weight of loss {term.kind!r}", term.weight, low=0.0)
-        _integer(f"{where}: start of loss {term.kind!r}", term.start, low=0)
+            number(f"{where}: weight of loss {term.kind!r}", term.weight, low=0.0)
+        integer(f"{where}: start of loss {term.kind!r}", term.start, low=0)
         if term.depth is not None:
-            _one_of(f"{where}: depth of loss {term.kind!r}", term.depth, DEPTH_KINDS)
+            one_of(f"{where}: depth of loss {term.kind!r}", term.depth, DEPTH_KINDS)
     if stage.iterations > 0:
         active = [term for term in stage.losses if term.weight != 0 and term.start == 0]
-        _require(bool(active), f"{where}: no loss is active from the first iteration: got {kinds or 'none'}")
-        _require(bool(stage.train), f"{where}: train names no attribute for {stage.iterations} iterations")
+        require(bool(active), f"{where}: no loss is active from the first iteration: got {kinds or 'none'}")
+        require(bool(stage.train), f"{where}: train names no attribute for {stage.iterations} iterations")
 
 
 def _check_densify(where: str, densify: GradDensify, stage: Stage) -> None:
     for name in ("start", "stop", "reset_every", "prune_grace", "cap_every"):
-        _integer(f"{where}.{name}", getattr(densify, name), low=0)
-    _integer(f"{where}.every", densify.every, low=1)
-    _integer(f"{where}.split_count", densify.split_count, low=2)
+        integer(f"{where}.{name}", getattr(densify, name), low=0)
+    integer(f"{where}.every", densify.every, low=1)
+    integer(f"{where}.split_count", densify.split_count, low=2)
     for name in ("grad_threshold", "abs_threshold", "percent_dense", "opacity_cull", "scale_cull"):
-        _number(f"{where}.{name}", getattr(densify, name), low=0.0)
-    shrink = _number(f"{where}.split_shrink", densify.split_shrink, low=0.0)
-    _require(shrink > 0, f"{where}.split_shrink must be positive, got {shrink}")
+        number(f"{where}.{name}", getattr(densify, name), low=0.0)
+    shrink = number(f"{where}.split_shrink", densify.split_shrink, low=0.0)
+    require(shrink > 0, f"{where}.split_shrink must be positive, got {shrink}")
     for name in ("reset_opacity", "opacity_cap"):
-        value = _number(f"{where}.{name}", getattr(densify, name), low=0.0)
-        _require(0 < value < 1, f"{where}.{name} must be in (0, 1), got {value}")
+        value = number(f"{where}.{name}", getattr(densify, name), low=0.0)
+        require(0 < value < 1, f"{where}.{name} must be in (0, 1), got {value}")
     for value in densify.reset_at:
-        _integer(f"{where}.reset_at", value, low=1)
+        integer(f"{where}.reset_at", value, low=1)
     if densify.last_reset is not None:
-        _integer(f"{where}.last_reset", densify.last_reset, low=0)
+        integer(f"{where}.last_reset", densify.last_reset, low=0)
     if densify.max_splats is not None:
-        _integer(f"{where}.max_splats", densify.max_splats, low=1)
+        integer(f"{where}.max_splats", densify.max_splats, low=1)
     touches_opacity = densify.reset_every > 0 or densify.cap_every > 0 or bool(densify.reset_at)
-    _require(
+    require(
         not touches_opacity or stage.train.get("opacity_logits") == "all",
         f"{where} resets or caps opacity, which the stage must then train for all rows; "
         "set reset_every and cap_every to 0 or train opacity_logits",
     )
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise RecipeError(message)
-
-
-def _integer(where: str, value: object, *, low: int) -> None:
-    ok = isinstance(value, int) and not isinstance(value, bool) and value >= low
-    _require(ok, f"{where} must be an integer >= {low}, got {value!r}")
-
-
-def _number(where: str, value: object, *, low: float) -> float:
-    ok = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= low
-    _require(ok, f"{where} must be a finite number >= {low:g}, got {value!r}")
-    assert isinstance(value, int | float)
-    return float(value)
-
-
-def _one_of(where: str, value: str, known: tuple[str, ...]) -> None:
-    _require(value in known, f"{where} must be one of {', '.join(known)}; got {value!r}")
-
-
-def _group(where: str, name: str, groups: list[str]) -> None:
-    written = f"the groups written so far are {', '.join(groups)}" if groups else "no action has written a group yet"
-    _require(name in groups, f"{where}: no earlier action writes the row group {name!r}; {written}")

@@ -18,6 +18,7 @@ from gs2d.recipe import (
     ALPHA,
     SH,
     CloneInPlace,
+    Exposure,
     GradDensify,
     LossTerm,
     RankByError,
@@ -27,6 +28,7 @@ from gs2d.recipe import (
 )
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
+SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned
 NC_START, DISTORTION_START = 7_000, 3_000  # official: active when iteration > start
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
@@ -132,6 +134,18 @@ def with_silhouette(recipe: Recipe, weight: float = 0.1, *, name: str) -> Recipe
     return replace(recipe, name=name, stages=tuple(stages))
 
 
+def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
+    """The recipe with a colour transform for each training photograph (``NAME-exposure``); itself if it has them.
+
+    Not in the paper. For photographs of a camera on automatic, whose exposure or white balance changes. View-dependent
+    colour comes three times as late: it can feign exposures (docs/decisions.md).
+    """
+    if recipe.exposure is not None:
+        return recipe
+    stages = (replace(stage, sh_interval=SH_PATIENCE * stage.sh_interval) for stage in recipe.stages)
+    return replace(recipe, name=name or f"{recipe.name}-exposure", stages=tuple(stages), exposure=Exposure())
+
+
 def _normal_consistency(weight: float, start: int) -> tuple[LossTerm, ...]:
     return (LossTerm("normal_consistency", weight, start),) if weight > 0 else ()
 
@@ -214,6 +228,9 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
             f"{base} that also keeps empty what the photographs' alpha channel says is empty",
             partial(with_silhouette, build()),
         )
+    for base, build in bases.items():
+        about = f"{base} with an exposure and a white balance for each photograph (`gs2d train --exposure`)"
+        add(f"{base}-exposure", about, partial(with_exposure, build()))
 
 
 RECIPES: Mapping[str, NamedRecipe] = MappingProxyType(_registry())

@@ -17,8 +17,9 @@ import numpy as np
 
 from gs2d.camera import Camera
 from gs2d.disk import atomic_write
-from gs2d.io.run import MESH, RENDERS, REPORT, open_run
+from gs2d.io.run import EXPOSURE, MESH, RENDERS, REPORT, open_run
 from gs2d.report_curves import curves, read_history
+from gs2d.report_exposure import exposure_section
 from gs2d.report_html import drawing, escape, facts, missing, page, table
 from gs2d.report_pictures import hero, mesh_section, view_sections
 from gs2d.report_surface import surface_scores
@@ -119,6 +120,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
         "<h2>Training</h2>",
         curve_section(record),
         story(record.events),
+        *_exposure(record),
         "<h2>What was run</h2>",
         facts(definition_facts(record.definition)),
         _raw("The whole definition (run.json)", record.definition),
@@ -128,6 +130,15 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
     with atomic_write(target, "w") as file:
         file.write(page(f"{title}: gs2d report", [part for part in body if part]))
     return target
+
+
+def _exposure(record: RunRecord) -> list[str]:
+    """The section about exposures, where the recipe learns them."""
+    recipe = record.definition.get("recipe")
+    if not isinstance(recipe, Mapping) or not recipe.get("exposure"):
+        return []
+    last = record.stages[-1] if record.stages else {}
+    return ["<h2>Exposure of the photographs</h2>", exposure_section(record.path / EXPOSURE, last)]
 
 
 def _title(record: RunRecord) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-_INK = "#858b94"  # readable on white and on black
+INK = "#858b94"  # readable on white and on black
 _COLORS = ("#3f86d6", "#e0893a", "#46a56b", "#c6509f", "#8a74d8", "#b9a02d", "#50a9b8")
 _STEP_KINDS = ("step", "progress")
 _CHANGES = ("mean", "covariance", "opacity", "sh")
@@ -166,7 +166,7 @@ def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str |
         for k, (label, history) in enumerate(histories.items()):
             _draw_stages(axes, history, panel.series, label=label, smooth=panel.smooth, **_style(k))
         _dress(axes, longest, log=panel.log, legend=False)
-        axes.set_title(panel.title, fontsize=9, color=_INK, pad=16 if len(longest.stages) > 1 else 6)
+        axes.set_title(panel.title, fontsize=9, color=INK, pad=16 if len(longest.stages) > 1 else 6)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(
         handles,
@@ -175,9 +175,9 @@ def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str |
         ncols=min(4, len(labels)),
         fontsize=8,
         frameon=False,
-        labelcolor=_INK,
+        labelcolor=INK,
     )
-    return _svg(figure)
+    return svg_text(figure)
 
 
 def _style(k: int) -> dict[str, Any]:
@@ -228,13 +228,13 @@ def _figure(
                 textcoords="offset points",
                 ha="right",
                 fontsize=8,
-                color=_INK,
+                color=INK,
             )
     _dress(axes, history, log=log, legend=any(lines) or bool(marks and marks[1]))
-    return _svg(figure)
+    return svg_text(figure)
 
 
-def _svg(figure: Any) -> str:
+def svg_text(figure: Any) -> str:
     import matplotlib
 
     text = io.StringIO()
@@ -260,20 +260,18 @@ def _dress(axes: Any, history: History, *, log: bool, legend: bool) -> None:
     axes.set_xlim(0, max(last, 1))
     for span in history.stages:
         if span.start:
-            axes.axvline(span.start, color=_INK, linewidth=0.8, linestyle=(0, (4, 3)))
+            axes.axvline(span.start, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
         if len(history.stages) > 1 and span.stop - span.start >= 0.06 * last:
             middle = (span.start + span.stop) / 2
-            axes.text(
-                middle, 1.02, span.name, transform=axes.get_xaxis_transform(), ha="center", fontsize=8, color=_INK
-            )
+            axes.text(middle, 1.02, span.name, transform=axes.get_xaxis_transform(), ha="center", fontsize=8, color=INK)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_xlabel("iteration", fontsize=8, color=_INK)
-    axes.tick_params(colors=_INK, labelsize=8, which="both", length=3)
-    axes.grid(True, color=_INK, alpha=0.18, linewidth=0.6)
+    axes.set_xlabel("iteration", fontsize=8, color=INK)
+    axes.tick_params(colors=INK, labelsize=8, which="both", length=3)
+    axes.grid(True, color=INK, alpha=0.18, linewidth=0.6)
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(_INK)
+        spine.set_color(INK)
     if legend:
-        axes.legend(fontsize=8, frameon=False, labelcolor=_INK, loc="best", handlelength=1.4)
+        axes.legend(fontsize=8, frameon=False, labelcolor=INK, loc="best", handlelength=1.4)
     if any(side > 9999 for side in axes.get_ylim()) and not log:
         axes.yaxis.set_major_formatter(EngFormatter(sep=""))

@@ -48,6 +48,7 @@ def _train_options(command: c.Train) -> Any:
         downscale=command.downscale,
         schedule_scale=command.schedule_scale,
         overrides=command.overrides,
+        exposure=command.exposure,
         seed=command.seed,
         resume=command.resume,
         overwrite=command.overwrite,
@@ -82,6 +83,8 @@ def demo(command: c.Demo, console: Console) -> None:
         resume=command.resume,
         overwrite=command.overwrite,
         schedule_scale=command.schedule_scale,
+        vary_exposure=command.vary_exposure,
+        exposure=command.exposure,
     )
     run = run_demo(options, console.on_event)
     console.close()
@@ -153,6 +156,7 @@ def render(command: c.Render, console: Console) -> None:
         out=command.out,
         video=command.video,
         fps=command.fps,
+        exposure_of=command.exposure_of,
         threads=command.threads,
     )
     console.close()
@@ -184,11 +188,16 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
     from gs2d.pipeline.options import EvaluateOptions
 
     options = EvaluateOptions(
-        ground_truth=command.ground_truth, thresholds=command.thresholds, lpips_weights=command.lpips_weights
+        ground_truth=command.ground_truth,
+        thresholds=command.thresholds,
+        lpips_weights=command.lpips_weights,
+        match_exposure=command.match_exposure,
     )
     result = evaluate_run(command.run, options, console.on_event, threads=command.threads)
     console.close()
     rows = [row for split in ("train", "test") for row in _both_scores(split, result.get(split))]
+    if command.match_exposure:
+        rows += _both_scores("test, matched", result["test_matched"])
     console.table("", ["views", "pictures", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
     for split in ("train", "test"):
         reason = (result.get(split) or {}).get("lpips_reason") or result.get(f"{split}_reason")

@@ -51,6 +51,10 @@ class Demo(TrainingCommon):
     """Run folder; the capture goes to its sub-folder `capture`. An earlier demo there is replaced."""
     schedule_scale: float | None = None
     """Fraction of the full schedule (default: what fits five minutes on two cores)."""
+    vary_exposure: bool = False
+    """Photograph as a camera on automatic does: training pictures differ in exposure and white balance."""
+    exposure: bool = False
+    """Learn an exposure and a white balance for each photograph, as in `gs2d train`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +107,8 @@ class Train(TrainingCommon):
     """Shrink the photographs by this integer, area-filtered."""
     schedule_scale: float = 1.0
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
+    exposure: bool = False
+    """Learn an exposure and a white balance for each photograph: for cameras on automatic."""
     start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
     """Take the stages that this recipe shares with another run from that run."""
     cache: Annotated[Path | None, arg(metavar="DIR")] = None
@@ -174,6 +180,8 @@ class Render(Common):
     """With --orbit or --flight: also a film of the frames, .mp4 (AV1) or .webp."""
     fps: float = 30.0
     """Frames a second of the film."""
+    exposure_of: Annotated[str | None, arg(metavar="PHOTOGRAPH")] = None
+    """Of a run with --exposure: in the exposure of this training photograph (default: in the mean of all)."""
     threads: int | None = None
     """CPU threads."""
 
@@ -204,6 +212,8 @@ class Evaluate(Common):
     """Distances at which precision and recall are taken, world units (default: 0.25, 0.5, 1 % of its size)."""
     lpips_weights: Path | None = None
     """VGG-16 and LPIPS weights for the LPIPS metric."""
+    match_exposure: bool = False
+    """Score test views once more, each half of a rendering matched in colour to the other half of its photograph."""
     threads: int | None = None
     """CPU threads."""
 

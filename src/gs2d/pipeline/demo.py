@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.data.toy import write_demo_capture
+from gs2d.data.toy_exposure import GAINS, vary_exposure
 from gs2d.errors import RunError
 from gs2d.io.run import RunFolder, is_run, open_run
 from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
@@ -21,7 +22,10 @@ SCHEDULE_SCALE = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions:
-    """Where and how; see ``TrainOptions``. ``size`` is the width and height of the photographs, px."""
+    """Where and how; see ``TrainOptions``. ``size`` is the width and height of the photographs, px.
+
+    With ``vary_exposure`` the training photographs get random gains (``data.toy_exposure``).
+    """
 
     out: Path = Path("runs/demo")
     backend: str = "auto"
@@ -30,6 +34,8 @@ class DemoOptions:
     resume: bool = False
     overwrite: bool = False
     schedule_scale: float | None = None
+    vary_exposure: bool = False
+    exposure: bool = False
     train_views: int = TRAIN_VIEWS
     test_views: int = TEST_VIEWS
     size: int = SIZE
@@ -64,12 +70,16 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
             on_progress=lambda done, _total: on_event(Step(done)),
             threads=options.threads,
         )
+        (capture / GAINS).unlink(missing_ok=True)
+        if options.vary_exposure:
+            vary_exposure(capture)
     run = train(
         TrainOptions(
             scene=capture,
             out=options.out,
             backend=options.backend,
             seed=options.seed,
+            exposure=options.exposure,
             threads=options.threads,
             resume=options.resume,
             overwrite=overwrite,

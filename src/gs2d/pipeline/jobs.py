@@ -31,6 +31,7 @@ from gs2d.io.run import (
     remove_made,
 )
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
+from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
@@ -137,11 +138,13 @@ def render_run(
     out: Path | None = None,
     video: Path | None = None,
     fps: float = FPS,
+    exposure_of: str | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
     """Render the views of a split, ``orbit`` frames of a circle or ``flight`` frames past the photographs, as PNGs.
 
-    Frames of a circle or a flight can be made a film too: ``video`` names it, ``fps`` frames a second.
+    Frames of a circle or a flight can be made a film too: ``video`` names it, ``fps`` frames a second. All are in the
+    mean exposure of the photographs, or in that of the training photograph ``exposure_of``.
 
     Raises
     ------
@@ -152,6 +155,7 @@ def render_run(
     path, out, video = Path(path), None if out is None else Path(out), None if video is None else Path(video)
     moving = check_frames(orbit, flight, video, fps)
     run, job, splats = open_job(path, threads, on_event)
+    transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, job.recipe))
     views: list[tuple[str, View]]
     if moving:
         image = np.zeros((1, 1, 3), np.uint8)
@@ -177,7 +181,7 @@ def render_run(
         written: list[Path] = []
         try:
             for name, view in counted(views, "rendering", len(views), on_event):
-                color = render_view(splats, view, job.settings, job.backend).color.clamp(0, 1)
+                color = exposed(render_view(splats, view, job.settings, job.backend), transform, job).clamp(0, 1)
                 is_new = not (folder / f"{name}.png").exists()
                 write_image(folder / f"{name}.png", color.cpu().numpy())
                 written += [folder / f"{name}.png"] if is_new else []
@@ -269,9 +273,15 @@ def evaluate_run(
     has_mesh = run.file(MESH).exists()
     if truth is not None and not has_mesh and given is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
+    drawing = (job.settings, job.backend)
+    exposures = read_exposures(run, job.recipe)
+    if options.match_exposure:
+        name = "scoring test views, colours matched"
+        scores = score_views(splats, job.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)
+        result |= split_metrics(scores, "test_matched", "test")
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         name = f"scoring {split} views"
-        scores = score_views(splats, views, job.settings, job.backend, name=name, on_event=on_event, lpips=lpips)
+        scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, exposures=exposures)
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
     if truth is not None and has_mesh:

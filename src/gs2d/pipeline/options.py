@@ -38,6 +38,8 @@ class TrainOptions:
     overrides : tuple of str
         ``stage.field=value``; applied after the schedule is scaled, so that a number means what it says.
     seed : int
+    exposure : bool
+        Learn an exposure and a white balance for each photograph (``recipes.with_exposure``).
     resume, overwrite : bool
         What to do with a run that is already in ``out``.
     start_from : Path or None
@@ -69,6 +71,7 @@ class TrainOptions:
     schedule_scale: float = 1.0
     overrides: tuple[str, ...] = ()
     seed: int = 0
+    exposure: bool = False
     resume: bool = False
     overwrite: bool = False
     start_from: Path | None = None
@@ -149,11 +152,14 @@ class EvaluateOptions:
     thresholds : tuple of float
         Distances at which precision and recall are taken, wu; empty = 0.25, 0.5 and 1 % of the true diagonal.
     lpips_weights : Path or None
+    match_exposure : bool
+        Score the test views once more, each half of a rendering matched in colour to the other half of its photograph.
     """
 
     ground_truth: Path | None = None
     thresholds: tuple[float, ...] = field(default=())
     lpips_weights: Path | None = None
+    match_exposure: bool = False
 
     def __post_init__(self) -> None:
         paths_of(self, "ground_truth", "lpips_weights")

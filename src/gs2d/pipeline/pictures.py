@@ -19,6 +19,7 @@ from gs2d.errors import DataError
 from gs2d.images import write_image
 from gs2d.io.files import write_json
 from gs2d.io.run import RENDERS, RunFolder, make_folder
+from gs2d.pipeline.exposure import NONE, Transforms, photographed
 from gs2d.pipeline.prepare import Job
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
@@ -64,9 +65,17 @@ def _short_hash(text: str) -> str:
 
 
 def draw_stage(
-    run: RunFolder, job: Job, shown: Sequence[tuple[str, View]], stage: str, splats: Splats, group: Tensor | None
+    run: RunFolder,
+    job: Job,
+    shown: Sequence[tuple[str, View]],
+    stage: str,
+    splats: Splats,
+    group: Tensor | None,
+    exposures: Transforms = NONE,
 ) -> None:
     """Write the pictures of one stage, the photographs, and the index of both.
+
+    Training views are drawn in the exposures of their photographs, where those are known.
 
     Parameters
     ----------
@@ -90,7 +99,8 @@ def draw_stage(
         depth = output.depth(job.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
         near_far = limits.get(view.name) or list(depth_limits(depth, alpha))  # of the first stage: stages compare
-        color, photo = output.color.cpu().numpy(), view.target(job.settings.background)
+        photo = view.target(job.settings.background)
+        color = photographed(view, output.color, exposures, job.settings.background).cpu().numpy()
         pictures = {
             "color": np.clip(color, 0, 1),
             "normal": normal_picture(output.normal.cpu().numpy(), alpha),

@@ -22,7 +22,7 @@ from gs2d.pipeline.options import TrainOptions
 from gs2d.protocols import FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
 from gs2d.recipe import Recipe, validate
 from gs2d.recipe_json import apply_overrides, from_json, to_json
-from gs2d.recipes import get_recipe
+from gs2d.recipes import get_recipe, with_exposure
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.schedule import scale_schedule
@@ -92,6 +92,7 @@ class Job:
             "start": [recipe["init_points"], recipe["sh_degree"]],
             "stages": recipe["stages"][: index + 1],
             "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
+            **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -101,7 +102,9 @@ class Job:
         return any(is_cacheable(self.recipe, stage, backend_name=name, views=views) for stage in stages)
 
 
-def build_recipe(recipe: str | Recipe, *, schedule_scale: float, seed: int, overrides: tuple[str, ...]) -> Recipe:
+def build_recipe(
+    recipe: str | Recipe, *, schedule_scale: float, seed: int, overrides: tuple[str, ...], exposure: bool = False
+) -> Recipe:
     """The recipe as it will be trained: found, scaled, seeded, overridden, validated.
 
     Raises
@@ -111,6 +114,7 @@ def build_recipe(recipe: str | Recipe, *, schedule_scale: float, seed: int, over
     value = get_recipe(recipe) if isinstance(recipe, str) else recipe
     if not isinstance(value, Recipe):
         raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
+    value = with_exposure(value) if exposure else value
     return validate(apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides))
 
 
@@ -122,7 +126,11 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     RecipeError, ProtocolError, BackendError, DataError
     """
     recipe = build_recipe(
-        options.recipe, schedule_scale=options.schedule_scale, seed=options.seed, overrides=options.overrides
+        options.recipe,
+        schedule_scale=options.schedule_scale,
+        seed=options.seed,
+        overrides=options.overrides,
+        exposure=options.exposure,
     )
     if options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
@@ -285,6 +293,8 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         old = before.get(name)
         if name == "protocol" and isinstance(old, dict):
             old, value = _training_facts(old), _training_facts(value)
+        if name == "recipe" and isinstance(old, dict):
+            old = {"exposure": None, **old}  # runs of before there were exposures
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]

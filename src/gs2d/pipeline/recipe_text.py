@@ -10,6 +10,12 @@ from gs2d.recipe import ALL, CloneInPlace, RankByError, Recipe, Stage
 def describe_recipe(recipe: Recipe) -> Iterator[str]:
     """Lines that say what is trained."""
     yield f"{recipe.name}: {recipe.iterations:,} iterations, SH degree {recipe.sh_degree}, seed {recipe.seed}"
+    if recipe.exposure is not None:
+        e = recipe.exposure
+        yield (
+            f"exposures: a colour transform for each photograph after iteration {e.start:,}, "
+            f"rate {e.rate:g} to {e.rate_final:g} over {e.horizon:,} iterations, prior {e.prior:g}"
+        )
     for number, stage in enumerate(recipe.stages, start=1):
         yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
         for line in _describe_stage(stage):

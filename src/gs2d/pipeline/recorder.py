@@ -14,6 +14,7 @@ from gs2d.errors import DivergedError
 from gs2d.io.run import RunFolder, load_tensors
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
+from gs2d.pipeline.exposure import Transforms, named
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
 from gs2d.pipeline.prepare import Job
@@ -148,7 +149,7 @@ class Recorder:
     def _probe_psnr(self, splats: Splats) -> float | None:
         """Mean PSNR over a few fixed views (test views where there are any)."""
         self._stop_clock()
-        psnr = mean_psnr(splats, self._probes, self._settings, self._job.backend)
+        psnr = mean_psnr(splats, self._probes, self._settings, self._job.backend, self._exposures)
         self._start_clock()
         return psnr
 
@@ -187,9 +188,7 @@ class Recorder:
         if state.stage > 0 and done < state.stage:
             self._score_stage(state.stage - 1)
         elif state.stage > 0:
-            draw_stage(
-                self._run, self._job, self._shown, self._stage(state.stage - 1).name, state.splats, _group(state)
-            )
+            self._draw(self._stage(state.stage - 1).name)
 
     def _score_stage(self, index: int) -> None:
         """Score a finished stage, draw it, write its entry of metrics.json, put it in the cache."""
@@ -209,7 +208,7 @@ class Recorder:
             entry |= split_metrics(scores, split)
         if self._at_entry:
             entry["after_clone"] = self._at_entry
-        draw_stage(self._run, self._job, self._shown, stage.name, state.splats, _group(state))
+        self._draw(stage.name)
         metrics = self._run.metrics()
         stages = [*metrics["stages"][:index], entry]
         self._run.write_metrics({"stages": stages, "surface": None})
@@ -219,12 +218,21 @@ class Recorder:
         self._on_event(StageDone(entry))
 
     def _score(self, splats: Splats, views: Any, name: str, on_event: OnEvent) -> Any:
-        return score_views(splats, views, self._settings, self._job.backend, name=name, on_event=on_event)
+        backend, exposures = self._job.backend, self._exposures
+        return score_views(splats, views, self._settings, backend, name=name, on_event=on_event, exposures=exposures)
+
+    def _draw(self, stage: str) -> None:
+        state = self._state
+        draw_stage(self._run, self._job, self._shown, stage, state.splats, _group(state), self._exposures)
 
     # -- small things --------------------------------------------------------------------------------------------------
     @property
     def _settings(self) -> Any:
         return self._job.settings
+
+    @property
+    def _exposures(self) -> Transforms:
+        return named(self._job.scene.train, self._state.exposures)
 
     @property
     def _state(self) -> TrainState:

@@ -16,6 +16,7 @@ from gs2d.data import View
 from gs2d.evaluate.images import ImageMetrics, image_metrics, mean_metrics, psnr_float
 from gs2d.evaluate.lpips import Lpips
 from gs2d.pipeline.events import OnEvent, Phase, Step
+from gs2d.pipeline.exposure import NONE, Transforms, matched_by_halves, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings
@@ -31,11 +32,17 @@ def score_views(
     name: str,
     on_event: OnEvent,
     lpips: Lpips | None = None,
+    exposures: Transforms = NONE,
+    match: bool = False,
 ) -> dict[str, ImageMetrics]:
-    """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere."""
+    """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere.
+
+    A view with a transform in ``exposures`` is rendered in the exposure of its photograph, any other as the scene is;
+    with ``match`` by :func:`~gs2d.pipeline.exposure.matched_by_halves`.
+    """
     on_event(Phase(name, len(views)))
     scores: dict[str, ImageMetrics] = {}
-    for done, drawn in enumerate(_drawn(splats, views, settings, backend), start=1):
+    for done, drawn in enumerate(_drawn(splats, views, settings, backend, exposures, match), start=1):
         scores[drawn.name] = image_metrics(
             drawn.image, drawn.target, drawn.mask, backend_name=backend.name, lpips=lpips
         )
@@ -43,9 +50,15 @@ def score_views(
     return scores
 
 
-def mean_psnr(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> float | None:
+def mean_psnr(
+    splats: Splats,
+    views: Sequence[View],
+    settings: RasterSettings,
+    backend: Backend,
+    exposures: Transforms = NONE,
+) -> float | None:
     """Mean ``psnr_float`` of the views that have one, as by :func:`score_views`, without the other metrics."""
-    values = [psnr_float(d.image, d.target, d.mask) for d in _drawn(splats, views, settings, backend)]
+    values = [psnr_float(d.image, d.target, d.mask) for d in _drawn(splats, views, settings, backend, exposures)]
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
@@ -60,21 +73,33 @@ class _Drawn:
     mask: torch.Tensor | None  # [H, W] bool
 
 
-def _drawn(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> Iterator[_Drawn]:
+def _drawn(
+    splats: Splats,
+    views: Sequence[View],
+    settings: RasterSettings,
+    backend: Backend,
+    exposures: Transforms,
+    match: bool = False,
+) -> Iterator[_Drawn]:
     settings = replace(settings, sh_degree=splats.sh_degree)
     for view in views:
         with torch.no_grad():
             image = rasterize(splats, view.camera, settings, backend=backend).color
         target = torch.from_numpy(view.target(settings.background)).to(image)
-        mask = view.mask()
-        yield _Drawn(view.name, image, target, None if mask is None else torch.from_numpy(mask).to(image.device))
+        pixels = view.mask()
+        mask = None if pixels is None else torch.from_numpy(pixels).to(image.device)
+        if match:
+            image = matched_by_halves(view, image, target, mask, settings.background)
+        else:
+            image = photographed(view, image, exposures, settings.background)
+        yield _Drawn(view.name, image, target, mask)
 
 
-def split_metrics(scores: dict[str, ImageMetrics], split: str) -> dict[str, Any]:
-    """``{split: means}``; null with the reason where the scene has no such views."""
+def split_metrics(scores: dict[str, ImageMetrics], name: str, split: str | None = None) -> dict[str, Any]:
+    """``{name: means}``; null with the reason where the scene has no views of the split (by default ``name``)."""
     if not scores:
-        return {split: None, f"{split}_reason": f"the scene has no {split} views"}
-    return {split: mean_metrics(list(scores.values())).to_json()}
+        return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
+    return {name: mean_metrics(list(scores.values())).to_json()}
 
 
 class PeakGpuMemory:

@@ -13,6 +13,7 @@ import torch
 from gs2d.data import View
 from gs2d.disk import check_writable
 from gs2d.errors import ProtocolError, RunError
+from gs2d.exposure import take_back
 from gs2d.images import to_uint8
 from gs2d.io.ply import read_mesh
 from gs2d.io.run import MESH, TEXTURED, RunFolder
@@ -20,6 +21,7 @@ from gs2d.io.textured import write_textured, written_files
 from gs2d.mesh.atlas import required, simplified, unwrap
 from gs2d.mesh.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
+from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.jobs import mesh_run, open_job
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.paths import up_direction
@@ -67,7 +69,7 @@ def texture_run(
         if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
             raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
     mesh = _mesh(run, job, splats, mesh_options, target.parent, on_event)
-    baked = textured_mesh(job, splats, mesh, options, on_event)
+    baked = textured_mesh(job, splats, mesh, options, on_event, exposures=read_exposures(run, job.recipe))
     write_textured(target, baked.mesh, up=up_direction([view.camera for view in job.scene.train]))
     return {
         "files": [str(file) for file in files],
@@ -83,8 +85,18 @@ def texture_run(
     }
 
 
-def textured_mesh(job: Job, splats: Splats, mesh: Mesh, options: TextureOptions, on_event: OnEvent = ignore) -> Baked:
+def textured_mesh(
+    job: Job,
+    splats: Splats,
+    mesh: Mesh,
+    options: TextureOptions,
+    on_event: OnEvent = ignore,
+    *,
+    exposures: Transforms = NONE,
+) -> Baked:
     """Simplify a mesh of a run, cut it into charts and colour them.
+
+    Photographs whose exposure is known are taken back to the mean exposure first.
 
     Raises
     ------
@@ -97,9 +109,8 @@ def textured_mesh(job: Job, splats: Splats, mesh: Mesh, options: TextureOptions,
             Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
         )
     size = options.size or texture_size(small, [view.camera for view in views])
-    return bake(
-        unwrap(small, size), _photographs(job, views, splats, options, on_event), size, threads=torch.get_num_threads()
-    )
+    photographs = _photographs(job, views, splats, options, exposures, on_event)
+    return bake(unwrap(small, size), photographs, size, threads=torch.get_num_threads())
 
 
 def check_texture_options(options: TextureOptions) -> None:
@@ -134,7 +145,12 @@ def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[Vie
 
 
 def _photographs(
-    job: Job, views: Sequence[View], splats: Splats, options: TextureOptions, on_event: OnEvent
+    job: Job,
+    views: Sequence[View],
+    splats: Splats,
+    options: TextureOptions,
+    exposures: Transforms,
+    on_event: OnEvent,
 ) -> Iterator[Photograph]:
     """The views, or what the splats look like from them."""
     for view in counted(views, "colouring the texture", len(views), on_event):
@@ -143,7 +159,10 @@ def _photographs(
             shown = (output.alpha >= OPAQUE).cpu().numpy()
             yield Photograph(view.camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
         else:
-            yield Photograph(view.camera, view.image(), _usable(view, job))
+            image = view.image()
+            if view.name in exposures:
+                image = take_back(image, exposures[view.name].numpy())
+            yield Photograph(view.camera, image, _usable(view, job))
 
 
 def _usable(view: View, job: Job) -> np.ndarray | None:

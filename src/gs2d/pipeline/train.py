@@ -11,6 +11,7 @@ from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
 from gs2d.pipeline.events import OnEvent, Phase, ignore
+from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
@@ -62,7 +63,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             extra = {"title": options.title} if options.title else {}
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         start = choose_start(run, job, options, on_event)
-        splats = train_stages(run, job, options, start, on_event)
+        splats, exposures = train_stages(run, job, options, start, on_event)
+        write_exposures(run, exposures)
         finish(run, job, splats, on_event)
     return run
 
@@ -95,8 +97,10 @@ def undone_if_worthless(run: RunFolder) -> Iterator[None]:
         raise
 
 
-def train_stages(run: RunFolder, job: Job, options: TrainOptions, start: Start, on_event: OnEvent) -> Splats:
-    """Train from where ``start`` is to the end of the last stage."""
+def train_stages(
+    run: RunFolder, job: Job, options: TrainOptions, start: Start, on_event: OnEvent
+) -> tuple[Splats, Transforms]:
+    """Train from where ``start`` is to the end of the last stage; the splats, and the exposures of the photographs."""
     from gs2d.train.loop import Trainer
 
     recorder = Recorder(run, job, options, start, on_event)
@@ -113,7 +117,7 @@ def train_stages(run: RunFolder, job: Job, options: TrainOptions, start: Start, 
     recorder.begin(trainer)
     with recorder.naming_the_last_checkpoint():
         trainer.run()
-    return trainer.splats
+    return trainer.splats, named(job.scene.train, trainer.state.exposures)
 
 
 def finish(run: RunFolder, job: Job, splats: Splats, on_event: OnEvent) -> None:

@@ -89,5 +89,5 @@ class CachedViews:
         color = self.views[index].render(leaves["sh0"], leaves["shN"])
         unseen = color.new_empty(0)  # the losses of such a stage look at nothing else
         output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
-        losses, gradients = self._whole.differentiate(stage, iteration, index, output, leaves)
+        losses, gradients = self._whole.differentiate(state, stage, iteration, index, output, leaves)
         return Evaluated(losses, gradients, None, None, self.rows)

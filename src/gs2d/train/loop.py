@@ -27,6 +27,7 @@ from gs2d.train import events
 from gs2d.train.actions import clone_in_place, rank_by_error
 from gs2d.train.cached_views import choose_evaluator
 from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
+from gs2d.train.exposure import Exposures, as_photographed, check_views, exposure_step, uncount
 from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
 from gs2d.train.optimizer_fused import fused_adam_step
@@ -197,6 +198,9 @@ class Trainer:
                 options["cancel"] = cancel
             rates = rates_at(stage.rates, iteration, self.scene.extent)
             self._adam_step(self.state, stage, result.gradients, rates, **options)  # type: ignore[arg-type]
+        if self.state.exposures is not None:
+            gradient = result.gradients["exposure"]
+            exposure_step(self.state.exposures, index, gradient, self.recipe, self.state.stage, iteration, cancel)
         return result, happened
 
     def _settle(self) -> None:
@@ -207,6 +211,8 @@ class Trainer:
         for name, parameter in self.state.splats.items():
             if name in stage.train and parameter.numel() > 0:
                 self.state.moments[name].steps -= 1  # counted on the host
+        if self.state.exposures is not None:
+            uncount(self.state.exposures, self._last[1], self.recipe, self.state.stage, self._last[0])
         self._budget.exact = True
         self._learn(stage, *self._last)
 
@@ -237,7 +243,8 @@ class Trainer:
             background,
             use_masks=use_masks,
             with_maps=self.backend.name == "cpu",
-            with_silhouettes=any(t.kind == "silhouette" for stage in self.recipe.stages for t in stage.losses),
+            with_silhouettes=self.recipe.exposure is not None
+            or any(t.kind == "silhouette" for stage in self.recipe.stages for t in stage.losses),
             dtype=dtype,
             device=device,
             limit_bytes=1 << 29 if limit_bytes is None else limit_bytes,
@@ -254,7 +261,10 @@ class Trainer:
             dtype=dtype,
         )
         self._pending.append(events.Initialised(len(initial.splats), initial.source, initial.dropped))
-        return TrainState(initial.splats, generator)
+        state = TrainState(initial.splats, generator)
+        if self.recipe.exposure is not None:
+            state.exposures = Exposures.start(len(self.scene.train), state.splats.means)
+        return state
 
     def _checked(self, state: TrainState) -> TrainState:
         """A state from outside, if it is of this recipe."""
@@ -277,6 +287,7 @@ class Trainer:
                 f"the checkpoint waits for training view {last}, but the scene has {len(self.scene.train)}; "
                 "is it of another scene?"
             )
+        check_views(state.exposures, len(self.scene.train) if self.recipe.exposure else 0)
         return state
 
     def _densify(self, stage: Stage, iteration: int, result: Evaluated, cancel: Tensor | None) -> list[events.Event]:
@@ -315,12 +326,15 @@ class Trainer:
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """The inner sum of E_i [N] for each training view."""
         for index, view in enumerate(self.scene.train):
-            target = self._targets[index]
+            target, splats, settings = self._targets[index], self.state.splats, self.settings
+            if self.state.exposures is not None:
+                transform = self.state.exposures.transform(index)
+                splats, settings = as_photographed(splats, view.camera, transform, settings)
             yield splat_errors(
-                self.state.splats,
+                splats,
                 view.camera,
                 target.image,
-                self.settings,
+                settings,
                 backend=self.backend,
                 mask=target.mask,
                 occlusion=occlusion,
@@ -374,3 +388,5 @@ class Trainer:
         for name, tensor in self.state.splats.items():
             if name in names and not finite(tensor):
                 raise diverged(stage, self.state.step, name)
+        if self.state.exposures is not None and not finite(self.state.exposures.offsets):
+            raise diverged(stage, self.state.step, "an exposure")

@@ -12,6 +12,7 @@ from torch import Tensor
 from gs2d.check import check_shapes
 from gs2d.errors import RunError
 from gs2d.splats import ATTRIBUTES, Splats
+from gs2d.train.exposure import Exposures
 
 FORMAT = 1  # of the state dict
 
@@ -82,6 +83,8 @@ class TrainState:
         Whether the entry actions of the stage are done.
     queue : list of int
         Training views that are still to come in this epoch; the next is the last.
+    exposures : Exposures or None
+        Colour transforms of the training views, where the recipe learns them.
     """
 
     splats: Splats
@@ -93,6 +96,7 @@ class TrainState:
     step: int = 0
     entered: bool = False
     queue: list[int] = field(default_factory=list)
+    exposures: Exposures | None = None
 
     def next_view(self, count: int) -> int:
         """Index of the next training view: shuffled epochs, without replacement."""
@@ -118,6 +122,7 @@ class TrainState:
             "entered": self.entered,
             "queue": list(self.queue),
             "generator": self.generator.get_state(),
+            **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
         }
 
     @classmethod
@@ -149,6 +154,7 @@ class TrainState:
                 int(data["step"]),
                 bool(data["entered"]),
                 [int(index) for index in data["queue"]],
+                Exposures.from_state_dict(data["exposures"]) if "exposures" in data else None,
             )
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
             raise RunError(f"checkpoint is broken ({type(error).__name__}: {error}); train again") from error
@@ -163,6 +169,8 @@ class TrainState:
         self.groups = {name: mask.to(device) for name, mask in self.groups.items()}
         if self.statistics is not None:
             self.statistics = Statistics(**{k: v.to(device) for k, v in vars(self.statistics).items()})
+        if self.exposures is not None:
+            self.exposures.move_to(device)
 
     def check(self) -> None:
         """Raise ShapeError unless everything has the same N."""
@@ -176,6 +184,8 @@ class TrainState:
         if self.statistics is not None:
             arrays |= {f"statistics {name}": (tensor, "N") for name, tensor in vars(self.statistics).items()}
         check_shapes(arrays)
+        if self.exposures is not None:
+            self.exposures.check()
 
 
 def _copy(tensor: Tensor) -> Tensor:

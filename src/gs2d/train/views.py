@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gs2d.data.scene import Scene
 from gs2d.errors import DivergedError
+from gs2d.exposure import expose, identity
 from gs2d.losses import compute_losses
 from gs2d.protocols import Protocol
 from gs2d.recipe import Recipe, Stage
@@ -21,7 +22,7 @@ from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
 from gs2d.train.state import TrainState
-from gs2d.train.targets import TargetSource
+from gs2d.train.targets import Target, TargetSource
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
@@ -53,7 +54,8 @@ class Evaluated:
     losses : mapping of kind to float or Tensor []
         Weighted. Tensors on a GPU: to read them is to wait for it.
     gradients : mapping of attribute to Tensor
-        Like the attributes; only of ``rows``, in their order, where those are given.
+        Like the attributes; only of ``rows``, in their order, where those are given. Where exposures are learned also
+        "exposure" [3, 4], of the photograph's transform.
     signal : Tensor [N, 2] or [N, 4], or None
     radii : Tensor [N] px or None
         None where nothing was projected.
@@ -82,6 +84,7 @@ class WholeViews:
     ) -> None:
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
         self._targets = targets
+        self._background = torch.tensor(protocol.background, device=backend.device)
 
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
         """The rasterizer's constants at an iteration (1-based)."""
@@ -101,13 +104,21 @@ class WholeViews:
         camera, settings = self.scene.train[index].camera, self.settings(stage, iteration)
         rows = None if gather else _learning_rows(state, stage)  # the signal is of every splat
         output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
-        losses, gradients = self.differentiate(stage, iteration, index, output, dict(leaves.items()))
+        losses, gradients = self.differentiate(state, stage, iteration, index, output, dict(leaves.items()))
         return Evaluated(losses, gradients, None if probe is None else _gradient(probe), output.radii)
 
     def differentiate(
-        self, stage: Stage, iteration: int, index: int, output: RenderOutput, leaves: Mapping[str, Tensor]
+        self,
+        state: TrainState,
+        stage: Stage,
+        iteration: int,
+        index: int,
+        output: RenderOutput,
+        leaves: Mapping[str, Tensor],
     ) -> tuple[dict[str, float | Tensor], dict[str, Tensor]]:
         """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
+
+        Where exposures are learned, colours are compared in that of the photograph, and "exposure" is among both.
 
         Raises
         ------
@@ -116,6 +127,10 @@ class WholeViews:
             trainer looks at losses and parameters together, before anything is reported or saved.
         """
         target = self._targets[index]
+        transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
+        if transform is not None:
+            color = expose(output.color, transform, target.silhouette, self._background)
+            output = replace(output, color=up_to_white(color, target))
         terms = compute_losses(
             output,
             target.image,
@@ -128,6 +143,9 @@ class WholeViews:
             target_cache=target.maps,
             silhouette=target.silhouette,
         )
+        if transform is not None:
+            assert self.recipe.exposure is not None
+            terms["exposure"] = self.recipe.exposure.prior * (transform - identity(transform)).square().sum()
         loss = torch.stack(list(terms.values())).sum()
         watched = not waits(loss.device)
         values: dict[str, float | Tensor] = {
@@ -138,12 +156,22 @@ class WholeViews:
         if loss.requires_grad:  # not where no splat is in the picture
             loss.backward()
         gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
+        if transform is not None:
+            gradients["exposure"] = _gradient(transform)
         if not watched:
             return values, gradients
         for name, gradient in gradients.items():
             if not finite(gradient):
                 raise diverged(stage, iteration, f"the gradient of {name}")
         return values, gradients
+
+
+def up_to_white(color: Tensor, target: Target) -> Tensor:
+    """The picture, at most 1 where the photograph is clipped: such a pixel says that it was this bright or brighter."""
+    clipped = target.image >= 1
+    if target.silhouette is not None:  # a white background is no light
+        clipped &= target.silhouette[..., None] > 0
+    return torch.where(clipped, color.clamp(max=1), color)
 
 
 def waits(device: torch.device) -> bool:

@@ -1,0 +1,141 @@
+"""The exposure and white balance of a photograph: an affine transform of colour, 12 numbers.
+
+What a camera on automatic does to the colours c of a scene is taken to be A c + b, A a 3x3 matrix (gains of the
+channels on its diagonal) and b an offset; ``transform`` [3, 4] is [A | b]. Formulas: docs/math.md, "Exposure".
+
+A photograph with an alpha channel has no background of its own: the protocol's background is put behind photograph and
+rendering alike, after the camera. There the transform acts on what the photograph shows, and the background stays.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gs2d.check import check_shapes
+
+RIDGE = 1e-4  # of a fit, per pixel: keeps what a picture says nothing about at the identity
+
+
+def identity(like: Tensor) -> Tensor:
+    """The transform [3, 4] that changes nothing, of the type and on the device of ``like``."""
+    return torch.eye(3, 4, dtype=like.dtype, device=like.device)
+
+
+def expose(
+    color: Tensor, transform: Tensor, coverage: Tensor | None = None, background: Tensor | None = None
+) -> Tensor:
+    """A rendered picture as a camera with this transform would have taken it.
+
+    With k = ``coverage`` (1 without one) and B = ``background``: A (C - (1 - k) B) + k b + (1 - k) B. The bits do not
+    depend on the number of threads, those of the gradients neither.
+
+    Parameters
+    ----------
+    color : Tensor [H, W, 3]
+        Over the background; not clamped.
+    transform : Tensor [3, 4]
+    coverage : Tensor [H, W], optional
+        Alpha in [0, 1] of what the camera saw; without it the whole picture. Not differentiated.
+    background : Tensor [3], optional
+        Needed with ``coverage``.
+
+    Returns
+    -------
+    Tensor [H, W, 3]
+        Differentiable in ``color`` and ``transform``.
+    """
+    arrays = {"color": (color, "H W 3"), "transform": (transform, "3 4")}
+    if coverage is None:
+        check_shapes(arrays)
+        exposed: Tensor = _Expose.apply(color, transform, None)
+        return exposed
+    assert background is not None
+    check_shapes(arrays | {"coverage": (coverage, "H W"), "background": (background, "3")})
+    behind = (1 - coverage[..., None]) * background.to(color.dtype)
+    lit: Tensor = _Expose.apply(color - behind, transform, coverage)
+    return lit + behind
+
+
+class _Expose(torch.autograd.Function):
+    """A c + k b for each pixel."""
+
+    @staticmethod
+    def forward(ctx: Any, light: Tensor, transform: Tensor, coverage: Tensor | None) -> Tensor:
+        ctx.save_for_backward(light, transform, coverage)
+        offset = transform[:, 3] if coverage is None else coverage[..., None] * transform[:, 3]
+        return _apply(light, transform[:, :3]) + offset
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        light, transform, coverage = ctx.saved_tensors
+        to_light = _apply(upstream, transform[:, :3].T) if ctx.needs_input_grad[0] else None
+        to_transform = _outer_sum(upstream, light, coverage) if ctx.needs_input_grad[1] else None
+        return to_light, to_transform, None
+
+
+def _apply(vectors: Tensor, matrix: Tensor) -> Tensor:
+    """``matrix @ v`` for each v of [H, W, 3], in one order of operations wherever the pixel lies."""
+    columns = [vectors[..., k : k + 1] * matrix[:, k] for k in range(3)]
+    return columns[0].add_(columns[1]).add_(columns[2])
+
+
+def _outer_sum(upstream: Tensor, light: Tensor, coverage: Tensor | None) -> Tensor:
+    """The sum over pixels of ``upstream`` times (light, coverage), [3, 4].
+
+    On the CPU numpy sums, on one thread: torch would split the sum by the number of threads, and round accordingly.
+    """
+    ups = upstream.reshape(-1, 3).T.contiguous()
+    right = [*light.reshape(-1, 3).T.contiguous(), None if coverage is None else coverage.reshape(-1)]
+    products = (up if other is None else up * other for up in ups for other in right)
+    if upstream.device.type == "cpu":
+        sums = [float(np.add.reduce(product.numpy())) for product in products]
+        return torch.tensor(sums, dtype=upstream.dtype).reshape(3, 4)
+    return torch.stack([product.sum() for product in products]).reshape(3, 4)
+
+
+def fit_exposure(
+    color: Tensor,
+    target: Tensor,
+    pixels: Tensor,
+    coverage: Tensor | None = None,
+    background: Tensor | None = None,
+) -> Tensor:
+    """The transform [3, 4] that takes a rendered picture nearest to a photograph: least squares over some pixels.
+
+    A ridge of ``RIDGE`` a pixel towards the identity decides what the pixels leave open.
+
+    Parameters
+    ----------
+    color, target : Tensor [H, W, 3]
+        Rendering and photograph, over the background.
+    pixels : Tensor [H, W] bool
+        Those that are looked at; without any the result is the identity.
+    coverage, background
+        As for :func:`expose`.
+    """
+    check_shapes({"color": (color, "H W 3"), "target": (target, "H W 3"), "pixels": (pixels, "H W")})
+    light, weight, wanted = color.double(), torch.ones_like(color[..., :1], dtype=torch.float64), target.double()
+    if coverage is not None:
+        assert background is not None
+        weight = coverage.double()[..., None]
+        behind = (1 - weight) * background.double()
+        light, wanted = light - behind, wanted - behind
+    rows = torch.cat([light, weight], dim=-1)[pixels]  # [P, 4]
+    missing = (wanted - light)[pixels]  # [P, 3]
+    normal = rows.T @ rows + RIDGE * max(len(rows), 1) * torch.eye(4, dtype=rows.dtype, device=rows.device)
+    return (identity(rows) + torch.linalg.solve(normal, rows.T @ missing).T).to(color.dtype)
+
+
+def take_back(image: np.ndarray, transform: np.ndarray) -> np.ndarray:
+    """A photograph uint8 [H, W, 3 or 4] in the exposure of the scene: A^-1 (P - b), rounded; alpha stays."""
+    back = np.linalg.inv(transform[:, :3].astype(np.float64))
+    color = (image[..., :3] / 255.0 - transform[:, 3]) @ back.T
+    result = image.copy()
+    result[..., :3] = np.rint(255 * np.clip(color, 0, 1))
+    return result

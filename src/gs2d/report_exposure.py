@@ -1,0 +1,88 @@
+"""The exposures of the photographs in the report: what a run's ``exposure.json`` says, as a plot and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.errors import DataError
+from gs2d.io.files import read_json
+from gs2d.report_curves import INK, svg_text
+from gs2d.report_html import drawing, escape, missing
+
+GREY = 0.5  # the scene's colour whose picture is shown
+_CHANNELS = {"red": "#d0463b", "green": "#3f9a5f", "blue": "#3f86d6"}
+
+
+def exposure_section(path: Path, last_stage: Mapping[str, Any]) -> str:
+    """Plot and sentences (HTML) about ``exposure.json``.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it may be missing.
+    last_stage : mapping
+        Entry of metrics.json.
+    """
+    if not path.exists():
+        return missing(f"{path.name} is missing: it is written when training is finished.")
+    names, gains = _gains(path)
+    low, high = int(gains.mean(axis=1).argmin()), int(gains.mean(axis=1).argmax())
+    words = (
+        f"Each training photograph has a colour transform of its own, learned with the scene; their mean is the "
+        f"identity. A middle grey of the scene is {gains[low].mean():.2f} times as bright in {escape(names[low])} (the "
+        f"darkest) and {gains[high].mean():.2f} times in {escape(names[high])} (the brightest). Training views are "
+        "scored and drawn in the exposures of their photographs; test views, the mesh and new views in the mean "
+        "exposure, and nothing is fitted to test photographs."
+    )
+    title = "How bright a middle grey comes out, by photograph and channel (1 = the mean)"
+    return f'<p>{words}</p>{_matched(last_stage)}<div class="curves">{drawing(_plot(gains), title)}</div>'
+
+
+def _matched(stage: Mapping[str, Any]) -> str:
+    """The second score of the test views, where there is one."""
+    plain, matched = (stage.get(name) or {} for name in ("test", "test_matched"))
+    if not isinstance(matched.get("psnr"), int | float) or not isinstance(plain.get("psnr"), int | float):
+        return ""
+    return (
+        f"<p>Test views have {plain['psnr']:.2f} dB as they are, and {matched['psnr']:.2f} dB where each half of a "
+        "rendering is matched in colour to the other half of its photograph, which also forgives errors of colour.</p>"
+    )
+
+
+def _gains(path: Path) -> tuple[list[str], np.ndarray]:
+    """Names, and what a middle grey becomes as a share of itself [V, 3]."""
+    try:
+        photographs = read_json(path)["photographs"]
+        names = [str(entry["name"]) for entry in photographs]
+        gains = np.array([entry["grey"] for entry in photographs], dtype=np.float64).reshape(len(names), 3) / GREY
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path} must hold name and grey of each photograph, got another entry ({error})") from error
+    if not names or not np.isfinite(gains).all():
+        raise DataError(f"{path} must hold finite numbers of one photograph or more, got others")
+    return names, gains
+
+
+def _plot(gains: np.ndarray) -> str:
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.2, 2.7), layout="constrained")
+    FigureCanvasSVG(figure)
+    axes = figure.add_subplot()
+    axes.axhline(1.0, color=INK, linewidth=0.8)
+    for k, (name, color) in enumerate(_CHANNELS.items()):
+        axes.plot(
+            np.arange(1, len(gains) + 1), gains[:, k], "o-", color=color, markersize=2.5, linewidth=0.8, label=name
+        )
+    axes.set_xlabel("training photograph, by name", fontsize=8, color=INK)
+    axes.tick_params(colors=INK, labelsize=8)
+    axes.grid(True, color=INK, alpha=0.18, linewidth=0.6)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(INK)
+    axes.legend(fontsize=8, frameon=False, labelcolor=INK, ncols=3)
+    return svg_text(figure)

@@ -1,0 +1,215 @@
+"""Exposures through a whole run: its files and scores, pictures in an exposure, resuming, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ball_runs import SMALL, Stop, comparable, options
+from gs2d.data import View
+from gs2d.data.toy_exposure import GAINS, random_gains, vary_exposure
+from gs2d.errors import DataError, RunError
+from gs2d.images import read_image
+from gs2d.io.run import EXPOSURE, RunFolder
+from gs2d.pipeline.events import Event, Step, ignore
+from gs2d.pipeline.exposure import matched_by_halves, read_exposures
+from gs2d.pipeline.jobs import evaluate_run, open_job, render_run, report_run
+from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.paths import orbit_cameras
+from gs2d.pipeline.pictures import render_view
+from gs2d.pipeline.prepare import build_recipe, prepare
+from gs2d.pipeline.scoring import score_views
+from gs2d.pipeline.texture import TextureOptions, _photographs
+from gs2d.pipeline.train import train
+from gs2d.recipes import get_recipe
+from tiny import ball_cameras
+
+EARLY = (*SMALL, "exposure.start=5", "exposure.rate=0.2")  # so that 60 iterations show something
+
+
+@pytest.fixture(scope="module")
+def varied(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("varied") / "ball"
+    shutil.copytree(capture, folder)
+    vary_exposure(folder)
+    return folder
+
+
+def learning(varied: Path, out: Path, **changes: object) -> TrainOptions:
+    return options(varied, out, exposure=True, overrides=EARLY, **changes)
+
+
+@pytest.fixture(scope="module")
+def run(varied: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return train(learning(varied, tmp_path_factory.mktemp("runs") / "exposure"))
+
+
+def test_the_capture_has_gains_whose_mean_is_one_on_its_training_pictures_alone(capture: Path, varied: Path) -> None:
+    truth = json.loads((varied / GAINS).read_text())
+    gains = np.array(list(truth.values()))
+    assert gains.mean(axis=0) == pytest.approx([1, 1, 1])
+    assert np.array_equal(gains, random_gains(6, 0))
+    before, after = (read_image(folder / "train/r_3.png") for folder in (capture, varied))
+    assert np.array_equal(before[..., 3], after[..., 3])
+    expected = np.minimum(before[..., :3] * np.array(truth["train/r_3.png"]), 255)
+    assert np.abs(after[..., :3] - expected).max() <= 0.5
+    assert (varied / "test/r_0.png").read_bytes() == (capture / "test/r_0.png").read_bytes()
+    with pytest.raises(DataError, match="have gains already"):
+        vary_exposure(varied)
+
+
+def test_the_transforms_lie_beside_the_run_and_their_mean_is_the_identity(run: RunFolder) -> None:
+    entries = json.loads(run.file(EXPOSURE).read_text())["photographs"]
+    assert [entry["name"] for entry in entries] == [f"train/r_{i}.png" for i in range(6)]
+    transforms = np.array([entry["transform"] for entry in entries])
+    assert transforms.mean(axis=0) == pytest.approx(np.eye(3, 4), abs=1e-6)
+    assert np.abs(transforms - np.eye(3, 4)).max() > 0.02
+    grey = 0.5 * transforms[0, :, :3].sum(axis=1) + transforms[0, :, 3]
+    assert entries[0]["grey"] == pytest.approx(grey, abs=1e-6)
+    assert run.definition()["recipe"]["name"] == "2dgs-r-exposure"
+
+
+def test_training_views_are_scored_in_their_exposures_and_test_views_as_they_are(run: RunFolder) -> None:
+    _, job, splats = open_job(run.path, 1, ignore)
+    transforms = read_exposures(run, job.recipe)
+    drawing = {"settings": job.settings, "backend": job.backend, "name": "", "on_event": ignore}
+    last = run.metrics()["stages"][-1]
+    for split, views in (("train", job.scene.train), ("test", job.scene.test)):
+        plain, own = (
+            np.mean([m.psnr.value for m in score_views(splats, views, exposures=e, **drawing).values()])  # type: ignore[arg-type]
+            for e in ({}, transforms)
+        )
+        assert last[split]["psnr"] == pytest.approx(own)
+        assert (plain == own) == (split == "test")
+
+
+def test_matched_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: RunFolder) -> None:
+    plain = run.metrics()["stages"][-1]
+    assert "test_matched" not in plain
+    matched = evaluate_run(run.path, EvaluateOptions(match_exposure=True))
+    assert matched["test"]["psnr"] == plain["test"]["psnr"]
+    assert matched["test_matched"]["psnr"] != plain["test"]["psnr"]
+    assert run.metrics()["stages"][-1]["test_matched"] == matched["test_matched"]
+    assert "matched in colour to the other half" in run.file("report.html").read_text()
+
+
+def test_no_pixel_is_matched_by_itself() -> None:
+    # The left half of the photograph is the rendering x 0.5, the right x 0.8: each half gets the other's factor.
+    rng = np.random.default_rng(0)
+    image = rng.integers(60, 200, (20, 20, 3)).astype(np.uint8)
+    factors = np.where(np.arange(20) < 10, 0.5, 0.8)[None, :, None]
+    view = View.from_arrays("a", ball_cameras(1, 20)[0], np.rint(image * factors).astype(np.uint8))
+    color, target = torch.from_numpy(image / 255.0), torch.from_numpy(view.target((0, 0, 0))).double()
+    matched = matched_by_halves(view, color, target, None, (0.0, 0.0, 0.0))
+    assert torch.allclose(matched[:, :10], 0.8 * color[:, :10], atol=0.02)
+    assert torch.allclose(matched[:, 10:], 0.5 * color[:, 10:], atol=0.02)
+    mask = torch.ones(20, 20, dtype=torch.bool)
+    mask[:, 10:] = False  # nothing to learn from on the right: the left half stays as it is
+    assert torch.equal(matched_by_halves(view, color, target, mask, (0.0, 0.0, 0.0))[:, :10], color[:, :10])
+
+
+def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder, tmp_path: Path) -> None:
+    render_run(run.path, orbit=2, out=tmp_path, exposure_of="train/r_1.png")
+    _, job, splats = open_job(run.path, 1, ignore)
+    camera = orbit_cameras([view.camera for view in job.scene.train], 2)[0]
+    output = render_view(
+        splats, View.from_arrays("0", camera, np.zeros((1, 1, 3), np.uint8)), job.settings, job.backend
+    )
+    A, b = read_exposures(run, job.recipe)["train/r_1.png"].split([3, 1], dim=1)
+    alpha = output.alpha[..., None]
+    light = (output.color - (1 - alpha)) @ A.T + alpha * b[:, 0]  # the white behind the ball is no photograph
+    expected = 255 * (light + 1 - alpha).clamp(0, 1).numpy()
+    assert np.abs(read_image(tmp_path / "0000.png") - expected).max() <= 0.51
+    assert np.abs(255 * output.color.clamp(0, 1).numpy() - expected).max() > 2
+    with pytest.raises(RunError, match=r"no training photograph 'train/r_9.png'; there is train/r_"):
+        render_run(run.path, exposure_of="train/r_9.png")
+
+
+def test_a_run_without_exposures_has_none_to_render_in(undisturbed: RunFolder) -> None:
+    assert not undisturbed.file(EXPOSURE).exists()
+    assert "Exposure of the photographs" not in undisturbed.file("report.html").read_text()
+    with pytest.raises(RunError, match="learned none; train with --exposure"):
+        render_run(undisturbed.path, exposure_of="train/r_1.png")
+
+
+def test_the_texture_takes_photographs_in_the_exposure_of_the_scene(run: RunFolder) -> None:
+    _, job, splats = open_job(run.path, 1, ignore)
+    transforms = read_exposures(run, job.recipe)
+    views = job.scene.train[:2]
+    for view, photograph in zip(
+        views, _photographs(job, views, splats, TextureOptions(), transforms, ignore), strict=True
+    ):
+        A, b = np.split(transforms[view.name].double().numpy(), [3], axis=1)
+        inside = view.image()[..., 3] > 0
+        expected = 255 * np.clip((view.image()[inside][:, :3] / 255 - b[:, 0]) @ np.linalg.inv(A).T, 0, 1)
+        assert np.abs(photograph.image[inside][:, :3] - expected).max() <= 0.51
+
+
+def test_a_stopped_run_resumes_to_the_same_splats_and_exposures(run: RunFolder, varied: Path, tmp_path: Path) -> None:
+    def listen(event: Event) -> None:
+        if isinstance(event, Step) and event.done >= 37 and "loss" in event.detail:  # in the second stage
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(learning(varied, tmp_path / "run"), listen)
+    assert not (tmp_path / "run" / EXPOSURE).exists()
+    resumed = train(learning(varied, tmp_path / "run", resume=True))
+    assert comparable(resumed)[0] == comparable(run)[0]
+    assert resumed.file(EXPOSURE).read_bytes() == run.file(EXPOSURE).read_bytes()
+
+
+def test_stages_are_not_shared_between_runs_with_and_without_exposures(varied: Path, tmp_path: Path) -> None:
+    plain = prepare(options(varied, tmp_path / "a"), ignore)
+    with_them = prepare(learning(varied, tmp_path / "b"), ignore)
+    assert plain.stage_key(0) != with_them.stage_key(0)
+    same_stages = replace(with_them, recipe=replace(with_them.recipe, exposure=None))
+    assert same_stages.stage_key(0) != with_them.stage_key(0)
+
+
+def test_the_flag_is_the_named_recipe() -> None:
+    rest = {"schedule_scale": 0.1, "seed": 3, "overrides": ()}
+    flagged = build_recipe("2dgs-r", exposure=True, **rest)  # type: ignore[arg-type]
+    assert flagged == build_recipe("2dgs-r-exposure", **rest)  # type: ignore[arg-type]
+    assert flagged == build_recipe("2dgs-r-exposure", exposure=True, **rest)  # type: ignore[arg-type]
+    assert get_recipe("2dgs-r").exposure is None
+
+
+def test_a_run_made_before_there_were_exposures_is_resumed(
+    undisturbed: RunFolder, capture: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "old"
+    shutil.copytree(undisturbed.path, copy)
+    definition = json.loads((copy / "run.json").read_text())
+    assert definition["recipe"].pop("exposure", "absent") is None
+    (copy / "run.json").write_text(json.dumps(definition))
+    resumed = train(options(capture, copy, resume=True))
+    assert comparable(resumed) == comparable(undisturbed)
+
+
+def test_a_lost_or_damaged_file_of_exposures_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(tmp_path / "copy")
+    shutil.copytree(run.path, copy.path)
+    for damage in ('{"photographs": [{"name": "a"}]}', '{"photographs": [{"name": "a", "transform": [[1]]}]}', "{"):
+        copy.file(EXPOSURE).write_text(damage)
+        with pytest.raises(RunError, match=r"exposure.json must hold .*--resume"):
+            evaluate_run(copy.path)
+    copy.file(EXPOSURE).unlink()
+    with pytest.raises(RunError, match=r"exposure.json must hold .*--resume"):
+        evaluate_run(copy.path)
+    report_run(copy.path)
+    assert "exposure.json is missing" in copy.file("report.html").read_text()
+
+
+def test_the_report_shows_the_exposures(run: RunFolder) -> None:
+    page = run.file("report.html").read_text()
+    assert "Exposure of the photographs" in page
+    assert "A middle grey of the scene is" in page
+    entries = json.loads(run.file(EXPOSURE).read_text())["photographs"]
+    darkest = min(entries, key=lambda entry: sum(entry["grey"]))
+    assert f"times as bright in {darkest['name']} (the darkest)" in page
