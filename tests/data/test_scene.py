@@ -57,6 +57,8 @@ def test_a_named_format_that_is_not_there_is_an_error(tmp_path: Path, format: st
 def test_a_missing_folder_a_file_an_empty_folder_and_an_unknown_layout_are_errors(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nowhere must be the folder of a capture, got no such folder"):
         load_scene(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="cannot read the folder .*: File name too long"):
+        load_scene(tmp_path / ("a" * 300))
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(DataError, match="empty must hold a capture, got an empty folder"):

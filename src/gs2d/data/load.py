@@ -61,12 +61,11 @@ def _photographs(folder: Path) -> int:
 
 def _folder(path: str | os.PathLike[str]) -> Path:
     root = Path(path)
-    if not root.exists():
-        raise DataError(f"{root} must be the folder of a capture, got no such folder")
-    if not root.is_dir():
-        raise DataError(f"{root} must be the folder of a capture, got a file; give its folder")
     try:
         os.listdir(root)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        got = "a file; give its folder" if root.exists() else "no such folder"
+        raise DataError(f"{root} must be the folder of a capture, got {got}") from error
     except OSError as error:
         raise DataError(f"cannot read the folder {root}: {error.strerror or error}") from error
     return root
