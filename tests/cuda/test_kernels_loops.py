@@ -71,8 +71,14 @@ def test_the_blend_kernels_leave_room_for_the_warps_that_hide_their_latencies(
     measured: dict[str, dict[str, Any]],
 ) -> None:
     """sm_90 has 65536 registers and 228 KB of shared memory (1 KB of each block's is the system's): 128 threads of 72
-    registers are 7 blocks, 28 warps; of 64 registers 8 blocks, 32 warps. The distortion's loss is rare: 5 blocks."""
-    least = {"blend_forward": 8, "blend_vjp": 7, "blend_vjp_distortion": 5, "splat_errors": 8}
+    registers are 7 blocks, 28 warps; of 64 registers 8 blocks, 32 warps. The distortion's loss is rare: 7 and 5."""
+    least = {
+        "blend_forward": 8,
+        "blend_forward_distortion": 7,
+        "blend_vjp": 7,
+        "blend_vjp_distortion": 5,
+        "splat_errors": 8,
+    }
     for kernel, figures in measured.items():
         wanted = [blocks for name, blocks in least.items() if kernel.startswith(name)]
         if not wanted:

@@ -236,13 +236,13 @@ GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, V t, V tu, V tv, V rho
 }
 
 // All of it.
-template <bool Geo, bool Dist, bool Abs, bool Column = false, class V>
+template <bool Geo, bool Dist, bool Abs, bool Filtered, bool Column, class V>
 GS2D_HD void composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
                            const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
     const PairGradient<V> p = weigh_vjp<Geo, Dist>(s, h.depth, h.inverse_depth, h.alpha, k, g, T, S);
     add_colors<Geo>(g, p, sums);
     const V t = p.ln_alpha * h.depth;
-    add_geometry<Geo, Abs, true, Column>(s, dx, dy, t, t * h.u, t * h.v, h.rho, h.inverse_depth, h.ray, p, sums);
+    add_geometry<Geo, Abs, Filtered, Column>(s, dx, dy, t, t * h.u, t * h.v, h.rho, h.inverse_depth, h.ray, p, sums);
 }
 
 // The part of it that reaches the splat's colour: all that is needed while everything else is frozen.

@@ -44,10 +44,12 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
     for (int h = 0; h < HALVES; ++h)
         p[h] = {1.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, at.inside[h]};
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
-    const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];
+    const int64 begin = a.ranges[2 * int64(at.tile)];
+    const int count = int(a.ranges[2 * int64(at.tile) + 1] - begin);
 
-    for (int64 i = begin; i < end; i += 32) {
-        const uint entry = i + at.lane < end ? a.entries[i + at.lane] : 0u;
+    for (int chunk = 0; 32 * chunk < count; ++chunk) {
+        const int i = 32 * chunk + at.lane;
+        const uint entry = i < count ? a.entries[begin + i] : 0u;
         uint hits[HALVES];  // of this warp: all its lanes agree
 #pragma unroll
         for (int h = 0; h < HALVES; ++h) {
@@ -57,25 +59,30 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
         }
         if (!__any_sync(FULL_MASK, p[0].live || p[1].live)) break;
         const uint wanted = hits[0] | hits[1];
-        if (wanted >> at.lane & 1u) fetch_record(a.records, entry >> 8, records, at.lane);
+        bool mine_is_plain = false;
+        if (wanted >> at.lane & 1u) {
+            fetch_record(a.records, entry >> 8, records, at.lane);
+            mine_is_plain = plain_for_warp(a.view, at, records);
+        }
+        const uint plain = __ballot_sync(FULL_MASK, mine_is_plain);
         __syncwarp();
         uint seen[HALVES] = {0u, 0u};
-        for (uint todo = wanted; todo; todo &= todo - 1) {
-            const int j = __ffs(int(todo)) - 1;
-            const uint bit = todo & (0u - todo);
+        for_each_splat(wanted, plain, [&](auto is_plain, int j, uint bit) {
             const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
-            const float zc = reciprocal(s.iz);
+            const float dx = x - s.cx, dy = y - s.cy;
+            PlaneAt<float> planes[HALVES];
+            planes_of(s, dx, dy, planes);
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;  // the same for all lanes
-                const Hit<float> hit = intersect(s, zc, x - s.cx, y + float(4 * h) - s.cy, limits);
+                const Hit<float> hit = hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits);
                 const bool saw = composite(s, hit.alpha, hit.depth, hit.inverse_depth, limits, p[h]);
                 seen[h] |= saw ? bit : 0u;
             }
-        }
+        });
         __syncwarp();  // before the records are overwritten
         if (a.seen) {
-            const int64 words = word_of(begin, at.tile, (i - begin) >> 5);
+            const int64 words = word_of(begin, at.tile, chunk);
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 const uint word = or_over_warp(seen[h]);
@@ -88,9 +95,11 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
         if (at.inside[h]) write_pixel<DIST>(a, at.x, at.y + 4 * h, p[h]);
 }
 
-// Blocks per multiprocessor to compile for: 8 leave 64 registers a thread, with which sm_75 would spill.
+// Blocks per multiprocessor to compile for: 8 leave 64 registers a thread, with which sm_75 and sm_80 would spill.
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ < 800
 constexpr int BLOCKS = 6;
+#elif defined(__CUDA_ARCH__) && __CUDA_ARCH__ == 800
+constexpr int BLOCKS = 7;
 #else
 constexpr int BLOCKS = 8;
 #endif
@@ -101,7 +110,7 @@ extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_forward(BlendArg
     blend<false>(a, records[threadIdx.x >> 5]);
 }
 
-extern "C" __global__ void __launch_bounds__(128, BLOCKS) blend_forward_distortion(BlendArguments a) {
+extern "C" __global__ void __launch_bounds__(128, BLOCKS - 1) blend_forward_distortion(BlendArguments a) {
     __shared__ float4 records[4][4][32];
     blend<true>(a, records[threadIdx.x >> 5]);
 }

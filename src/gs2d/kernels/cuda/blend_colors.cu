@@ -62,29 +62,32 @@ extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendCol
         const uint wanted = hits[0] | hits[1];
         if (wanted == 0u) continue;  // the same for all lanes
         const uint learn = learning(i, wanted);
+        bool mine_is_plain = false;
         if (wanted >> at.lane & 1u) {
             const uint splat = a.entries[i + at.lane] >> 8;
             fetch_record(a.records, splat, records, at.lane);
             rows[at.warp][at.lane] = a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
+            mine_is_plain = plain_for_warp(a.view, at, records);
         }
+        const uint plain = __ballot_sync(FULL_MASK, mine_is_plain);
         __syncwarp();
-        for (uint todo = wanted; todo; todo &= todo - 1) {
-            const int j = __ffs(int(todo)) - 1;
-            const uint bit = todo & (0u - todo);
+        for_each_splat(wanted, plain, [&](auto is_plain, int j, uint bit) {
             const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
-            const float zc = reciprocal(s.iz);
+            const float dx = x - s.cx, dy = y - s.cy;
+            PlaneAt<float> planes[HALVES];
+            planes_of(s, dx, dy, planes);
             Vec3<float> sum = {0.f, 0.f, 0.f};
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;
-                const Hit<float> hit = intersect(s, zc, x - s.cx, y + float(4 * h) - s.cy, limits);
+                const Hit<float> hit = hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits);
                 composite_color_vjp(hit, limits, g[h], T[h], sum);
             }
-            if (!(learn & bit)) continue;  // the same for all lanes
+            if (!(learn & bit)) return;  // the same for all lanes
             float v[4] = {sum.x, sum.y, sum.z, 0.f};
             const float mine = transpose_reduce<4>(v, at.lane);
             if (!(at.lane & 7)) atomicAdd(a.gradients + 4 * int64(rows[at.warp][j]) + (at.lane >> 3), mine);
-        }
+        });
         __syncwarp();  // before the records are overwritten
     }
 }

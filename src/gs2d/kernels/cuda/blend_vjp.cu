@@ -57,11 +57,12 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
 }
 
 // `row` is the splat's, or with slots the one of this entry and warp.
-template <bool ABS>
+template <bool ABS, bool PLAIN>
 __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 row, const RecordGradient<float>& g, int lane) {
     float v[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.ai, g.bi, g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
     const float sum = transpose_reduce<16>(v, lane);
     if (!(lane & 1)) atomicAdd(a.gradients + 16 * row + (lane >> 1), sum);
+    if constexpr (PLAIN && !ABS) return;  // no low-pass filter
     if constexpr (ABS) {
         float extra[4] = {g.lowpass_cx, g.lowpass_cy, g.abs_x, g.abs_y};
         const float mine = transpose_reduce<4>(extra, lane);
@@ -77,16 +78,21 @@ __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 r
 template <bool GEO> struct Upstream {
     float4 color[HALVES][128];               // red, green, blue, alpha
     float4 normal[HALVES][GEO ? 128 : 1];    // and depth
+    float2 median[HALVES][GEO ? 128 : 1];    // and the transmittance behind the median pair
     __device__ __forceinline__ void put(int h, const PixelGradient<float>& g) {
         color[h][threadIdx.x] = {g.red, g.green, g.blue, g.alpha};
-        if constexpr (GEO) normal[h][threadIdx.x] = {g.nx, g.ny, g.nz, g.depth};
+        if constexpr (!GEO) return;
+        const int i = GEO ? threadIdx.x : 0;
+        normal[h][i] = {g.nx, g.ny, g.nz, g.depth}, median[h][i] = {g.median, g.median_below};
     }
     __device__ __forceinline__ void get(int h, PixelGradient<float>& g) const {
         const float4 c = color[h][threadIdx.x];
         g.red = c.x, g.green = c.y, g.blue = c.z, g.alpha = c.w;
         if constexpr (!GEO) return;
-        const float4 n = normal[h][GEO ? threadIdx.x : 0];
-        g.nx = n.x, g.ny = n.y, g.nz = n.z, g.depth = n.w;
+        const int i = GEO ? threadIdx.x : 0;
+        const float4 n = normal[h][i];
+        const float2 m = median[h][i];
+        g.nx = n.x, g.ny = n.y, g.nz = n.z, g.depth = n.w, g.median = m.x, g.median_below = m.y;
     }
 };
 
@@ -111,41 +117,46 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         upstream.put(h, g[h]);
     }
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
-    const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];
+    const int64 begin = a.ranges[2 * int64(at.tile)];
+    const int count = int(a.ranges[2 * int64(at.tile) + 1] - begin);
 
-    for (int64 i = begin; i < end; i += 32) {
-        const uint* words = a.seen + word_of(begin, at.tile, (i - begin) >> 5);
+    for (int chunk = 0; 32 * chunk < count; ++chunk) {
+        const int64 i = begin + 32 * chunk;
+        const uint* words = a.seen + word_of(begin, at.tile, chunk);
         const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane), uniform(words[at.sub_block[1]], at.lane)};
         const uint wanted = hits[0] | hits[1];
         if (wanted == 0u) continue;  // the same for all lanes
-        bool learns = true;
+        bool learns = true, mine_is_plain = false;
         if (wanted >> at.lane & 1u) {
             const uint splat = a.entries[i + at.lane] >> 8;
             if (a.learns) learns = a.learns[splat];
             fetch_record(a.records, splat, staged.records, at.lane);
             staged.rows[at.lane] = a.slots ? uint(a.slots[i + at.lane]) * 4u + uint(at.warp) : splat;
+            mine_is_plain = plain_for_warp(a.view, at, staged.records);
         }
+        const uint plain = __ballot_sync(FULL_MASK, mine_is_plain);
         const uint learning = __ballot_sync(FULL_MASK, learns);
         __syncwarp();
-        for (uint todo = wanted; todo; todo &= todo - 1) {
-            const int j = __ffs(int(todo)) - 1;
-            const uint bit = todo & (0u - todo);
+        for_each_splat(wanted, plain, [&](auto is_plain, int j, uint bit) {
+            constexpr bool PLAIN = decltype(is_plain)::value;
             const auto& r = staged.records;
             const Record<float> s = record_of(r[0][j], r[1][j], r[2][j], r[3][j]);
-            const float zc = reciprocal(s.iz), dx = x - s.cx;
+            const float dx = x - s.cx, first_dy = y - s.cy;
+            PlaneAt<float> planes[HALVES];
+            planes_of(s, dx, first_dy, planes);
             PairSums<float> sums = {};
 #pragma unroll
             for (int h = 0; h < HALVES; ++h) {
                 if (!(hits[h] & bit)) continue;
-                const float dy = y + float(4 * h) - s.cy;
-                const Hit<float> hit = intersect(s, zc, dx, dy, limits);
+                const float dy = first_dy + float(4 * h);
+                const Hit<float> hit = hit_of<PLAIN>(s, planes[h], dx, dy, limits);
                 upstream.get(h, g[h]);
-                composite_vjp<GEO, DIST, ABS, true>(s, dx, dy, hit, limits, g[h], T[h], S[h], sums);
+                composite_vjp<GEO, DIST, ABS, !PLAIN, true>(s, dx, dy, hit, limits, g[h], T[h], S[h], sums);
             }
-            if (!(learning & bit)) continue;  // the same for all lanes
+            if (!(learning & bit)) return;  // the same for all lanes
             finish_column(dx, sums);
-            add_gradient<ABS>(a, staged.rows[j], finish(s, zc, sums, limits), at.lane);
-        }
+            add_gradient<ABS, PLAIN>(a, staged.rows[j], finish(s, ABS ? reciprocal(s.iz) : 0.f, sums, limits), at.lane);
+        });
         __syncwarp();  // before the records are overwritten
     }
 }

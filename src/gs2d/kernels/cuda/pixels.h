@@ -45,4 +45,46 @@ __device__ __forceinline__ void fetch_record(const float* records, int64 splat, 
     for (int k = 0; k < 4; ++k) to[k][lane] = from[k];
 }
 
+// Whether the splat whose record this lane has fetched is plain (core/blend.h) at all 8x8 pixels of the warp.
+__device__ __forceinline__ bool plain_for_warp(const View& v, const Place& at, float4 (*records)[32]) {
+    const Record<float> s = record_of(records[0][at.lane], records[1][at.lane], records[2][at.lane], records[3][at.lane]);
+    const float x = float(at.x - (at.lane & 7) + 4), y = float(at.y - (at.lane >> 3) + 4);
+    return is_plain(x - s.cx, y - s.cy, s.ai, s.bi, s.iz, plain_from(s, v.lowpass_px), v.near, 4.f);  // half a pixel to spare
+}
+
+// The splat's plane at the pixels of a thread; dx, dy: of the first.
+__device__ __forceinline__ void planes_of(const Record<float>& s, float dx, float dy, PlaneAt<float>* p) {
+    p[0] = plane_at(s, dx, dy);
+    p[1] = {fma(4.f, s.bu, p[0].X), fma(4.f, s.bv, p[0].Y), fma(4.f, s.bi, p[0].I)};
+}
+
+template <bool PLAIN>
+__device__ __forceinline__ Hit<float> hit_of(const Record<float>& s, const PlaneAt<float>& p, float dx, float dy, const BlendLimits<float>& k) {
+    if constexpr (!PLAIN) return intersect(s, p, reciprocal(s.iz), dx, dy, k);
+    Hit<float> hit = meet_plane(p);
+    hit.alpha = plain_alpha_of(s.log2_opacity, hit.rho, k);
+    return hit;
+}
+
+struct Yes {
+    static constexpr bool value = true;
+};
+struct No {
+    static constexpr bool value = false;
+};
+
+// Calls step(Yes or No: plain; j, bit j) for the splats of a chunk that are wanted, in order. Runs of plain ones, nearly all, have
+// a loop of their own, without the code for the others.
+template <class F> __device__ __forceinline__ void for_each_splat(uint wanted, uint plain, F&& step) {
+    while (wanted) {
+        const uint others = wanted & ~plain;
+        uint run = wanted & ((others & (0u - others)) - 1u);
+        wanted &= ~run;
+        for (; run; run &= run - 1) step(Yes(), __ffs(int(run)) - 1, run & (0u - run));
+        const uint bit = wanted & (0u - wanted);
+        wanted &= wanted - 1;
+        if (bit) step(No(), __ffs(int(bit)) - 1, bit);
+    }
+}
+
 }  // namespace gs2d
