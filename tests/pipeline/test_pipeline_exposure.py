@@ -12,12 +12,13 @@ import pytest
 import torch
 
 from ball_runs import SMALL, Stop, comparable, options
-from gs2d.data import View
-from gs2d.data.toy_exposure import GAINS, random_gains, vary_exposure
-from gs2d.errors import DataError, RunError
-from gs2d.images import read_image
+from gs2d.data import View, toy
+from gs2d.data.toy_exposure import GAINS, random_gains, with_gains
+from gs2d.errors import RunError
+from gs2d.images import read_image, write_image
 from gs2d.io.run import EXPOSURE, RunFolder
-from gs2d.pipeline.events import Event, Step, ignore
+from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.exposure import matched_by_halves, read_exposures
 from gs2d.pipeline.jobs import evaluate_run, open_job, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
@@ -37,7 +38,8 @@ EARLY = (*SMALL, "exposure.start=5", "exposure.rate=0.2")  # so that 60 iteratio
 def varied(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("varied") / "ball"
     shutil.copytree(capture, folder)
-    vary_exposure(folder)
+    for i, gains in enumerate(random_gains(6, 0)):
+        write_image(folder / f"train/r_{i}.png", with_gains(read_image(folder / f"train/r_{i}.png"), gains))
     return folder
 
 
@@ -47,21 +49,36 @@ def learning(varied: Path, out: Path, **changes: object) -> TrainOptions:
 
 @pytest.fixture(scope="module")
 def run(varied: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    return train(learning(varied, tmp_path_factory.mktemp("runs") / "exposure"))
+    notices: list[str] = []
+
+    def listen(event: Event) -> None:
+        notices.extend([event.text] if isinstance(event, Notice) else [])
+
+    made = train(learning(varied, tmp_path_factory.mktemp("runs") / "exposure"), listen)
+    assert any(text.startswith("exposures: 0.") and "times the mean: exposure.json" in text for text in notices)
+    return made
 
 
-def test_the_capture_has_gains_whose_mean_is_one_on_its_training_pictures_alone(capture: Path, varied: Path) -> None:
-    truth = json.loads((varied / GAINS).read_text())
-    gains = np.array(list(truth.values()))
-    assert gains.mean(axis=0) == pytest.approx([1, 1, 1])
-    assert np.array_equal(gains, random_gains(6, 0))
-    before, after = (read_image(folder / "train/r_3.png") for folder in (capture, varied))
-    assert np.array_equal(before[..., 3], after[..., 3])
-    expected = np.minimum(before[..., :3] * np.array(truth["train/r_3.png"]), 255)
-    assert np.abs(after[..., :3] - expected).max() <= 0.5
-    assert (varied / "test/r_0.png").read_bytes() == (capture / "test/r_0.png").read_bytes()
-    with pytest.raises(DataError, match="have gains already"):
-        vary_exposure(varied)
+def test_the_demo_s_training_pictures_have_gains_whose_mean_is_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
+    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
+    monkeypatch.setattr(toy, "render_picture", lambda *_: toy.Picture(drawn, np.zeros(1, bool)))
+    for name, vary in (("plain", False), ("varied", True)):
+        toy.write_demo_capture(tmp_path / name, train_views=3, test_views=1, size=16, vary_exposure=vary)
+    truth = json.loads((tmp_path / "varied" / GAINS).read_text())
+    assert list(truth) == [f"train/r_{k}.png" for k in range(3)]
+    assert np.array(list(truth.values())).mean(axis=0) == pytest.approx([1, 1, 1])
+    for name, gains in truth.items():
+        before, after = (read_image(tmp_path / which / name) for which in ("plain", "varied"))
+        assert np.array_equal(before[..., 3], after[..., 3])
+        assert np.abs(after[..., :3] - np.minimum(before[..., :3] * np.array(gains), 255)).max() <= 0.5
+    assert not (tmp_path / "plain" / GAINS).exists()
+    assert (tmp_path / "varied/test/r_0.png").read_bytes() == (tmp_path / "plain/test/r_0.png").read_bytes()
+    (tmp_path / "plain").rename(tmp_path / "capture")
+    with pytest.raises(RunError, match="made without --vary-exposure; resume with the same options"):
+        demo(DemoOptions(out=tmp_path, resume=True, vary_exposure=True))
 
 
 def test_the_transforms_lie_beside_the_run_and_their_mean_is_the_identity(run: RunFolder) -> None:

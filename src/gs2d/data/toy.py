@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.camera import Camera, look_at
+from gs2d.data.toy_exposure import GAINS, random_gains, with_gains
 from gs2d.data.toy_light import BakedLight, bake, shade
 from gs2d.data.toy_rays import cast_camera
 from gs2d.data.toy_scene import ToyScene, build_scene
@@ -51,6 +52,7 @@ def write_demo_capture(
     train_views: int = 40,
     test_views: int = 8,
     size: int = 256,
+    vary_exposure: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
 ) -> None:
@@ -69,6 +71,9 @@ def write_demo_capture(
     train_views, test_views : int
     size : int
         Width and height, px.
+    vary_exposure : bool
+        Training pictures get random gains (``toy_exposure``), which ``exposure_gt.json`` holds; test pictures keep the
+        gain 1, the mean of the others.
     on_progress : callable, optional
         Called with (pictures done, pictures in all) after each picture, always from the calling thread.
     threads : int, optional
@@ -94,10 +99,13 @@ def write_demo_capture(
     cameras = demo_cameras(seed, train_views, test_views, size)
     jobs = [(split, k, camera) for split, split_cameras in cameras.items() for k, camera in enumerate(split_cameras)]
 
+    gains = random_gains(train_views, seed)
+
     def picture(job: tuple[str, int, Camera]) -> np.ndarray:
         split, k, camera = job
         result = render_picture(scene, light, camera)
-        write_image(root / split / f"r_{k}.png", result.rgba)
+        varied = vary_exposure and split == "train"
+        write_image(root / split / f"r_{k}.png", with_gains(result.rgba, gains[k]) if varied else result.rgba)
         return result.seen
 
     counts = np.zeros(len(scene.patch.faces), dtype=np.int64)
@@ -110,6 +118,8 @@ def write_demo_capture(
     write_mesh(root / "mesh_gt.ply", demo_mesh(scene))
     with atomic_write(root / "mesh_gt_seen.npy") as file:
         np.save(file, np.minimum(counts, 255).astype(np.uint8))
+    if vary_exposure:
+        write_json(root / GAINS, {f"train/r_{k}.png": list(map(float, gain)) for k, gain in enumerate(gains)})
     for split in ("test", "train") if test_views else ("train",):  # the last file is what makes the folder a capture
         write_json(root / f"transforms_{split}.json", _transforms(split, cameras[split]))
 
@@ -120,7 +130,8 @@ def _make_folders(root: Path, splits: tuple[str, ...]) -> None:
             (root / split).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise disk_error(root / split, error) from error
-    (root / "transforms_train.json").unlink(missing_ok=True)
+    for name in ("transforms_train.json", GAINS):
+        (root / name).unlink(missing_ok=True)
 
 
 def demo_mesh(scene: ToyScene) -> Mesh:

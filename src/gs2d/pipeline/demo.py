@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.data.toy import write_demo_capture
-from gs2d.data.toy_exposure import GAINS, vary_exposure
+from gs2d.data.toy_exposure import GAINS
 from gs2d.errors import RunError
 from gs2d.io.run import RunFolder, is_run, open_run
 from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
@@ -67,12 +67,15 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
             train_views=options.train_views,
             test_views=options.test_views,
             size=options.size,
+            vary_exposure=options.vary_exposure,
             on_progress=lambda done, _total: on_event(Step(done)),
             threads=options.threads,
         )
-        (capture / GAINS).unlink(missing_ok=True)
-        if options.vary_exposure:
-            vary_exposure(capture)
+    elif (capture / GAINS).exists() != options.vary_exposure:
+        raise RunError(
+            f"the photographs in {capture} were made with{'out' * options.vary_exposure} --vary-exposure; "
+            "resume with the same options, or start again with --overwrite"
+        )
     run = train(
         TrainOptions(
             scene=capture,

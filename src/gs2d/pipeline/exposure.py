@@ -14,6 +14,7 @@ from gs2d.errors import DataError, RunError
 from gs2d.exposure import expose, fit_exposure
 from gs2d.io.files import read_json, write_json
 from gs2d.io.run import EXPOSURE, RunFolder
+from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.prepare import Job
 from gs2d.recipe import Recipe
 from gs2d.render.types import RenderOutput
@@ -37,8 +38,8 @@ def named(views: Sequence[View], exposures: Exposures | None) -> Transforms:
     return {view.name: transform for view, transform in zip(views, exposures.transforms().detach(), strict=True)}
 
 
-def write_exposures(run: RunFolder, transforms: Transforms) -> None:
-    """Write ``exposure.json`` beside the splats, where there are any.
+def write_exposures(run: RunFolder, transforms: Transforms, on_event: OnEvent) -> None:
+    """Write ``exposure.json`` beside the splats, where there are any, and say how far they differ.
 
     Raises
     ------
@@ -51,6 +52,9 @@ def write_exposures(run: RunFolder, transforms: Transforms) -> None:
         grey = GREY * transform[:, :3].sum(dim=1) + transform[:, 3]
         photographs.append({"name": name, "transform": transform.tolist(), "grey": grey.tolist()})
     write_json(run.file(EXPOSURE), {"format": 1, "about": ABOUT, "photographs": photographs})
+    gains = {entry["name"]: sum(entry["grey"]) / (3 * GREY) for entry in photographs}
+    low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
+    on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {EXPOSURE}"))
 
 
 def read_exposures(run: RunFolder, recipe: Recipe) -> Transforms:

@@ -64,7 +64,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         start = choose_start(run, job, options, on_event)
         splats, exposures = train_stages(run, job, options, start, on_event)
-        write_exposures(run, exposures)
+        write_exposures(run, exposures, on_event)
         finish(run, job, splats, on_event)
     return run
 
