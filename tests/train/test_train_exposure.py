@@ -16,7 +16,7 @@ from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.data.toy_exposure import random_gains
 from gs2d.errors import RunError
 from gs2d.geometry import camera_extent
-from gs2d.protocols import GENERIC
+from gs2d.protocols import GENERIC, NERF_SYNTHETIC
 from gs2d.recipe import Exposure, Rates, Recipe
 from gs2d.recipes import appearance, refine, surface, with_exposure
 from gs2d.render.api import rasterize, splat_errors
@@ -27,6 +27,8 @@ from gs2d.train.cached_views import CachedViews
 from gs2d.train.exposure import Exposures, as_photographed, exposure_step, uncount
 from gs2d.train.loop import Trainer
 from gs2d.train.state import TrainState
+from gs2d.train.targets import Target
+from gs2d.train.views import up_to_white
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 
@@ -145,6 +147,34 @@ def test_exposures_that_stay_where_they_are_change_no_bit_of_the_splats(scene: S
     assert on.exposures is not None
     assert not on.exposures.offsets.any()
     assert sum(on.exposures.steps) == 10 + 4 + 5
+
+
+def test_the_white_behind_a_photograph_with_an_alpha_channel_has_no_exposure(scene: Scene, backend: str) -> None:
+    # The photograph is empty and so is the rendering: both are white, whatever the transform, and the loss is 0.
+    empty = View.from_arrays("empty", scene.train[0].camera, np.zeros((SIZE, SIZE, 4), np.uint8))
+    splats = random_splats(5)
+    splats.opacity_logits.fill_(-20.0)
+    state = TrainState(splats, torch.Generator().manual_seed(0))
+    state.exposures = Exposures.start(2, splats.means)
+    state.exposures.offsets[0] = -0.5
+    views = replace(scene, train=(empty, scene.train[1]))
+    trainer = Trainer(views, by(Exposure()), NERF_SYNTHETIC, backend=backend, state=state)
+    trainer.enter(0)
+    found = trainer._whole.evaluate(state, trainer.recipe.stages[0], 1, 0)
+    assert found.losses["l1"] == pytest.approx(0, abs=1e-6)
+    assert found.losses["exposure"] > 0
+
+
+def test_a_clipped_pixel_says_this_or_brighter() -> None:
+    photograph = torch.tensor([[[1.0, 0.9, 1.0]]])
+    rendered = torch.tensor([[[1.3, 1.3, 0.7]]], requires_grad=True)
+    shown = up_to_white(rendered, Target(photograph, None, None))
+    assert shown.flatten().tolist() == pytest.approx([1.0, 1.3, 0.7])  # red is no error, green and blue are
+    shown.sum().backward()
+    assert rendered.grad is not None
+    assert rendered.grad.flatten().tolist() == [0, 1, 1]
+    background = Target(photograph, None, None, silhouette=torch.zeros(1, 1))
+    assert torch.equal(up_to_white(rendered, background), rendered)
 
 
 def test_errors_are_ranked_in_the_exposure_of_the_photograph(scene: Scene, backend: str) -> None:
