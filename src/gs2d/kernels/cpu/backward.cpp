@@ -129,18 +129,6 @@ __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t 
     }
 }
 
-// The sums over a splat's pixels that follow from weight and alpha alone.
-struct ColorSums {
-    real sums[7][LANES];
-    void put(const PairSums<V>& s) {
-        const V values[7] = {s.ln_alpha, s.red, s.green, s.blue, s.nx, s.ny, s.nz};
-        for (int k = 0; k < 7; ++k) store(sums[k], values[k]);
-    }
-    void get(PairSums<V>& s) const {
-        V* const values[7] = {&s.ln_alpha, &s.red, &s.green, &s.blue, &s.nx, &s.ny, &s.nz};
-        for (int k = 0; k < 7; ++k) *values[k] = load(sums[k]);
-    }
-};
 constexpr bool COLORS_FIT = REGISTERS >= 32;  // the registers hold them beside what moves T and S on
 
 // Pairs (splat, block) of some splats in a row. They are worked on in passes, each with a short chain of operations, so that
@@ -152,7 +140,6 @@ struct Batch {
     real alpha[PAIRS][LANES];                      // in the end dL/d ln(alpha)
     real I[PAIRS][LANES];                          // dL/d(1 / z)
     real w[COLORS_FIT ? 1 : PAIRS][LANES];         // weight
-    ColorSums colors[COLORS_FIT ? PAIRS : 1];      // of each splat
     M ray[PAIRS];                                  // of splats that are not plain
     uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch
     // Of each splat. Its pairs are those before `end`; filtered: the low-pass filter decided one of them.
@@ -206,36 +193,18 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
     }
 }
 
-template <bool Geo, bool Dist> inline __attribute__((always_inline)) void weigh_pairs(Batch& w, Planes s, const BlendLimits<V>& limits) {
-    const auto weigh = [&](int i, const Record<V>& splat, const PixelGradient<V>& g) {
-        const int at = w.block[i] * LANES;
-        V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
-        const V inverse_depth = Dist ? load(w.inverse_depth[i]) : V(0);
-        const PairGradient<V> p =
-            weigh_vjp<Geo, Dist>(splat, load(w.depth[i]), inverse_depth, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
-        store(&s[T][at], pixel_T), store(&s[S][at], pixel_S);
-        store(w.alpha[i], p.ln_alpha);
-        if constexpr (Geo) store(w.I[i], p.I);
-        return p;
-    };
-    if constexpr (COLORS_FIT) {  // splat by splat: what is added up needs the same pixels, and the splat stays in registers
-        for (int j = 0, i = 0; j < w.splats; ++j) {
-            const Record<V> splat = broadcast(w.record[j]);
-            const V zero = V(0);
-            PairSums<V> sums;
-            sums.ln_alpha = sums.red = sums.green = sums.blue = sums.nx = sums.ny = sums.nz = zero;
-            do {
-                const PixelGradient<V> g = load_gradient(s, w.block[i]);
-                add_colors<Geo>(g, weigh(i, splat, g), sums);
-            } while (++i < w.end[j]);
-            w.colors[j].put(sums);
-        }
-    } else {
-        for (int i = 0; i < w.pairs; ++i) {
-            const int j = w.splat[i];
-            store(w.w[i], weigh(i, broadcast(w.record[j]), load_gradient(s, w.block[i])).w);
-        }
-    }
+// One pair: T and S move on; what its sums need is left in the batch.
+template <bool Geo, bool Dist>
+inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const PixelGradient<V>& g, Planes s, const BlendLimits<V>& limits) {
+    const int at = w.block[i] * LANES;
+    V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
+    const V inverse_depth = Dist ? load(w.inverse_depth[i]) : V(0);
+    const PairGradient<V> p =
+        weigh_vjp<Geo, Dist>(splat, load(w.depth[i]), inverse_depth, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
+    store(&s[T][at], pixel_T), store(&s[S][at], pixel_S);
+    store(w.alpha[i], p.ln_alpha);
+    if constexpr (Geo) store(w.I[i], p.I);
+    return p;
 }
 
 // Of one splat, whose pairs these are.
@@ -278,13 +247,23 @@ inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool fil
 template <bool Geo, bool Dist, bool Abs>
 __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const Centres& centres, const BlendLimits<V>& limits) {
     find_hits<Dist || Abs>(w, centres, limits);
-    weigh_pairs<Geo, Dist>(w, s, limits);
+    if constexpr (!COLORS_FIT)
+        for (int i = 0; i < w.pairs; ++i) {
+            const PixelGradient<V> g = load_gradient(s, w.block[i]);
+            store(w.w[i], weigh_pair<Geo, Dist>(w, i, broadcast(w.record[w.splat[i]]), g, s, limits).w);
+        }
     for (int j = 0, first = 0; j < w.splats; first = w.end[j++], to = to.from(1)) {
         const V zero = V(0);
         PairSums<V> sums = {zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero,
                             zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
-        if constexpr (COLORS_FIT) w.colors[j].get(sums);
         const Record<V> splat = broadcast(w.record[j]);
+        if constexpr (COLORS_FIT) {  // both read the same pixels
+            int i = first;
+            do {
+                const PixelGradient<V> g = load_gradient(s, w.block[i]);
+                add_colors<Geo>(g, weigh_pair<Geo, Dist>(w, i, splat, g, s, limits), sums);
+            } while (++i < w.end[j]);
+        }
         if (w.filtered[j])
             sum_pairs<Geo, Abs, true>(w, j, first, w.end[j], splat, s, centres, sums);
         else
