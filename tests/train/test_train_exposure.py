@@ -28,7 +28,7 @@ from gs2d.train.exposure import Exposures, as_photographed, exposure_step, uncou
 from gs2d.train.loop import Trainer
 from gs2d.train.state import TrainState
 from gs2d.train.targets import Target
-from gs2d.train.views import up_to_white
+from gs2d.train.views import clipped_pixels
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 
@@ -165,16 +165,11 @@ def test_the_white_behind_a_photograph_with_an_alpha_channel_has_no_exposure(sce
     assert found.losses["exposure"] > 0
 
 
-def test_a_clipped_pixel_says_this_or_brighter() -> None:
-    photograph = torch.tensor([[[1.0, 0.9, 1.0]]])
-    rendered = torch.tensor([[[1.3, 1.3, 0.7]]], requires_grad=True)
-    shown = up_to_white(rendered, Target(photograph, None, None))
-    assert shown.flatten().tolist() == pytest.approx([1.0, 1.3, 0.7])  # red is no error, green and blue are
-    shown.sum().backward()
-    assert rendered.grad is not None
-    assert rendered.grad.flatten().tolist() == [0, 1, 1]
-    background = Target(photograph, None, None, silhouette=torch.zeros(1, 1))
-    assert torch.equal(up_to_white(rendered, background), rendered)
+def test_pixels_at_the_ceiling_are_clipped_but_not_the_white_behind_a_photograph() -> None:
+    photograph = torch.tensor([[[1.0, 0.9, 1.0], [1.0, 1.0, 1.0]]])
+    assert clipped_pixels(Target(photograph, None, None)).tolist() == [[[True, False, True], [True, True, True]]]
+    cut_out = Target(photograph, None, None, silhouette=torch.tensor([[0.5, 0.0]]))
+    assert clipped_pixels(cut_out).tolist() == [[[True, False, True], [False, False, False]]]
 
 
 def test_errors_are_ranked_in_the_exposure_of_the_photograph(scene: Scene, backend: str) -> None:

@@ -129,8 +129,9 @@ class WholeViews:
         target = self._targets[index]
         transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
         if transform is not None:
-            color = expose(output.color, transform, target.silhouette, self._background)
-            output = replace(output, color=up_to_white(color, target))
+            clipped, background = clipped_pixels(target), self._background
+            color = expose(output.color, transform, target.silhouette, background, clipped=clipped)
+            output = replace(output, color=color)
         terms = compute_losses(
             output,
             target.image,
@@ -166,12 +167,10 @@ class WholeViews:
         return values, gradients
 
 
-def up_to_white(color: Tensor, target: Target) -> Tensor:
-    """The picture, at most 1 where the photograph is clipped: such a pixel says that it was this bright or brighter."""
+def clipped_pixels(target: Target) -> Tensor:
+    """Where a photograph is at its ceiling [H, W, 3]; not in the white that is put behind one with an alpha channel."""
     clipped = target.image >= 1
-    if target.silhouette is not None:  # a white background is no light
-        clipped &= target.silhouette[..., None] > 0
-    return torch.where(clipped, color.clamp(max=1), color)
+    return clipped if target.silhouette is None else clipped & (target.silhouette[..., None] > 0)
 
 
 def waits(device: torch.device) -> bool:
