@@ -20,6 +20,7 @@ from gs2d.io.run import EXPOSURE, RunFolder
 from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.exposure import matched_by_halves, read_exposures
+from gs2d.pipeline.figures import rank_run
 from gs2d.pipeline.jobs import evaluate_run, open_job, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.paths import orbit_cameras
@@ -166,6 +167,21 @@ def test_the_texture_takes_photographs_in_the_exposure_of_the_scene(run: RunFold
         inside = view.image()[..., 3] > 0
         expected = 255 * np.clip((view.image()[inside][:, :3] / 255 - b[:, 0]) @ np.linalg.inv(A).T, 0, 1)
         assert np.abs(photograph.image[inside][:, :3] - expected).max() <= 0.51
+
+
+def test_figures_of_e_i_compare_in_the_exposures_that_were_found(run: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(tmp_path / "copy")
+    shutil.copytree(run.path, copy.path)
+    _, job, _ = open_job(run.path, 1, ignore)
+    found = rank_run(copy, job).errors
+    data = json.loads(copy.file(EXPOSURE).read_text())
+    for entry in data["photographs"]:
+        entry["transform"] = np.eye(3, 4).tolist()
+    copy.file(EXPOSURE).write_text(json.dumps(data))
+    as_if_one = rank_run(copy, job).errors
+    plain = rank_run(copy, replace(job, recipe=replace(job.recipe, exposure=None))).errors
+    assert torch.allclose(as_if_one, plain, rtol=1e-3, atol=1e-3)
+    assert not torch.allclose(found, plain, rtol=1e-3, atol=1e-3)
 
 
 def test_a_stopped_run_resumes_to_the_same_splats_and_exposures(run: RunFolder, varied: Path, tmp_path: Path) -> None:

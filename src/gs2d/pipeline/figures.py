@@ -17,6 +17,7 @@ from gs2d.disk import atomic_write
 from gs2d.errors import Gs2dError
 from gs2d.io.run import RunFolder, load_tensors, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
+from gs2d.pipeline.exposure import photographed, read_exposures
 from gs2d.pipeline.jobs import finished_splats
 from gs2d.pipeline.pictures import choose_views, render_view, share_of_group, splatted
 from gs2d.pipeline.prepare import Job, reload_job
@@ -28,6 +29,7 @@ from gs2d.report_curves import Panel, compared, read_history
 from gs2d.report_images import ERROR_TOP, error_picture, error_scale, highlight_picture
 from gs2d.splats import Splats
 from gs2d.train.actions import worst
+from gs2d.train.exposure import as_photographed
 from gs2d.train.state import TrainState
 
 TRACES = (
@@ -175,15 +177,19 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
     splats, group, when = _ranked(run, job, index, action)
     splats = splats.to(job.backend.device)
     total = torch.zeros(len(splats), dtype=torch.float64, device=splats.device)
-    views = job.scene.train
+    views, transforms = job.scene.train, read_exposures(run, job.recipe)
     for view in counted(views, "errors of each splat", len(views), on_event):
+        seen, settings = splats, job.settings
+        if view.name in transforms:  # those of the end: after stage 1 they hardly move
+            transform = transforms[view.name].to(splats.means)
+            seen, settings = as_photographed(splats, view.camera, transform, settings)
         image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
         mask = view.mask() if job.protocol.use_mask_in_training else None
         errors = splat_errors(
-            splats,
+            seen,
             view.camera,
             image,
-            job.settings,
+            settings,
             backend=job.backend,
             mask=None if mask is None else torch.from_numpy(mask).to(splats.device),
             occlusion=action.occlusion,
@@ -251,7 +257,7 @@ def draw_error_maps(
     RunError, DataError, BackendError, DiskError
     """
     job = reload_job(run, on_event, backend=backend)
-    ranking = rank_run(run, job, on_event)
+    ranking, transforms = rank_run(run, job, on_event), read_exposures(run, job.recipe)
     limits = map_limits(ranking.errors)
     positions = error_positions(ranking.errors, limits)
     shown = choose_views(job.scene, views)
@@ -260,7 +266,8 @@ def draw_error_maps(
     rows: list[tuple[str, list[np.ndarray]]] = []
     for (split, view), share in zip(shown, shares, strict=True):
         output = render_view(ranking.splats, view, job.settings, job.backend)
-        color, alpha = np.clip(output.color.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
+        own = photographed(view, output.color, transforms, job.settings.background)
+        color, alpha = np.clip(own.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
         photo = view.target(job.settings.background)
         pictures = [
             photo,
