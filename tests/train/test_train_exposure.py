@@ -5,16 +5,19 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 from train_toys import SIZE, VIEWS, backends, random_splats, same, short
 
 from gs2d.camera import Camera, look_at
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.data.toy_exposure import random_gains
 from gs2d.errors import RunError
+from gs2d.exposure import _exposed, _gradients
 from gs2d.geometry import camera_extent
 from gs2d.protocols import GENERIC, NERF_SYNTHETIC
 from gs2d.recipe import Exposure, Rates, Recipe
@@ -107,6 +110,30 @@ def test_a_cancelled_update_changes_nothing_but_the_count() -> None:
     assert all(torch.equal(before[name], after[name]) for name in ("offsets", "mean", "square"))
     exposure_step(made, 0, torch.ones(3, 4), recipe, 0, 2, torch.tensor(0, dtype=torch.int32))
     assert not torch.equal(made.offsets, before["offsets"])
+
+
+class Looks(TorchDispatchMode):
+    """Counts the operations for which a host would wait for its device."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = function.overloadpacket.__name__
+        self.count += name in ("_local_scalar_dense", "nonzero", "is_nonzero", "masked_select")
+        return function(*args, **(kwargs or {}))
+
+
+def test_on_a_device_neither_the_transform_nor_its_update_waits() -> None:
+    made, recipe, cancel = exposures(), by(Exposure(start=0)), torch.tensor(0, dtype=torch.int32)
+    color, coverage, white = torch.rand(4, 5, 3), torch.rand(4, 5), torch.ones(3)
+    with Looks() as looks:
+        transform = made.transform(1)
+        image, over = _exposed(color, transform, coverage, white, color > 0.5)
+        _, gradient = _gradients(image, color, transform, coverage, white, over)
+        exposure_step(made, 1, gradient, recipe, 0, 1, cancel)
+        assert looks.count == 0
+        bool(cancel)  # this is one
+    assert looks.count == 1
 
 
 # -- the loss -----------------------------------------------------------------------------------------------------
