@@ -259,7 +259,7 @@ template <class V> GS2D_HD void finish_column(V dx, PairSums<V>& a) {
     a.Xx = dx * a.X, a.Yx = dx * a.Y, a.Ix = dx * a.I, a.lowpass_x = dx * a.lowpass_x;
 }
 
-// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz.
+// dL/d(record) from the sums, per lane (the sum over lanes is left to the caller). zc = 1 / iz, where abs_x and abs_y are wanted.
 template <class V>
 GS2D_HD RecordGradient<V> finish(const Record<V>& s, V zc, const PairSums<V>& a, const BlendLimits<V>& k) {
     RecordGradient<V> g;

@@ -151,7 +151,8 @@ struct Batch {
 
     bool has_room(uint32_t blocks) const { return pairs + __builtin_popcount(blocks) <= PAIRS; }
 
-    void add(const real* splat_record, bool plain, uint32_t blocks, const Centres& centres) {  // no branch depends on `blocks`: none could be foreseen
+    // No branch depends on `blocks`: none could be foreseen.
+    void add(const real* splat_record, bool plain, uint32_t blocks, const Centres& centres) {
         memset(&splat[pairs], splats, BLOCKS);
         for (int first = 0; first < BLOCKS; first += 8) {
             const uint32_t byte = blocks >> first & 255u;
@@ -195,7 +196,8 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
 
 // One pair: T and S move on; what its sums need is left in the batch.
 template <bool Geo, bool Dist>
-inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const PixelGradient<V>& g, Planes s, const BlendLimits<V>& limits) {
+inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const PixelGradient<V>& g, Planes s,
+                                  const BlendLimits<V>& limits) {
     const int at = w.block[i] * LANES;
     V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
     const V inverse_depth = Dist ? load(w.inverse_depth[i]) : V(0);
@@ -232,7 +234,7 @@ inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>
 
 template <bool Abs>
 inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool filtered, const Slots& to, const BlendLimits<V>& limits) {
-    RecordGradient<V> g = finish(splat, reciprocal(splat.iz), sums, limits);
+    RecordGradient<V> g = finish(splat, Abs ? reciprocal(splat.iz) : V(0), sums, limits);
     if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
     const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.ai, g.bi,
                           g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};

@@ -59,7 +59,6 @@ inline Hit<V> hit_at(const Record<V>& s, V zc, const PlaneAt<V>& plane, bool pla
     if (!plain) return intersect(s, plane, zc, centres.at_x(b) - s.cx, centres.at_y(b) - s.cy, k);
     Hit<V> h = meet_plane(plane);
     h.alpha = plain_alpha_of(s.log2_opacity, h.rho, k);
-    h.ray = h.alpha >= V(0);
     return h;
 }
 
