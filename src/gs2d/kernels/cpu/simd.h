@@ -109,7 +109,12 @@ template <int K, int I, int S> constexpr int packed_target(int lane) {
     return vector == S ? LANES + at : S > 1 ? lane : vector == 0 ? at : 0;
 }
 template <int K, int I, int S, bool Load, int... L> GS2D_HD V merge_packed(V a, V b, std::integer_sequence<int, L...>) {
+#if defined(GS2D_IN_PARTS)
+    const auto lane = [&](int i) { return i < LANES ? a[i] : b[i - LANES]; };
+    return per_lane([&](int i) { return lane(Load ? packed_source<K, I, S>(i) : packed_target<K, I, S>(i)); });
+#else
     return __builtin_shufflevector(a.v, b.v, (Load ? packed_source<K, I, S>(L) : packed_target<K, I, S>(L))...);
+#endif
 }
 template <int K, int I, bool Load, int S = 1> GS2D_HD V gather_packed(const V* v, V sofar) {
     if constexpr (S == K)
