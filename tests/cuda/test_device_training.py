@@ -30,7 +30,7 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.protocols import GENERIC
-from gs2d.recipe import Recipe
+from gs2d.recipe import Exposure, Recipe
 from gs2d.render import cuda, cuda_budget, cuda_passes
 from gs2d.render.backend import Backend, get_backend
 from gs2d.render.types import RasterSettings
@@ -60,9 +60,12 @@ def cpu_backend() -> Backend:
         pytest.skip(str(error))
 
 
-def test_three_stages_give_the_cpu_backends_scene_within_rounding(emulated: Backend, scene: Scene) -> None:
+@pytest.mark.parametrize("exposure", [None, Exposure(start=2, horizon=10)], ids=["plain", "exposure"])
+def test_three_stages_give_the_cpu_backends_scene_within_rounding(
+    emulated: Backend, scene: Scene, exposure: Exposure | None
+) -> None:
     """19 iterations with densifications, a reset, ranking, a clone and frozen rows; decisions and counts are equal."""
-    recipe = train_toys.short()
+    recipe = replace(train_toys.short(), exposure=exposure)
     results = [
         train_toys.train(scene, recipe, backend=backend, stage2_cache_bytes=0) for backend in (cpu_backend(), emulated)
     ]
