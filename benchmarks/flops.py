@@ -7,7 +7,7 @@ it was what the loops executed until November 2026. ``EXECUTED`` is what they ex
 
 A fused multiply-add counts 2, any other addition, subtraction, multiplication, division or rounding 1; comparisons,
 selects, minima, maxima, loads and the exponent's integer arithmetic count nothing. Executed, with AVX-512, for a pair
-whose splat is plain (``is_plain``), as nearly all are:
+whose splat is plain (``is_plain``), as nearly all are (with AVX2 2^x has one term more: 2 operations):
 
     meet, alpha                            composite                 weigh_vjp, add_colors, add_geometry
       X, Y, I: lane + block      3           T after, w        3       T after, w                         3
