@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from gs2d.cli.actions import _train_options as train_options
+from gs2d.cli.actions import train_options
 from gs2d.cli.app import parse
 from gs2d.cli.commands import Train
 from gs2d.cli.paper import parse_seeds

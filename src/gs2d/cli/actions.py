@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from gs2d.cli import commands as c
 from gs2d.cli.console import Console, figure
+from gs2d.cli.options import Common, Training, TrainingCommon
 from gs2d.errors import DataError, ProtocolError, RecipeError
 
 
-def execute(command: c.Common, console: Console) -> None:
+def execute(command: Common, console: Console) -> None:
     """Run a parsed command."""
     actions: dict[type, Callable[[Any, Console], None]] = {
         c.Demo: demo,
@@ -35,37 +37,26 @@ def execute(command: c.Common, console: Console) -> None:
         console.close()
 
 
-def _train_options(command: c.Train) -> Any:
+def train_options(command: c.Train) -> Any:
+    """The pipeline's options of ``gs2d train``."""
+    own = ("scene", "out", "format", "downscale", "schedule_scale")
+    return training_options(command, command, **{name: getattr(command, name) for name in own})
+
+
+def training_options(command: TrainingCommon, training: Training, **own: Any) -> Any:
+    """The pipeline's options: every field of `Training` by its name, those of every training, and a command's own."""
     from gs2d.pipeline.options import TrainOptions
 
-    return TrainOptions(
-        scene=command.scene,
-        out=command.out,
-        recipe=command.recipe,
-        protocol=command.protocol,
-        backend=command.backend,
-        format=command.format,
-        downscale=command.downscale,
-        schedule_scale=command.schedule_scale,
-        overrides=command.overrides,
-        exposure=command.exposure,
-        seed=command.seed,
-        resume=command.resume,
-        overwrite=command.overwrite,
-        start_from=command.start_from,
-        cache=command.cache,
-        threads=command.threads,
-        checkpoint_every=command.checkpoint_every,
-        checkpoint_seconds=command.checkpoint_seconds,
-        stage2_cache_mb=command.stage2_cache_mb,
-    )
+    shared = {field.name: getattr(training, field.name) for field in fields(Training)}
+    common = ("backend", "seed", "threads", "resume", "overwrite")
+    return TrainOptions(**shared, **{name: getattr(command, name) for name in common}, **own)
 
 
 def train(command: c.Train, console: Console) -> None:
     """``gs2d train``."""
     from gs2d.pipeline.train import train as run_training
 
-    run = run_training(_train_options(command), console.on_event)
+    run = run_training(train_options(command), console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console)
 

@@ -18,9 +18,10 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import gs2d
-from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Doctor, Info, Recipes, TableCommon, Train
+from gs2d.cli.commands import COMMANDS, Command, Demo, Doctor, Info, Recipes, TableCommon, Train
 from gs2d.cli.console import Console
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
+from gs2d.cli.options import Common, TrainingCommon
 from gs2d.errors import Gs2dError
 
 OK, OURS, USERS, NOBODY_READS = 0, 1, 2, 141
@@ -58,6 +59,9 @@ def run(argv: Sequence[str]) -> int:
         command = parse(argv)
     except SystemExit as exit_:
         return exit_.code if isinstance(exit_.code, int) else USERS
+    except BrokenPipeError:  # `gs2d train --help | head`
+        _drop_stdout()
+        return NOBODY_READS
     except UsageError as error:
         return _fail(str(error))
     interruptible = Interruptible()
@@ -128,7 +132,7 @@ def parse(argv: Sequence[str]) -> Common:
         if not exit_.code:
             raise
         raise UsageError(_one_line(complaint.getvalue(), argv)) from None
-    if isinstance(command, Train | Demo) and command.resume and command.overwrite:
+    if isinstance(command, TrainingCommon) and command.resume and command.overwrite:
         raise UsageError("--resume and --overwrite exclude each other; give one")
     return command
 

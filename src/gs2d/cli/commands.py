@@ -6,41 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional, arg, subcommand
 
-Backend = Literal["auto", "cpu", "cuda", "reference"]
-LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+from gs2d.cli.options import Backend, Common, Finding, Overrides, Training, TrainingCommon
+
 RunPath = Annotated[Positional[Path], arg(metavar="RUN")]
-Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), tyro.conf.UseAppendAction]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Common:
-    """Options of every command."""
-
-    quiet: bool = False
-    """No progress and no tables; errors only."""
-    json: bool = False
-    """Results as JSON on stdout, and nothing else there."""
-    debug: bool = False
-    """Show the traceback of an error."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingCommon(Common):
-    """Options of the commands that train."""
-
-    backend: Backend = "auto"
-    """Rasterizer: auto takes the fastest that this machine has; `gs2d doctor` lists them."""
-    seed: int = 0
-    """Seed of every random choice; the same seed gives the same bytes."""
-    threads: int | None = None
-    """CPU threads (default: all cores that this process may use)."""
-    resume: bool = False
-    """Continue the run in --out from its last checkpoint (or start, if there is none)."""
-    overwrite: bool = False
-    """Replace the run in --out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,29 +28,13 @@ class Demo(TrainingCommon):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Poses(Common):
+class Poses(Finding, Common):
     """Photographs without cameras to a capture that `gs2d train` reads: structure from motion, by COLMAP."""
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
     """Folder of photographs, with or without sub-folders; it is only read."""
     out: Annotated[Path, arg(metavar="CAPTURE")]
     """Capture folder to make: images/, sparse/0, poses.json, poses.png. It appears when all is done."""
-    cameras: Literal["auto", "one", "each"] = "auto"
-    """Which photographs share a camera: same folder, size, camera, lens and focal length; all; none."""
-    camera_model: LensModel = "auto"
-    """Lens (auto: OPENCV where 8 or more photographs share a camera, else SIMPLE_RADIAL)."""
-    matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
-    """Pairs to match: all; next ones by name (frames of a video); next and most similar ones. auto: all up to 150."""
-    overlap: int = 10
-    """Next photographs that each is matched with, where not all pairs are."""
-    neighbours: int = 40
-    """Similar photographs that each is matched with, where not all pairs are."""
-    max_size: int | None = None
-    """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
-    feature_size: int = 1600
-    """Longer side on which features are found, px: larger is slower and a little more accurate."""
-    link: bool = False
-    """Hard links instead of copies of the photographs: no disk is used."""
     threads: int | None = None
     """CPU threads (default: all cores that this process may use)."""
     seed: int = 0
@@ -90,37 +44,19 @@ class Poses(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(TrainingCommon):
+class Train(Training, TrainingCommon):
     """Posed photographs to splats, mesh and report."""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
     """Folder of the capture: COLMAP, Blender or nerfstudio transforms, DTU."""
     out: Annotated[Path, arg(metavar="RUN")]
     """Run folder to make."""
-    recipe: str = "2dgs-r"
-    """What is trained; `gs2d recipes` lists them."""
-    protocol: str = "auto"
-    """What depends on the data set: background, depth, near plane, fusion limits."""
     format: Literal["auto", "blender", "nerfstudio", "dtu", "colmap"] = "auto"
     """Format of the capture."""
     downscale: int = 1
     """Shrink the photographs by this integer, area-filtered."""
     schedule_scale: float = 1.0
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
-    exposure: bool = False
-    """Learn an exposure and a white balance for each photograph: for cameras on automatic."""
-    start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
-    """Take the stages that this recipe shares with another run from that run."""
-    cache: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
-    overrides: Overrides = ()
-    """Change the recipe, e.g. --set refine.iterations=2000; may be repeated."""
-    checkpoint_every: int = 10_000
-    """Iterations between checkpoints."""
-    checkpoint_seconds: float = 120.0
-    """Seconds between checkpoints, whichever comes first."""
-    stage2_cache_mb: int = 1024
-    """MiB for cached views in stage 2, about 5 MiB a view of 400x400 (0 = none; results differ by rounding)."""
 
 
 @dataclass(frozen=True, kw_only=True)
