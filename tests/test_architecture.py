@@ -66,6 +66,7 @@ RENDER = {
     "api": 4,
     "backend": 3,
     "cpu_cached": 3,
+    "camera_gradient": 3,
     "cpu": 2,
     "cuda": 2,
     "cuda_passes": 1,

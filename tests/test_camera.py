@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from gs2d.camera import Camera, look_at
 from gs2d.errors import ShapeError
@@ -84,3 +85,20 @@ def test_sizes_are_whole_numbers_of_pixels(width: object) -> None:
     with pytest.raises(ShapeError, match="width and height must be whole numbers of pixels, got"):
         Camera(width, 4, 5.0, 5.0, 3.0, 2.0, EYE4)  # type: ignore[arg-type]
     assert Camera(np.int64(9), 4, 5.0, 5.0, 3.0, 2.0, EYE4).width == 9  # type: ignore[arg-type]
+
+
+def test_a_pose_that_learns_is_kept_as_the_tensor_it_is() -> None:
+    T = torch.eye(4, requires_grad=True)
+    camera = Camera(20, 10, 8.0, 10.0, 5.0, 3.0, T)
+    assert camera.pose is T
+    assert camera.T_cam_world.dtype == np.float64
+    assert camera.resized(10, 5).pose is T
+    assert camera.downscaled(2).pose is T
+    assert Camera(20, 10, 8.0, 10.0, 5.0, 3.0, torch.eye(4)).pose is None  # it learns nothing
+    assert replace(camera, pose=None).pose is None
+
+
+def test_a_pose_that_is_not_that_of_the_camera_is_refused() -> None:
+    camera = Camera(20, 10, 8.0, 10.0, 5.0, 3.0, torch.eye(4, requires_grad=True))
+    with pytest.raises(ShapeError, match="pose must be the tensor that T_cam_world was made of, got another"):
+        replace(camera, T_cam_world=EYE4 + np.eye(4, k=3))

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gs2d.errors import ShapeError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +27,9 @@ class Camera:
     fx, fy, cx, cy : float
         Focal lengths and principal point, px, in the corner-origin convention above.
     T_cam_world : ndarray [4, 4] float64
-        x_cam = T_cam_world @ x_world (homogeneous).
+        x_cam = T_cam_world @ x_world (homogeneous). May be given as a torch tensor, which ``pose`` keeps if it learns.
+    pose : Tensor [4, 4] or None
+        The tensor that ``T_cam_world`` was given as, where it requires a gradient (``rasterize``, rule 20).
     """
 
     width: int
@@ -33,9 +39,14 @@ class Camera:
     cx: float
     cy: float
     T_cam_world: np.ndarray  # [4, 4]
+    pose: Tensor | None = None  # [4, 4]
 
     def __post_init__(self) -> None:
-        T = np.asarray(self.T_cam_world, dtype=np.float64)
+        given: Any = self.T_cam_world
+        if hasattr(given, "requires_grad"):  # a torch tensor: this module does without torch
+            object.__setattr__(self, "pose", given if given.requires_grad else None)
+            given = given.detach().cpu().numpy()
+        T = np.asarray(given, dtype=np.float64)
         if T.shape != (4, 4):
             raise ShapeError(f"T_cam_world must be [4, 4], got {list(T.shape)}")
         if not (np.isfinite(T).all() and np.allclose(T[3], (0, 0, 0, 1), atol=1e-6)):
@@ -56,6 +67,11 @@ class Camera:
             raise ShapeError(
                 f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
                 f"fx={self.fx}, fy={self.fy}"
+            )
+        if self.pose is not None and not np.array_equal(T, self.pose.detach().cpu().numpy()):
+            raise ShapeError(
+                "pose must be the tensor that T_cam_world was made of, got another; give the new T_cam_world as a "
+                "tensor, or with pose=None"
             )
         object.__setattr__(self, "T_cam_world", T)
 

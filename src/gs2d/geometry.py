@@ -1,8 +1,10 @@
-"""Rotations, neighbour distances, and what a set of cameras says about the size of a scene."""
+"""Rotations, rigid motions, neighbour distances, and what a set of cameras says about the size of a scene."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +15,7 @@ from gs2d.camera import Camera
 from gs2d.check import check_shapes
 from gs2d.errors import ShapeError
 
-__all__ = ["camera_extent", "focus_point", "nearest_distances", "quats_to_matrices"]
+__all__ = ["camera_extent", "focus_point", "moved", "nearest_distances", "quats_to_matrices", "rigid_motion"]
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:
@@ -36,6 +38,45 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+
+
+def rigid_motion(motion: Tensor) -> Tensor:
+    """The rigid motion of a twist: a rotation and a translation, exact and differentiable everywhere, 0 included.
+
+    Parameters
+    ----------
+    motion : Tensor [6]
+        A rotation vector (axis times angle, rad), then a velocity (wu): the motion of a body that turns and moves at
+        these rates for one unit of time. Without rotation the velocity is the translation.
+
+    Returns
+    -------
+    Tensor [4, 4]
+        In the dtype and on the device of ``motion``.
+    """
+    check_shapes({"motion": (motion, "6")})
+    x, y, z, u, v, w = motion.unbind()
+    o = torch.zeros_like(x)
+    rows = ((o, -z, y, u), (z, o, -x, v), (-y, x, o, w), (o, o, o, o))
+    return torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows]))
+
+
+def moved(camera: Camera, motion: Tensor) -> Camera:
+    """The camera after a motion in its own frame: ``T_cam_world = rigid_motion(motion) @ camera.T_cam_world``.
+
+    The rotation is about the camera's own centre. Where ``motion`` (or the camera) requires a gradient the result
+    carries it to ``gs2d.rasterize``.
+
+    Parameters
+    ----------
+    camera : Camera
+    motion : Tensor [6]
+        As for :func:`rigid_motion`; best float64, whose digits the camera keeps.
+    """
+    pose = torch.as_tensor(camera.T_cam_world) if camera.pose is None else camera.pose
+    T = rigid_motion(motion)
+    placed: Any = T @ pose.to(T)
+    return replace(camera, T_cam_world=placed, pose=None)
 
 
 def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:

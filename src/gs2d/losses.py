@@ -27,6 +27,7 @@ from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda import ops as cuda_ops
 from gs2d.losses_reference import normals_from_depth
 from gs2d.recipe import LossTerm
+from gs2d.render.camera_gradient import turning_normals
 from gs2d.render.types import RenderOutput
 
 __all__ = ["LOSSES", "LossInputs", "TargetMaps", "compute_losses", "normals_from_depth", "target_maps"]
@@ -134,8 +135,10 @@ LossFunction = Callable[[LossInputs, str], Tensor]
 
 
 def _normals(inputs: LossInputs, depth_kind: str) -> tuple[Tensor, Tensor, Tensor, Camera, Tensor | None]:
-    output = inputs.output
-    return output.normal, output.depth(depth_kind), output.alpha, inputs.camera, inputs.mask
+    output, pose, normal = inputs.output, inputs.camera.pose, inputs.output.normal
+    if pose is not None and normal.requires_grad:
+        normal = turning_normals(output, pose)  # both normals turn with the camera, which changes nothing
+    return normal, output.depth(depth_kind), output.alpha, inputs.camera, inputs.mask
 
 
 def _silhouette(inputs: LossInputs, _: str) -> Tensor:
@@ -209,6 +212,7 @@ def compute_losses(
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
     camera : Camera
+        That of the rendering, with its ``pose`` where that learns: the terms then say how they change with it.
     terms : sequence of LossTerm
         A term is active when ``iteration > term.start``. Terms of one kind add up.
     iteration : int

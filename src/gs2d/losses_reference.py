@@ -95,7 +95,7 @@ def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None
     Tensor [H, W, 3]
         Unit normals in the world frame; 0 on the one-pixel border, at ignored pixels, and wherever one of the four
         neighbours was not hit.
-        Differentiable in ``depth``.
+        Differentiable in ``depth``; the camera is a constant.
     """
     height, width = depth.shape
     if min(height, width) < 3:

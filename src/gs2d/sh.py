@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from gs2d.check import check_shapes
 from gs2d.errors import ShapeError
 
-__all__ = ["MAX_DEGREE", "num_coefficients", "rgb_to_sh0", "sh_basis", "sh_degree_of", "sh_to_rgb"]
+__all__ = ["MAX_DEGREE", "harmonics", "num_coefficients", "rgb_to_sh0", "sh_basis", "sh_degree_of", "sh_to_rgb"]
 
 MAX_DEGREE = 3
 
@@ -65,7 +67,13 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     if not 0 <= degree <= MAX_DEGREE:
         raise ShapeError(f"SH degree must be 0 to {MAX_DEGREE}, got {degree}")
     x, y, z = directions.unbind(1)  # [N] each
-    basis = [torch.full_like(x, C0)]
+    basis = [torch.full_like(x, C0), *harmonics(x, y, z, degree)]
+    return torch.stack(basis, dim=1)
+
+
+def harmonics(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
+    """The basis functions of degrees 1 to ``degree`` at unit vectors (x, y, z): arrays or tensors of one shape."""
+    basis = []
     if degree >= 1:
         basis += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:
@@ -86,7 +94,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
             C3[4] * z * (x * x - y * y),
             -C3[0] * x * (x * x - 3 * y * y),
         ]
-    return torch.stack(basis, dim=1)
+    return basis
 
 
 def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:

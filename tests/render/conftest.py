@@ -90,7 +90,7 @@ def _from_host(backend: Backend) -> Backend:
             output = backend.rasterize(moved, c, r, there(p))
         else:
             output = backend.rasterize_rows(moved, c, r, there(p), there(rows))
-        return RenderOutput(**{k: t.cpu() for k, t in vars(output).items()})
+        return RenderOutput(**{k: t.cpu() for k, t in vars(output).items() if t is not None})
 
     def splat_errors(
         s: Splats, c: Camera, image: Tensor, r: RasterSettings, mask: Tensor | None = None, occlusion: bool = False

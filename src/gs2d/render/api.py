@@ -30,8 +30,8 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     to weights and depths.
 11. *Colour* c = SH of degree min(settings.sh_degree, splats.sh_degree) along the unit vector from the camera centre to
     the splat's centre, + 0.5, clamped at 0; clamped channels have zero gradient. The direction carries gradient.
-12. *Gradients* reach means, quats, log_scales, opacity_logits, sh0, shN and screen_probe; not the camera, settings,
-    radii, nor any threshold or order.
+12. *Gradients* reach means, quats, log_scales, opacity_logits, sh0, shN, screen_probe and the camera's pose (20); not
+    its intrinsics, settings, radii, nor any threshold or order.
 13. *Screen probe.* screen_probe is zeros, [N, 2] or [N, 4]. Columns 0:2 of its gradient are
     z_c (W/2, H/2) * dL/d(Tu.z, Tv.z), where Tu, Tv are the first rows of the splat-to-pixel map
     (x z, y z, z) = (Tu, Tv, Tw) (u, v, 1): the densification signal of 2DGS. Only pairs with rho3d <= rho2d count.
@@ -55,6 +55,10 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     official rasterizer touches: centre b and half side h = ceil(max(|b^2 - a|_+^1/2, lowpass_px k)) of the line that
     touches an ellipse (docs/math.md, "Footprint"), although the disc's image is a hyperbola; its radius is half the
     longer side of these tiles, clipped to the image.
+20. *Camera.* Where T_cam_world was given as a tensor that requires a gradient it gets one, [4, 4]: its inner product
+    with a change of T_cam_world along a rigid motion is the derivative of the loss. Of other changes (of scale, of
+    shear) it says nothing. Images and all other gradients are the same bit for bit. ``gradient_rows`` (18) would leave
+    out the part of the other splats, and is refused.
 """
 
 from __future__ import annotations
@@ -69,6 +73,7 @@ from gs2d.camera import Camera
 from gs2d.check import check_shapes
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.backend import Backend, get_backend
+from gs2d.render.camera_gradient import carried, with_world_normals
 from gs2d.render.types import CROSSING, RasterSettings, RenderOutput
 from gs2d.sh import MAX_DEGREE, sh_degree_of
 from gs2d.splats import Splats
@@ -92,6 +97,7 @@ def rasterize(
     splats : Splats
         N splats, float32, or float64 for the reference backend.
     camera : Camera
+        With a ``pose`` that requires a gradient, that of the camera is worked out too (rule 20).
     settings : RasterSettings
     backend : str or Backend
         "auto" (by the device of the splats), "cpu", "cuda" or "reference" (``gs2d.render.backend``).
@@ -129,6 +135,15 @@ def rasterize(
         # On a GPU the look would make the host wait in every iteration.
         if screen_probe.device.type == "cpu" and bool((screen_probe.detach() != 0).any()):
             raise ShapeError("screen_probe must be all zeros (its gradient is what matters), got other values")
+    if camera.pose is not None and torch.is_grad_enabled():
+        if gradient_rows is not None:
+            raise ShapeError(
+                "gradient_rows must be None for a camera that learns, whose gradient is a sum over all splats, got "
+                "rows; leave one of the two away"
+            )
+        splats = carried(splats, camera.pose, settings.sh_degree)
+        output = chosen.rasterize(splats, camera, settings, screen_probe)
+        return with_world_normals(output, camera.pose)
     if gradient_rows is None:
         return chosen.rasterize(splats, camera, settings, screen_probe)
     check_shapes({"means": (splats.means, "N 3"), "gradient_rows": (gradient_rows, "N")})

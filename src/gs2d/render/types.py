@@ -76,6 +76,8 @@ class RenderOutput:
         Sum over pairs i > j of w_i w_j (m_i - m_j)^2, m the mapped depth.
     radii : Tensor [N] px
         Half the longer side of each splat's screen box; 0 for splats that touch no pixel.
+    turning_normal : Tensor [H, W, 3] or None
+        Where a camera learns: ``normal`` as if the world turned with the camera. For losses that compare normals.
     """
 
     color: Tensor
@@ -85,6 +87,7 @@ class RenderOutput:
     depth_median: Tensor
     distortion: Tensor
     radii: Tensor
+    turning_normal: Tensor | None = None
 
     def depth(self, kind: str) -> Tensor:
         """``depth_mean`` or ``depth_median`` by the name a recipe or protocol uses."""

@@ -1,0 +1,259 @@
+"""Rule 20 of the contract: the gradient of a camera's pose, on every backend.
+
+The judge is autograd straight through the reference, whose formulas take a camera of tensors like one of arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad, splat
+from torch import Tensor
+from torch.testing import assert_close
+
+from gs2d.camera import Camera
+from gs2d.errors import ShapeError
+from gs2d.geometry import moved
+from gs2d.losses import compute_losses
+from gs2d.losses_reference import normal_consistency, normal_consistency_per_splat
+from gs2d.recipe import LossTerm
+from gs2d.render import camera_gradient, reference
+from gs2d.render.api import rasterize
+from gs2d.render.backend import Backend, get_backend
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import Splats
+
+SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without decisions near by
+
+
+def scene(seed: int, count: int = 12, dtype: torch.dtype = torch.float64) -> tuple[Splats, Camera, dict[str, Tensor]]:
+    rng = np.random.default_rng(seed)
+    camera = random_camera(rng)
+    return random_splats(rng, camera, count).to(dtype=dtype), camera, random_cotangents(rng, camera)
+
+
+def learning(camera: Camera) -> tuple[Camera, Tensor]:
+    """The same camera, and the pose that learns."""
+    pose = torch.tensor(camera.T_cam_world, requires_grad=True)
+    return replace(camera, T_cam_world=pose), pose
+
+
+def live(camera: Camera) -> tuple[Any, Tensor]:
+    """What the reference takes for a camera, made of tensors, and its pose."""
+    T = torch.tensor(camera.T_cam_world, requires_grad=True)
+    facts = {f.name: getattr(camera, f.name) for f in fields(camera) if f.name not in ("T_cam_world", "pose")}
+    R, t = T[:3, :3], T[:3, 3]
+    return SimpleNamespace(**facts, T_cam_world=T, rotation=R, center=-R.T @ t), T
+
+
+def along_motions(gradient: Tensor | None, camera: Camera) -> Tensor:
+    """Its products with the six motions of the camera in its own frame: three turns, three shifts [6]."""
+    assert gradient is not None
+    at_rest = torch.zeros(6, dtype=torch.float64)
+
+    def placed(motion: Tensor) -> Tensor:
+        pose = moved(camera, motion).pose
+        assert pose is not None
+        return pose
+
+    changes = torch.autograd.functional.jacobian(placed, at_rest)  # [4, 4, 6]
+    return torch.einsum("ij,ijk->k", gradient.double(), changes)
+
+
+def straight(splats: Splats, camera: Camera, settings: RasterSettings, cotangents: dict[str, Tensor]) -> Tensor:
+    """What autograd says of the six motions [6]."""
+    lens, pose = live(camera)
+    contraction(reference.rasterize(splats, lens, settings), cotangents).backward()
+    return along_motions(pose.grad, camera)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_20_the_reference_has_the_gradient_of_autograd(seed: int, degree: int) -> None:
+    splats, camera, cotangents = scene(seed)
+    settings = RasterSettings(sh_degree=degree)
+    lens, pose = learning(camera)
+    contraction(rasterize(splats, lens, settings, backend="reference"), cotangents).backward()
+    expected = straight(splats, camera, settings, cotangents)
+    assert expected.abs().max() > 1
+    assert_close(along_motions(pose.grad, camera), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("image", IMAGES)
+def test_20_each_image_tells_every_backend_how_it_changes_with_the_camera(backend: Backend, image: str) -> None:
+    rng = np.random.default_rng(3)
+    camera = random_camera(rng)
+    splats = random_splats(rng, camera, 12, SMOOTH)
+    cotangents = {image: random_cotangents(rng, camera)[image]}
+    expected = straight(splats, camera, RasterSettings(), cotangents)
+    lens, pose = learning(camera)
+    contraction(rasterize(splats.to(dtype=torch.float32), lens, backend=backend), cotangents).backward()
+    found = along_motions(pose.grad, camera)
+    assert expected.abs().max() > 1e-3
+    assert_close(found, expected, rtol=2e-3, atol=2e-4 * float(expected.abs().max()))
+
+
+def test_20_the_gradient_is_what_finite_differences_find() -> None:
+    rng = np.random.default_rng(3)
+    camera = random_camera(rng)
+    splats, cotangents = random_splats(rng, camera, 12, SMOOTH), random_cotangents(rng, camera)
+    cotangents = {name: cotangents[name] for name in ("color", "normal", "depth_mean")}
+    lens, pose = learning(camera)
+    contraction(rasterize(splats, lens, backend="reference"), cotangents).backward()
+    found, step = along_motions(pose.grad, camera), 1e-6
+    for k, motion in enumerate(step * torch.eye(6, dtype=torch.float64)):
+        ends = [
+            float(contraction(rasterize(splats, moved(camera, end), backend="reference"), cotangents))
+            for end in (motion, -motion)
+        ]
+        assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float(found[k]), rel=1e-4, abs=1e-4)
+
+
+def test_20_the_camera_learns_where_nothing_else_does(backend: Backend) -> None:
+    splats, camera, cotangents = scene(1, dtype=torch.float32)
+    lens, pose = learning(camera)
+    contraction(rasterize(splats, lens, backend=backend), cotangents).backward()
+    assert pose.grad is not None
+    assert bool((pose.grad[:3] != 0).any())
+    assert not pose.grad[3].any()
+    assert all(tensor.grad is None for _, tensor in splats.items())
+
+
+def test_20_images_and_all_other_gradients_keep_their_bits(backend: Backend) -> None:
+    splats, camera, cotangents = scene(2, dtype=torch.float32)
+    found = []
+    for lens in (camera, learning(camera)[0]):
+        leaves, probe = requiring_grad(splats), torch.zeros(len(splats), 4, requires_grad=True)
+        output = rasterize(leaves, lens, backend=backend, screen_probe=probe)
+        contraction(output, cotangents).backward()
+        found.append([getattr(output, name) for name in IMAGES] + [t.grad for _, t in leaves.items()] + [probe.grad])
+    for before, after in zip(*found, strict=True):
+        assert torch.equal(before, after)
+
+
+def test_20_a_camera_without_a_pose_costs_nothing(cpu: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    splats, camera, _ = scene(0, dtype=torch.float32)
+    monkeypatch.setattr("gs2d.render.api.carried", None)  # would raise
+    rasterize(requiring_grad(splats), camera, backend=cpu).color.sum().backward()
+    with torch.no_grad():
+        rasterize(splats, learning(camera)[0], backend=cpu)
+    with pytest.raises(TypeError):
+        rasterize(splats, learning(camera)[0], backend=cpu)
+
+
+def test_20_gradient_rows_are_refused(backend: Backend) -> None:
+    splats, camera, _ = scene(0, dtype=torch.float32)
+    rows = torch.ones(len(splats), dtype=torch.bool)
+    with pytest.raises(ShapeError, match="gradient_rows must be None for a camera that learns"):
+        rasterize(splats, learning(camera)[0], backend=backend, gradient_rows=rows)
+    with torch.no_grad():
+        rasterize(splats, learning(camera)[0], backend=backend, gradient_rows=rows)
+
+
+@pytest.mark.parametrize("attribute", ["means", "quats", "sh0", "shN", "log_scales"])
+def test_20_splats_that_are_not_finite_do_not_count(backend: Backend, attribute: str) -> None:
+    splats, camera, cotangents = scene(1, dtype=torch.float32)
+    lens, pose = learning(camera)
+    contraction(rasterize(splats.rows(torch.arange(1, 12)), lens, backend=backend), cotangents).backward()
+    getattr(splats, attribute)[0] = torch.nan
+    broken, other = learning(camera)
+    contraction(rasterize(splats, broken, backend=backend), cotangents).backward()
+    assert pose.grad is not None
+    assert other.grad is not None
+    assert_close(other.grad, pose.grad, rtol=1e-4, atol=1e-4 * float(pose.grad.abs().max()))
+
+
+def test_20_where_nothing_is_seen_the_gradient_is_zero(backend: Backend) -> None:
+    _, camera, cotangents = scene(0)
+    for splats in (splat(mean=(0, 0, 0)).rows(torch.arange(0)), splat(mean=(1e3, 0, -5))):
+        lens, pose = learning(camera)
+        contraction(rasterize(splats, lens, backend=backend), cotangents).backward()
+        assert pose.grad is not None
+        assert not pose.grad.any()
+
+
+def test_20_the_bits_do_not_depend_on_the_number_of_threads(cpu: Backend) -> None:
+    rng = np.random.default_rng(0)
+    camera, found, before = random_camera(rng), [], torch.get_num_threads()
+    splats = random_splats(rng, camera, 3 * camera_gradient.PIECE, ("tiny",)).to(dtype=torch.float32)
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            lens, pose = learning(camera)
+            output = rasterize(splats, lens, backend=cpu)
+            (output.color.square().mean() + output.normal[..., 0].mean()).backward()
+            found.append(pose.grad)
+    finally:
+        torch.set_num_threads(before)
+    assert found[0] is not None
+    assert found[0].any()
+    assert all(torch.equal(found[0], other) for other in found[1:])
+
+
+def test_20_on_a_device_the_sums_are_those_of_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    splats, camera, cotangents = scene(4)
+    found = []
+    for on_host in (True, False):
+        monkeypatch.setattr(camera_gradient, "_on_host", lambda _, on_host=on_host: on_host)
+        lens, pose = learning(camera)
+        contraction(rasterize(splats, lens, backend="reference"), cotangents).backward()
+        found.append(pose.grad)
+    assert_close(*found, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("kind", ["normal_consistency", "normal_consistency_per_splat"])
+def test_20_normal_consistency_knows_that_both_normals_turn_with_the_camera(kind: str, masked: bool) -> None:
+    rng = np.random.default_rng(3)
+    camera = random_camera(rng)
+    splats = random_splats(rng, camera, 12, SMOOTH)
+    mask = torch.tensor(rng.random((camera.height, camera.width)) < 0.8) if masked else None
+    lens, expected = live(camera)
+    output = reference.rasterize(splats, lens, RasterSettings())
+    judge = {"normal_consistency": normal_consistency, "normal_consistency_per_splat": normal_consistency_per_splat}
+    judge[kind](output.normal, output.depth_mean, output.alpha, lens, mask).backward()
+
+    def found(change: Any = lambda output: output) -> Tensor:
+        lens, pose = learning(camera)
+        output = change(rasterize(splats, lens, backend="reference"))
+        target = torch.zeros_like(output.color)
+        options: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend_name": "reference"}
+        compute_losses(output, target, mask, lens, (LossTerm(kind, 1.0),), **options)[kind].backward()
+        return along_motions(pose.grad, camera)
+
+    assert_close(found(), along_motions(expected.grad, camera), rtol=1e-9, atol=1e-12)
+
+    def copied(output: RenderOutput) -> RenderOutput:  # normals that somebody has touched
+        return replace(output, normal=output.normal * 1)
+
+    assert_close(found(copied), along_motions(expected.grad, camera), rtol=1e-9, atol=1e-12)
+
+
+def test_a_camera_finds_its_way_back_to_a_photograph(cpu: Backend) -> None:
+    rng = np.random.default_rng(0)
+    camera = random_camera(rng)
+    camera = replace(camera, width=40, height=30, fx=40.0, fy=40.0, cx=20.0, cy=15.0)
+    splats = random_splats(rng, camera, 60, ("plain",)).to(dtype=torch.float32)
+    photograph = rasterize(splats, camera, backend=cpu).color
+    lost = moved(camera, torch.tensor([0.02, -0.01, 0.015, 0.05, -0.04, 0.03], dtype=torch.float64))
+    motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([motion], lr=3e-3)
+    for _ in range(120):
+        optimizer.zero_grad()
+        (rasterize(splats, moved(lost, motion), backend=cpu).color - photograph).abs().mean().backward()
+        optimizer.step()
+    found = moved(lost, motion.detach()).T_cam_world @ np.linalg.inv(camera.T_cam_world)
+    start = lost.T_cam_world @ np.linalg.inv(camera.T_cam_world)
+    assert np.abs(found - np.eye(4)).max() < 0.1 * np.abs(start - np.eye(4)).max()
+
+
+def test_a_backend_by_name_takes_a_learning_camera_too() -> None:
+    splats, camera, _ = scene(0)
+    lens, pose = learning(camera)
+    rasterize(splats, lens, backend=get_backend("reference")).color.sum().backward()
+    assert pose.grad is not None
