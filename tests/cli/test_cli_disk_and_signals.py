@@ -145,8 +145,17 @@ def test_a_second_ctrl_c_right_after_the_first_does_not_stop_the_cleaning_up(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("stdout", "code", "message"), [("closed pipe", 141, ""), ("full disk", 2, "No space left")])
-def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(stdout: str, code: int, message: str) -> None:
+@pytest.mark.parametrize(
+    ("words", "stdout", "code", "message"),
+    [
+        (["recipes"], "closed pipe", 141, ""),
+        (["recipes"], "full disk", 2, "No space left"),
+        (["train", "--help"], "closed pipe", 141, ""),
+    ],
+)
+def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(
+    words: list[str], stdout: str, code: int, message: str
+) -> None:
     if stdout == "full disk":
         if not os.path.exists("/dev/full"):
             pytest.skip("there is no /dev/full here")
@@ -155,8 +164,9 @@ def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(stdout: str, code: int,
         reader, file = os.pipe()
         os.close(reader)
     try:
-        words = [sys.executable, "-m", "gs2d", "recipes"]
-        done = subprocess.run(words, stdout=file, stderr=subprocess.PIPE, text=True, timeout=100)
+        done = subprocess.run(
+            [sys.executable, "-m", "gs2d", *words], stdout=file, stderr=subprocess.PIPE, text=True, timeout=100
+        )
     finally:
         os.close(file)
     assert done.returncode == code

@@ -12,12 +12,15 @@ import pytest
 import torch
 
 from ball_runs import Stop, comparable, options
-from gs2d.errors import DiskError, DivergedError, RecipeError, RunError
+from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.ply import read_splats
 from gs2d.io.run import RunFolder
 from gs2d.pipeline.demo import DemoOptions, demo
-from gs2d.pipeline.events import Event, Notice, Step
+from gs2d.pipeline.estimate import duration
+from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.prepare import prepare
 from gs2d.pipeline.train import train
+from tiny import write_capture
 
 
 def test_a_run_holds_everything_that_was_promised(undisturbed: RunFolder) -> None:
@@ -190,3 +193,47 @@ def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Pa
     assert "... and 1 more views skipped; `gs2d info` lists them" in texts
     assert any(text.startswith("near plane at") for text in texts)
     assert not (tmp_path / "run").exists()  # nothing was saved yet
+
+
+def test_an_estimate_is_told_before_training_and_changes_no_byte(
+    undisturbed: RunFolder, capture: Path, tmp_path: Path
+) -> None:
+    heard: list[Event] = []
+    run = train(replace(options(capture, tmp_path / "run"), estimate=True), heard.append)
+    assert run.file("splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
+    texts = [event.text for event in heard if isinstance(event, Notice)]
+    told = next(i for i, text in enumerate(texts) if text.startswith("training will take about"))
+    assert "60 iterations" in texts[told]
+    assert "photographs do not train, they score the result" in texts[told + 1]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.4, "0 s"),
+        (89, "89 s"),
+        (91, "2 min"),
+        (5399, "90 min"),
+        (5400, "1.5 h"),
+        (36001, "10 h"),
+        (172_800, "2.0 days"),
+    ],
+)
+def test_times_are_told_as_people_say_them(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(("every", "test"), [(0, 0), (2, 4), (3, 3)])
+def test_every_so_many_th_view_is_a_test_view(tmp_path: Path, every: int, test: int) -> None:
+    capture = tmp_path / "capture"
+    write_capture(capture, train=8, test=0, size=20)
+    (capture / "transforms_train.json").rename(capture / "transforms.json")  # of nerfstudio: without a split
+    job = prepare(options(capture, tmp_path / "run", test_every=every), ignore)
+    assert (len(job.scene.train), len(job.scene.test)) == (8 - test, test)
+
+
+def test_a_capture_with_a_split_of_its_own_takes_no_other(capture: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        ProtocolError, match=r"--test-every is for captures without a split of their own, got .*leave it"
+    ):
+        prepare(options(capture, tmp_path / "run", test_every=4), ignore)

@@ -17,6 +17,7 @@ def execute(command: Common, console: Console) -> None:
     """Run a parsed command."""
     actions: dict[type, Callable[[Any, Console], None]] = {
         c.Demo: demo,
+        c.Reconstruct: reconstruct,
         c.Poses: poses,
         c.Train: train,
         c.Mesh: mesh,
@@ -43,13 +44,19 @@ def train_options(command: c.Train) -> Any:
     return training_options(command, command, **{name: getattr(command, name) for name in own})
 
 
+def reconstruct(command: c.Reconstruct, console: Console) -> None:
+    """``gs2d reconstruct``."""
+    from gs2d.cli.reconstruct import reconstruct as run_all
+
+    run_all(command, console)
+
+
 def training_options(command: TrainingCommon, training: Training, **own: Any) -> Any:
     """The pipeline's options: every field of `Training` by its name, those of every training, and a command's own."""
     from gs2d.pipeline.options import TrainOptions
 
-    shared = {field.name: getattr(training, field.name) for field in fields(Training)}
     common = ("backend", "seed", "threads", "resume", "overwrite")
-    return TrainOptions(**shared, **{name: getattr(command, name) for name in common}, **own)
+    return TrainOptions(**values(Training, training), **{name: getattr(command, name) for name in common}, **own)
 
 
 def train(command: c.Train, console: Console) -> None:
@@ -59,6 +66,11 @@ def train(command: c.Train, console: Console) -> None:
     run = run_training(train_options(command), console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console)
+
+
+def values(kind: type[Any], options: Any) -> dict[str, Any]:
+    """The fields that ``options`` has of a group of options, by name; not those of its own."""
+    return {field.name: getattr(options, field.name) for field in fields(kind)}
 
 
 def demo(command: c.Demo, console: Console) -> None:
@@ -302,7 +314,13 @@ def info(command: c.Info, console: Console) -> None:
 
 
 # -- tables ----------------------------------------------------------------------------------------------------
-def show_run(path: Path, metrics: dict[str, Any], console: Console, definition: dict[str, Any] | None = None) -> None:
+def show_run(
+    path: Path,
+    metrics: dict[str, Any],
+    console: Console,
+    definition: dict[str, Any] | None = None,
+    extra: dict[str, Any] | None = None,
+) -> None:
     """The metrics of a run as a table, and where its files are."""
     if definition is not None:
         recipe, scene = definition["recipe"]["name"], definition["scene"]
@@ -325,10 +343,10 @@ def show_run(path: Path, metrics: dict[str, Any], console: Console, definition: 
     columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
     console.table("", columns, rows)
     _surface_table(metrics.get("surface"), console)
-    for name in ("report.html", "mesh.ply", "splats.ply"):
+    for name in ("report.html", "mesh.ply", "mesh.glb", "splats.ply"):
         if (path / name).exists():
             console.say(f"{path / name}")
-    extra = {} if definition is None else {"definition": definition}
+    extra = (extra or {}) | ({} if definition is None else {"definition": definition})
     console.result({"run": str(path), **metrics, **extra})
 
 

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import gs2d
-from gs2d.cli.commands import COMMANDS, Command, Demo, Doctor, Info, Recipes, TableCommon, Train
+from gs2d.cli.commands import COMMANDS, Command, Demo, Doctor, Info, Recipes, Reconstruct, TableCommon, Train
 from gs2d.cli.console import Console
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.options import Common, TrainingCommon
@@ -174,7 +174,8 @@ def _report(error: Exception, debug: bool) -> int:
 
 def _interrupted(argv: Sequence[str], command: Common) -> int:
     line = "interrupted"
-    if isinstance(command, Train | Demo) and any((command.out / "checkpoints").glob("*.pt")):
+    kept = isinstance(command, Train | Demo) and any((command.out / "checkpoints").glob("*.pt"))
+    if kept or isinstance(command, Reconstruct):  # which starts where there is nothing yet
         words = [word for word in argv if word not in ("--resume", "--overwrite")]
         line += f"; resume with: gs2d {shlex.join([*words, '--resume'])}"
     if isinstance(command, TableCommon) and not command.no_train:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from gs2d.cli.options import Backend, Common, Finding, Overrides, Training, TrainingCommon
 
@@ -25,6 +25,29 @@ class Demo(TrainingCommon):
     """Photograph as a camera on automatic does: training pictures differ in exposure and white balance."""
     exposure: bool = False
     """Learn an exposure and a white balance for each photograph, as in `gs2d train`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct(TrainingCommon):
+    """A folder of photographs to cameras, splats, a mesh and a report: `gs2d poses` and `gs2d train` in one."""
+
+    photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
+    """Folder of photographs, with or without sub-folders; it is only read."""
+    out: Annotated[Path, arg(metavar="RUN")]
+    """Run folder to make; the photographs with their cameras go to its sub-folder `capture`."""
+    quality: Literal["draft", "normal", "full"] = "normal"
+    """How long is trained on how large pictures. On a CPU: 0.03 of the full schedule at 400 px, 0.1 at 800, all at
+    1600; on a GPU 0.1 at 800 px, 0.5 at 1600, all at 1600. The time it will take is told before it begins."""
+    schedule_scale: float | None = None
+    """Fraction of the full schedule (default: by --quality)."""
+    downscale: int | None = None
+    """Shrink the photographs by this integer for training (default: by --quality)."""
+    texture: bool = False
+    """Also write mesh.glb, with a texture from the photographs."""
+    training: Annotated[Training, OmitArgPrefixes] = field(default_factory=Training)
+    """As in `gs2d train`."""
+    cameras: Annotated[Finding, OmitArgPrefixes] = field(default_factory=Finding)
+    """As in `gs2d poses`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,10 +281,11 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Poses, Train, Mesh, Render, View, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
+    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
+    | Annotated[Reconstruct, subcommand("reconstruct")]
     | Annotated[Poses, subcommand("poses")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Mesh, subcommand("mesh")]

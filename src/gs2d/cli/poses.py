@@ -39,9 +39,10 @@ def poses(command: c.Poses, console: Console) -> None:
 
 def poses_lines(result: dict[str, Any]) -> list[str]:
     """The outcome in lines for people."""
+    from gs2d.pipeline.poses import placed_line
+
     lines = [
-        f"{result['placed']} of {result['count']} photographs have a place; {result['points']:,} points, each seen by "
-        f"{result['photos_per_point']:.1f} of them, {result['mean_error_px']:.2f} px off in the mean",
+        placed_line(result),
         *(f"camera: {camera['about']}" for camera in result["cameras"][:4]),
     ]
     if len(result["cameras"]) > 4:

@@ -59,6 +59,10 @@ class TrainOptions:
         Views that are rendered after each stage for the report.
     allowed : tuple of str
         Names that may already be in ``out`` (the demo's capture).
+    test_every : int or None
+        Every n-th view is a test view, 0 = none; None: what the protocol says.
+    estimate : bool
+        Tell before training how long it will take and what is held out.
     """
 
     scene: Path
@@ -83,6 +87,8 @@ class TrainOptions:
     title: str | None = None
     shown_views: int = 3
     allowed: tuple[str, ...] = ()
+    test_every: int | None = None
+    estimate: bool = False
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "start_from", "cache")

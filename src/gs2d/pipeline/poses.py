@@ -31,6 +31,9 @@ CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar")
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 SHARED_ENOUGH = 8  # photographs of one camera that tell more than its focal length and one distortion
+ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
+    "cameras", "camera_model", "matching", "overlap", "neighbours", "max_size", "feature_size", "seed"
+)  # fmt: skip
 SMALLEST_SIDE, MOST_THREADS = 64, 1024
 _DOUBTFUL_SHARE, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
 
@@ -92,7 +95,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     """
     started = time.monotonic()
     check_installed()
-    _check(options)
+    check_poses_options(options)
     paths, notes = find_photos(options.photos)
     for note in notes:
         on_event(Notice(note))
@@ -130,7 +133,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     return {"capture": str(options.out), **result}
 
 
-def _check(options: PosesOptions) -> None:
+def check_poses_options(options: PosesOptions) -> None:
     """Raise RunError for an option that means nothing."""
     for name, allowed in (
         ("cameras", ("auto", "one", "each")),
@@ -265,6 +268,7 @@ def _result(
             for i, piece in enumerate(pieces[1:], start=1)
         ],
         "photographs": rows,
+        "asked": {name: getattr(options, name) for name in ASKED_FOR},
         "options": {
             "matching": request.matching,
             "pairs_matched": len(facts.matches),
@@ -277,6 +281,14 @@ def _result(
         },
         "created": now(),
     }
+
+
+def placed_line(result: dict[str, Any]) -> str:
+    """How well it went, for people."""
+    return (
+        f"{result['placed']} of {result['count']} photographs have a place; {result['points']:,} points, each seen by "
+        f"{result['photos_per_point']:.1f} of them, {result['mean_error_px']:.2f} px off in the mean"
+    )
 
 
 def _title(result: dict[str, Any]) -> str:
@@ -309,4 +321,4 @@ def _doubts(result: dict[str, Any]) -> list[str]:
     return doubts
 
 
-__all__ = ["PosesOptions", "find_poses"]
+__all__ = ["ASKED_FOR", "PosesOptions", "check_poses_options", "find_poses", "placed_line"]

@@ -14,7 +14,7 @@ import torch
 
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.data.layouts import missing_lines, protocol_of
-from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
@@ -31,6 +31,7 @@ from gs2d.train.loop import raster_settings
 
 DECODE_THREADS = 2
 SHOWN_SKIPS = 3
+MOST_VIEWS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -118,12 +119,12 @@ def build_recipe(
     return validate(apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides))
 
 
-def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
-    """Check the options, cheapest first, then read the capture.
+def check_train_options(options: TrainOptions) -> Recipe:
+    """The recipe, if the options mean something; nothing is read.
 
     Raises
     ------
-    RecipeError, ProtocolError, BackendError, DataError
+    RecipeError, ProtocolError
     """
     recipe = build_recipe(
         options.recipe,
@@ -140,14 +141,27 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
         raise RecipeError(f"--checkpoint-seconds must be a positive number, got {options.checkpoint_seconds}")
     if options.stage2_cache_mb < 0:
         raise RecipeError(f"--stage2-cache-mb must be a whole number >= 0, got {options.stage2_cache_mb}")
-    named = options.protocol
-    if isinstance(named, str) and named != "auto":
-        named = get_protocol(named)
+    if options.test_every is not None and options.test_every not in (0, *range(2, MOST_VIEWS)):
+        raise ProtocolError(
+            f"--test-every must be 0 (all views train) or a whole number >= 2 (every n-th is a test view), got "
+            f"{options.test_every}"
+        )
+    if isinstance(options.protocol, str) and options.protocol != "auto":
+        get_protocol(options.protocol)
+    return recipe
+
+
+def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
+    """Check the options, cheapest first, then read the capture.
+
+    Raises
+    ------
+    RecipeError, ProtocolError, BackendError, DataError
+    """
+    recipe = check_train_options(options)
     backend = choose_backend(options.backend, on_event)
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
-    protocol = protocol_of(options.scene, scene_format) if isinstance(named, str) else named
-    if isinstance(named, str) and protocol is not protocol_for(scene_format):
-        on_event(Notice(f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"))
+    protocol = choose_protocol(options, scene_format, on_event)
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
@@ -155,6 +169,30 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     if protocol.near is None:
         on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
     return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, options.stage2_cache_mb << 20)
+
+
+def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent) -> Protocol:
+    """The protocol of a name, or of the capture, with what the options change in it.
+
+    Raises
+    ------
+    ProtocolError
+    """
+    named = options.protocol
+    if named == "auto":
+        protocol = protocol_of(options.scene, scene_format)
+        if protocol is not protocol_for(scene_format):
+            on_event(Notice(f"protocol {protocol.name}: {options.scene.name} is a scene of that data set"))
+    else:
+        protocol = get_protocol(named) if isinstance(named, str) else named
+    if options.test_every is None:
+        return protocol
+    if scene_format == "blender":
+        raise ProtocolError(
+            f"--test-every is for captures without a split of their own, got {options.scene} with its "
+            "transforms_test.json; leave it out"
+        )
+    return replace(protocol, test_every=options.test_every)
 
 
 def choose_backend(name: str, on_event: OnEvent) -> Backend:

@@ -31,6 +31,8 @@ from gs2d.pipeline.surface import OPAQUE, extract_mesh
 from gs2d.splats import Splats
 from gs2d.triangles import Mesh
 
+PACKAGES = ("xatlas", "fast_simplification")  # of the extra `texture`
+
 
 def texture_run(
     path: Path,
@@ -51,7 +53,7 @@ def texture_run(
     RunError, DataError, ProtocolError, BackendError, DiskError
     """
     check_texture_options(options)
-    for package in ("xatlas", "fast_simplification"):
+    for package in PACKAGES:
         required(package)  # before minutes are spent
     path = Path(path)
     target = path / TEXTURED if out is None else Path(out)

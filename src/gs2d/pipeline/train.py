@@ -10,7 +10,7 @@ import torch
 from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
-from gs2d.pipeline.events import OnEvent, Phase, ignore
+from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
@@ -63,6 +63,9 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             extra = {"title": options.title} if options.title else {}
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         start = choose_start(run, job, options, on_event)
+        if options.estimate and start.state is None:
+            for text in foretold(job):
+                on_event(Notice(text))
         splats, exposures = train_stages(run, job, options, start, on_event)
         write_exposures(run, exposures, on_event)
         finish(run, job, splats, on_event)
@@ -118,6 +121,19 @@ def train_stages(
     with recorder.naming_the_last_checkpoint():
         trainer.run()
     return trainer.splats, named(job.scene.train, trainer.state.exposures)
+
+
+def foretold(job: Job) -> list[str]:
+    """What a person wants to know before hours of training: which photographs do not train, and how long it takes."""
+    from gs2d.pipeline.estimate import estimate, estimate_text
+
+    found, test, views = estimate(job), len(job.scene.test), len(job.scene.views)
+    lines = [] if found is None else [estimate_text(found, job.recipe.iterations)]
+    if test:
+        lines.append(
+            f"{test} of {views} photographs do not train, they score the result (--test-every 0 trains on all)"
+        )
+    return lines
 
 
 def finish(run: RunFolder, job: Job, splats: Splats, on_event: OnEvent) -> None:

@@ -57,6 +57,11 @@ def check_out(given: Path, photographs: Path, *, overwrite: bool) -> None:
         raise RunError(f"--out {given} is the folder that you are in, and is replaced as a whole; go elsewhere")
 
 
+def hidden_workplace(out: Path) -> Path:
+    """Where the capture ``out`` is made."""
+    return out.with_name(f".{out.name[:200]}.poses")
+
+
 @contextlib.contextmanager
 def workplace(out: Path) -> Iterator[Path]:
     """The hidden folder beside the capture, empty and held against other processes; removed at the end.
@@ -66,7 +71,7 @@ def workplace(out: Path) -> Iterator[Path]:
     RunError
         Another process makes the same capture.
     """
-    work = out.with_name(f".{out.name[:200]}.poses")
+    work = hidden_workplace(out)
     made = make_folder(work)
     with contextlib.ExitStack() as held:
         try:

@@ -1,0 +1,74 @@
+"""How long a training will take, from a few iterations of it that are thrown away."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+
+from gs2d.errors import Gs2dError
+from gs2d.pipeline.prepare import Job
+from gs2d.train.loop import Trainer
+
+WARM_UP, FEWEST, MOST = 2, 3, 30  # iterations
+MEASURED_SECONDS = 3.0
+# Seconds of a whole training over iterations x seconds of its first ones: docs/decisions.md has the captures.
+LEAST_GROWTH, MOST_GROWTH = 1.0, 3.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Seconds that training takes, between two bounds, from ``iteration``: seconds of an iteration at its start."""
+
+    iteration: float
+    least: float
+    most: float
+
+
+def estimate(job: Job) -> Estimate | None:
+    """Measure the first iterations of a job and forget them; None where they fail, of which training itself will tell.
+
+    Iterations get slower while splats are added, so that the first ones tell a lower bound; how much slower is known
+    from other captures only.
+    """
+    try:
+        trainer = Trainer(job.scene, job.recipe, job.protocol, backend=job.backend, progress_every=1)
+        trainer.enter(0)
+        iteration = _seconds(trainer, job.recipe.stages[0].iterations)
+    except Gs2dError:
+        return None
+    if iteration is None:
+        return None
+    whole = iteration * job.recipe.iterations
+    return Estimate(iteration, LEAST_GROWTH * whole, MOST_GROWTH * whole)
+
+
+def _seconds(trainer: Trainer, iterations: int) -> float | None:
+    """The median of some iterations, without the first, which compile and decode; None where there are too few."""
+    taken: list[float] = []
+    begun = time.perf_counter()
+    for number in range(min(iterations, WARM_UP + MOST)):
+        started = time.perf_counter()
+        trainer.step()
+        if number >= WARM_UP:
+            taken.append(time.perf_counter() - started)
+        if len(taken) >= FEWEST and time.perf_counter() - begun > MEASURED_SECONDS:
+            break
+    return statistics.median(taken) if len(taken) >= FEWEST else None
+
+
+def duration(seconds: float) -> str:
+    """A time as people say it: "40 s", "12 min", "3.5 h", "2.1 days"."""
+    for unit, size, until in (("s", 1, 90), ("min", 60, 90 * 60), ("h", 3600, 48 * 3600)):
+        if seconds < until:
+            digits = 1 if unit == "h" and seconds < 10 * size else 0
+            return f"{seconds / size:.{digits}f} {unit}"
+    return f"{seconds / 86400:.1f} days"
+
+
+def estimate_text(found: Estimate, iterations: int) -> str:
+    """The estimate for people."""
+    return (
+        f"training will take about {duration(found.least)} to {duration(found.most)}: {iterations:,} iterations, "
+        f"{found.iteration * 1000:.0f} ms each at the start and more as splats are added"
+    )

@@ -1,0 +1,283 @@
+"""``gs2d reconstruct``: a folder of photographs becomes cameras, splats, a mesh and a report, in one run folder."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from gs2d.data import detect_format, load_scene
+from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.io.files import read_json
+from gs2d.io.run import LOCK, TEXTURED, RunFolder, check_claim, is_run, make_folder, remove_made
+from gs2d.mesh.atlas import required
+from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.options import TrainOptions, paths_of
+from gs2d.pipeline.poses import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
+from gs2d.pipeline.prepare import check_train_options
+from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
+from gs2d.pipeline.texture import texture_run
+from gs2d.pipeline.train import train
+from gs2d.render.backend import get_backend
+from gs2d.sfm.photos import find_photos
+from gs2d.sfm.solve import check_installed
+from gs2d.sfm.workplace import POSES_JSON, POSES_PNG, hidden_workplace
+
+CAPTURE = "capture"
+FEW = 24  # photographs, below which each is needed for the surface and none is held out
+NO_NAMES = ("images", "photos", "photographs", "pictures")  # of folders; the one above has a better one
+SHOWN_LOST = 3  # photographs without a place that are named; poses.json has all
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How much is trained on what: a fraction of the full schedule, and about how long the longer side is, px."""
+
+    schedule_scale: float
+    side: int
+
+
+_FULL = Quality(1.0, 1600)  # the side at which the official code trains, too
+QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> device -> what it means there
+    {
+        "draft": {"cpu": Quality(0.03, 400), "cuda": Quality(0.1, 800)},
+        "normal": {"cpu": Quality(0.1, 800), "cuda": Quality(0.5, 1600)},
+        "full": {"cpu": _FULL, "cuda": _FULL},
+    }
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions:
+    """From photographs to a mesh.
+
+    Attributes
+    ----------
+    photos, out : Path
+        The folder of photographs, which is only read, and the run folder.
+    quality : str
+        A name of ``QUALITIES``: it sets schedule and picture size by the device of the backend.
+    schedule_scale : float or None
+        Fraction of the full schedule; None: what ``quality`` says.
+    downscale : int or None
+        By what the photographs are shrunk for training; None: what ``quality`` says.
+    texture : bool
+        Write ``mesh.glb`` too.
+    threads, seed, resume, overwrite
+        Of both commands; see ``TrainOptions``.
+    finding, training : mapping
+        The other fields of ``PosesOptions`` and of ``TrainOptions``, by their names.
+    """
+
+    photos: Path
+    out: Path
+    quality: str = "normal"
+    schedule_scale: float | None = None
+    downscale: int | None = None
+    texture: bool = False
+    threads: int | None = None
+    seed: int = 0
+    resume: bool = False
+    overwrite: bool = False
+    finding: Mapping[str, Any] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        paths_of(self, "photos", "out")
+
+    @property
+    def poses_options(self) -> PosesOptions:
+        """Those of ``gs2d poses``, which puts the capture into the run folder."""
+        return PosesOptions(
+            photos=self.photos,
+            out=self.out / CAPTURE,
+            threads=self.threads,
+            seed=self.seed,
+            overwrite=self.overwrite,
+            **self.finding,
+        )
+
+    @property
+    def train_options(self) -> TrainOptions:
+        """Those of ``gs2d train``, but for what ``quality`` decides."""
+        capture = self.out / CAPTURE
+        return TrainOptions(
+            scene=capture,
+            out=self.out,
+            format="colmap",
+            threads=self.threads,
+            seed=self.seed,
+            resume=self.resume,
+            overwrite=self.overwrite,
+            title=_title(self.photos.resolve()),
+            allowed=(CAPTURE, hidden_workplace(capture).name),
+            estimate=True,
+            **self.training,
+        )
+
+
+def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunFolder:
+    """Find the cameras of photographs and train on them; resumable.
+
+    What can be refused is refused before anything is made. The capture is kept in the run folder from when it is
+    whole, also where training fails later: ``resume`` then does not find the cameras again.
+
+    Raises
+    ------
+    Gs2dError
+    """
+    quality = _check(options)
+    capture = options.out / CAPTURE
+    if options.resume and (capture / POSES_JSON).exists():
+        poses = _same_poses(capture, options)
+        on_event(Notice(f"the cameras were found before, in {capture}: {placed_line(poses)}"))
+    else:
+        with _claimed(options.out):
+            poses = find_poses(options.poses_options, on_event)
+            if options.overwrite:  # its checkpoints are of other cameras
+                RunFolder(options.out).clear()
+        _tell(poses, capture, on_event)
+    training = replace(options.train_options, overwrite=False)
+    run = train(_by_the_photographs(training, options, quality, on_event), on_event)
+    if options.texture and not run.file(TEXTURED).exists():
+        texture_run(run.path, on_event=on_event, threads=options.threads)
+    return run
+
+
+def _title(photos: Path) -> str:
+    """What the report is called."""
+    return photos.parent.name if photos.name.lower() in NO_NAMES and photos.parent.name else photos.name
+
+
+def _check(options: ReconstructOptions) -> Quality:
+    """Refuse what can be refused before anything is made; the schedule and the picture size that are meant."""
+    training, out = options.train_options, options.out
+    if options.quality not in QUALITIES:
+        raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {options.quality}")
+    device = get_backend(training.backend).device
+    quality = QUALITIES[options.quality][device]
+    if options.schedule_scale is not None:
+        quality = replace(quality, schedule_scale=options.schedule_scale)
+    downscale = 1 if options.downscale is None else options.downscale
+    check_train_options(replace(training, schedule_scale=quality.schedule_scale, downscale=downscale))
+    check_claim(out, resume=options.resume, overwrite=options.overwrite, allowed=training.allowed)
+    if options.texture:
+        for package in TEXTURE_PACKAGES:
+            required(package)
+    if options.resume and (out / CAPTURE / POSES_JSON).exists():
+        return quality
+    check_installed()
+    check_poses_options(options.poses_options)
+    _check_photos(options)
+    if (out / CAPTURE).exists() and not options.overwrite:
+        raise RunError(
+            f"{out} holds the cameras of photographs, and no run: go on with --resume, or begin anew with --overwrite"
+        )
+    return quality
+
+
+def _check_photos(options: ReconstructOptions) -> None:
+    """Refuse a folder that is no folder of photographs without cameras, or that the run would lie in."""
+    photos, out = options.photos, options.out
+    find_photos(photos)
+    folder, run = photos.resolve(), out.resolve()
+    if run == folder or folder in run.parents or run in folder.parents:
+        raise RunError(f"--out {out} must lie beside the photographs, not in their folder or above it ({photos})")
+    try:
+        kind = detect_format(photos)
+    except DataError:
+        return
+    raise DataError(
+        f"{photos} must hold photographs alone, got cameras too ({kind}): gs2d train {shlex.quote(str(photos))} --out "
+        f"{shlex.quote(str(out))} trains with these; to find others give the folder of the photographs"
+    )
+
+
+@contextmanager
+def _claimed(out: Path) -> Iterator[None]:
+    """Hold the run folder while something else than training works in it; what was made for nothing goes again."""
+    made, run = make_folder(out), RunFolder(out)
+    try:
+        with run.locked():
+            try:
+                yield
+            except BaseException:
+                if not is_run(out):
+                    run.file(LOCK).unlink(missing_ok=True)
+                raise
+    except BaseException:
+        remove_made(made)
+        raise
+
+
+def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
+    """What ``poses.json`` holds, if these photographs and options made it.
+
+    Raises
+    ------
+    RunError
+        Names the first difference.
+    """
+    poses, wanted = read_json(capture / POSES_JSON), options.poses_options
+    again = "resume with the same, or begin anew with --overwrite"
+    try:
+        if poses["photos"] != str(options.photos.resolve()):
+            raise RunError(f"{capture} was made of {poses['photos']}, not of {options.photos}; {again}")
+        for name in ASKED_FOR:
+            if poses["asked"][name] != getattr(wanted, name):
+                option = f"--{name.replace('_', '-')}"
+                raise RunError(
+                    f"{capture} was made with {option} {poses['asked'][name]}, now {getattr(wanted, name)}; {again}"
+                )
+        if options.photos.is_dir():  # their folder is not needed any more
+            before = {row["source"] for row in poses["photographs"]}
+            now = {path.relative_to(options.photos).as_posix() for path in find_photos(options.photos)[0]}
+            for name in sorted(before ^ now)[:1]:
+                what = "is new in" if name in now else "is gone from"
+                raise RunError(
+                    f"{name} {what} {options.photos} since the cameras were found; begin anew with --overwrite"
+                )
+        placed_line(poses)
+    except (KeyError, TypeError) as error:
+        raise RunError(
+            f"{capture / POSES_JSON} must be as `gs2d reconstruct` writes it, got another entry ({error}); begin anew "
+            "with --overwrite"
+        ) from error
+    return dict(poses)
+
+
+def _tell(poses: dict[str, Any], capture: Path, on_event: OnEvent) -> None:
+    """How the search for the cameras ended."""
+    on_event(Notice(f"{placed_line(poses)}; {capture / POSES_PNG} shows them"))
+    lost = [row for row in poses["photographs"] if not row["placed"]]
+    for row in lost[:SHOWN_LOST]:
+        on_event(Notice(f"no place: {row['source']}: {row['reason']}"))
+    if len(lost) > SHOWN_LOST:
+        on_event(Notice(f"... and {len(lost) - SHOWN_LOST} more without a place, in {capture / POSES_JSON}"))
+
+
+def _by_the_photographs(
+    training: TrainOptions, options: ReconstructOptions, quality: Quality, on_event: OnEvent
+) -> TrainOptions:
+    """What depends on the photographs that have a place: the size of the pictures, and whether some are held out."""
+    cameras = [view.camera for view in load_scene(training.scene, format="colmap", test_every=0).views]
+    largest = max(cameras, key=lambda camera: max(camera.width, camera.height))
+    side = max(largest.width, largest.height)
+    downscale = options.downscale or max(1, math.floor(side / quality.side + 0.5))
+    chosen = replace(training, schedule_scale=quality.schedule_scale, downscale=downscale)
+    iterations, shown = check_train_options(chosen).iterations, largest.downscaled(downscale)
+    on_event(
+        Notice(
+            f"quality {options.quality}: {iterations:,} iterations (--schedule-scale {quality.schedule_scale:g}) "
+            f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
+        )
+    )
+    if training.test_every is None and training.protocol == "auto" and len(cameras) < FEW:
+        on_event(Notice(f"all photographs train, because they are fewer than {FEW} (--test-every 8 holds some out)"))
+        chosen = replace(chosen, test_every=0)
+    return chosen

@@ -1,0 +1,303 @@
+"""``gs2d reconstruct``: from photographs to a run; what is refused, kept and not done twice."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cli_runs import TINY, one_line
+from gs2d.cli import commands, run
+from gs2d.cli.app import parse
+from gs2d.cli.options import Training
+from gs2d.io.run import open_run
+from gs2d.pipeline import reconstruct as module
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.reconstruct import FEW, QUALITIES, ReconstructOptions, reconstruct
+from room_photos import Room, write_room
+from tiny import write_capture
+
+SMALL = {"threads": 1, "quality": "draft", "schedule_scale": 0.0005, "downscale": 8}
+TRAINING = {"overrides": ("init_points=100", "surface.densify.max_splats=150")}
+
+
+def words_for(photos: Path, out: Path, *words: str) -> list[str]:
+    return ["reconstruct", str(photos), "--out", str(out), "--threads", "1", "--downscale", "8", *TINY, *words]
+
+
+def started(room: Room, tmp_path: Path) -> Path:
+    """A run folder in which the cameras were found before."""
+    out = tmp_path / "run"
+    shutil.copytree(room.capture, out / "capture")
+    return out
+
+
+def notices(options: ReconstructOptions) -> list[str]:
+    heard: list[Event] = []
+    reconstruct(options, heard.append)
+    return [event.text for event in heard if isinstance(event, Notice)]
+
+
+def test_photographs_become_a_run_with_its_capture(
+    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "runs" / "a room"
+    assert run(words_for(room.photos, out)) == 0
+    said = capsys.readouterr()
+    assert "12 of 12 photographs have a place" in said.err
+    assert "on pictures of 25x25 (--downscale 8)" in said.err
+    assert re.search(r"training will take about \d+ s to \d+ s: \d+ iterations", said.err)
+    assert said.out.splitlines()[-1] == f"look at it: gs2d view '{out}'"
+    assert {"capture", "splats.ply", "mesh.ply", "report.html"} <= {path.name for path in out.iterdir()}
+    assert sorted(path.name for path in (out / "capture").iterdir()) == ["images", "poses.json", "poses.png", "sparse"]
+    definition = open_run(out).definition()
+    assert definition["scene"]["path"] == str((out / "capture").resolve())
+    assert (definition["scene"]["train"], definition["scene"]["test"]) == (12, 0)  # so few are all needed
+    assert run(["render", str(out), "--split", "train", "--quiet"]) == 0  # later commands find the capture
+    # what is done is not done again, and the folder of the photographs is not needed any more
+    finished = (out / "splats.ply").read_bytes()
+    assert run([*words_for(room.photos, out, "--resume", "--json", "--quiet")]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["poses"]["placed"] == 12
+    assert (out / "splats.ply").read_bytes() == finished
+
+
+def test_cameras_that_were_found_are_not_found_again(
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = started(room, tmp_path)
+    monkeypatch.setattr(module, "find_poses", lambda *_: pytest.fail("cameras were looked for again"))
+    options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
+    said = notices(options)
+    assert any(text.startswith(f"the cameras were found before, in {out / 'capture'}: 12 of 12") for text in said)
+    assert (out / "mesh.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["--feature-size", "1000"],
+            "was made with --feature-size 1600, now 1000; resume with the same, or begin anew",
+        ),
+        (["--cameras", "one"], "was made with --cameras auto, now one"),
+        (["--seed", "3"], "was made with --seed 0, now 3"),
+    ],
+)
+def test_a_resume_with_other_options_for_the_cameras_is_refused(
+    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    out = started(room, tmp_path)
+    assert run(words_for(room.photos, out, "--resume", "--quiet", *words)) == 2
+    assert message in one_line(capsys.readouterr().err)
+
+
+def test_a_resume_with_other_photographs_is_refused(
+    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, photos = started(room, tmp_path), tmp_path / "photos"
+    shutil.copytree(room.photos, photos)
+    assert run(words_for(photos, out, "--resume", "--quiet")) == 2
+    assert f"was made of {room.photos}, not of {photos}" in one_line(capsys.readouterr().err)
+    poses = json.loads((out / "capture" / "poses.json").read_text())
+    (out / "capture" / "poses.json").write_text(json.dumps({**poses, "photos": str(photos)}))
+    (photos / "003.jpg").rename(photos / "new.jpg")
+    assert run(words_for(photos, out, "--resume", "--quiet")) == 2
+    assert "003.jpg is gone from" in one_line(capsys.readouterr().err)
+    (out / "capture" / "poses.json").write_text("{}")
+    assert run(words_for(photos, out, "--resume", "--quiet")) == 2
+    assert "must be as `gs2d reconstruct` writes it, got another entry ('photos')" in one_line(capsys.readouterr().err)
+
+
+def test_a_folder_with_cameras_only_says_how_to_go_on(
+    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = started(room, tmp_path)
+    assert run(words_for(room.photos, out, "--quiet")) == 2
+    assert "and no run: go on with --resume, or begin anew with --overwrite" in one_line(capsys.readouterr().err)
+
+
+def nothing(_photos: Path) -> None: ...
+
+
+def a_capture(photos: Path) -> None:
+    write_capture(photos, train=3, test=1, size=20)
+    for i, path in enumerate(photos.rglob("*.png")):
+        shutil.copy(path, photos / f"{i}.png")
+
+
+@pytest.mark.parametrize(
+    ("fill", "words", "message"),
+    [
+        (nothing, [], "must hold 3 or more photographs, got none"),
+        (lambda photos: write_room(photos, 1), [], "must hold 3 or more photographs, got 1 photographs"),
+        (a_capture, [], "must hold photographs alone, got cameras too (blender): gs2d train"),
+        (lambda photos: (photos / "a.heic").write_bytes(b"x"), [], "HEIC is not decoded here; convert to JPEG"),
+        (lambda photos: write_room(photos, 3), ["--schedule-scale", "0"], "schedule"),
+        (lambda photos: write_room(photos, 3), ["--downscale", "0"], "--downscale must be a whole number >= 1, got 0"),
+        (lambda photos: write_room(photos, 3), ["--test-every", "1"], "--test-every must be 0"),
+        (lambda photos: write_room(photos, 3), ["--recipe", "3dgs"], "no recipe '3dgs'"),
+        (lambda photos: write_room(photos, 3), ["--protocol", "x"], "no protocol 'x'"),
+        (lambda photos: write_room(photos, 3), ["--max-size", "3"], "--max-size must be a whole number from 64"),
+    ],
+)
+def test_what_makes_no_run_is_refused_before_anything_is_made(
+    colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], fill: Any, words: list[str], message: str
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    fill(photos)
+    given = ["reconstruct", str(photos), "--out", str(tmp_path / "run"), "--quiet", *words]
+    assert run(given) == 2
+    assert message in one_line(capsys.readouterr().err)
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_run_does_not_lie_among_the_photographs(
+    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos = tmp_path / "photos"
+    shutil.copytree(room.photos, photos)
+    for out in (photos, photos / "run"):
+        before = sorted(photos.rglob("*"))
+        assert run(words_for(photos, out, "--quiet")) == 2
+        assert "--out" in one_line(capsys.readouterr().err)
+        assert sorted(photos.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("package", "words", "message"),
+    [("pycolmap", [], 'pip install "2dgs-r[sfm]"'), ("xatlas", ["--texture"], "pip install '2dgs-r[texture]'")],
+)
+def test_an_extra_that_is_missing_is_one_line_before_anything_is_made(
+    package: str,
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_room(tmp_path / "photos", 3)
+    monkeypatch.setitem(sys.modules, package, None)
+    if package == "pycolmap":
+        monkeypatch.setattr("gs2d.sfm.solve.importlib.util.find_spec", lambda _name: None)
+    assert run(words_for(tmp_path / "photos", tmp_path / "run", "--quiet", *words)) == 2
+    assert message in one_line(capsys.readouterr().err)
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_overwrite_begins_anew_and_a_failure_keeps_the_old_run(
+    room: Room, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = started(room, tmp_path)
+    assert run(words_for(room.photos, out, "--resume", "--quiet")) == 0
+    mesh = (out / "mesh.ply").read_bytes()
+    assert run(words_for(room.photos, out, "--quiet")) == 2
+    assert "already holds a run; continue it with --resume" in one_line(capsys.readouterr().err)
+    photos = tmp_path / "other"
+    write_room(photos, 2)
+    (photos / "001.png").write_bytes(b"no picture")
+    assert run(words_for(photos, out, "--overwrite", "--quiet")) == 2
+    assert "001.png" in one_line(capsys.readouterr().err)
+    assert (out / "mesh.ply").read_bytes() == mesh
+    assert json.loads((out / "capture" / "poses.json").read_text())["photos"] == str(room.photos)
+
+
+def interrupt(words: list[str], until: str) -> str:
+    """Ctrl-C when a phase is named; what was said on stderr."""
+    with subprocess.Popen([sys.executable, "-m", "gs2d", *words], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        said = ""
+        for line in process.stderr:
+            said += line
+            if line.startswith(until):
+                time.sleep(0.3)
+                process.send_signal(signal.SIGINT)
+                break
+        said += process.stderr.read()
+    assert process.returncode == 130, said
+    assert "Traceback" not in said
+    return said
+
+
+def test_ctrl_c_among_the_cameras_leaves_nothing_and_names_the_command(room: Room, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    said = interrupt(words_for(room.photos, out), "finding features")
+    assert said.splitlines()[-1].startswith("interrupted; resume with: gs2d reconstruct ")
+    assert said.splitlines()[-1].endswith(" --resume")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_in_training_keeps_the_cameras(room: Room, tmp_path: Path) -> None:
+    out = started(room, tmp_path)
+    words = [*words_for(room.photos, out, "--resume"), "--schedule-scale", "1.0"]
+    said = interrupt(words, "training 2dgs-r")
+    assert said.splitlines()[-1].endswith(" --resume")
+    assert [path.name for path in out.iterdir()] == ["capture"]
+
+
+def test_every_option_of_train_is_one_of_reconstruct() -> None:
+    """But those that it decides itself; a new option of `Training` is there by itself."""
+    words = ["--recipe", "2dgs", "--exposure", "--test-every", "5", "--set", "init_points=9", "--cameras", "each"]
+    command = parse(["reconstruct", "photos", "--out", "run", *words])
+    assert isinstance(command, commands.Reconstruct)
+    from gs2d.cli.reconstruct import reconstruct_options
+
+    options = reconstruct_options(command)
+    for field in fields(Training):
+        assert getattr(options.train_options, field.name) == getattr(command.training, field.name)
+    assert options.train_options.recipe == "2dgs"
+    assert options.train_options.test_every == 5
+    assert options.poses_options.cameras == "each"
+
+
+def test_the_help_states_the_qualities_that_are_there() -> None:
+    text = (Path(commands.__file__)).read_text(encoding="utf-8")
+    stated = re.search(r'quality: Literal\["draft", "normal", "full"\].*?"""(.*?)"""', text, re.DOTALL)
+    assert stated is not None
+    assert list(QUALITIES) == ["draft", "normal", "full"]
+    cpu, gpu = stated[1].split("on a GPU")
+    for device, said in (("cpu", cpu), ("cuda", gpu)):
+        numbers = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", said)]
+        for quality in QUALITIES.values():
+            assert quality[device].side in numbers
+            assert quality[device].schedule_scale in (*numbers, 1.0)
+
+
+@pytest.mark.parametrize(("quality", "downscale"), [("draft", 4), ("normal", 2), ("full", 1)])
+def test_the_size_of_the_pictures_is_by_the_quality(
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quality: str, downscale: int
+) -> None:
+    sides = {"draft": 50, "normal": 95, "full": 10_000}  # of 200x200: 4, 2.1 and less than 1 times smaller
+    monkeypatch.setattr(
+        module, "QUALITIES", {name: {"cpu": module.Quality(0.0005, side)} for name, side in sides.items()}
+    )
+    asked: list[Any] = []
+    monkeypatch.setattr(module, "train", lambda options, _: asked.append(options) or open_run(tmp_path))
+    out = started(room, tmp_path)
+    options = ReconstructOptions(photos=room.photos, out=out, resume=True, quality=quality)
+    with pytest.raises(Exception, match="expected a run folder"):
+        reconstruct(options)
+    assert asked[0].downscale == downscale
+    assert asked[0].schedule_scale == 0.0005
+    assert asked[0].test_every == 0
+    assert FEW > 12
+
+
+def test_test_views_are_as_many_as_asked_for(room: Room, tmp_path: Path) -> None:
+    out = started(room, tmp_path)
+    training = {**TRAINING, "test_every": 4}
+    options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=training, **SMALL)  # type: ignore[arg-type]
+    assert "3 of 12 photographs do not train, they score the result (--test-every 0 trains on all)" in notices(options)
+    definition = open_run(out).definition()
+    assert (definition["scene"]["train"], definition["scene"]["test"]) == (9, 3)
+    assert definition["protocol"]["test_every"] == 4
