@@ -19,7 +19,7 @@ import torch
 from gs2d.errors import BackendError
 from gs2d.kernels.recycle import Recycler
 
-ABI_VERSION = 5
+ABI_VERSION = 6
 VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
 LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "portable", "f64": "portable, float64"}
 FOLDER = Path(__file__).parent / "lib"
@@ -55,14 +55,18 @@ class Library:
         self.path = path
         self.variant = variant
         self.recycler = Recycler()
+        self._functions: dict[tuple[Any, ...], Any] = {}
         self.lanes = int(self._dll.gs2d_lanes())
         self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32
 
     def function(self, name: str, restype: Any, argtypes: Sequence[Any]) -> Any:
         """The exported function ``name`` with its C signature. The GIL is released while it runs."""
-        function = self._dll[name]  # a fresh object: two callers cannot disturb each other's signature
-        function.restype = restype
-        function.argtypes = list(argtypes)
+        key = (name, restype, *argtypes)  # each signature has an object of its own: callers cannot disturb each other
+        function = self._functions.get(key)
+        if function is None:
+            function = self._dll[name]
+            function.restype, function.argtypes = restype, list(argtypes)
+            self._functions[key] = function
         return function
 
     def use_threads(self, n: int) -> None:
@@ -112,7 +116,12 @@ def load(variant: str | None = None) -> Library:
     BackendError
         If the library was not built, or the named variant cannot run here.
     """
-    wanted = variant or os.environ.get("GS2D_CPU_VARIANT")
+    return _choose(FOLDER, variant or os.environ.get("GS2D_CPU_VARIANT"))
+
+
+@cache  # an iteration asks three times, and to look at the files again takes 0.2 ms
+def _choose(folder: Path, wanted: str | None) -> Library:
+    """The library of a name in a folder; errors are not remembered."""
     choices = available_variants()
     if not choices:
         raise BackendError(f"expected the native CPU library in the package's kernels/lib, found none; {REMEDY}")

@@ -30,7 +30,7 @@ from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
 from gs2d.train.exposure import Exposures, as_photographed, check_views, exposure_step, uncount
 from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
-from gs2d.train.optimizer_fused import fused_adam_step
+from gs2d.train.optimizer_fused import fused_adam_step, native_adam_step
 from gs2d.train.rows import keep_rows
 from gs2d.train.state import Statistics, TrainState
 from gs2d.train.targets import DeviceTargets, Targets, TargetSource
@@ -41,6 +41,7 @@ from gs2d.train.views import (
     check_losses,
     diverged,
     finite,
+    first_not_finite,
     raster_settings,
     seen_rows,
     waits,
@@ -104,7 +105,7 @@ class Trainer:
         self.state = self._new_state(dtype) if state is None else self._checked(state)
         self.state.move_to(self.backend.device)
         self._targets = self._make_targets(target_bytes)
-        self._adam_step = fused_adam_step if self.backend.name == "cuda" else adam_step
+        self._adam_step = {"cpu": native_adam_step, "cuda": fused_adam_step}.get(self.backend.name, adam_step)
         self._budget = PairBudget()  # used by the cuda backend alone
         self._last: tuple[int, int] | None = None  # iteration and view that settle() may have to do again
         self._whole = WholeViews(scene, self.recipe, protocol, self._with_budget(self.backend), self._targets)
@@ -385,8 +386,9 @@ class Trainer:
 
     def _check_parameters(self, stage: Stage, names: tuple[str, ...]) -> None:
         """Raise DivergedError if a parameter is not finite: the rasterizer would quietly leave such a splat out."""
-        for name, tensor in self.state.splats.items():
-            if name in names and not finite(tensor):
-                raise diverged(stage, self.state.step, name)
+        parameters = {name: tensor for name, tensor in self.state.splats.items() if name in names}
+        broken = first_not_finite(parameters, self.backend.name)
+        if broken is not None:
+            raise diverged(stage, self.state.step, broken)
         if self.state.exposures is not None and not finite(self.state.exposures.offsets):
             raise diverged(stage, self.state.step, "an exposure")

@@ -1,4 +1,4 @@
-"""Adam in one launch of a CUDA kernel: ``optimizer.adam_step`` for a state on a GPU, without waiting for it."""
+"""``optimizer.adam_step`` in one call of a kernel, for the cpu and cuda backends; a GPU is not waited for."""
 
 from __future__ import annotations
 
@@ -6,9 +6,25 @@ from collections.abc import Collection, Mapping
 
 from torch import Tensor
 
+from gs2d.kernels import adam as native
+from gs2d.kernels.adam import AdamUpdate
 from gs2d.kernels.cuda import adam, launch
 from gs2d.recipe import Stage
 from gs2d.train.state import TrainState
+
+
+def native_adam_step(
+    state: TrainState,
+    stage: Stage,
+    gradients: Mapping[str, Tensor],
+    rates: Mapping[str, float],
+    *,
+    skip: Collection[str] = (),
+    rows: Tensor | None = None,
+) -> None:
+    """``optimizer.adam_step`` by the native CPU library."""
+    updates = _updates(state, stage, gradients, rates, skip, rows)
+    native.adam_step(updates, beta1=stage.rates.beta1, beta2=stage.rates.beta2, eps=stage.rates.eps)
 
 
 def fused_adam_step(
@@ -21,15 +37,29 @@ def fused_adam_step(
     rows: Tensor | None = None,
     cancel: Tensor | None = None,
 ) -> None:
-    """One Adam update, in place, of the rows and attributes that the stage trains.
+    """``optimizer.adam_step`` in one launch on a GPU.
 
     Parameters
     ----------
     state, stage, gradients, rates, skip, rows
-        As for ``optimizer.adam_step``.
+        As there.
     cancel : Tensor [] int32, optional
         On the device: where it is not 0 nothing is changed (but the step counts, which are the host's).
     """
+    updates = _updates(state, stage, gradients, rates, skip, rows)
+    settings = {"beta1": stage.rates.beta1, "beta2": stage.rates.beta2, "eps": stage.rates.eps}
+    adam.adam_step(updates, **settings, launcher=launch.launcher_for(state.splats.device), skip=cancel)
+
+
+def _updates(
+    state: TrainState,
+    stage: Stage,
+    gradients: Mapping[str, Tensor],
+    rates: Mapping[str, float],
+    skip: Collection[str],
+    rows: Tensor | None,
+) -> list[AdamUpdate]:
+    """What each attribute that the stage trains does; their steps are counted."""
     updates = []
     for name, parameter in state.splats.items():
         if name not in stage.train or name in skip or parameter.numel() == 0:
@@ -37,7 +67,7 @@ def fused_adam_step(
         moments, group = state.moments[name], stage.train[name]
         moments.steps += 1
         updates.append(
-            adam.AdamUpdate(
+            AdamUpdate(
                 parameter,
                 moments.mean,
                 moments.square,
@@ -49,5 +79,4 @@ def fused_adam_step(
                 compact=rows is not None and group != "all",
             )
         )
-    settings = {"beta1": stage.rates.beta1, "beta2": stage.rates.beta2, "eps": stage.rates.eps}
-    adam.adam_step(updates, **settings, launcher=launch.launcher_for(state.splats.device), skip=cancel)
+    return updates

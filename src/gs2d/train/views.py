@@ -14,6 +14,7 @@ from torch import Tensor
 from gs2d.data.scene import Scene
 from gs2d.errors import DivergedError
 from gs2d.exposure import expose, identity
+from gs2d.kernels import adam
 from gs2d.losses import compute_losses
 from gs2d.protocols import Protocol
 from gs2d.recipe import Recipe, Stage
@@ -161,9 +162,9 @@ class WholeViews:
             gradients["exposure"] = _gradient(transform)
         if not watched:
             return values, gradients
-        for name, gradient in gradients.items():
-            if not finite(gradient):
-                raise diverged(stage, iteration, f"the gradient of {name}")
+        broken = first_not_finite(gradients, self.backend.name)
+        if broken is not None:
+            raise diverged(stage, iteration, f"the gradient of {broken}")
         return values, gradients
 
 
@@ -211,6 +212,15 @@ def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
 def _gradient(leaf: Tensor) -> Tensor:
     """The gradient of a leaf; zero where nothing depends on it."""
     return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+
+def first_not_finite(tensors: Mapping[str, Tensor], backend_name: str) -> str | None:
+    """The name of the first tensor that holds a NaN or an infinity; None if all are finite."""
+    if backend_name == "cpu":  # one native call: a tenth of the time of six sums
+        names = list(tensors)
+        found = adam.first_not_finite(list(tensors.values()))
+        return None if found is None else names[found]
+    return next((name for name, tensor in tensors.items() if not finite(tensor)), None)
 
 
 def finite(tensor: Tensor) -> bool:

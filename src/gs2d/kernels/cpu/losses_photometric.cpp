@@ -71,15 +71,14 @@ class Piece {
           stride(row_stride(n)),
           known(images.target_mean != nullptr),
           maps(known ? MOMENTS - 1 : MOMENTS),
-          scratch(stride * (2 + 1 + 1 + MOMENTS + DERIVATIVES + TAPS * (maps + DERIVATIVES))) {}
+          scratch(stride * (1 + 1 + MOMENTS + DERIVATIVES + TAPS * (maps + DERIVATIVES))) {}
 
     bool run() {
         if (scratch.failed()) return false;
         int64_t r = 0;
         rendered = scratch.row(r++, stride);
-        target = scratch.row(r++, stride);
         validity = scratch.row(r++, stride);
-        mean = scratch.row(r++, stride);
+        if (im.mask == nullptr) fill_validity(nullptr, im.width, 3, validity);
         products = scratch.row(r, stride), r += MOMENTS;
         derivatives = scratch.row(r, stride), r += DERIVATIVES;
         moments = {scratch.data + r * stride, stride, maps}, r += TAPS * maps;
@@ -97,26 +96,31 @@ class Piece {
     bool inside(int64_t y) const { return y >= 0 && y < im.height; }
     bool mine(int64_t y) const { return y >= begin && y < end; }
     const uint8_t* mask_row(int64_t y) const { return im.mask ? im.mask + y * im.width : nullptr; }
-    void copy_row(const real* image, int64_t y, real* row) const {
-        std::memcpy(row, image + y * n, static_cast<size_t>(n) * sizeof(real));
-    }
-    // Both images' row y; the rendered one holds the target where pixels are ignored.
-    void read_images(int64_t y) {
-        copy_row(im.rendered, y, rendered);
-        copy_row(im.target, y, target);
-        fill_validity(mask_row(y), im.width, 3, validity);
-        if (im.mask == nullptr) return;
-        for (int64_t i = 0; i < length; i += LANES) {
-            store(rendered + i, select(load(validity + i) > V(real(0)), load(rendered + i), load(target + i)));
+    // A row of an image, i < length: zero beyond its end. Nothing behind the image is read.
+    struct Row {
+        const real* at;
+        int64_t n;
+        GS2D_HD V load(int64_t i) const {
+            return n - i >= LANES ? gs2d::load(at + i) : load_first(at + i, static_cast<int>(n - i > 0 ? n - i : 0));
         }
+    };
+    Row row_of(const real* image, int64_t y) const { return {image + y * n, n}; }
+    // The rendered row; where pixels are ignored, a copy that holds the target there.
+    Row rendered_row(int64_t y) const {
+        const Row given = row_of(im.rendered, y), wanted = row_of(im.target, y);
+        if (im.mask == nullptr) return given;
+        fill_validity(mask_row(y), im.width, 3, validity);
+        for (int64_t i = 0; i < length; i += LANES)
+            store(rendered + i, select(load(validity + i) > V(real(0)), given.load(i), wanted.load(i)));
+        return {rendered, length};
     }
 
     void input_row(int64_t y) {
         if (!inside(y)) return moments.clear(y, length);
-        read_images(y);
+        const Row x = rendered_row(y), target = row_of(im.target, y);
         V l1 = V(real(0));
         for (int64_t i = 0; i < length; i += LANES) {
-            const V u = load(rendered + i), v = load(target + i);
+            const V u = x.load(i), v = target.load(i);
             store(products + MEAN * stride + i, u);
             store(products + SQUARES * stride + i, fma(u, u, v * v));
             store(products + PRODUCT * stride + i, u * v);
@@ -129,13 +133,13 @@ class Piece {
 
     void ssim_row(int64_t y) {
         if (!inside(y)) return pullbacks.clear(y, length);
-        fill_validity(mask_row(y), im.width, 3, validity);
-        if (known) copy_row(im.target_mean, y, mean);
+        if (im.mask != nullptr) fill_validity(mask_row(y), im.width, 3, validity);
+        const Row mean = row_of(im.target_mean, known ? y : 0);
         const Column a(moments, y, MEAN), s(moments, y, SQUARES), p(moments, y, PRODUCT);
         const Column b(moments, y, known ? MEAN : TARGET_MEAN);
         V total = V(real(0));
         for (int64_t i = 0; i < length; i += LANES) {
-            const V b_i = known ? load(mean + i) : b.blur(i);
+            const V b_i = known ? mean.load(i) : b.blur(i);
             const SsimPoint<V> point = ssim_point<V>(a.blur(i), b_i, s.blur(i), p.blur(i));
             const V valid = load(validity + i);
             total = fma(valid, point.value, total);
@@ -149,12 +153,12 @@ class Piece {
     }
 
     void gradient_row(int64_t y) {
-        read_images(y);
+        const Row x = rendered_row(y), target = row_of(im.target, y);
         const Column dm(pullbacks, y, D_MEAN), ds(pullbacks, y, D_SQUARES), dp(pullbacks, y, D_PRODUCT);
         const V l1_scale = V(real(im.l1_scale)), ssim_scale = V(real(im.ssim_scale)), two = V(real(2));
         real* out = im.gradient + y * n;
         for (int64_t i = 0; i < n; i += LANES) {
-            const V u = load(rendered + i), v = load(target + i);
+            const V u = x.load(i), v = target.load(i);
             const V ssim = fma(two * u, ds.blur(i), fma(v, dp.blur(i), dm.blur(i)));
             const V both = load(validity + i) * fma(ssim_scale, ssim, l1_scale * l1_sign(u, v));
             if (n - i >= LANES) {
@@ -170,7 +174,7 @@ class Piece {
     const bool known;  // the target's blur is given
     const int maps;
     const Scratch scratch;
-    real *rendered = nullptr, *target = nullptr, *validity = nullptr, *mean = nullptr;
+    real *rendered = nullptr, *validity = nullptr;  // all 1 without a mask
     real *products = nullptr, *derivatives = nullptr;
     Ring moments{}, pullbacks{};
 };

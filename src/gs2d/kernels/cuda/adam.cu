@@ -1,5 +1,6 @@
 // Adam over all attributes in one launch, with the arithmetic of torch's fused kernels. What is not trained is not
 // written: frozen rows stay as they are, bit for bit.
+#include "core/adam.h"
 #include "cuda/common.h"
 
 namespace gs2d {
@@ -25,12 +26,9 @@ struct AdamArguments {
 };
 
 __device__ __forceinline__ void update(const AdamAttribute& p, const AdamArguments& a, int64 at, float g) {
-    const float old_mean = p.mean[at];
-    const float mean = fma(a.weight_1, g - old_mean, old_mean);
-    const float square = fma(a.weight_2 * g, g, p.square[at] * a.beta2);
-    const float denominator = sqrt(square) / p.root_2 + a.eps;
-    p.mean[at] = mean, p.square[at] = square;
-    p.parameter[at] = p.parameter[at] - p.step_size * mean / denominator;
+    float parameter = p.parameter[at], mean = p.mean[at], square = p.square[at];
+    adam(g, parameter, mean, square, AdamConstants<float>{a.weight_1, a.beta2, a.weight_2, a.eps, p.step_size, p.root_2});
+    p.mean[at] = mean, p.square[at] = square, p.parameter[at] = parameter;
 }
 
 extern "C" __global__ void __launch_bounds__(128) adam_step(AdamArguments a) {

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from gs2d.errors import ShapeError
+from gs2d.kernels.adam import AdamUpdate, bias_corrections, check_update
 from gs2d.kernels.cuda.arguments import AdamArguments, fill
 from gs2d.kernels.cuda.ops import ready
 
@@ -21,57 +21,6 @@ __all__ = ["AdamUpdate", "adam_step"]
 
 THREADS = 128
 BLOCK_ELEMENTS = 512  # adam.cu
-
-
-@dataclass(frozen=True, eq=False)
-class AdamUpdate:
-    """One attribute's part of a step.
-
-    Attributes
-    ----------
-    parameter, mean, square : Tensor [N, ...] float32
-        Contiguous; changed in place.
-    gradient : Tensor
-        Like the parameter; with ``compact``, of ``rows`` alone and in their order.
-    rate : float
-    step : int
-        Of the bias correction, counted from 1 and with this one.
-    trained : Tensor [N] bool, optional
-        Rows that are False are not written, and their gradients are not read.
-    rows : Tensor [M] int64, optional
-        Only these rows, each once; instead of ``trained``.
-    compact : bool
-    """
-
-    parameter: Tensor
-    mean: Tensor
-    square: Tensor
-    gradient: Tensor
-    rate: float
-    step: int
-    trained: Tensor | None = None
-    rows: Tensor | None = None
-    compact: bool = False
-
-
-def _check_update(update: AdamUpdate) -> None:
-    parameter = update.parameter
-    for name in ("mean", "square", *(() if update.compact else ("gradient",))):
-        if getattr(update, name).shape != parameter.shape:
-            raise ShapeError(f"{name} must be {list(parameter.shape)}, got {list(getattr(update, name).shape)}")
-    for name in ("parameter", "mean", "square"):
-        if not getattr(update, name).is_contiguous():
-            raise ShapeError(f"{name} must be contiguous to be changed in place")
-    if update.trained is not None and update.rows is not None:
-        raise ShapeError("an AdamUpdate takes trained or rows, got both")
-    if update.trained is not None and (update.trained.dtype != torch.bool or len(update.trained) != len(parameter)):
-        raise ShapeError(
-            f"trained must be bool [{len(parameter)}], got {update.trained.dtype} {list(update.trained.shape)}"
-        )
-    if update.rows is not None and update.rows.dtype != torch.int64:
-        raise ShapeError(f"rows must be int64, got {update.rows.dtype}")
-    if update.compact and (update.rows is None or len(update.gradient) != len(update.rows)):
-        raise ShapeError("a compact gradient needs rows, one for each of its own")
 
 
 @torch.no_grad()
@@ -107,7 +56,7 @@ def adam_step(
     alive = []  # what the pointers belong to
     blocks = 0
     for update in updates:
-        _check_update(update)
+        check_update(update)
         tensors = {"parameter": update.parameter, "mean": update.mean, "square": update.square}
         *_, gradient = ready(**tensors, gradient=update.gradient)
         trained = None if update.trained is None else update.trained.contiguous()
@@ -119,8 +68,7 @@ def adam_step(
         slot = arguments.attributes[arguments.count]
         fill(slot, **tensors, gradient=gradient, trained=trained, rows=rows)
         slot.elements, slot.first_block, slot.columns, slot.compact = elements, blocks, columns, int(update.compact)
-        slot.step_size = update.rate / (1 - beta1**update.step)
-        slot.root_2 = math.sqrt(1 - beta2**update.step)
+        slot.step_size, slot.root_2 = bias_corrections(update, beta1, beta2)
         arguments.count += 1
         blocks += -(-elements // BLOCK_ELEMENTS)
         alive += [gradient, trained, rows]

@@ -1,0 +1,153 @@
+"""Adam on the CPU: all attributes in one native call, and what is not trained is not written."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gs2d.errors import ShapeError
+from gs2d.kernels.library import Library, prepare
+
+__all__ = ["AdamUpdate", "adam_step", "bias_corrections", "check_update", "first_not_finite"]
+
+
+@dataclass(frozen=True, eq=False)
+class AdamUpdate:
+    """One attribute's part of a step.
+
+    Attributes
+    ----------
+    parameter, mean, square : Tensor [N, ...] float32
+        Contiguous; changed in place.
+    gradient : Tensor
+        Like the parameter; with ``compact``, of ``rows`` alone and in their order.
+    rate : float
+    step : int
+        Of the bias correction, counted from 1 and with this one.
+    trained : Tensor [N] bool, optional
+        Rows that are False are not written, and their gradients are not read.
+    rows : Tensor [M] int64, optional
+        Only these rows, each once; instead of ``trained``.
+    compact : bool
+    """
+
+    parameter: Tensor
+    mean: Tensor
+    square: Tensor
+    gradient: Tensor
+    rate: float
+    step: int
+    trained: Tensor | None = None
+    rows: Tensor | None = None
+    compact: bool = False
+
+
+def check_update(update: AdamUpdate) -> None:
+    """Raise ShapeError unless the tensors fit each other."""
+    parameter = update.parameter
+    for name in ("mean", "square", *(() if update.compact else ("gradient",))):
+        if getattr(update, name).shape != parameter.shape:
+            raise ShapeError(f"{name} must be {list(parameter.shape)}, got {list(getattr(update, name).shape)}")
+    for name in ("parameter", "mean", "square"):
+        if not getattr(update, name).is_contiguous():
+            raise ShapeError(f"{name} must be contiguous to be changed in place")
+    if update.trained is not None and update.rows is not None:
+        raise ShapeError("an AdamUpdate takes trained or rows, got both")
+    if update.trained is not None and (update.trained.dtype != torch.bool or len(update.trained) != len(parameter)):
+        raise ShapeError(
+            f"trained must be bool [{len(parameter)}], got {update.trained.dtype} {list(update.trained.shape)}"
+        )
+    if update.rows is not None and update.rows.dtype != torch.int64:
+        raise ShapeError(f"rows must be int64, got {update.rows.dtype}")
+    if update.compact and (update.rows is None or len(update.gradient) != len(update.rows)):
+        raise ShapeError("a compact gradient needs rows, one for each of its own")
+
+
+def bias_corrections(update: AdamUpdate, beta1: float, beta2: float) -> tuple[float, float]:
+    """rate / (1 - beta1^t) and sqrt(1 - beta2^t)."""
+    return update.rate / (1 - beta1**update.step), math.sqrt(1 - beta2**update.step)
+
+
+class _Attribute(ctypes.Structure):
+    """``struct AdamAttribute`` of kernels/cpu/adam.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("parameter", "mean", "square", "gradient", "rows")),
+        *((name, ctypes.c_int64) for name in ("height", "count", "columns", "compact")),
+        *((name, ctypes.c_double) for name in ("step_size", "root_2")),
+    )
+
+
+@torch.no_grad()
+def adam_step(
+    updates: Sequence[AdamUpdate], *, beta1: float, beta2: float, eps: float, library: Library | None = None
+) -> None:
+    """One Adam step of some attributes, in place; the arithmetic of torch's fused Adam (to rounding).
+
+    Parameters
+    ----------
+    updates : sequence of AdamUpdate
+        Tensors of the library's dtype on the CPU.
+    beta1, beta2, eps : float
+    library : Library, optional
+        By default this machine's best, on as many threads as torch uses; the bits do not depend on how many.
+
+    Raises
+    ------
+    ShapeError
+        If something has another shape, dtype or device.
+    """
+    library = library or prepare()
+    attributes = (_Attribute * len(updates))()
+    alive = []  # what the pointers belong to
+    for slot, update in zip(attributes, updates, strict=True):
+        check_update(update)
+        gradient = update.gradient.contiguous()
+        for name, tensor in (
+            *((k, getattr(update, k)) for k in ("parameter", "mean", "square")),
+            ("gradient", gradient),
+        ):
+            if not tensor.is_cpu or tensor.dtype != library.dtype:
+                raise ShapeError(f"{name} must be {library.dtype} on the cpu, got {tensor.dtype} on {tensor.device}")
+            setattr(slot, name, tensor.data_ptr())
+        rows = update.rows if update.trained is None else update.trained.nonzero().squeeze(1)
+        if rows is not None:
+            if not rows.is_cpu:
+                raise ShapeError(f"rows must be on the cpu, got {rows.device}")
+            rows = rows.contiguous()
+            slot.rows = rows.data_ptr()
+        slot.height, slot.columns = len(update.parameter), max(1, math.prod(update.parameter.shape[1:]))
+        slot.count = 0 if update.parameter.numel() == 0 else slot.height if rows is None else len(rows)
+        slot.compact = update.compact
+        slot.step_size, slot.root_2 = bias_corrections(update, beta1, beta2)
+        alive += [gradient, rows]
+    function = library.function("gs2d_adam", ctypes.c_int, (ctypes.c_void_p, ctypes.c_int, *[ctypes.c_double] * 3))
+    if function(attributes, len(updates), beta1, beta2, eps) != 0:
+        raise ShapeError("rows must be those of the parameter, from 0 on, got others")
+    del alive
+
+
+def first_not_finite(tensors: Sequence[Tensor], *, library: Library | None = None) -> int | None:
+    """The number of the first tensor that holds a NaN or an infinity, None if all are finite.
+
+    Raises
+    ------
+    ShapeError
+        If one is not of the library's dtype on the CPU.
+    """
+    library = library or prepare()
+    plain = [tensor.detach().contiguous() for tensor in tensors]
+    for tensor in plain:
+        if not tensor.is_cpu or tensor.dtype != library.dtype:
+            raise ShapeError(f"tensors must be {library.dtype} on the cpu, got {tensor.dtype} on {tensor.device}")
+    count = len(plain)
+    pointers = (ctypes.c_void_p * count)(*(tensor.data_ptr() for tensor in plain))
+    sizes = (ctypes.c_int64 * count)(*(tensor.numel() for tensor in plain))
+    function = library.function("gs2d_first_not_finite", ctypes.c_int, (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int))
+    first = int(function(pointers, sizes, count))
+    return None if first == count else first

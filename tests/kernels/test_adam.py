@@ -1,0 +1,138 @@
+"""The native Adam against torch's fused Adam: all rows, some rows, any number of threads; and what is not finite."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.optim.adam import adam
+
+from gs2d.errors import ShapeError
+from gs2d.kernels.adam import AdamUpdate, adam_step, first_not_finite
+from gs2d.kernels.library import Library
+
+WRITTEN = ("parameter", "mean", "square")
+BETAS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
+SHAPES = ((3,), (4,), (2,), (), (1, 3), (15, 3))
+
+
+def attribute(count: int, shape: tuple[int, ...], dtype: torch.dtype, seed: int = 0) -> AdamUpdate:
+    """Parameters of different sizes, moments of some steps, gradients with exact zeros."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand() -> Tensor:
+        return torch.randn(count, *shape, generator=g).to(dtype)
+
+    gradient = torch.where(rand() < -1, 0.0, 1e-3 * rand()).to(dtype)
+    return AdamUpdate(rand(), 1e-3 * rand(), 1e-6 * rand() ** 2, gradient, 1.6e-4 * (1 + seed), 7)
+
+
+def copied(update: AdamUpdate) -> AdamUpdate:
+    return replace(update, **{name: getattr(update, name).clone() for name in WRITTEN})
+
+
+def by_torch(update: AdamUpdate) -> AdamUpdate:
+    """The same step, of all rows."""
+    out = copied(update)
+    lists = [[t] for t in (out.parameter, out.gradient, out.mean, out.square)]
+    adam(
+        *lists, [], [torch.tensor(float(update.step - 1))], fused=True, amsgrad=False, beta1=BETAS["beta1"],
+        beta2=BETAS["beta2"], eps=BETAS["eps"], lr=update.rate, weight_decay=0.0, maximize=False,
+    )  # fmt: skip
+    return out
+
+
+def equal(a: AdamUpdate, b: AdamUpdate) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in WRITTEN)
+
+
+def test_it_takes_torchs_fused_step(any_native: Library) -> None:
+    """1000 rows of 45 are several pieces of 8192 elements; 1001 of 1 end within a vector."""
+    dtype = any_native.dtype
+    updates = [attribute(1000 + (shape == ()), shape, dtype, seed=k) for k, shape in enumerate(SHAPES)]
+    before, expected = [copied(u) for u in updates], [by_torch(u) for u in updates]
+    adam_step(updates, **BETAS, library=any_native)
+    digits = 5e-7 if dtype == torch.float32 else 1e-15
+    for found, wanted, start in zip(updates, expected, before, strict=True):
+        for name in WRITTEN:
+            a, b, old = (getattr(update, name) for update in (found, wanted, start))
+            assert bool(((a - b).abs() <= digits * (b.abs() + old.abs())).all()), name
+            assert bool((a != old).any()), name
+
+
+def test_the_bits_do_not_depend_on_threads(native: Library) -> None:
+    results = []
+    for threads in (1, 2, 5):
+        native.use_threads(threads)
+        updates = [attribute(3000, shape, torch.float32, seed=k) for k, shape in enumerate(SHAPES)]
+        adam_step(updates, **BETAS, library=native)
+        results.append(updates)
+    assert all(equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+@pytest.mark.parametrize("compact", [False, True])
+@pytest.mark.parametrize("shape", [(), (3,), (15, 3)])
+def test_only_the_rows_that_are_named_are_written_and_as_they_would_be_alone(
+    native: Library, shape: tuple[int, ...], compact: bool
+) -> None:
+    start = attribute(400, shape, torch.float32)
+    mask = torch.arange(400) % 3 == 1
+    rows = mask.nonzero().squeeze(1)
+    alone = AdamUpdate(
+        start.parameter[rows], start.mean[rows], start.square[rows], start.gradient[rows], start.rate, start.step
+    )
+    adam_step([alone], **BETAS, library=native)
+    expected = copied(start)
+    for name in WRITTEN:
+        getattr(expected, name)[rows] = getattr(alone, name)
+    found = copied(
+        replace(start, rows=rows, compact=compact, gradient=start.gradient[rows] if compact else start.gradient)
+    )
+    adam_step([found], **BETAS, library=native)
+    assert equal(found, expected)
+    if not compact:
+        masked = copied(replace(start, trained=mask))
+        adam_step([masked], **BETAS, library=native)
+        assert equal(masked, expected)
+
+
+def test_nothing_is_a_step_too(native: Library) -> None:
+    empty = attribute(5, (0, 3), torch.float32)
+    none = replace(attribute(5, (3,), torch.float32), rows=torch.zeros(0, dtype=torch.int64))
+    before = copied(none)
+    adam_step([empty, none], **BETAS, library=native)
+    adam_step([], **BETAS, library=native)
+    assert equal(none, before)
+
+
+@pytest.mark.parametrize("rows", [[0, 5], [-1]])
+def test_rows_that_are_not_there_change_nothing(native: Library, rows: list[int]) -> None:
+    good, bad = attribute(5, (3,), torch.float32), attribute(5, (3,), torch.float32, seed=1)
+    before = copied(good)
+    with pytest.raises(ShapeError, match="rows must be those of the parameter"):
+        adam_step([good, replace(bad, rows=torch.tensor(rows))], **BETAS, library=native)
+    assert equal(good, before)
+
+
+def test_other_dtypes_are_refused(native: Library) -> None:
+    update = attribute(5, (3,), torch.float32)
+    with pytest.raises(ShapeError, match="gradient must be torch.float32 on the cpu, got torch.float64"):
+        adam_step([replace(update, gradient=update.gradient.double())], **BETAS, library=native)
+    with pytest.raises(ShapeError, match=r"tensors must be torch\.float32"):
+        first_not_finite([torch.zeros(3, dtype=torch.float64)], library=native)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_the_first_tensor_that_is_not_finite_is_found_wherever_it_is(any_native: Library, value: float) -> None:
+    sizes = (1, 37, 70_000, 300_001)
+    large = 3e38 if any_native.dtype == torch.float32 else 1e308
+    for which, size in enumerate(sizes):
+        for at in (0, size // 2, size - 1):
+            tensors = [torch.full((n,), large, dtype=any_native.dtype) for n in sizes]
+            assert first_not_finite(tensors, library=any_native) is None  # their sum is not finite: each of them is
+            tensors[which][at] = value
+            tensors[-1][-1] = value
+            assert first_not_finite(tensors, library=any_native) == which
+    assert first_not_finite([torch.empty(0, dtype=any_native.dtype)], library=any_native) is None
