@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import io
 import socket
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -66,12 +67,12 @@ def required_viser() -> Any:
         return importlib.import_module("viser")
     except ModuleNotFoundError as error:
         raise BackendError(
-            f"`gs2d view` needs {error.name}, which is not installed; pip install '2dgs-r[view]'"
+            f"the viewer needs {error.name}, which is not installed; pip install '2dgs-r[view]'"
         ) from error
 
 
-def free_port(host: str, port: int | None) -> int:
-    """``port`` if nobody listens there; without one the first free one from 8080 on.
+def free_port(host: str, port: int | None, *, option: str = "--port") -> int:
+    """``port`` if nobody listens there; without one the first free one from 8080 on. ``option`` is what sets it.
 
     Raises
     ------
@@ -82,7 +83,7 @@ def free_port(host: str, port: int | None) -> int:
     reason = ""
     for number in wanted:
         if not 1 <= number <= 65535:
-            raise BackendError(f"--port must be 1 to 65535, got {number}")
+            raise BackendError(f"{option} must be 1 to 65535, got {number}")
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
             with socket.socket(family, kind, protocol) as probe:
@@ -92,7 +93,7 @@ def free_port(host: str, port: int | None) -> int:
         except OSError as error:
             reason = error.strerror or str(error)
     tried = f"port {port}" if port is not None else f"ports {wanted[0]} to {wanted[-1]}"
-    raise BackendError(f"a free port on {host} was expected, {tried}: {reason}; choose another --port or --host")
+    raise BackendError(f"a free port on {host} was expected, {tried}: {reason}; choose another {option}")
 
 
 def thumbnail(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
@@ -130,6 +131,10 @@ class Viewer:
         self._nodes: dict[str, list[Any]] = {}
         self._splats: Any = None
         self._exact: ExactPictures | None = None
+        self._stages: dict[str, Stage] = {}
+        self._showing = (
+            threading.Lock()
+        )  # held by whoever changes the splats: browsers' threads, and that of a training
 
     @property
     def url(self) -> str:
@@ -152,33 +157,40 @@ class Viewer:
     def add_stages(self, stages: Mapping[str, Stage]) -> None:
         """Splats to choose from; the last ones are shown first."""
         gui, names = self._server.gui, list(stages)
-        chosen = gui.add_dropdown("stage", names, initial_value=names[-1], visible=len(names) > 1)
-        drawn = gui.add_dropdown("splats", [*PICTURES, "none"], initial_value="preview")
+        self._stages = dict(stages)
+        self._chosen = gui.add_dropdown("stage", names, initial_value=names[-1], visible=len(names) > 1)
+        self._drawn = gui.add_dropdown("splats", [*PICTURES, "none"], initial_value="preview")
         self._exact = ExactPictures(self._server, self._frame, stages[names[-1]].render)
-
-        def show(load: bool) -> None:
-            stage = stages[chosen.value]
-            if load:
-                self._show_splats(stage.preview())
-                assert self._exact is not None
-                self._exact.scene(stage.render)
-            if self._splats is not None:
-                self._splats.visible = drawn.value == "preview"
-            assert self._exact is not None
-            self._exact.draw(drawn.value if drawn.value in PICTURES[1:] else None)
 
         def choose(_: Any) -> None:
             try:
-                show(load=True)
+                self._show(load=True)
             except Gs2dError as error:  # a checkpoint that cannot be read: what was shown stays
                 for client in self._server.get_clients().values():
                     client.add_notification("This stage cannot be shown", str(error), color="red")
 
-        show(load=True)
-        chosen.on_update(choose)
-        drawn.on_update(lambda _: show(load=False))
+        self._show(load=True)
+        self._chosen.on_update(choose)
+        self._drawn.on_update(lambda _: self._show(load=False))
 
-    def _show_splats(self, splats: Preview) -> None:
+    def replace_stage(self, name: str, stage: Stage) -> None:
+        """Other splats under a name that there is; shown at once where it is the one that is looked at."""
+        self._stages[name] = stage
+        if self._chosen.value == name:
+            self._show(load=True)
+
+    def _show(self, *, load: bool) -> None:
+        assert self._exact is not None
+        with self._showing:
+            stage, drawn = self._stages[self._chosen.value], self._drawn.value
+            if load:
+                self._show_splats(stage.preview(), visible=drawn == "preview")
+                self._exact.scene(stage.render)
+            elif self._splats is not None:
+                self._splats.visible = drawn == "preview"
+            self._exact.draw(drawn if drawn in PICTURES[1:] else None)
+
+    def _show_splats(self, splats: Preview, *, visible: bool) -> None:
         with self._server.atomic():
             if self._splats is not None:
                 self._splats.remove()
@@ -190,7 +202,27 @@ class Viewer:
                 opacities=splats.opacities,
                 scale=splats.scale / self._frame.unit,
                 position=self._frame.inside(np.zeros(3)),
+                visible=visible,
             )
+
+    def add_status(self, text: str) -> Callable[[str], None]:
+        """A line of text above all else, in Markdown; returns what changes it."""
+        line = self._server.gui.add_markdown(text, order=-1)
+        return lambda changed: setattr(line, "content", changed)
+
+    def add_switch(self, label: str, on_change: Callable[[bool], None]) -> None:
+        """A box that is off at first."""
+        box = self._server.gui.add_checkbox(label, initial_value=False)
+        box.on_update(lambda _: on_change(bool(box.value)))
+
+    @property
+    def watchers(self) -> int:
+        """Browsers that look at it."""
+        return len(self._server.get_clients())
+
+    def flush(self) -> None:
+        """Send what was changed."""
+        self._server.flush()
 
     def add_mesh(self, glb: bytes, turn: Sequence[float]) -> None:
         """A mesh as a .glb file, whose own ``turn`` (x, y, z, w) is undone: the scene is in the capture's frame."""

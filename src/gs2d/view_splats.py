@@ -48,7 +48,8 @@ def preview(splats: Splats, cameras: Sequence[Camera] = ()) -> Preview:
     """
     splats = splats.to("cpu", torch.float32)
     finite = torch.stack([tensor.flatten(1).isfinite().all(1) for _, tensor in _by_row(splats)]).all(0)
-    splats = splats.rows(finite)
+    if not finite.all():  # else no copy of everything
+        splats = splats.rows(finite)
     if not len(splats):
         return Preview(1.0, *(np.zeros((0, *shape), np.float32) for shape in ((3,), (3, 3), (3,), (1,))))
     scale = max(float(splats.scales.median()), 1e-12)

@@ -88,6 +88,8 @@ def demo(command: c.Demo, console: Console) -> None:
         schedule_scale=command.schedule_scale,
         vary_exposure=command.vary_exposure,
         exposure=command.exposure,
+        viewer=command.viewer,
+        viewer_port=command.viewer_port,
     )
     run = run_demo(options, console.on_event)
     console.close()

@@ -25,6 +25,10 @@ class Demo(TrainingCommon):
     """Photograph as a camera on automatic does: training pictures differ in exposure and white balance."""
     exposure: bool = False
     """Learn an exposure and a white balance for each photograph, as in `gs2d train`."""
+    viewer: bool = False
+    """Show the training in the browser while it runs, as in `gs2d train`."""
+    viewer_port: int | None = None
+    """With --viewer: port of the page (default: the first free one from 8080 on)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -64,6 +64,10 @@ class Training:
     """Iterations between checkpoints."""
     checkpoint_seconds: float = 120.0
     """Seconds between checkpoints, whichever comes first."""
+    viewer: bool = False
+    """Show the training in the browser while it runs; the address is printed, and nothing of the result changes."""
+    viewer_port: int | None = None
+    """With --viewer: port of the page (default: the first free one from 8080 on)."""
     stage2_cache_mb: int = 1024
     """MiB for cached views in stage 2, about 5 MiB a view of 400x400 (0 = none; results differ by rounding)."""
 

@@ -12,7 +12,7 @@ from gs2d.io.run import RunFolder, is_run, open_run
 from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
 from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
-from gs2d.pipeline.train import train, use_threads
+from gs2d.pipeline.train import check_viewer, train, use_threads
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 TITLE = "gs2d demo: a still life whose true surface is known"
@@ -36,6 +36,8 @@ class DemoOptions:
     schedule_scale: float | None = None
     vary_exposure: bool = False
     exposure: bool = False
+    viewer: bool = False
+    viewer_port: int | None = None
     train_views: int = TRAIN_VIEWS
     test_views: int = TEST_VIEWS
     size: int = SIZE
@@ -57,6 +59,7 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
                 f"{options.out} holds a run that is not a demo; choose another --out or replace it with --overwrite"
             )
         overwrite = True
+    check_viewer(TrainOptions(scene=capture, out=options.out, viewer=options.viewer, viewer_port=options.viewer_port))
     use_threads(options.threads)
     if not (options.resume and (capture / "transforms_train.json").exists()):
         total = options.train_views + options.test_views
@@ -83,6 +86,8 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
             backend=options.backend,
             seed=options.seed,
             exposure=options.exposure,
+            viewer=options.viewer,
+            viewer_port=options.viewer_port,
             threads=options.threads,
             resume=options.resume,
             overwrite=overwrite,

@@ -61,6 +61,10 @@ class TrainOptions:
         Names that may already be in ``out`` (the demo's capture).
     test_every : int or None
         Every n-th view is a test view, 0 = none; None: what the protocol says.
+    viewer : bool
+        Show the training in the browser while it runs.
+    viewer_port : int or None
+        Port of that page; None = the first free one from 8080 on.
     estimate : bool
         Tell before training how long it will take and what is held out.
     """
@@ -88,6 +92,8 @@ class TrainOptions:
     shown_views: int = 3
     allowed: tuple[str, ...] = ()
     test_every: int | None = None
+    viewer: bool = False
+    viewer_port: int | None = None
     estimate: bool = False
 
     def __post_init__(self) -> None:

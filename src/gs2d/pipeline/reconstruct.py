@@ -22,7 +22,7 @@ from gs2d.pipeline.poses import ASKED_FOR, PosesOptions, check_poses_options, fi
 from gs2d.pipeline.prepare import check_train_options
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run
-from gs2d.pipeline.train import train
+from gs2d.pipeline.train import check_viewer, train
 from gs2d.render.backend import get_backend
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.solve import check_installed
@@ -169,6 +169,7 @@ def _check(options: ReconstructOptions) -> Quality:
     if options.texture:
         for package in TEXTURE_PACKAGES:
             required(package)
+    check_viewer(training)
     if options.resume and (out / CAPTURE / POSES_JSON).exists():
         return quality
     check_installed()

@@ -49,6 +49,7 @@ class Recorder:
         self._at_entry = dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self._trainer: Trainer | None = None
+        self.psnr: float | None = None  # of the probe views, the last time that they were scored
         self._before: Snapshot | None = None  # of the last step line, until it is compared with the next progress
 
     # -- called by the pipeline ----------------------------------------------------------------------------------------
@@ -74,6 +75,13 @@ class Recorder:
             saved = self._run.checkpoints()
             last = f"the last good checkpoint is {saved[-1].path}" if saved else "there is no checkpoint yet"
             raise DivergedError(f"{error}; {last}") from error
+
+    @contextmanager
+    def off_the_clock(self) -> Iterator[None]:
+        """What is done meanwhile is no training time."""
+        self._stop_clock()
+        yield
+        self._start_clock()
 
     def on_training_event(self, event: train_events.Event) -> None:
         """Log an event, and do what is due."""
@@ -114,6 +122,7 @@ class Recorder:
             if last or _due(event.iteration, event.iterations, PROBES, self.progress_every):
                 psnr = self._probe_psnr(state.splats)
                 if psnr is not None:
+                    self.psnr = psnr
                     extra["psnr"] = psnr
             self._log("step", event, **extra)
             if not last:

@@ -10,7 +10,7 @@ import torch
 from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
-from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
+from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
@@ -18,6 +18,8 @@ from gs2d.pipeline.recorder import Recorder
 from gs2d.pipeline.restart import Start, check_sources, choose_start
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
+from gs2d.train import events
+from gs2d.train.state import TrainState
 
 
 def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
@@ -42,6 +44,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     Gs2dError
         Anything that the user can mend.
     """
+    check_viewer(options)
     claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": options.allowed}
     check_claim(options.out, **claim)  # type: ignore[arg-type]
     use_threads(options.threads)
@@ -49,7 +52,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     if options.overwrite:
         check_sources(job, options)
     run = claim_run(options.out, **claim)  # type: ignore[arg-type]
-    with run.locked(), undone_if_worthless(run):
+    with run.locked(), undone_if_worthless(run), watched(run, job, options, on_event) as watch:
+        on_event = watch.on_event
         if options.cache is not None:  # now, not when the first stage has been trained
             run.made += make_folder(options.cache)
         if is_run(run.path):
@@ -66,10 +70,69 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         if options.estimate and start.state is None:
             for text in foretold(job):
                 on_event(Notice(text))
-        splats, exposures = train_stages(run, job, options, start, on_event)
+        splats, exposures = train_stages(run, job, options, start, watch)
         write_exposures(run, exposures, on_event)
         finish(run, job, splats, on_event)
     return run
+
+
+class Watch:
+    """Nobody watches a training; ``pipeline.live.Live`` has the same methods."""
+
+    def __init__(self, on_event: OnEvent) -> None:
+        self._tell = on_event
+
+    def on_event(self, event: Event) -> None:
+        """Pass an event of the pipeline on."""
+        self._tell(event)
+
+    def on_training_event(self, event: events.Event, state: TrainState) -> None:
+        """Nothing is shown."""
+
+    def scored(self, psnr: float | None) -> None:
+        """Nothing is shown."""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether there is something to do in a turn."""
+        return False
+
+    def turn(self) -> None:
+        """Nothing was asked for."""
+
+
+@contextmanager
+def watched(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[Watch]:
+    """The page of a training while it lasts, if one is asked for."""
+    if not options.viewer:
+        yield Watch(on_event)
+        return
+    from gs2d.pipeline.live import open_live
+
+    live = open_live(job, options, on_event)
+    try:
+        yield live
+        live.close(f"**finished**: `gs2d view {run.path}`")
+    except BaseException:
+        live.close("**stopped**")
+        raise
+
+
+def check_viewer(options: TrainOptions) -> None:
+    """Raise for a page that cannot be served, before anything slow happens.
+
+    Raises
+    ------
+    RecipeError, BackendError
+    """
+    if not options.viewer:
+        if options.viewer_port is not None:
+            raise RecipeError("--viewer-port belongs to --viewer, which was not given; give both")
+        return
+    from gs2d.view import free_port, required_viser
+
+    required_viser()
+    free_port("127.0.0.1", options.viewer_port, option="--viewer-port")
 
 
 MOST_THREADS = 1024  # each has a stack: far more of them end in errors that name anything but the cause
@@ -101,18 +164,30 @@ def undone_if_worthless(run: RunFolder) -> Iterator[None]:
 
 
 def train_stages(
-    run: RunFolder, job: Job, options: TrainOptions, start: Start, on_event: OnEvent
+    run: RunFolder, job: Job, options: TrainOptions, start: Start, watch: Watch
 ) -> tuple[Splats, Transforms]:
     """Train from where ``start`` is to the end of the last stage; the splats, and the exposures of the photographs."""
     from gs2d.train.loop import Trainer
 
-    recorder = Recorder(run, job, options, start, on_event)
+    recorder = Recorder(run, job, options, start, watch.on_event)
+
+    def listen(event: events.Event) -> None:
+        recorder.on_training_event(event)
+        watch.scored(recorder.psnr)
+        watch.on_training_event(event, trainer.state)
+
+    def between() -> None:
+        if watch.waiting:
+            with recorder.off_the_clock():
+                watch.turn()
+
     trainer = Trainer(
         job.scene,
         job.recipe,
         job.protocol,
         backend=job.backend,
-        on_event=recorder.on_training_event,
+        on_event=listen,
+        between=between,
         state=start.state,
         progress_every=recorder.progress_every,
         stage2_cache_bytes=job.stage2_cache_bytes,

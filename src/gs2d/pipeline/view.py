@@ -80,7 +80,7 @@ def open_viewer(path: Path, options: ViewOptions = ViewOptions(), on_event: OnEv
     load = lru_cache(maxsize=1)(lambda name: content.stages[name]())  # one stage in memory
     final = load(list(content.stages)[-1])
     centers = final.means.cpu().numpy()
-    frame, up = _frame(content.cameras, centers), np.array([0.0, 0.0, 1.0])
+    frame, up = frame_around(content.cameras, centers), np.array([0.0, 0.0, 1.0])
     if content.cameras:
         up = up_direction(content.cameras)
     viewer = Viewer(title=f"gs2d: {content.title}", host=options.host, port=options.port, frame=frame, up=up)
@@ -90,7 +90,7 @@ def open_viewer(path: Path, options: ViewOptions = ViewOptions(), on_event: OnEv
         if mesh is not None:
             viewer.add_mesh(*mesh)
         if content.views:
-            viewer.add_cameras(_shots(content, on_event))
+            viewer.add_cameras(shots(content.views, content.settings, on_event))
         first = content.cameras[0] if content.cameras else _from_aside(frame, up)
         viewer.look_from(first, frame.origin)
     except BaseException:
@@ -113,7 +113,7 @@ def serve(viewer: Viewer, on_event: OnEvent = ignore) -> None:
     raise viewer.failure
 
 
-def _frame(cameras: Sequence[Camera], centers: np.ndarray) -> Frame:
+def frame_around(cameras: Sequence[Camera], centers: np.ndarray) -> Frame:
     """Around what is looked at; its unit is the distance from which it is, or the spread of the splats."""
     middle = middle_of(cameras, centers)
     points = np.array([camera.center for camera in cameras]) if cameras else centers[np.isfinite(centers).all(axis=1)]
@@ -140,7 +140,8 @@ def _of_run(path: Path, on_event: OnEvent) -> _Content:
     for checkpoint in ends[:-1]:  # the last one is what splats.ply holds
         stages[checkpoint.stage] = partial(_splats_of, checkpoint.path)
     stages[FINAL] = lambda: splats
-    name, mesh = run.definition()["scene"]["name"], partial(_mesh_of, run)
+    definition, mesh = run.definition(), partial(_mesh_of, run)
+    name = definition.get("title") or definition["scene"]["name"]
     if job is None:
         backend = get_backend("auto")
         return _Content(name, stages, (), _settings(splats), backend, "median", mesh)
@@ -202,13 +203,13 @@ def drawn(
     return Drawn(to_uint8(image), np.where((alpha >= OPAQUE) & (depth > 0), depth, np.inf).astype(np.float32))
 
 
-def _shots(content: _Content, on_event: OnEvent) -> list[Shot]:
+def shots(views: Sequence[View], settings: RasterSettings, on_event: OnEvent) -> list[Shot]:
     """Some of the photographs, small."""
-    views: list[Any] = list(content.views)
-    if len(views) > MOST_CAMERAS:
-        on_event(Notice(f"{MOST_CAMERAS} of {len(views)} cameras are shown"))
-        views = [views[i] for i in np.linspace(0, len(views) - 1, MOST_CAMERAS).round().astype(int)]
-    shots = []
-    for view in counted(views, "thumbnails", len(views), on_event):
-        shots.append(Shot(view.name, view.camera, thumbnail(view.image(), content.settings.background)))
-    return shots
+    some: list[Any] = list(views)
+    if len(some) > MOST_CAMERAS:
+        on_event(Notice(f"{MOST_CAMERAS} of {len(some)} cameras are shown"))
+        some = [some[i] for i in np.linspace(0, len(some) - 1, MOST_CAMERAS).round().astype(int)]
+    return [
+        Shot(view.name, view.camera, thumbnail(view.image(), settings.background))
+        for view in counted(some, "thumbnails", len(some), on_event)
+    ]

@@ -64,6 +64,9 @@ class Trainer:
         Rasterizer: "auto", "cuda", "cpu" or "reference". Its device is where everything is kept.
     on_event : callable
         Gets every event; the state is whole then, so ``state.state_dict()`` may be saved. What it raises stops the run.
+    between : callable
+        Called after each iteration on a device that nobody waits for (the CPU), when no event is due: a moment for
+        something else that uses the rasterizer. It must leave the state alone.
     state : TrainState, optional
         To go on from; without it training starts anew from ``recipe.seed``.
     progress_every : int
@@ -90,6 +93,7 @@ class Trainer:
         *,
         backend: str | Backend = "auto",
         on_event: OnEvent = lambda event: None,
+        between: Callable[[], None] = lambda: None,
         state: TrainState | None = None,
         progress_every: int = 10,
         target_bytes: int | None = None,
@@ -100,7 +104,7 @@ class Trainer:
             raise DataError(f"scene {scene.name} has no training views")
         self.scene, self.recipe, self.protocol = scene, validate(recipe), protocol
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
-        self._on_event, self._progress_every = on_event, progress_every
+        self._on_event, self._between, self._progress_every = on_event, between, progress_every
         self._pending: list[events.Event] = []
         self.state = self._new_state(dtype) if state is None else self._checked(state)
         self.state.move_to(self.backend.device)
@@ -135,6 +139,8 @@ class Trainer:
             stage = self.recipe.stages[self.state.stage]
             while self.state.step < stage.iterations:
                 self.step()
+                if not waits(self.state.splats.device):
+                    self._between()
             self._finish(stage)
         return self.state.splats
 
