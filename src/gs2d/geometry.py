@@ -15,7 +15,16 @@ from gs2d.camera import Camera
 from gs2d.check import check_shapes
 from gs2d.errors import ShapeError
 
-__all__ = ["camera_extent", "focus_point", "moved", "nearest_distances", "quats_to_matrices", "rigid_motion"]
+__all__ = [
+    "camera_extent",
+    "common_motion",
+    "focus_point",
+    "moved",
+    "nearest_distances",
+    "quats_to_matrices",
+    "rigid_motion",
+    "similarity_motions",
+]
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:
@@ -77,6 +86,41 @@ def moved(camera: Camera, motion: Tensor) -> Camera:
     T = rigid_motion(motion)
     placed: Any = T @ pose.to(T)
     return replace(camera, T_cam_world=placed, pose=None)
+
+
+def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
+    """What a small similarity of a whole scene does to each of its cameras, which stay where they are in it.
+
+    Parameters
+    ----------
+    poses : ndarray [V, 4, 4]
+        T_cam_world.
+    extent : float
+        wu.
+
+    Returns
+    -------
+    ndarray [V, 6, 7]
+        Motions of the cameras in their own frames (``moved``; rotations in rad, shifts in extents) by the scene's
+        rotation about the mean of their centres (rad), its shift (extents) and the growth of its size.
+    """
+    R = poses[:, :3, :3]
+    centers = -np.einsum("vji,vj->vi", R, poses[:, :3, 3])
+    arms = (centers - centers.mean(axis=0)) / extent  # [V, 3]
+    x, y, z = arms.T
+    o = np.zeros_like(x)
+    J = np.zeros((len(poses), 6, 7))
+    J[:, :3, :3] = J[:, 3:, 3:6] = -R
+    J[:, 3:, :3] = R @ np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)  # -R (w x arm)
+    J[:, 3:, 6] = -np.einsum("vij,vj->vi", R, arms)
+    return J
+
+
+def common_motion(motions: np.ndarray, by_similarity: np.ndarray) -> np.ndarray:
+    """The similarity [7] whose motions of the cameras come nearest to these [V, 6], in the sense of least squares."""
+    products = np.einsum("via,vib->ab", by_similarity, by_similarity)
+    inverse = np.linalg.pinv(products, rcond=1e-9, hermitian=True)  # of one camera, or of all in one place
+    return np.asarray(inverse @ np.einsum("via,vi->a", by_similarity, motions))
 
 
 def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:

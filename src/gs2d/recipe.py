@@ -14,6 +14,9 @@ from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 
 from gs2d.recipe_checks import group, integer, number, one_of, require
+from gs2d.recipe_views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
+from gs2d.recipe_views import PoseRefinement as PoseRefinement
+from gs2d.recipe_views import check_exposure, check_poses
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
@@ -215,41 +218,14 @@ class Stage:
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", MappingProxyType(dict(self.train)))
 
+    @property
+    def moves_all(self) -> bool:
+        """Whether the means of all splats are trained."""
+        return self.train.get("means") == "all"
+
     def active_sh_degree(self, iteration: int, max_degree: int) -> int:
         """SH degree that is trained at an iteration (1-based): 0, then one more every ``sh_interval`` iterations."""
         return max_degree if self.sh_interval == 0 else min(max_degree, iteration // self.sh_interval)
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One affine colour transform for each training photograph, learned with the splats (``train/exposure.py``).
-
-    Attributes
-    ----------
-    rate, rate_final, horizon : float, float, int
-        Adam's rate decays log-linearly from ``rate`` to ``rate_final`` over ``horizon`` iterations of the run, all
-        stages counted; a transform is updated when its photograph has its turn.
-    start : int
-        Learned when iteration of the run > start: colours need some to leave the grey that random points begin with.
-    prior : float
-        Weight of the summed squares of what a transform differs from the identity by.
-    beta1, beta2, eps : float
-        Adam's.
-    """
-
-    rate: float = 0.05
-    rate_final: float = 0.001
-    horizon: int = 30_000
-    start: int = 500
-    prior: float = 0.001
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-15
-
-    def rate_at(self, iteration: int) -> float:
-        """Rate at an iteration of the run (1-based): log-linear, then constant."""
-        t = min(max(iteration / self.horizon, 0.0), 1.0)
-        return math.exp((1.0 - t) * math.log(self.rate) + t * math.log(self.rate_final))
 
 
 @dataclass(frozen=True)
@@ -257,7 +233,7 @@ class Recipe:
     """Stages in order, the seed of every random choice, and the start.
 
     ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
-    photographs are taken to have one exposure.
+    photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says.
     """
 
     name: str
@@ -266,6 +242,7 @@ class Recipe:
     sh_degree: int = 3
     init_points: int = 100_000
     exposure: Exposure | None = None
+    poses: PoseRefinement | None = None
 
     @property
     def iterations(self) -> int:
@@ -290,7 +267,11 @@ def validate(recipe: Recipe) -> Recipe:
     integer(f"{where}: init_points", recipe.init_points, low=1)
     require(recipe.init_points < 2**31, f"{where}: init_points must be at most 2^31 - 1, got {recipe.init_points}")
     if recipe.exposure is not None:
-        _check_exposure(f"{where}: exposure", recipe.exposure)
+        check_exposure(f"{where}: exposure", recipe.exposure)
+    if recipe.poses is not None:
+        check_poses(f"{where}: poses", recipe.poses)
+        learns = any(stage.moves_all for stage in recipe.stages)
+        require(learns, f"{where}: poses learn while the means of all splats do, and no stage trains those")
     names = [stage.name for stage in recipe.stages]
     for name in names:
         require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")
@@ -301,17 +282,6 @@ def validate(recipe: Recipe) -> Recipe:
     for stage in recipe.stages:
         _check_stage(f"stage {stage.name!r}", stage, groups)
     return recipe
-
-
-def _check_exposure(where: str, exposure: Exposure) -> None:
-    for name in ("rate", "rate_final", "eps"):
-        value = number(f"{where}.{name}", getattr(exposure, name), low=0.0)
-        require(value > 0, f"{where}.{name} must be positive, got {value} (exposure=null leaves exposures alone)")
-    for name in ("prior", "beta1", "beta2"):
-        number(f"{where}.{name}", getattr(exposure, name), low=0.0)
-    require(max(exposure.beta1, exposure.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
-    integer(f"{where}.horizon", exposure.horizon, low=1)
-    integer(f"{where}.start", exposure.start, low=0)
 
 
 def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:

@@ -21,6 +21,7 @@ from gs2d.recipe import (
     Exposure,
     GradDensify,
     LossTerm,
+    PoseRefinement,
     RankByError,
     Rates,
     Recipe,
@@ -159,6 +160,16 @@ def _rates_after_surface() -> Rates:
     return Rates().at_end(30_000)
 
 
+def with_poses(recipe: Recipe, *, name: str | None = None) -> Recipe:
+    """The recipe with a refined pose for each training photograph (``NAME-poses``); itself if it has them.
+
+    Not in the paper. For cameras that are off by a pixel or more (docs/guides/poses.md).
+    """
+    if recipe.poses is not None:
+        return recipe
+    return replace(recipe, name=name or f"{recipe.name}-poses", poses=PoseRefinement())
+
+
 @dataclass(frozen=True)
 class NamedRecipe:
     """An entry of the registry; calling it builds the recipe."""
@@ -231,6 +242,9 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
     for base, build in bases.items():
         about = f"{base} with an exposure and a white balance for each photograph (`gs2d train --exposure`)"
         add(f"{base}-exposure", about, partial(with_exposure, build()))
+    for base, build in bases.items():
+        about = f"{base} with a refined pose for each photograph (`gs2d train --refine-poses`)"
+        add(f"{base}-poses", about, partial(with_poses, build()))
 
 
 RECIPES: Mapping[str, NamedRecipe] = MappingProxyType(_registry())

@@ -17,11 +17,12 @@ import numpy as np
 
 from gs2d.camera import Camera
 from gs2d.disk import atomic_write
-from gs2d.io.run import EXPOSURE, MESH, RENDERS, REPORT, open_run
+from gs2d.io.run import EXPOSURE, MESH, POSES, RENDERS, REPORT, open_run
 from gs2d.report_curves import curves, read_history
 from gs2d.report_exposure import exposure_section
 from gs2d.report_html import drawing, escape, facts, missing, page, table
 from gs2d.report_pictures import hero, mesh_section, view_sections
+from gs2d.report_poses import poses_section
 from gs2d.report_surface import surface_scores
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
@@ -120,7 +121,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
         "<h2>Training</h2>",
         curve_section(record),
         story(record.events),
-        *_exposure(record),
+        *_of_views(record),
         "<h2>What was run</h2>",
         facts(definition_facts(record.definition)),
         _raw("The whole definition (run.json)", record.definition),
@@ -132,13 +133,16 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
     return target
 
 
-def _exposure(record: RunRecord) -> list[str]:
-    """The section about exposures, where the recipe learns them."""
-    recipe = record.definition.get("recipe")
-    if not isinstance(recipe, Mapping) or not recipe.get("exposure"):
-        return []
-    last = record.stages[-1] if record.stages else {}
-    return ["<h2>Exposure of the photographs</h2>", exposure_section(record.path / EXPOSURE, last)]
+def _of_views(record: RunRecord) -> list[str]:
+    """The sections about exposures and poses, where the recipe learns them."""
+    recipe, last = record.definition.get("recipe"), record.stages[-1] if record.stages else {}
+    learned: Mapping[str, Any] = recipe if isinstance(recipe, Mapping) else {}
+    parts = []
+    if learned.get("exposure"):
+        parts += ["<h2>Exposure of the photographs</h2>", exposure_section(record.path / EXPOSURE, last)]
+    if learned.get("poses"):
+        parts += ["<h2>Where the photographs were taken</h2>", poses_section(record.path / POSES, last)]
+    return parts
 
 
 def _title(record: RunRecord) -> str:

@@ -1,10 +1,10 @@
 """Short runs that still behave: a recipe scaled by a factor.
 
 Scaled: stage lengths, loss starts, the SH interval, start and stop of densification, the horizons of the rates of means
-and exposures (so that rates end where they should). *Not* scaled: the densification interval, as long as ten
-densifications fit, the first iterations without exposures, and opacity resets. A reset puts opacity at 0.01, below the
-0.05 at which splats are pruned; Adam moves a logit by about its rate, 0.05, a step, and 1.65 are missing, so a splat
-needs dozens of views to come back.
+exposures and poses (so that rates end where they should). *Not* scaled: the densification interval, as long as ten
+densifications fit, the first iterations without exposures and poses, and opacity resets. A reset puts opacity at 0.01,
+below the 0.05 at which splats are pruned; Adam moves a logit by about its rate, 0.05, a step, and 1.65 are missing, so
+a splat needs dozens of views to come back.
 Pure Python; never imports torch.
 """
 
@@ -12,15 +12,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
 
 from gs2d.errors import RecipeError
-from gs2d.recipe import Exposure, GradDensify, Recipe, Stage
+from gs2d.recipe import Exposure, GradDensify, PoseRefinement, Recipe, Stage
 
 MIN_DENSIFICATIONS = 10
 PRUNE_GRACE = 100  # iterations after a reset in which nothing is pruned for opacity
 RESET_MARGIN = 200  # iterations of densification that a reset must leave
 MIN_INIT_POINTS = 10_000
-EXPOSURE_WAIT = 200  # iterations before exposures are learned, where the schedule has them
+VIEWS_WAIT = 200  # iterations before exposures and poses are learned, where the schedule has them
+OfViews = TypeVar("OfViews", Exposure, PoseRefinement)
 MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the keyboard
 
 
@@ -48,15 +50,16 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
         recipe,
         stages=tuple(_scale_stage(stage, factor) for stage in recipe.stages),
         init_points=min(recipe.init_points, points),
-        exposure=None if recipe.exposure is None else _scale_exposure(recipe.exposure, factor),
+        exposure=None if recipe.exposure is None else _scale_views(recipe.exposure, factor),
+        poses=None if recipe.poses is None else _scale_views(recipe.poses, factor),
     )
 
 
-def _scale_exposure(exposure: Exposure, factor: float) -> Exposure:
-    """Colours leave the grey they start from by the count of iterations, not by the share of the schedule."""
-    horizon = _scaled(exposure.horizon, factor)
-    least = min(exposure.start, EXPOSURE_WAIT, horizon // 6)
-    return replace(exposure, horizon=horizon, start=max(least, round(exposure.start * factor)))
+def _scale_views(learned: OfViews, factor: float) -> OfViews:
+    """Splats become a scene, and leave the grey they start from, by the count of iterations, not by its share."""
+    horizon = _scaled(learned.horizon, factor)
+    least = min(learned.start, VIEWS_WAIT, horizon // 6)
+    return replace(learned, horizon=horizon, start=max(least, round(learned.start * factor)))
 
 
 def _scale_stage(stage: Stage, factor: float) -> Stage:

@@ -90,6 +90,8 @@ def demo(command: c.Demo, console: Console) -> None:
         exposure=command.exposure,
         viewer=command.viewer,
         viewer_port=command.viewer_port,
+        vary_poses=command.vary_poses,
+        refine_poses=command.refine_poses,
     )
     run = run_demo(options, console.on_event)
     console.close()
@@ -197,12 +199,15 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
         thresholds=command.thresholds,
         lpips_weights=command.lpips_weights,
         match_exposure=command.match_exposure,
+        match_poses=command.match_poses,
     )
     result = evaluate_run(command.run, options, console.on_event, threads=command.threads)
     console.close()
     rows = [row for split in ("train", "test") for row in _both_scores(split, result.get(split))]
     if command.match_exposure:
         rows += _both_scores("test, matched", result["test_matched"])
+    if command.match_poses:
+        rows += _both_scores("test, aligned", result["test_aligned"])
     console.table("", ["views", "pictures", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
     for split in ("train", "test"):
         reason = (result.get(split) or {}).get("lpips_reason") or result.get(f"{split}_reason")

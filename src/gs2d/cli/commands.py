@@ -25,6 +25,10 @@ class Demo(TrainingCommon):
     """Photograph as a camera on automatic does: training pictures differ in exposure and white balance."""
     exposure: bool = False
     """Learn an exposure and a white balance for each photograph, as in `gs2d train`."""
+    vary_poses: bool = False
+    """Say wrong places for the cameras: those of training pictures are off by half a degree and half a percent."""
+    refine_poses: bool = False
+    """Learn where each photograph was taken from, as in `gs2d train`."""
     viewer: bool = False
     """Show the training in the browser while it runs, as in `gs2d train`."""
     viewer_port: int | None = None
@@ -177,6 +181,8 @@ class Evaluate(Common):
     """VGG-16 and LPIPS weights for the LPIPS metric."""
     match_exposure: bool = False
     """Score test views once more, each half of a rendering matched in colour to the other half of its photograph."""
+    match_poses: bool = False
+    """Score test views once more, each camera moved to where the splats look most like its photograph."""
     threads: int | None = None
     """CPU threads."""
 

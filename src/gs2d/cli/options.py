@@ -54,6 +54,8 @@ class Training:
     """Learn an exposure and a white balance for each photograph: for cameras on automatic."""
     test_every: int | None = None
     """Every so many-th view, by name, is a test view; 0: all train (default: what the protocol says, mostly 8)."""
+    refine_poses: bool = False
+    """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
     start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
     """Take the stages that this recipe shares with another run from that run."""
     cache: Annotated[Path | None, arg(metavar="DIR")] = None

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +52,11 @@ class View:
         """A view of arrays in memory: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
         picture = Picture(image, mask, object_mask)
         return cls(name, camera, lambda: picture)
+
+    def at(self, T_cam_world: np.ndarray) -> View:
+        """The same photograph, taken from elsewhere; its picture stays in the cache of this one."""
+        camera = replace(self.camera, T_cam_world=T_cam_world)
+        return View(self.name, camera, self._picture, path=self.path)
 
     def image(self) -> np.ndarray:
         """The photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
@@ -165,6 +170,12 @@ class Scene:
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     root: Path | None = None
+
+    def with_poses(self, poses: Mapping[str, np.ndarray]) -> Scene:
+        """The scene with training cameras moved: T_cam_world [4, 4] by the name of the view. Pictures are shared."""
+        return replace(
+            self, train=tuple(view.at(poses[view.name]) if view.name in poses else view for view in self.train)
+        )
 
     @property
     def views(self) -> tuple[View, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 from gs2d.camera import Camera, look_at
 from gs2d.data.toy_exposure import GAINS, random_gains, with_gains
 from gs2d.data.toy_light import BakedLight, bake, shade
+from gs2d.data.toy_poses import TRUTH, disturbed
 from gs2d.data.toy_rays import cast_camera
 from gs2d.data.toy_scene import ToyScene, build_scene
 from gs2d.data.toy_shapes import merge_vertices
@@ -53,6 +54,7 @@ def write_demo_capture(
     test_views: int = 8,
     size: int = 256,
     vary_exposure: bool = False,
+    vary_poses: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
     threads: int | None = None,
 ) -> None:
@@ -74,6 +76,9 @@ def write_demo_capture(
     vary_exposure : bool
         Training pictures get random gains (``toy_exposure``), which ``exposure_gt.json`` holds; test pictures keep the
         gain 1, the mean of the others.
+    vary_poses : bool
+        The poses of training pictures are said to be a little off where they are (``toy_poses``); ``poses_gt.json`` has
+        the true ones.
     on_progress : callable, optional
         Called with (pictures done, pictures in all) after each picture, always from the calling thread.
     threads : int, optional
@@ -120,6 +125,9 @@ def write_demo_capture(
         np.save(file, np.minimum(counts, 255).astype(np.uint8))
     if vary_exposure:
         write_json(root / GAINS, {f"train/r_{k}.png": list(map(float, gain)) for k, gain in enumerate(gains)})
+    if vary_poses:
+        write_json(root / TRUTH, _transforms("train", cameras["train"]))
+        cameras["train"] = disturbed(cameras["train"], seed)
     for split in ("test", "train") if test_views else ("train",):  # the last file is what makes the folder a capture
         write_json(root / f"transforms_{split}.json", _transforms(split, cameras[split]))
 
@@ -130,7 +138,7 @@ def _make_folders(root: Path, splits: tuple[str, ...]) -> None:
             (root / split).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise disk_error(root / split, error) from error
-    for name in ("transforms_train.json", GAINS):
+    for name in ("transforms_train.json", GAINS, TRUTH):
         (root / name).unlink(missing_ok=True)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gs2d.data.toy import write_demo_capture
 from gs2d.data.toy_exposure import GAINS
+from gs2d.data.toy_poses import TRUTH as TRUE_POSES
 from gs2d.errors import RunError
 from gs2d.io.run import RunFolder, is_run, open_run
 from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
@@ -24,7 +25,8 @@ SCHEDULE_SCALE = 0.1
 class DemoOptions:
     """Where and how; see ``TrainOptions``. ``size`` is the width and height of the photographs, px.
 
-    With ``vary_exposure`` the training photographs get random gains (``data.toy_exposure``).
+    With ``vary_exposure`` the training photographs get random gains (``data.toy_exposure``), with ``vary_poses`` their
+    cameras are said to be a little off where they were (``data.toy_poses``).
     """
 
     out: Path = Path("runs/demo")
@@ -38,6 +40,8 @@ class DemoOptions:
     exposure: bool = False
     viewer: bool = False
     viewer_port: int | None = None
+    vary_poses: bool = False
+    refine_poses: bool = False
     train_views: int = TRAIN_VIEWS
     test_views: int = TEST_VIEWS
     size: int = SIZE
@@ -71,14 +75,19 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
             test_views=options.test_views,
             size=options.size,
             vary_exposure=options.vary_exposure,
+            vary_poses=options.vary_poses,
             on_progress=lambda done, _total: on_event(Step(done)),
             threads=options.threads,
         )
-    elif (capture / GAINS).exists() != options.vary_exposure:
-        raise RunError(
-            f"the photographs in {capture} were made with{'out' * options.vary_exposure} --vary-exposure; "
-            "resume with the same options, or start again with --overwrite"
-        )
+    for file, varied, option in (
+        (GAINS, options.vary_exposure, "--vary-exposure"),
+        (TRUE_POSES, options.vary_poses, "--vary-poses"),
+    ):
+        if (capture / file).exists() != varied:
+            raise RunError(
+                f"the photographs in {capture} were made with{'out' * varied} {option}; "
+                "resume with the same options, or start again with --overwrite"
+            )
     run = train(
         TrainOptions(
             scene=capture,
@@ -88,6 +97,7 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
             exposure=options.exposure,
             viewer=options.viewer,
             viewer_port=options.viewer_port,
+            refine_poses=options.refine_poses,
             threads=options.threads,
             resume=options.resume,
             overwrite=overwrite,
@@ -97,5 +107,5 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
         ),
         on_event,
     )
-    evaluate_run(run.path, EvaluateOptions(ground_truth=capture / TRUTH), on_event)
+    evaluate_run(run.path, EvaluateOptions(ground_truth=capture / TRUTH, match_poses=options.refine_poses), on_event)
     return run

@@ -36,6 +36,7 @@ from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
 from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.refined import aligned
 from gs2d.pipeline.scoring import score_views, split_metrics
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
@@ -279,6 +280,11 @@ def evaluate_run(
         name = "scoring test views, colours matched"
         scores = score_views(splats, job.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)
         result |= split_metrics(scores, "test_matched", "test")
+    if options.match_poses:
+        name = "scoring test views, cameras aligned"
+        best = tuple(aligned(splats, job.scene.test, *drawing, job.scene.extent, on_event))
+        scores = score_views(splats, best, *drawing, name=name, on_event=on_event, lpips=lpips)
+        result |= split_metrics(scores, "test_aligned", "test")
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         name = f"scoring {split} views"
         scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, exposures=exposures)

@@ -40,6 +40,8 @@ class TrainOptions:
     seed : int
     exposure : bool
         Learn an exposure and a white balance for each photograph (``recipes.with_exposure``).
+    refine_poses : bool
+        Learn where each photograph was taken from, beginning where the capture says (``recipes.with_poses``).
     resume, overwrite : bool
         What to do with a run that is already in ``out``.
     start_from : Path or None
@@ -80,6 +82,7 @@ class TrainOptions:
     overrides: tuple[str, ...] = ()
     seed: int = 0
     exposure: bool = False
+    refine_poses: bool = False
     resume: bool = False
     overwrite: bool = False
     start_from: Path | None = None
@@ -166,12 +169,15 @@ class EvaluateOptions:
     lpips_weights : Path or None
     match_exposure : bool
         Score the test views once more, each half of a rendering matched in colour to the other half of its photograph.
+    match_poses : bool
+        Score the test views once more, each from where the splats look most like its photograph.
     """
 
     ground_truth: Path | None = None
     thresholds: tuple[float, ...] = field(default=())
     lpips_weights: Path | None = None
     match_exposure: bool = False
+    match_poses: bool = False
 
     def __post_init__(self) -> None:
         paths_of(self, "ground_truth", "lpips_weights")

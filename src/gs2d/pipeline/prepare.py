@@ -19,10 +19,11 @@ from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.refined import with_found_poses
 from gs2d.protocols import FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
 from gs2d.recipe import Recipe, validate
 from gs2d.recipe_json import apply_overrides, from_json, to_json
-from gs2d.recipes import get_recipe, with_exposure
+from gs2d.recipes import get_recipe, with_exposure, with_poses
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.schedule import scale_schedule
@@ -94,6 +95,7 @@ class Job:
             "stages": recipe["stages"][: index + 1],
             "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
+            **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -104,7 +106,13 @@ class Job:
 
 
 def build_recipe(
-    recipe: str | Recipe, *, schedule_scale: float, seed: int, overrides: tuple[str, ...], exposure: bool = False
+    recipe: str | Recipe,
+    *,
+    schedule_scale: float,
+    seed: int,
+    overrides: tuple[str, ...],
+    exposure: bool = False,
+    poses: bool = False,
 ) -> Recipe:
     """The recipe as it will be trained: found, scaled, seeded, overridden, validated.
 
@@ -116,6 +124,7 @@ def build_recipe(
     if not isinstance(value, Recipe):
         raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
     value = with_exposure(value) if exposure else value
+    value = with_poses(value) if poses else value
     return validate(apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides))
 
 
@@ -132,6 +141,7 @@ def check_train_options(options: TrainOptions) -> Recipe:
         seed=options.seed,
         overrides=options.overrides,
         exposure=options.exposure,
+        poses=options.refine_poses,
     )
     if options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
@@ -280,7 +290,7 @@ def _arrays(view: View) -> Iterator[np.ndarray]:
 
 
 def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> Job:
-    """The job of a run on disk, to mesh, render or score it again.
+    """The job of a run on disk, to mesh, render or score it again, with the cameras that it found.
 
     Raises
     ------
@@ -308,6 +318,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
             f"the capture at {where} has {names[0]} + {names[1]} views, the run was made with "
             f"{data['scene']['train']} + {data['scene']['test']}; restore it or train again"
         )
+    scene = with_found_poses(run, recipe, scene)
     chosen = get_backend(named if backend == "auto" else backend)
     return Job(recipe, protocol, scene, chosen, settings, downscale, digest, cache_bytes)
 
@@ -332,7 +343,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         if name == "protocol" and isinstance(old, dict):
             old, value = _training_facts(old), _training_facts(value)
         if name == "recipe" and isinstance(old, dict):
-            old = {"exposure": None, **old}  # runs of before there were exposures
+            old = {"exposure": None, "poses": None, **old}  # runs of before there were such
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]

@@ -16,6 +16,12 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
             f"exposures: a colour transform for each photograph after iteration {e.start:,}, "
             f"rate {e.rate:g} to {e.rate_final:g} over {e.horizon:,} iterations, prior {e.prior:g}"
         )
+    if recipe.poses is not None:
+        p = recipe.poses
+        yield (
+            f"poses: a motion for each training camera after iteration {p.start:,}, rate {p.rate:g} to "
+            f"{p.rate_final:g} (rad, shares of the extent) over {p.horizon:,} iterations, while all splats move"
+        )
     for number, stage in enumerate(recipe.stages, start=1):
         yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
         for line in _describe_stage(stage):

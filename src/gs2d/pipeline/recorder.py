@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
+from gs2d.data import View
 from gs2d.errors import DivergedError
 from gs2d.io.run import RunFolder, load_tensors
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
@@ -24,6 +25,7 @@ from gs2d.recipe import CloneInPlace, Stage
 from gs2d.splats import Splats
 from gs2d.train import events as train_events
 from gs2d.train.loop import Trainer
+from gs2d.train.per_view import scene_now
 from gs2d.train.state import TrainState
 
 LOG_LINES = 300  # step lines a stage
@@ -158,7 +160,7 @@ class Recorder:
     def _probe_psnr(self, splats: Splats) -> float | None:
         """Mean PSNR over a few fixed views (test views where there are any)."""
         self._stop_clock()
-        psnr = mean_psnr(splats, self._probes, self._settings, self._job.backend, self._exposures)
+        psnr = mean_psnr(splats, self._now(self._probes), self._settings, self._job.backend, self._exposures)
         self._start_clock()
         return psnr
 
@@ -228,11 +230,13 @@ class Recorder:
 
     def _score(self, splats: Splats, views: Any, name: str, on_event: OnEvent) -> Any:
         backend, exposures = self._job.backend, self._exposures
+        views = self._now(views)
         return score_views(splats, views, self._settings, backend, name=name, on_event=on_event, exposures=exposures)
 
     def _draw(self, stage: str) -> None:
         state = self._state
-        draw_stage(self._run, self._job, self._shown, stage, state.splats, _group(state), self._exposures)
+        shown = zip((split for split, _ in self._shown), self._now([view for _, view in self._shown]), strict=True)
+        draw_stage(self._run, self._job, list(shown), stage, state.splats, _group(state), self._exposures)
 
     # -- small things --------------------------------------------------------------------------------------------------
     @property
@@ -242,6 +246,12 @@ class Recorder:
     @property
     def _exposures(self) -> Transforms:
         return named(self._job.scene.train, self._state.exposures)
+
+    def _now(self, views: Sequence[View]) -> list[View]:
+        """Views of the capture from where their cameras are now."""
+        now = {view.name: view for view in scene_now(self._state, self._job.scene).train}
+        learned = set(map(id, self._job.scene.train))
+        return [now[view.name] if id(view) in learned else view for view in views]
 
     @property
     def _state(self) -> TrainState:

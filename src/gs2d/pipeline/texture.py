@@ -140,10 +140,11 @@ def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder
 
 
 def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
-    """The training views, in another size if one is asked for."""
+    """The training views, in another size if one is asked for, from where those of the job are."""
     if options.downscale in (None, job.downscale) or job.scene.root is None:
         return job.scene.train
-    return read_scene(job.scene.root, job.scene.format, options.downscale or 1, job.protocol, on_event).train
+    scene = read_scene(job.scene.root, job.scene.format, options.downscale or 1, job.protocol, on_event)
+    return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}).train
 
 
 def _photographs(

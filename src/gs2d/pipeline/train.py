@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 
@@ -15,6 +16,7 @@ from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
+from gs2d.pipeline.refined import FoundPoses, found_poses, write_poses
 from gs2d.pipeline.restart import Start, check_sources, choose_start
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
@@ -70,8 +72,10 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         if options.estimate and start.state is None:
             for text in foretold(job):
                 on_event(Notice(text))
-        splats, exposures = train_stages(run, job, options, start, watch)
+        splats, exposures, poses = train_stages(run, job, options, start, watch)
         write_exposures(run, exposures, on_event)
+        write_poses(run, job.scene, poses, on_event)
+        job = replace(job, scene=job.scene.with_poses(poses)) if poses else job
         finish(run, job, splats, on_event)
     return run
 
@@ -165,9 +169,10 @@ def undone_if_worthless(run: RunFolder) -> Iterator[None]:
 
 def train_stages(
     run: RunFolder, job: Job, options: TrainOptions, start: Start, watch: Watch
-) -> tuple[Splats, Transforms]:
-    """Train from where ``start`` is to the end of the last stage; the splats, and the exposures of the photographs."""
+) -> tuple[Splats, Transforms, FoundPoses]:
+    """Train from where ``start`` is to the end of the last stage; splats, exposures and poses of the photographs."""
     from gs2d.train.loop import Trainer
+    from gs2d.train.per_view import scene_now
 
     recorder = Recorder(run, job, options, start, watch.on_event)
 
@@ -195,7 +200,9 @@ def train_stages(
     recorder.begin(trainer)
     with recorder.naming_the_last_checkpoint():
         trainer.run()
-    return trainer.splats, named(job.scene.train, trainer.state.exposures)
+    state = trainer.state
+    poses = found_poses(job.scene, scene_now(state, job.scene))
+    return state.splats, named(job.scene.train, state.exposures), poses
 
 
 def foretold(job: Job) -> list[str]:

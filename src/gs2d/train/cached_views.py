@@ -73,8 +73,8 @@ class CachedViews:
         self.rows: Tensor = state.groups[group].nonzero().squeeze(1)
         self.views: list[CachedView] = []
         settings, room = whole.settings(stage, 1), limit_bytes
-        for view in whole.scene.train:
-            cached = cache_view(state.splats, view.camera, settings, self.rows, limit_bytes=room)
+        for index in range(len(whole.scene.train)):
+            cached = cache_view(state.splats, whole.camera(state, index), settings, self.rows, limit_bytes=room)
             if cached is None:
                 break
             room -= cached.nbytes
@@ -89,5 +89,6 @@ class CachedViews:
         color = self.views[index].render(leaves["sh0"], leaves["shN"])
         unseen = color.new_empty(0)  # the losses of such a stage look at nothing else
         output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
-        losses, gradients = self._whole.differentiate(state, stage, iteration, index, output, leaves)
+        camera = self._whole.camera(state, index)  # of a stage that moves no splats: it stands still
+        losses, gradients = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
         return Evaluated(losses, gradients, None, None, self.rows)

@@ -23,11 +23,11 @@ from gs2d.render.backend import Backend, get_backend
 from gs2d.render.cuda_budget import PairBudget
 from gs2d.render.types import RasterSettings
 from gs2d.splats import Splats
-from gs2d.train import events
+from gs2d.train import events, per_view
 from gs2d.train.actions import clone_in_place, rank_by_error
 from gs2d.train.cached_views import choose_evaluator
 from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
-from gs2d.train.exposure import Exposures, as_photographed, check_views, exposure_step, uncount
+from gs2d.train.exposure import as_photographed
 from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
 from gs2d.train.optimizer_fused import fused_adam_step, native_adam_step
@@ -40,7 +40,6 @@ from gs2d.train.views import (
     WholeViews,
     check_losses,
     diverged,
-    finite,
     first_not_finite,
     raster_settings,
     seen_rows,
@@ -205,9 +204,7 @@ class Trainer:
                 options["cancel"] = cancel
             rates = rates_at(stage.rates, iteration, self.scene.extent)
             self._adam_step(self.state, stage, result.gradients, rates, **options)  # type: ignore[arg-type]
-        if self.state.exposures is not None:
-            gradient = result.gradients["exposure"]
-            exposure_step(self.state.exposures, index, gradient, self.recipe, self.state.stage, iteration, cancel)
+        per_view.learn(self.state, self.recipe, iteration, index, result.gradients, cancel)
         return result, happened
 
     def _settle(self) -> None:
@@ -218,8 +215,7 @@ class Trainer:
         for name, parameter in self.state.splats.items():
             if name in stage.train and parameter.numel() > 0:
                 self.state.moments[name].steps -= 1  # counted on the host
-        if self.state.exposures is not None:
-            uncount(self.state.exposures, self._last[1], self.recipe, self.state.stage, self._last[0])
+        per_view.take_back(self.state, self.recipe, *self._last)
         self._budget.exact = True
         self._learn(stage, *self._last)
 
@@ -268,10 +264,7 @@ class Trainer:
             dtype=dtype,
         )
         self._pending.append(events.Initialised(len(initial.splats), initial.source, initial.dropped))
-        state = TrainState(initial.splats, generator)
-        if self.recipe.exposure is not None:
-            state.exposures = Exposures.start(len(self.scene.train), state.splats.means)
-        return state
+        return per_view.start(TrainState(initial.splats, generator), self.recipe, self.scene)
 
     def _checked(self, state: TrainState) -> TrainState:
         """A state from outside, if it is of this recipe."""
@@ -294,7 +287,7 @@ class Trainer:
                 f"the checkpoint waits for training view {last}, but the scene has {len(self.scene.train)}; "
                 "is it of another scene?"
             )
-        check_views(state.exposures, len(self.scene.train) if self.recipe.exposure else 0)
+        per_view.check(state, self.recipe, len(self.scene.train))
         return state
 
     def _densify(self, stage: Stage, iteration: int, result: Evaluated, cancel: Tensor | None) -> list[events.Event]:
@@ -332,14 +325,15 @@ class Trainer:
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """The inner sum of E_i [N] for each training view."""
-        for index, view in enumerate(self.scene.train):
+        for index in range(len(self.scene.train)):
             target, splats, settings = self._targets[index], self.state.splats, self.settings
+            camera = self._whole.camera(self.state, index)
             if self.state.exposures is not None:
                 transform = self.state.exposures.transform(index)
-                splats, settings = as_photographed(splats, view.camera, transform, settings)
+                splats, settings = as_photographed(splats, camera, transform, settings)
             yield splat_errors(
                 splats,
-                view.camera,
+                camera,
                 target.image,
                 settings,
                 backend=self.backend,
@@ -364,7 +358,8 @@ class Trainer:
         frozen = {"means", "quats", "log_scales", "opacity_logits"}.isdisjoint(stage.train)
         if frozen or self.protocol.crossing == "draw":
             return 0
-        seen = seen_rows(self.state.splats, self.scene, self.settings, self.backend)
+        scene = per_view.scene_now(self.state, self.scene)
+        seen = seen_rows(self.state.splats, scene, self.settings, self.backend)
         unseen = int((~seen).sum())
         if unseen == len(seen):
             return 0  # nothing is left to say what the scene is; evaluation will show it
@@ -396,5 +391,5 @@ class Trainer:
         broken = first_not_finite(parameters, self.backend.name)
         if broken is not None:
             raise diverged(stage, self.state.step, broken)
-        if self.state.exposures is not None and not finite(self.state.exposures.offsets):
-            raise diverged(stage, self.state.step, "an exposure")
+        if what := per_view.broken(self.state):
+            raise diverged(stage, self.state.step, what)

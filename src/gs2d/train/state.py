@@ -13,6 +13,7 @@ from gs2d.check import check_shapes
 from gs2d.errors import RunError
 from gs2d.splats import ATTRIBUTES, Splats
 from gs2d.train.exposure import Exposures
+from gs2d.train.poses import Poses
 
 FORMAT = 1  # of the state dict
 
@@ -85,6 +86,8 @@ class TrainState:
         Training views that are still to come in this epoch; the next is the last.
     exposures : Exposures or None
         Colour transforms of the training views, where the recipe learns them.
+    poses : Poses or None
+        Motions of the training cameras, where the recipe learns them.
     """
 
     splats: Splats
@@ -97,6 +100,7 @@ class TrainState:
     entered: bool = False
     queue: list[int] = field(default_factory=list)
     exposures: Exposures | None = None
+    poses: Poses | None = None
 
     def next_view(self, count: int) -> int:
         """Index of the next training view: shuffled epochs, without replacement."""
@@ -123,6 +127,7 @@ class TrainState:
             "queue": list(self.queue),
             "generator": self.generator.get_state(),
             **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
+            **({} if self.poses is None else {"poses": self.poses.state_dict()}),
         }
 
     @classmethod
@@ -155,6 +160,7 @@ class TrainState:
                 bool(data["entered"]),
                 [int(index) for index in data["queue"]],
                 Exposures.from_state_dict(data["exposures"]) if "exposures" in data else None,
+                Poses.from_state_dict(data["poses"]) if "poses" in data else None,
             )
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
             raise RunError(f"checkpoint is broken ({type(error).__name__}: {error}); train again") from error
@@ -186,6 +192,8 @@ class TrainState:
         check_shapes(arrays)
         if self.exposures is not None:
             self.exposures.check()
+        if self.poses is not None:
+            self.poses.check()
 
 
 def _copy(tensor: Tensor) -> Tensor:

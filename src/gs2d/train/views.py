@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.camera import Camera
 from gs2d.data.scene import Scene
 from gs2d.errors import DivergedError
 from gs2d.exposure import expose, identity
@@ -22,6 +23,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
+from gs2d.train.poses import pose_rate
 from gs2d.train.state import TrainState
 from gs2d.train.targets import Target, TargetSource
 
@@ -56,7 +58,7 @@ class Evaluated:
         Weighted. Tensors on a GPU: to read them is to wait for it.
     gradients : mapping of attribute to Tensor
         Like the attributes; only of ``rows``, in their order, where those are given. Where exposures are learned also
-        "exposure" [3, 4], of the photograph's transform.
+        "exposure" [3, 4], of the photograph's transform; where poses are, "pose" [6], of the camera's motion.
     signal : Tensor [N, 2] or [N, 4], or None
     radii : Tensor [N] px or None
         None where nothing was projected.
@@ -93,6 +95,11 @@ class WholeViews:
         wanted = any(term.kind == "distortion" for term in stage.losses)
         return replace(raster_settings(self.protocol, self.scene.extent, degree), with_distortion=wanted)
 
+    def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
+        """The camera of training view ``index`` where it is now; with ``learns`` its pose gets a gradient."""
+        given = self.scene.train[index].camera
+        return given if state.poses is None else state.poses.camera(index, given, learns=learns)
+
     def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
         """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
         splats, densify = state.splats, stage.densify
@@ -102,10 +109,11 @@ class WholeViews:
         if gather:
             columns = 4 if densify is not None and densify.absolute else 2
             probe = splats.means.new_zeros(len(splats), columns, requires_grad=True)
-        camera, settings = self.scene.train[index].camera, self.settings(stage, iteration)
+        camera = self.camera(state, index, learns=pose_rate(self.recipe, state.stage, iteration) > 0)
+        settings = self.settings(stage, iteration)
         rows = None if gather else _learning_rows(state, stage)  # the signal is of every splat
         output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
-        losses, gradients = self.differentiate(state, stage, iteration, index, output, dict(leaves.items()))
+        losses, gradients = self.differentiate(state, stage, iteration, index, camera, output, dict(leaves.items()))
         return Evaluated(losses, gradients, None if probe is None else _gradient(probe), output.radii)
 
     def differentiate(
@@ -114,12 +122,14 @@ class WholeViews:
         stage: Stage,
         iteration: int,
         index: int,
+        camera: Camera,
         output: RenderOutput,
         leaves: Mapping[str, Tensor],
     ) -> tuple[dict[str, float | Tensor], dict[str, Tensor]]:
         """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
 
-        Where exposures are learned, colours are compared in that of the photograph, and "exposure" is among both.
+        Where exposures are learned, colours are compared in that of the photograph, and "exposure" is among both; where
+        the camera that ``output`` was seen by learns, "pose" is among the gradients.
 
         Raises
         ------
@@ -137,7 +147,7 @@ class WholeViews:
             output,
             target.image,
             target.mask,
-            self.scene.train[index].camera,
+            camera,
             self.protocol.resolve(stage.losses),
             iteration=iteration,
             depth_kind=self.protocol.depth,
@@ -160,9 +170,10 @@ class WholeViews:
         gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
         if transform is not None:
             gradients["exposure"] = _gradient(transform)
-        if not watched:
-            return values, gradients
-        broken = first_not_finite(gradients, self.backend.name)
+        broken = first_not_finite(gradients, self.backend.name) if watched else None
+        if state.poses is not None and camera.pose is not None:
+            gradients["pose"] = state.poses.gradient(camera)  # in the host's memory, on a GPU too
+            broken = broken if finite(gradients["pose"]) else "pose"
         if broken is not None:
             raise diverged(stage, iteration, f"the gradient of {broken}")
         return values, gradients

@@ -1,0 +1,32 @@
+"""Cameras that are a little off, as a phone or a poor reconstruction leaves them, for captures with known poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from gs2d.camera import Camera
+from gs2d.geometry import camera_extent, common_motion, focus_point, moved, similarity_motions
+
+TRUTH = "poses_gt.json"  # the true cameras of the training photographs, in the layout of transforms_train.json
+DEGREES, SHARE = 0.5, 0.005  # root mean square of the rotations, and of the shifts as shares of the distance
+
+
+def disturbed(cameras: Sequence[Camera], seed: int, *, degrees: float = DEGREES, share: float = SHARE) -> list[Camera]:
+    """The cameras after random small motions, normally distributed.
+
+    What a similarity of the whole scene would do is taken out of them, since no photograph could show it: so the truth
+    that refinement can find is in the frame of the capture.
+    """
+    rng, views = np.random.default_rng([seed, 3]), len(cameras)
+    extent = camera_extent(cameras) or 1.0
+    middle = focus_point(cameras)
+    distance = np.array([np.linalg.norm(camera.center - middle) for camera in cameras])[:, None]
+    noise = rng.normal(size=(views, 6)) / np.sqrt(3)
+    motions = np.concatenate([noise[:, :3] * np.radians(degrees), noise[:, 3:] * share * distance / extent], axis=1)
+    J = similarity_motions(np.stack([camera.T_cam_world for camera in cameras]), extent)
+    motions -= J @ common_motion(motions, J)
+    motions[:, 3:] *= extent
+    return [moved(camera, torch.from_numpy(motion)) for camera, motion in zip(cameras, motions, strict=True)]

@@ -1,0 +1,180 @@
+"""The poses that a run found: its file ``poses.json``, and cameras of test views moved to where they fit best."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.camera import Camera
+from gs2d.data import Scene, View
+from gs2d.errors import DataError, RunError
+from gs2d.geometry import focus_point, moved
+from gs2d.io.files import read_json, write_json
+from gs2d.io.run import POSES, SPLATS, RunFolder
+from gs2d.losses import compute_losses
+from gs2d.pipeline.events import Notice, OnEvent, counted
+from gs2d.recipe import LossTerm, Recipe
+from gs2d.render.api import rasterize
+from gs2d.render.backend import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+FoundPoses = Mapping[str, np.ndarray]
+"""T_cam_world [4, 4] by the name of the training view; empty where a run learns none."""
+
+NONE: FoundPoses = MappingProxyType({})
+ABOUT = (
+    "cameras of the training photographs as refined, then those of the test photographs as given, in the layout of "
+    "nerfstudio's transforms.json (OpenGL camera to world), for pictures of size w x h without distortion; "
+    "T_cam_world: the same for OpenCV, world to camera; moved: from the given pose, shift as a share of the extent"
+)
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+GRID = 5  # points along each side of a picture, whose motion is measured
+STEPS = 80  # of Adam, to align a test view
+RATE, RATE_FINAL = 2e-3, 2e-5  # rad and extents
+PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
+
+
+def found_poses(given: Scene, now: Scene) -> FoundPoses:
+    """The poses of the training views of a scene whose cameras have moved; none if it is the same."""
+    return NONE if now is given else {view.name: view.camera.T_cam_world for view in now.train}
+
+
+def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEvent) -> None:
+    """Write ``poses.json`` beside the splats, where cameras were refined, and say how far they moved.
+
+    Raises
+    ------
+    DiskError
+    """
+    if not poses:
+        return
+    refined = scene.with_poses(poses)
+    middle = focus_point([view.camera for view in scene.train])
+    frames, far = [], []
+    for given, view in zip(scene.train, refined.train, strict=True):
+        far.append(how_far(given.camera, view.camera, middle, scene.extent))
+        frames.append({**_frame(view, scene.root), "split": "train", "moved": far[-1]})
+    frames += [{**_frame(view, scene.root), "split": "test"} for view in scene.test]
+    write_json(run.file(POSES), {"format": 1, "about": ABOUT, "frames": frames})
+    mean = {name: float(np.mean([entry[name] for entry in far])) for name in far[0]}
+    on_event(
+        Notice(
+            f"cameras moved by {mean['pixels']:.2f} px in the mean ({mean['degrees']:.3f} degrees, "
+            f"{100 * mean['shift']:.3f} % of the extent): {POSES}"
+        )
+    )
+
+
+def _frame(view: View, root: Path | None) -> dict[str, Any]:
+    camera, file = view.camera, view.name
+    if view.path is not None:
+        inside = root is not None and view.path.is_relative_to(root)
+        file = view.path.relative_to(root).as_posix() if inside and root is not None else str(view.path)
+    return {
+        "file_path": file,
+        "name": view.name,
+        "transform_matrix": (np.linalg.inv(camera.T_cam_world) @ _OPENGL).tolist(),
+        "T_cam_world": camera.T_cam_world.tolist(),
+        **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
+        **{"cx": camera.cx, "cy": camera.cy},
+    }
+
+
+def how_far(given: Camera, now: Camera, middle: np.ndarray, extent: float) -> dict[str, float]:
+    """What a camera has moved by: degrees, shift of the centre in extents, and pixels (rms over a grid of the picture).
+
+    Pixels are those of points as far away as ``middle`` [3], what all cameras look at (at least a tenth of the extent).
+    """
+    turn = now.rotation @ given.rotation.T
+    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    depth = max(float((middle - given.center) @ given.forward), 0.1 * extent)
+    columns, rows = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in (given.width, given.height)))
+    rays = np.stack([(columns - given.cx) / given.fx, (rows - given.cy) / given.fy, np.ones_like(rows)], axis=-1)
+    points = depth * rays.reshape(-1, 3) @ given.rotation + given.center
+    shift = now.project(points)[0] - given.project(points)[0]
+    return {
+        "degrees": float(np.degrees(np.arctan2(sine, (np.trace(turn) - 1) / 2))),
+        "shift": float(np.linalg.norm(now.center - given.center) / extent),
+        "pixels": float(np.sqrt((shift**2).sum(axis=1).mean())),
+    }
+
+
+def read_poses(run: RunFolder, recipe: Recipe) -> FoundPoses:
+    """What :func:`write_poses` wrote; none where the recipe refines none, or the run is not finished.
+
+    Raises
+    ------
+    RunError
+        The file is gone or damaged.
+    """
+    if recipe.poses is None or not (run.file(POSES).exists() or run.file(SPLATS).exists()):
+        return NONE
+    remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
+    try:
+        frames = [entry for entry in read_json(run.file(POSES))["frames"] if entry["split"] == "train"]
+        poses = {entry["name"]: np.array(entry["T_cam_world"], dtype=np.float64) for entry in frames}
+    except (DataError, KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{run.file(POSES)} must hold the poses that this run found, got: {error}; {remedy}") from error
+    for name, pose in poses.items():
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise RunError(f"{run.file(POSES)} must hold 4x4 numbers for {name}, got others; {remedy}")
+    return poses
+
+
+def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
+    """The capture of a run with the training cameras that it found: for all that is done with its splats.
+
+    Raises
+    ------
+    RunError
+        The file is gone, damaged, or of other photographs.
+    """
+    poses = read_poses(run, recipe)
+    if not poses:
+        return scene
+    missing = [view.name for view in scene.train if view.name not in poses]
+    if missing:
+        raise RunError(
+            f"{run.file(POSES)} must hold a pose for each training photograph, got none for {missing[0]}; continue "
+            f"with `gs2d train ... --out {run.path} --resume`, which writes it again"
+        )
+    return scene.with_poses(poses)
+
+
+def aligned(
+    splats: Splats,
+    views: Sequence[View],
+    settings: RasterSettings,
+    backend: Backend,
+    extent: float,
+    on_event: OnEvent,
+) -> Iterator[View]:
+    """Views whose cameras are moved to where the splats, which stay, look most like their photographs.
+
+    The photograph is looked at: a score from there says how good the scene is where its cameras are not, and no more.
+    """
+    for view in counted(views, "aligning cameras of test views", len(views), on_event):
+        target = torch.from_numpy(view.target(settings.background)).to(splats.means)
+        pixels = view.mask()
+        mask = None if pixels is None else torch.from_numpy(pixels).to(splats.device)
+        unit = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
+        motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        optimizer = torch.optim.Adam([motion], lr=RATE)
+        decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATE_FINAL / RATE) ** (1 / STEPS))
+        for step in range(1, STEPS + 1):
+            camera = moved(view.camera, motion * unit)
+            output = rasterize(splats, camera, settings, backend=backend)
+            options: dict[str, Any] = {"iteration": step, "depth_kind": "mean", "backend_name": backend.name}
+            loss = sum(compute_losses(output, target, mask, camera, PHOTOMETRIC, **options).values())
+            optimizer.zero_grad()
+            if isinstance(loss, torch.Tensor) and loss.requires_grad:
+                loss.backward()
+            optimizer.step()
+            decay.step()
+        yield view.at(moved(view.camera, motion.detach() * unit).T_cam_world)

@@ -1,0 +1,99 @@
+"""What a recipe may learn of each training photograph: an exposure, a pose. Pure Python; never imports torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from gs2d.recipe_checks import integer, number, require
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One affine colour transform for each training photograph, learned with the splats (``train/exposure.py``).
+
+    Attributes
+    ----------
+    rate, rate_final, horizon : float, float, int
+        Adam's rate decays log-linearly from ``rate`` to ``rate_final`` over ``horizon`` iterations of the run, all
+        stages counted; a transform is updated when its photograph has its turn.
+    start : int
+        Learned when iteration of the run > start: colours need some to leave the grey that random points begin with.
+    prior : float
+        Weight of the summed squares of what a transform differs from the identity by.
+    beta1, beta2, eps : float
+        Adam's.
+    """
+
+    rate: float = 0.05
+    rate_final: float = 0.001
+    horizon: int = 30_000
+    start: int = 500
+    prior: float = 0.001
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+
+    def rate_at(self, iteration: int) -> float:
+        """Rate at an iteration of the run (1-based): log-linear, then constant."""
+        return _decayed(self.rate, self.rate_final, iteration / self.horizon)
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """One rigid motion for each training camera, learned with the splats (``train/poses.py``).
+
+    It learns in stages that train the means of all splats: elsewhere nothing could follow.
+
+    Attributes
+    ----------
+    rate, rate_final, horizon : float, float, int
+        Adam's rate, in rad and in shares of the scene's extent, decays log-linearly from ``rate`` to ``rate_final``
+        over ``horizon`` iterations of the run, all stages counted; a camera moves when its photograph has its turn.
+    start : int
+        Learned when iteration of the run > start: before, the splats are no scene that could tell where cameras are.
+    beta1, beta2, eps : float
+        Adam's. A camera has a turn once an epoch, some hundred in all: a long memory would be that of the start.
+    """
+
+    rate: float = 2e-3
+    rate_final: float = 2e-5
+    horizon: int = 30_000
+    start: int = 500
+    beta1: float = 0.9
+    beta2: float = 0.99
+    eps: float = 1e-15
+
+    def rate_at(self, iteration: int) -> float:
+        """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
+        return _decayed(self.rate, self.rate_final, iteration / self.horizon) if iteration > self.start else 0.0
+
+
+def _decayed(first: float, last: float, share: float) -> float:
+    """Log-linear between the ends of [0, 1]."""
+    t = min(max(share, 0.0), 1.0)
+    return math.exp((1.0 - t) * math.log(first) + t * math.log(last))
+
+
+def check_exposure(where: str, exposure: Exposure) -> None:
+    """Raise RecipeError for numbers that make no exposures."""
+    for name in ("rate", "rate_final", "eps"):
+        value = number(f"{where}.{name}", getattr(exposure, name), low=0.0)
+        require(value > 0, f"{where}.{name} must be positive, got {value} (exposure=null leaves exposures alone)")
+    for name in ("prior", "beta1", "beta2"):
+        number(f"{where}.{name}", getattr(exposure, name), low=0.0)
+    require(max(exposure.beta1, exposure.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
+    integer(f"{where}.horizon", exposure.horizon, low=1)
+    integer(f"{where}.start", exposure.start, low=0)
+
+
+def check_poses(where: str, poses: PoseRefinement) -> None:
+    """Raise RecipeError for numbers that make no poses."""
+    for name in ("rate", "rate_final", "eps"):
+        value = number(f"{where}.{name}", getattr(poses, name), low=0.0)
+        require(value > 0, f"{where}.{name} must be positive, got {value} (poses=null leaves cameras alone)")
+    for name in ("beta1", "beta2"):
+        number(f"{where}.{name}", getattr(poses, name), low=0.0)
+    require(max(poses.beta1, poses.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
+    integer(f"{where}.horizon", poses.horizon, low=1)
+    integer(f"{where}.start", poses.start, low=0)

@@ -1,0 +1,66 @@
+"""What is learned of each training view, exposures and poses, as the training loop meets it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from gs2d.data.scene import Scene
+from gs2d.recipe import Recipe
+from gs2d.train.exposure import Exposures, check_views, exposure_step, uncount
+from gs2d.train.poses import Poses, check_poses, pose_rate, pose_step
+from gs2d.train.state import TrainState
+from gs2d.train.views import finite
+
+
+def start(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:
+    """The state with what the recipe learns of views, at its beginning."""
+    if recipe.exposure is not None:
+        state.exposures = Exposures.start(len(scene.train), state.splats.means)
+    if recipe.poses is not None:
+        state.poses = Poses.start([view.camera for view in scene.train], scene.extent)
+    return state
+
+
+def check(state: TrainState, recipe: Recipe, views: int) -> None:
+    """Raise RunError unless a state has what the recipe learns of so many views, and nothing else."""
+    check_views(state.exposures, views if recipe.exposure else 0)
+    check_poses(state.poses, views if recipe.poses else 0)
+
+
+def learn(
+    state: TrainState,
+    recipe: Recipe,
+    iteration: int,
+    index: int,
+    gradients: Mapping[str, Tensor],
+    cancel: Tensor | None = None,
+) -> None:
+    """Update what is learned of a view; ``cancel`` on a device: where it is not 0 nothing changes."""
+    if state.exposures is not None:
+        exposure_step(state.exposures, index, gradients["exposure"], recipe, state.stage, iteration, cancel)
+    if state.poses is not None and "pose" in gradients and (cancel is None or int(cancel) == 0):
+        # The host has waited for the gradient, so it may look at ``cancel`` too.
+        pose_step(state.poses, index, gradients["pose"], recipe, pose_rate(recipe, state.stage, iteration))
+
+
+def take_back(state: TrainState, recipe: Recipe, iteration: int, index: int) -> None:
+    """Take back what the host has counted of an update that was cancelled on the device."""
+    if state.exposures is not None:
+        uncount(state.exposures, index, recipe, state.stage, iteration)
+
+
+def broken(state: TrainState) -> str:
+    """What is not finite, in words; "" if all is."""
+    if state.exposures is not None and not finite(state.exposures.offsets):
+        return "an exposure"
+    return "a pose" if state.poses is not None and not finite(state.poses.offsets) else ""
+
+
+def scene_now(state: TrainState, scene: Scene) -> Scene:
+    """The scene with its training cameras where they are now."""
+    poses = state.poses
+    if poses is None:
+        return scene
+    return scene.with_poses({view.name: poses.pose(index).numpy() for index, view in enumerate(scene.train)})

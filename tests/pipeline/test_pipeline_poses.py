@@ -1,0 +1,244 @@
+"""Refined poses through a whole run: its file, who uses them, aligned scores, resuming, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ball_runs import SMALL, Stop, comparable, options
+from gs2d.camera import Camera
+from gs2d.data import load_scene, toy
+from gs2d.data.toy_poses import TRUTH, disturbed
+from gs2d.errors import RunError
+from gs2d.evaluate.images import mean_metrics
+from gs2d.geometry import camera_extent, common_motion, moved, similarity_motions
+from gs2d.io.run import POSES, RunFolder
+from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.jobs import evaluate_run, open_job, render_run, report_run
+from gs2d.pipeline.options import EvaluateOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.pictures import render_view, shown_cameras
+from gs2d.pipeline.prepare import build_recipe, prepare, reload_job
+from gs2d.pipeline.refined import aligned, how_far
+from gs2d.pipeline.scoring import score_views
+from gs2d.pipeline.texture import _views
+from gs2d.pipeline.train import train
+from gs2d.recipes import get_recipe
+from tiny import ball_cameras
+
+EARLY = (*SMALL, "poses.start=5", "poses.rate=0.01")  # so that 60 iterations show something
+
+
+def learning(capture: Path, out: Path, **changes: object) -> TrainOptions:
+    return options(capture, out, refine_poses=True, overrides=EARLY, **changes)
+
+
+@pytest.fixture(scope="module")
+def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    notices: list[str] = []
+
+    def listen(event: Event) -> None:
+        notices.extend([event.text] if isinstance(event, Notice) else [])
+
+    made = train(learning(capture, tmp_path_factory.mktemp("runs") / "poses"), listen)
+    assert any(text.startswith("cameras moved by ") and text.endswith("of the extent): poses.json") for text in notices)
+    return made
+
+
+def test_the_demo_s_training_cameras_are_off_and_the_true_ones_beside_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
+    picture = toy.Picture(np.full((16, 16, 4), 200, np.uint8), np.zeros(1, bool))
+    monkeypatch.setattr(toy, "render_picture", lambda *_: picture)
+    for name, vary in (("plain", False), ("varied", True)):
+        toy.write_demo_capture(tmp_path / name, train_views=5, test_views=1, size=16, vary_poses=vary)
+    plain, varied = (tmp_path / name for name in ("plain", "varied"))
+    assert (varied / TRUTH).read_bytes() == (plain / "transforms_train.json").read_bytes()
+    assert (varied / "transforms_train.json").read_bytes() != (plain / "transforms_train.json").read_bytes()
+    assert (varied / "transforms_test.json").read_bytes() == (plain / "transforms_test.json").read_bytes()
+    assert not (plain / TRUTH).exists()
+    plain.rename(tmp_path / "capture")
+    with pytest.raises(RunError, match="made without --vary-poses; resume with the same options"):
+        demo(DemoOptions(out=tmp_path, resume=True, vary_poses=True))
+
+
+def test_a_disturbance_has_its_size_and_no_motion_in_common() -> None:
+    cameras = ball_cameras(60, 20)
+    off = disturbed(cameras, 3)
+    middle = np.zeros(3)
+    far = [how_far(a, b, middle, 1.0) for a, b in zip(cameras, off, strict=True)]
+    distance = np.mean([np.linalg.norm(camera.center) for camera in cameras])
+    assert np.sqrt(np.mean([f["degrees"] ** 2 for f in far])) == pytest.approx(0.5, rel=0.2)
+    assert np.sqrt(np.mean([f["shift"] ** 2 for f in far])) == pytest.approx(0.005 * distance, rel=0.2)
+    extent = camera_extent(cameras)
+    J = similarity_motions(np.stack([camera.T_cam_world for camera in cameras]), extent)
+    steps = np.stack([b.T_cam_world @ np.linalg.inv(a.T_cam_world) for a, b in zip(cameras, off, strict=True)])
+    small = np.stack([steps[:, 2, 1], steps[:, 0, 2], steps[:, 1, 0], *steps[:, :3, 3].T / extent], axis=1)
+    assert np.abs(common_motion(small, J)).max() < 2e-5  # to first order
+
+
+def test_how_far_a_camera_moved_is_said_in_degrees_extents_and_pixels() -> None:
+    camera = Camera(100, 100, 200.0, 200.0, 50.0, 50.0, np.eye(4))
+    ahead = np.array([0.0, 0.0, 4.0])
+    aside = moved(camera, torch.tensor([0, 0, 0, 0.04, 0, 0], dtype=torch.float64))
+    assert how_far(camera, aside, ahead, 2.0) == pytest.approx({"degrees": 0, "shift": 0.02, "pixels": 2}, abs=1e-9)
+    turned = moved(camera, torch.tensor([0, 0, 0.01, 0, 0, 0], dtype=torch.float64))
+    assert how_far(camera, turned, ahead, 2.0)["degrees"] == pytest.approx(np.degrees(0.01))
+    behind = how_far(camera, aside, -ahead, 2.0)["pixels"]
+    assert behind == pytest.approx(200 * 0.04 / 0.2)  # nothing nearer than a tenth of the extent
+
+
+def test_the_poses_lie_beside_the_run_as_transforms_that_can_be_loaded(
+    run: RunFolder, capture: Path, tmp_path: Path
+) -> None:
+    frames = json.loads(run.file(POSES).read_text())["frames"]
+    assert [frame["split"] for frame in frames] == ["train"] * 6 + ["test"] * (len(frames) - 6)
+    assert frames[0]["file_path"] == "train/r_0.png"
+    assert max(frame["moved"]["pixels"] for frame in frames[:6]) > 0.05
+    shutil.copytree(capture, tmp_path / "again")
+    for file in ("transforms_train.json", "transforms_test.json"):
+        (tmp_path / "again" / file).unlink()
+    shutil.copy(run.file(POSES), tmp_path / "again/transforms.json")
+    again = {view.name: view.camera for view in load_scene(tmp_path / "again").views}
+    _, job, _ = open_job(run.path, 1, ignore)
+    for view in job.scene.views:
+        np.testing.assert_allclose(again[view.name].T_cam_world, view.camera.T_cam_world, atol=1e-9)
+        assert again[view.name].fx == pytest.approx(view.camera.fx)
+
+
+def test_everybody_takes_the_cameras_that_were_found(run: RunFolder, capture: Path, tmp_path: Path) -> None:
+    _, job, splats = open_job(run.path, 1, ignore)
+    given = load_scene(capture)
+    for view, before in zip(job.scene.train, given.train, strict=True):
+        assert not np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
+        assert np.array_equal(view.image(), before.image())
+    for view, before in zip(job.scene.test, given.test, strict=True):
+        assert np.array_equal(view.camera.T_cam_world, before.camera.T_cam_world)
+    # Scored while it trained, scored again, and drawn.
+    drawing = {"settings": job.settings, "backend": job.backend, "name": "", "on_event": ignore}
+    psnr = run.metrics()["stages"][-1]["train"]["psnr"]
+    own = mean_metrics(list(score_views(splats, job.scene.train, **drawing).values()))  # type: ignore[arg-type]
+    assert own.to_json()["psnr"] == psnr
+    as_given = mean_metrics(list(score_views(splats, given.train, **drawing).values()))  # type: ignore[arg-type]
+    assert as_given.to_json()["psnr"] != psnr
+    assert evaluate_run(run.path)["train"]["psnr"] == psnr
+    render_run(run.path, split="train", out=tmp_path)
+    assert len(list(tmp_path.glob("*.png"))) == 6
+    texture = _views(job, TextureOptions(downscale=2), ignore)
+    assert np.array_equal(texture[0].camera.T_cam_world, job.scene.train[0].camera.T_cam_world)
+    assert texture[0].camera.width == job.scene.train[0].camera.width // 2
+
+
+def test_pictures_of_training_views_are_drawn_from_where_they_were_taken(capture: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "alone"
+    shutil.copytree(capture, alone)
+    (alone / "transforms_test.json").write_text('{"camera_angle_x": 0.7, "frames": []}')
+    made = train(learning(alone, tmp_path / "run"))
+    found = {
+        tuple(np.array(frame["T_cam_world"]).ravel()) for frame in json.loads(made.file(POSES).read_text())["frames"]
+    }
+    assert all(tuple(camera.T_cam_world.ravel()) in found for camera in shown_cameras(made))
+
+
+def test_aligned_scores_are_beside_the_plain_ones_where_they_are_asked_for(run: RunFolder) -> None:
+    plain = run.metrics()["stages"][-1]
+    assert "test_aligned" not in plain
+    both = evaluate_run(run.path, EvaluateOptions(match_poses=True))
+    assert both["test"]["psnr"] == plain["test"]["psnr"]
+    assert both["test_aligned"]["psnr"] > plain["test"]["psnr"]
+    assert run.metrics()["stages"][-1]["test_aligned"] == both["test_aligned"]
+    assert "each camera is moved to fit its photograph" in run.file("report.html").read_text()
+
+
+def test_a_view_is_aligned_to_where_the_splats_look_like_its_photograph(run: RunFolder) -> None:
+    _, job, splats = open_job(run.path, 1, ignore)
+    view, drawing = job.scene.train[0], (job.settings, job.backend)
+    color = render_view(splats, view, *drawing).color.clamp(0, 1).numpy()
+    photograph = type(view).from_arrays("a", view.camera, np.rint(255 * color).astype(np.uint8))
+    off = moved(view.camera, torch.tensor([0.01, -0.01, 0, 0.01, 0.02, 0], dtype=torch.float64))
+    (found,) = aligned(splats, [photograph.at(off.T_cam_world)], *drawing, job.scene.extent, ignore)
+    middle = np.zeros(3)
+    before, after = (how_far(view.camera, c, middle, job.scene.extent)["pixels"] for c in (off, found.camera))
+    assert after < 0.3 * before
+
+
+def test_a_stopped_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capture: Path, tmp_path: Path) -> None:
+    def listen(event: Event) -> None:
+        if isinstance(event, Step) and event.done >= 37 and "loss" in event.detail:  # in the second stage
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(learning(capture, tmp_path / "run"), listen)
+    assert not (tmp_path / "run" / POSES).exists()
+    stopped = RunFolder(tmp_path / "run")
+    given = load_scene(capture).train[0].camera.T_cam_world
+    assert np.array_equal(reload_job(stopped, ignore).scene.train[0].camera.T_cam_world, given)  # not found yet
+    resumed = train(learning(capture, tmp_path / "run", resume=True))
+    assert comparable(resumed)[0] == comparable(run)[0]
+    assert resumed.file(POSES).read_bytes() == run.file(POSES).read_bytes()
+
+
+def test_stages_are_not_shared_between_runs_with_and_without_poses(capture: Path, tmp_path: Path) -> None:
+    plain = prepare(options(capture, tmp_path / "a"), ignore)
+    with_them = prepare(learning(capture, tmp_path / "b"), ignore)
+    assert plain.stage_key(0) != with_them.stage_key(0)
+    same_stages = replace(with_them, recipe=replace(with_them.recipe, poses=None))
+    assert same_stages.stage_key(0) != with_them.stage_key(0)
+
+
+def test_stages_of_another_run_bring_their_poses(run: RunFolder, capture: Path, tmp_path: Path) -> None:
+    taken = train(learning(capture, tmp_path / "taken", start_from=run.path))
+    assert all(stage["reused_from"] == str(run.path) for stage in taken.metrics()["stages"])
+    assert taken.file(POSES).read_bytes() == run.file(POSES).read_bytes()
+
+
+def test_the_flag_is_the_named_recipe_and_goes_with_the_other() -> None:
+    rest = {"schedule_scale": 0.1, "seed": 3, "overrides": ()}
+    flagged = build_recipe("2dgs-r", poses=True, **rest)  # type: ignore[arg-type]
+    assert flagged == build_recipe("2dgs-r-poses", **rest)  # type: ignore[arg-type]
+    assert flagged == build_recipe("2dgs-r-poses", poses=True, **rest)  # type: ignore[arg-type]
+    both = build_recipe("2dgs-r", poses=True, exposure=True, **rest)  # type: ignore[arg-type]
+    assert both.name == "2dgs-r-exposure-poses"
+    assert get_recipe("2dgs-r").poses is None
+
+
+def test_a_run_made_before_there_were_poses_is_resumed(undisturbed: RunFolder, capture: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "old"
+    shutil.copytree(undisturbed.path, copy)
+    definition = json.loads((copy / "run.json").read_text())
+    assert definition["recipe"].pop("poses", "absent") is None
+    (copy / "run.json").write_text(json.dumps(definition))
+    resumed = train(options(capture, copy, resume=True))
+    assert comparable(resumed) == comparable(undisturbed)
+    assert not resumed.file(POSES).exists()
+    assert "Where the photographs were taken" not in resumed.file("report.html").read_text()
+
+
+def test_a_lost_or_damaged_file_of_poses_is_named_with_its_remedy(run: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(tmp_path / "copy")
+    shutil.copytree(run.path, copy.path)
+    one = {"name": "train/r_0.png", "split": "train", "T_cam_world": np.eye(4).tolist()}
+    for frames in ([{"name": "a"}], [{**one, "T_cam_world": [[1]]}], [one], "{"):
+        copy.file(POSES).write_text(json.dumps({"frames": frames}))
+        with pytest.raises(RunError, match=r"poses.json must hold .*--resume"):
+            evaluate_run(copy.path)
+    copy.file(POSES).unlink()
+    with pytest.raises(RunError, match=r"poses.json must hold .*--resume"):
+        evaluate_run(copy.path)
+    report_run(copy.path)
+    assert "poses.json is missing" in copy.file("report.html").read_text()
+
+
+def test_the_report_shows_how_far_the_cameras_moved(run: RunFolder) -> None:
+    page = run.file("report.html").read_text()
+    assert "Where the photographs were taken" in page
+    frames = [frame for frame in json.loads(run.file(POSES).read_text())["frames"] if frame["split"] == "train"]
+    most = max(frames, key=lambda frame: frame["moved"]["pixels"])
+    assert f"most in {most['name']} ({most['moved']['pixels']:.2f} pixels)" in page
