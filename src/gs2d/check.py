@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from gs2d.errors import ShapeError
+
+
+@cache
+def _parsed(pattern: str) -> tuple[tuple[str, int | None], ...]:
+    """The words of a pattern, each with its value if it is a number."""
+    return tuple((word, int(word) if word.lstrip("-").isdigit() else None) for word in pattern.split())
 
 
 def check_shapes(arrays: Mapping[str, tuple[Any, str]]) -> dict[str, int]:
@@ -36,20 +43,20 @@ def check_shapes(arrays: Mapping[str, tuple[Any, str]]) -> dict[str, int]:
     sizes: dict[str, int] = {}
     fixed_by: dict[str, str] = {}
     for name, (array, pattern) in arrays.items():
-        words = pattern.split()
-        shape = tuple(int(size) for size in array.shape)
+        words, shape = _parsed(pattern), tuple(array.shape)
         fits = len(words) == len(shape)
-        for word, size in zip(words, shape, strict=False):
+        for (word, number), size in zip(words, shape, strict=False):
             if word == "_":
                 continue
-            if word.lstrip("-").isdigit():
-                fits = fits and int(word) == size
+            if number is not None:
+                fits = fits and number == size
             elif word in sizes:
                 fits = fits and sizes[word] == size
             elif fits:
                 sizes[word], fixed_by[word] = size, name
         if not fits:
-            known = [f"{w}={sizes[w]} (from {fixed_by[w]})" for w in words if w in sizes and fixed_by[w] != name]
+            names = [word for word, _ in words]
+            known = [f"{w}={sizes[w]} (from {fixed_by[w]})" for w in names if w in sizes and fixed_by[w] != name]
             context = f" with {', '.join(known)}" if known else ""
-            raise ShapeError(f"{name} must be [{', '.join(words)}]{context}, got {list(shape)}")
+            raise ShapeError(f"{name} must be [{', '.join(names)}]{context}, got {list(shape)}")
     return sizes

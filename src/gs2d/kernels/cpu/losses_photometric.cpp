@@ -1,9 +1,10 @@
 // L1 and SSIM of an image [H, W, 3], with the gradient of any weighted sum of both, in one pass over the rows.
 //
 // A row of W interleaved pixels is 3 W reals; the window's taps are 3 reals apart, so that channels need no planes. Each
-// piece of rows runs down the image with two rings of 11 horizontally blurred rows: of the moments x, x^2 + y^2, x y (and
-// y, unless its blur is given), and of SSIM's derivatives by the blurred moments. 5 rows behind the input a row of SSIM
-// is finished, 10 rows behind it a row of the gradient. Everything stays in the second-level cache.
+// piece of rows runs down the image with two rings of horizontally blurred rows: of the moments x, x^2 + y^2, x y (and
+// y, unless its blur is given), and of SSIM's derivatives by the blurred moments. 5 rows behind the input SSIM is
+// finished, 10 rows behind it the gradient, a few rows at a time: most of the rows above and below that they are blurred
+// from are the same. Everything stays in the second-level cache.
 #include "core/losses.h"
 #include "cpu/export.h"
 #include "cpu/losses_rows.h"
@@ -16,34 +17,57 @@ constexpr int RADIUS = SSIM_RADIUS, TAPS = SSIM_TAPS;
 // The window over 11 values `at(k)`, k = -5..5.
 template <class F> GS2D_HD V window(F at) {
     V sum = V(real(SSIM_WINDOW[0])) * at(0);
+#pragma GCC unroll 8
     for (int k = 1; k <= RADIUS; ++k) sum = fma(V(real(SSIM_WINDOW[k])), at(-k) + at(k), sum);
     return sum;
 }
 
 void blur_row(const real* in, real* out, int64_t length) {
+#if defined(GS2D_OWN_AFTER)  // a load of 64 bytes that are not one cache line takes two cycles
+    V before = load(in - LANES), here = load(in);
+    for (int64_t i = 0; i < length; i += LANES) {
+        const V next = load(in + i + LANES);
+        const V taps[TAPS] = {after<1>(before, here), after<4>(before, here), after<7>(before, here), after<10>(before, here),
+                              after<13>(before, here), here, after<3>(here, next), after<6>(here, next), after<9>(here, next),
+                              after<12>(here, next), after<15>(here, next)};
+        store(out + i, window([&](int k) { return taps[RADIUS + k]; }));
+        before = here, here = next;
+    }
+#else
     for (int64_t i = 0; i < length; i += LANES) store(out + i, window([&](int k) { return load(in + i + 3 * k); }));
+#endif
 }
 
-// The horizontally blurred rows y - 5 .. y + 5 of `MAPS` maps: row y of map m is row (y mod 11) * MAPS + m.
+constexpr int ROWS = 4;                    // finished together
+constexpr int NEEDED = TAPS - 1 + ROWS;    // blurred from so many
+
+// The horizontally blurred rows around y of `MAPS` maps: row y of map m is row (y mod NEEDED) * MAPS + m.
 struct Ring {
     real* data;
     int64_t stride;
     int maps;
-    static int64_t slot(int64_t y) { return (y + 1024 * TAPS) % TAPS; }
+    static int64_t slot(int64_t y) { return (y + 1024 * NEEDED) % NEEDED; }
     real* row(int64_t y, int map) const { return data + (slot(y) * maps + map) * stride + MARGIN; }
     void clear(int64_t y, int64_t length) const {
         for (int map = 0; map < maps; ++map) std::memset(row(y, map), 0, static_cast<size_t>(length) * sizeof(real));
     }
-};
-
-// Pointers to the 11 rows around y of one map.
-struct Column {
-    const real* rows[TAPS];
-    Column(const Ring& ring, int64_t y, int map) {
-        for (int k = 0; k < TAPS; ++k) rows[k] = ring.row(y + k - RADIUS, map);
+    // The window down the columns of rows y .. y + count - 1 of a map: of row r to out + r * stride.
+    void blur(int64_t y, int count, int map, int64_t length, real* out) const {
+        const real* rows[NEEDED];
+        for (int k = 0; k < NEEDED; ++k) rows[k] = row(y + k - RADIUS, map);
+        if (count == ROWS) return blur_rows<ROWS>(rows, length, out);
+        for (int r = 0; r < count; ++r) blur_rows<1>(rows + r, length, out + r * stride);
     }
-    GS2D_HD V blur(int64_t i) const {
-        return window([&](int k) { return load(rows[k + RADIUS] + i); });
+
+   private:
+    template <int R> void blur_rows(const real* const* rows, int64_t length, real* out) const {
+        for (int64_t i = 0; i < length; i += LANES) {
+            V v[TAPS - 1 + R];
+#pragma GCC unroll 16
+            for (int k = 0; k < TAPS - 1 + R; ++k) v[k] = load(rows[k] + i);
+#pragma GCC unroll 16
+            for (int r = 0; r < R; ++r) store(out + r * stride + i, window([&](int k) { return v[r + RADIUS + k]; }));
+        }
     }
 };
 
@@ -71,7 +95,7 @@ class Piece {
           stride(row_stride(n)),
           known(images.target_mean != nullptr),
           maps(known ? MOMENTS - 1 : MOMENTS),
-          scratch(stride * (1 + 1 + MOMENTS + DERIVATIVES + TAPS * (maps + DERIVATIVES))) {}
+          scratch(stride * (2 + MOMENTS + ROWS * (int(DERIVATIVES) + int(MOMENTS)) + NEEDED * (maps + DERIVATIVES))) {}
 
     bool run() {
         if (scratch.failed()) return false;
@@ -80,14 +104,17 @@ class Piece {
         validity = scratch.row(r++, stride);
         if (im.mask == nullptr) fill_validity(nullptr, im.width, 3, validity);
         products = scratch.row(r, stride), r += MOMENTS;
-        derivatives = scratch.row(r, stride), r += DERIVATIVES;
-        moments = {scratch.data + r * stride, stride, maps}, r += TAPS * maps;
+        derivatives = scratch.row(r, stride), r += DERIVATIVES * ROWS;
+        blurred = scratch.row(r, stride), r += MOMENTS * ROWS;
+        moments = {scratch.data + r * stride, stride, maps}, r += NEEDED * maps;
         pullbacks = {scratch.data + r * stride, stride, DERIVATIVES};
         const int64_t reach = im.gradient ? RADIUS : 0;  // rows of SSIM beyond the piece that its gradient needs
-        for (int64_t y = begin - reach - RADIUS; y < end + reach + RADIUS; ++y) {
-            input_row(y);
-            if (y - RADIUS >= begin - reach) ssim_row(y - RADIUS);
-            if (im.gradient && y - 2 * RADIUS >= begin) gradient_row(y - 2 * RADIUS);
+        const int64_t last = end + reach + RADIUS;
+        for (int64_t y = begin - reach - RADIUS; y < last; y += ROWS) {
+            const int count = last - y < ROWS ? static_cast<int>(last - y) : ROWS;
+            for (int k = 0; k < count; ++k) input_row(y + k);
+            from(begin - reach, y - RADIUS, count, [&](int64_t first, int n) { ssim_rows(first, n); });
+            if (im.gradient) from(begin, y - 2 * RADIUS, count, [&](int64_t first, int n) { gradient_rows(first, n); });
         }
         return true;
     }
@@ -124,42 +151,59 @@ class Piece {
             store(products + MEAN * stride + i, u);
             store(products + SQUARES * stride + i, fma(u, u, v * v));
             store(products + PRODUCT * stride + i, u * v);
-            store(products + TARGET_MEAN * stride + i, v);
+            if (!known) store(products + TARGET_MEAN * stride + i, v);
             l1 += abs(u - v);
         }
         if (mine(y)) im.l1_rows[y] = double(sum(l1));
         for (int m = 0; m < maps; ++m) blur_row(products + m * stride, moments.row(y, m), length);
     }
 
-    void ssim_row(int64_t y) {
+    // f for those of `count` rows from y on that are not above `least`.
+    template <class F> static void from(int64_t least, int64_t y, int count, F f) {
+        const int64_t above = least > y ? least - y : 0;
+        if (above < count) f(y + above, static_cast<int>(count - above));
+    }
+    real* derivative(int d, int r) const { return derivatives + (d * ROWS + r) * stride; }
+    V blurred_at(int map, int r, int64_t i) const { return load(blurred + (map * ROWS + r) * stride + i); }
+
+    // SSIM of rows y .. y + count - 1 and its derivatives, blurred along the rows.
+    void ssim_rows(int64_t y, int count) {
+        for (int m = 0; m < maps; ++m) moments.blur(y, count, m, length, blurred + m * ROWS * stride);
+        for (int r = 0; r < count; ++r) ssim_row(y + r, r);
+    }
+
+    void ssim_row(int64_t y, int r) {
         if (!inside(y)) return pullbacks.clear(y, length);
         if (im.mask != nullptr) fill_validity(mask_row(y), im.width, 3, validity);
         const Row mean = row_of(im.target_mean, known ? y : 0);
-        const Column a(moments, y, MEAN), s(moments, y, SQUARES), p(moments, y, PRODUCT);
-        const Column b(moments, y, known ? MEAN : TARGET_MEAN);
+        real* const to[DERIVATIVES] = {derivative(D_MEAN, r), derivative(D_SQUARES, r), derivative(D_PRODUCT, r)};
         V total = V(real(0));
         for (int64_t i = 0; i < length; i += LANES) {
-            const V b_i = known ? mean.load(i) : b.blur(i);
-            const SsimPoint<V> point = ssim_point<V>(a.blur(i), b_i, s.blur(i), p.blur(i));
+            const V b = known ? mean.load(i) : blurred_at(TARGET_MEAN, r, i);
+            const SsimPoint<V> point = ssim_point<V>(blurred_at(MEAN, r, i), b, blurred_at(SQUARES, r, i), blurred_at(PRODUCT, r, i));
             const V valid = load(validity + i);
             total = fma(valid, point.value, total);
-            store(derivatives + D_MEAN * stride + i, valid * point.d_mean);
-            store(derivatives + D_SQUARES * stride + i, valid * point.d_squares);
-            store(derivatives + D_PRODUCT * stride + i, valid * point.d_product);
+            store(to[D_MEAN] + i, valid * point.d_mean);
+            store(to[D_SQUARES] + i, valid * point.d_squares);
+            store(to[D_PRODUCT] + i, valid * point.d_product);
         }
         if (mine(y)) im.ssim_rows[y] = double(sum(total));
         if (!im.gradient) return;
-        for (int d = 0; d < DERIVATIVES; ++d) blur_row(derivatives + d * stride, pullbacks.row(y, d), length);
+        for (int d = 0; d < DERIVATIVES; ++d) blur_row(to[d], pullbacks.row(y, d), length);
     }
 
-    void gradient_row(int64_t y) {
+    void gradient_rows(int64_t y, int count) {
+        for (int d = 0; d < DERIVATIVES; ++d) pullbacks.blur(y, count, d, length, blurred + d * ROWS * stride);
+        for (int r = 0; r < count; ++r) gradient_row(y + r, r);
+    }
+
+    void gradient_row(int64_t y, int r) {
         const Row x = rendered_row(y), target = row_of(im.target, y);
-        const Column dm(pullbacks, y, D_MEAN), ds(pullbacks, y, D_SQUARES), dp(pullbacks, y, D_PRODUCT);
         const V l1_scale = V(real(im.l1_scale)), ssim_scale = V(real(im.ssim_scale)), two = V(real(2));
         real* out = im.gradient + y * n;
         for (int64_t i = 0; i < n; i += LANES) {
             const V u = x.load(i), v = target.load(i);
-            const V ssim = fma(two * u, ds.blur(i), fma(v, dp.blur(i), dm.blur(i)));
+            const V ssim = fma(two * u, blurred_at(D_SQUARES, r, i), fma(v, blurred_at(D_PRODUCT, r, i), blurred_at(D_MEAN, r, i)));
             const V both = load(validity + i) * fma(ssim_scale, ssim, l1_scale * l1_sign(u, v));
             if (n - i >= LANES) {
                 store(out + i, both);
@@ -175,7 +219,7 @@ class Piece {
     const int maps;
     const Scratch scratch;
     real *rendered = nullptr, *validity = nullptr;  // all 1 without a mask
-    real *products = nullptr, *derivatives = nullptr;
+    real *products = nullptr, *derivatives = nullptr, *blurred = nullptr;  // row r of map m: m * ROWS + r
     Ring moments{}, pullbacks{};
 };
 
@@ -220,10 +264,10 @@ GS2D_EXPORT int gs2d_blur(const real* image, int64_t height, int64_t width, real
     int failed = 0;
     const int64_t n = 3 * width, length = row_length(n), stride = row_stride(n);
     parallel_ranges(height, rows_per_piece(height, RADIUS), [&](int64_t begin, int64_t end) {
-        const Scratch scratch(stride * (1 + TAPS));
+        const Scratch scratch(stride * (2 + NEEDED));
         if (scratch.failed()) return __atomic_store_n(&failed, 1, __ATOMIC_RELAXED);
-        real* in = scratch.row(0, stride);
-        const Ring ring{scratch.data + stride, stride, 1};
+        real *in = scratch.row(0, stride), *blurred = scratch.row(1, stride);
+        const Ring ring{scratch.data + 2 * stride, stride, 1};
         for (int64_t y = begin - RADIUS; y < end + RADIUS; ++y) {
             if (y >= 0 && y < height) {
                 std::memcpy(in, image + y * n, static_cast<size_t>(n) * sizeof(real));
@@ -232,11 +276,8 @@ GS2D_EXPORT int gs2d_blur(const real* image, int64_t height, int64_t width, real
                 ring.clear(y, length);
             }
             if (y - RADIUS < begin) continue;
-            const Column column(ring, y - RADIUS, 0);
-            for (int64_t i = 0; i < n; i += LANES) {
-                const int left = static_cast<int>(n - i < LANES ? n - i : LANES);
-                store_first(out + (y - RADIUS) * n + i, column.blur(i), left);
-            }
+            ring.blur(y - RADIUS, 1, 0, length, blurred);
+            std::memcpy(out + (y - RADIUS) * n, blurred, static_cast<size_t>(n) * sizeof(real));
         }
     });
     return failed;

@@ -75,6 +75,12 @@ GS2D_HD void store_first(float* p, V a, int n) { _mm512_mask_storeu_ps(p, first(
 GS2D_HD V iota() { return _mm512_setr_ps(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
 GS2D_HD float sum(V a) { return _mm512_reduce_add_ps(a.v); }
 
+#define GS2D_OWN_AFTER
+// Lanes K .. K + LANES - 1 of a and b, one after the other.
+template <int K> GS2D_HD V after(V a, V b) {
+    return _mm512_castsi512_ps(_mm512_alignr_epi32(_mm512_castps_si512(b.v), _mm512_castps_si512(a.v), K));
+}
+
 // In place, LANES x LANES.
 GS2D_HD void transpose(V* v) {
     __m512 t[16], r[16];
