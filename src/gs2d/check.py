@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 from gs2d.errors import ShapeError
 
 
-@cache
+@lru_cache(maxsize=256)
 def _parsed(pattern: str) -> tuple[tuple[str, int | None], ...]:
     """The words of a pattern, each with its value if it is a number."""
     return tuple((word, int(word) if word.lstrip("-").isdigit() else None) for word in pattern.split())
