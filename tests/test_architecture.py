@@ -34,7 +34,7 @@ FLOORS = {
     "sh": 2,
     "geometry": 2,
     "images": 2,
-    "exposure": 2,
+    "exposure": 5,
     "data": 3,
     "io": 3,
     "kernels": 4,

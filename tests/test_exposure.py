@@ -11,10 +11,6 @@ from torch import Tensor
 
 from gs2d.errors import ShapeError
 from gs2d.exposure import (
-    _exposed,
-    _exposed_on_host,
-    _gradients,
-    _gradients_on_host,
     expose,
     fit_exposure,
     identity,
@@ -74,22 +70,6 @@ def test_a_clipped_pixel_says_this_bright_or_brighter() -> None:
     shown.sum().backward()
     assert rendered.grad is not None
     assert rendered.grad.flatten().tolist() == [0, 1, 1]
-
-
-@pytest.mark.parametrize("cut_out", [False, True])
-@pytest.mark.parametrize("clips", [False, True])
-def test_the_way_of_the_gpu_gives_the_same_as_that_of_the_host(cut_out: bool, clips: bool) -> None:
-    color, transform, upstream = random(130, 129, 3), random(3, 4, seed=1), random(130, 129, 3, seed=4)
-    cover = (random(130, 129, seed=2), random(3, seed=3)) if cut_out else (None, None)
-    clipped = random(130, 129, 3, seed=5) > 0.5 if clips else None
-    (a, over_a), (b, over_b) = (way(color, transform, *cover, clipped) for way in (_exposed, _exposed_on_host))
-    assert torch.allclose(a, b, rtol=1e-12)
-    if over_a is not None and over_b is not None:
-        assert torch.equal(over_a.reshape(-1, 3).T, over_b)
-        assert over_a.sum() > 100
-    ways = ((_gradients, over_a), (_gradients_on_host, over_b))
-    for a, b in zip(*(way(upstream, color, transform, *cover, over) for way, over in ways), strict=True):
-        assert torch.allclose(a, b, rtol=1e-11)
 
 
 def test_bits_do_not_depend_on_the_number_of_threads() -> None:

@@ -1,0 +1,39 @@
+// The exposure and white balance of a photograph at one pixel (docs/math.md, "Exposure").
+#pragma once
+
+#include "core/base.h"
+
+namespace gs2d {
+
+// c -> A c + b, of what the camera saw; the background is put behind it afterwards.
+template <class V> struct Exposure {
+    V A[3][3], b[3], background[3];
+};
+
+// What the camera saw of a colour that is over the background: `coverage` of it.
+template <class V> GS2D_HD void remove_background(const V* color, V coverage, const Exposure<V>& e, V* light) {
+    for (int i = 0; i < 3; ++i) light[i] = color[i] - (V(1.0f) - coverage) * e.background[i];
+}
+
+template <class V> GS2D_HD void expose(const V* color, V coverage, const Exposure<V>& e, V* out) {
+    V light[3];
+    remove_background(color, coverage, e, light);
+    for (int i = 0; i < 3; ++i) {
+        const V seen = fma(e.A[i][0], light[0], fma(e.A[i][1], light[1], e.A[i][2] * light[2]));
+        out[i] = fma(coverage, e.b[i], seen) + (V(1.0f) - coverage) * e.background[i];
+    }
+}
+
+// The gradient of the colour; those of A and b, row by row, are added to `sums`.
+template <class V> GS2D_HD void expose_vjp(const V* upstream, const V* color, V coverage, const Exposure<V>& e, V* to_color, V (*sums)[4]) {
+    V light[3];
+    remove_background(color, coverage, e, light);
+    for (int j = 0; j < 3; ++j)
+        to_color[j] = fma(e.A[0][j], upstream[0], fma(e.A[1][j], upstream[1], e.A[2][j] * upstream[2]));
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) sums[i][j] = fma(upstream[i], light[j], sums[i][j]);
+        sums[i][3] = fma(upstream[i], coverage, sums[i][3]);
+    }
+}
+
+}  // namespace gs2d

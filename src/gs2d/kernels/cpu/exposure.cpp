@@ -1,0 +1,111 @@
+// Renderings as a camera with a given exposure would have taken them, and the gradients. Pieces of the same size whatever
+// the number of threads, and their sums in order: so are the bits.
+#include "core/exposure.h"
+
+#include <cstdlib>
+#include <cstring>
+
+#include "cpu/export.h"
+#include "cpu/simd.h"
+#include "cpu/threads.h"
+
+namespace gs2d {
+namespace {
+
+constexpr int64_t PIECE = 2048;  // pixels
+constexpr int SUMS = 12;
+
+// kernels/exposure.py has the same.
+struct Picture {
+    const real* color;        // [pixels, 3]
+    const real* coverage;     // [pixels], or null: 1
+    int64_t pixels;
+    double transform[3][4];   // A, b
+    double background[3];
+};
+
+Exposure<V> exposure_of(const Picture& p) {
+    Exposure<V> e;
+    for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) e.A[i][j] = V(real(p.transform[i][j]));
+        e.b[i] = V(real(p.transform[i][3])), e.background[i] = V(real(p.background[i]));
+    }
+    return e;
+}
+
+// LANES pixels, zeros behind the last one of the picture.
+void load_pixels(const real* image, int64_t first, int64_t pixels, V* planes) {
+    if (pixels - first >= LANES) return load_packed<3>(image + 3 * first, planes);
+    real rest[3 * LANES] = {};
+    std::memcpy(rest, image + 3 * first, static_cast<size_t>(3 * (pixels - first)) * sizeof(real));
+    load_packed<3>(rest, planes);
+}
+void store_pixels(real* image, int64_t first, int64_t pixels, const V* planes) {
+    if (pixels - first >= LANES) return store_packed<3>(image + 3 * first, planes);
+    real rest[3 * LANES];
+    store_packed<3>(rest, planes);
+    std::memcpy(image + 3 * first, rest, static_cast<size_t>(3 * (pixels - first)) * sizeof(real));
+}
+V coverage_at(const Picture& p, int64_t first) {
+    if (!p.coverage) return V(real(1));
+    const int64_t left = p.pixels - first;
+    return left >= LANES ? load(p.coverage + first) : load_first(p.coverage + first, static_cast<int>(left));
+}
+
+}  // namespace
+}  // namespace gs2d
+
+using namespace gs2d;
+
+// `over` [pixels, 3] is set where `clipped` is and the exposed picture is above 1, which it then is not: both may be null.
+GS2D_EXPORT void gs2d_expose(const Picture* picture, const uint8_t* clipped, real* out, uint8_t* over) {
+    const Exposure<V> e = exposure_of(*picture);
+    parallel_ranges(picture->pixels, PIECE, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i += LANES) {
+            V color[3], seen[3];
+            load_pixels(picture->color, i, picture->pixels, color);
+            expose(color, coverage_at(*picture, i), e, seen);
+            store_pixels(out, i, picture->pixels, seen);
+        }
+        if (!clipped) return;
+        for (int64_t k = 3 * begin; k < 3 * end; ++k) {
+            const bool cut = clipped[k] && out[k] > real(1);
+            over[k] = cut;
+            out[k] = cut ? real(1) : out[k];
+        }
+    });
+}
+
+// sums: those of the transform's gradient [3, 4]. `over` may be null. Returns 1 where memory is short.
+GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const uint8_t* over, const real* upstream, real* to_color, double* sums) {
+    const int64_t pieces = (picture->pixels + PIECE - 1) / PIECE;
+    auto* const of_pieces = static_cast<double*>(std::malloc(static_cast<size_t>(pieces * SUMS + 1) * sizeof(double)));
+    if (!of_pieces) return 1;
+    const Exposure<V> e = exposure_of(*picture);
+    parallel_ranges(picture->pixels, PIECE, [&](int64_t begin, int64_t end) {
+        V totals[3][4];
+        for (auto& row : totals)
+            for (V& total : row) total = V(real(0));
+        for (int64_t i = begin; i < end; i += LANES) {
+            V color[3], given[3], gradient[3];
+            load_pixels(picture->color, i, picture->pixels, color);
+            if (over) {
+                real kept[3 * LANES];
+                const int64_t n = 3 * (picture->pixels - i < LANES ? picture->pixels - i : LANES);
+                for (int64_t k = 0; k < n; ++k) kept[k] = over[3 * i + k] ? real(0) : upstream[3 * i + k];
+                load_pixels(kept, 0, n / 3, given);
+            } else {
+                load_pixels(upstream, i, picture->pixels, given);
+            }
+            expose_vjp(given, color, coverage_at(*picture, i), e, gradient, totals);
+            store_pixels(to_color, i, picture->pixels, gradient);
+        }
+        for (int k = 0; k < SUMS; ++k) of_pieces[begin / PIECE * SUMS + k] = double(sum(totals[k / 4][k % 4]));
+    });
+    for (int k = 0; k < SUMS; ++k) {
+        sums[k] = 0;
+        for (int64_t i = 0; i < pieces; ++i) sums[k] += of_pieces[i * SUMS + k];
+    }
+    std::free(of_pieces);
+    return 0;
+}

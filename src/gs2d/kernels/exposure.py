@@ -1,0 +1,93 @@
+"""The native colour transform of a photograph and its gradients; ``gs2d.exposure`` has the same in torch."""
+
+from __future__ import annotations
+
+import ctypes
+
+import torch
+from torch import Tensor
+
+from gs2d.errors import ShapeError
+from gs2d.kernels.library import Library
+
+__all__ = ["exposed", "gradients"]
+
+
+class _Picture(ctypes.Structure):
+    """``struct Picture`` of kernels/cpu/exposure.cpp."""
+
+    _fields_ = (
+        ("color", ctypes.c_void_p),
+        ("coverage", ctypes.c_void_p),
+        ("pixels", ctypes.c_int64),
+        ("transform", ctypes.c_double * 12),
+        ("background", ctypes.c_double * 3),
+    )
+
+
+def _plain(library: Library, **tensors: Tensor | None) -> list[Tensor | None]:
+    """The tensors, contiguous, or ShapeError for one that native code cannot read."""
+    for name, tensor in tensors.items():
+        dtype = torch.bool if name in ("clipped", "over") else library.dtype
+        if tensor is not None and (not tensor.is_cpu or tensor.dtype != dtype):
+            raise ShapeError(f"{name} must be {dtype} on the cpu, got {tensor.dtype} on {tensor.device}")
+    return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors.values()]
+
+
+def _picture(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> _Picture:
+    behind = (0.0, 0.0, 0.0) if coverage is None or background is None else tuple(background.tolist())
+    return _Picture(
+        color.data_ptr(),
+        None if coverage is None else coverage.data_ptr(),
+        color.numel() // 3,
+        (ctypes.c_double * 12)(*transform.detach().flatten().tolist()),
+        (ctypes.c_double * 3)(*behind),
+    )
+
+
+def exposed(
+    library: Library,
+    color: Tensor,
+    transform: Tensor,
+    coverage: Tensor | None,
+    background: Tensor | None,
+    clipped: Tensor | None,
+) -> tuple[Tensor, Tensor | None]:
+    """The picture, and where it was cut to 1 [H, W, 3]; arguments as of ``gs2d.exposure.expose``.
+
+    Raises
+    ------
+    ShapeError
+        If a tensor has another dtype, or is not on the CPU.
+    """
+    plain, cover, ceiling = _plain(library, color=color, coverage=coverage, clipped=clipped)
+    assert plain is not None
+    out = torch.empty_like(plain)
+    over = None if ceiling is None else torch.empty_like(ceiling)
+    picture = _picture(plain, transform, cover, background)
+    function = library.function("gs2d_expose", None, (ctypes.c_void_p,) * 4)
+    pointers = [None if tensor is None else tensor.data_ptr() for tensor in (ceiling, out, over)]
+    function(ctypes.byref(picture), *pointers)
+    return out, over
+
+
+def gradients(
+    library: Library,
+    upstream: Tensor,
+    color: Tensor,
+    transform: Tensor,
+    coverage: Tensor | None,
+    background: Tensor | None,
+    over: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Those of ``color`` [H, W, 3] and ``transform`` [3, 4]."""
+    given, plain, cover, cut = _plain(library, upstream=upstream, color=color, coverage=coverage, over=over)
+    assert given is not None
+    assert plain is not None
+    to_color, sums = torch.empty_like(plain), (ctypes.c_double * 12)()
+    picture = _picture(plain, transform, cover, background)
+    function = library.function("gs2d_expose_vjp", ctypes.c_int, (ctypes.c_void_p,) * 5)
+    pointers = [None if tensor is None else tensor.data_ptr() for tensor in (cut, given, to_color)]
+    if function(ctypes.byref(picture), *pointers, sums) != 0:
+        raise MemoryError("no memory for the sums of an exposure's gradient")
+    return to_color, torch.tensor(list(sums), dtype=torch.float64).reshape(3, 4).to(transform.dtype)

@@ -1,0 +1,48 @@
+"""The native colour transform of a photograph against the formula in torch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d.errors import ShapeError
+from gs2d.exposure import _exposed, _gradients
+from gs2d.kernels.exposure import exposed, gradients
+from gs2d.kernels.library import Library
+
+
+@pytest.mark.parametrize("cut_out", [False, True])
+@pytest.mark.parametrize("clips", [False, True])
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (130, 129)])
+def test_picture_and_gradients_are_torchs(
+    any_native: Library, cut_out: bool, clips: bool, size: tuple[int, int]
+) -> None:
+    """130 x 129 pixels are nine pieces, the last one of 386, which is no multiple of a vector."""
+    g = torch.Generator().manual_seed(size[0])
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g).to(any_native.dtype)
+
+    color, transform, upstream = 1.5 * random(*size, 3), random(3, 4), random(*size, 3) - 0.5
+    cover = (random(*size), random(3)) if cut_out else (None, None)
+    clipped = random(*size, 3) > 0.5 if clips else None
+    wanted, over = _exposed(color, transform, *cover, clipped)
+    found, cut = exposed(any_native, color, transform, *cover, clipped)
+    digits = 1e-6 if any_native.dtype == torch.float32 else 1e-14
+    assert torch.allclose(found, wanted, rtol=digits, atol=digits)
+    if over is not None and cut is not None:
+        assert int((over != cut).sum()) <= 2  # a rounding around 1
+        assert size == (1, 1) or int(cut.sum()) > 0
+    by_torch = _gradients(upstream, color, transform, *cover, cut)
+    by_us = gradients(any_native, upstream, color, transform, *cover, cut)
+    for a, b in zip(by_us, by_torch, strict=True):
+        assert torch.allclose(a, b, rtol=100 * digits, atol=100 * digits * float(b.abs().max()))
+
+
+def test_what_native_code_cannot_read_is_named(native: Library) -> None:
+    color, transform = torch.zeros(2, 2, 3), torch.eye(3, 4)
+    with pytest.raises(ShapeError, match=r"color must be torch\.float32 on the cpu, got torch\.float64"):
+        exposed(native, color.double(), transform, None, None, None)
+    with pytest.raises(ShapeError, match=r"clipped must be torch\.bool on the cpu, got torch\.float32"):
+        exposed(native, color, transform, None, None, color)
