@@ -147,6 +147,9 @@ def a_capture(photos: Path) -> None:
         (lambda photos: write_room(photos, 3), ["--test-every", "1"], "--test-every must be 0"),
         (lambda photos: write_room(photos, 3), ["--recipe", "3dgs"], "no recipe '3dgs'"),
         (lambda photos: write_room(photos, 3), ["--protocol", "x"], "no protocol 'x'"),
+        (lambda photos: write_room(photos, 3), ["--from", "/nowhere"], "expected a run folder at /nowhere"),
+        (lambda photos: write_room(photos, 3), ["--cache", "/dev/null/x"], "cannot write /dev/null/x"),
+        (lambda photos: write_room(photos, 3), ["--viewer-port", "1"], "--viewer-port belongs to --viewer"),
         (lambda photos: write_room(photos, 3), ["--max-size", "3"], "--max-size must be a whole number from 64"),
     ],
 )

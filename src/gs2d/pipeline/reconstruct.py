@@ -14,7 +14,7 @@ from typing import Any
 from gs2d.data import detect_format, load_scene
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.io.files import read_json
-from gs2d.io.run import LOCK, TEXTURED, RunFolder, check_claim, is_run, make_folder, remove_made
+from gs2d.io.run import LOCK, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
 from gs2d.mesh.atlas import required
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.options import TrainOptions, paths_of
@@ -170,6 +170,10 @@ def _check(options: ReconstructOptions) -> Quality:
         for package in TEXTURE_PACKAGES:
             required(package)
     check_viewer(training)
+    if training.start_from is not None:
+        open_run(training.start_from)
+    if training.cache is not None:
+        remove_made(make_folder(training.cache))
     if options.resume and (out / CAPTURE / POSES_JSON).exists():
         return quality
     check_installed()
