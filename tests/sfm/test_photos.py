@@ -12,7 +12,7 @@ from PIL import ExifTags, Image, ImageOps
 from gs2d.camera import look_at
 from gs2d.errors import DataError
 from gs2d.images import image_size, read_image
-from gs2d.sfm.photos import Photo, camera_groups, find_photos, read_photos, turn
+from gs2d.sfm.photos import AVIF, Photo, camera_groups, find_photos, read_photos, turn
 from gs2d.sfm.similar import neighbour_pairs, similar_pairs
 from gs2d.sfm.stage import stage_photos
 from gs2d.sfm.upright import rotation_to_z, up_direction
@@ -254,6 +254,21 @@ def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> N
     assert stage(root, tmp_path / "images") == ["copied", "converted", "converted"]
     with Image.open(tmp_path / "images/2.tif.png") as file:
         assert (file.format, file.mode, file.getpixel((0, 0))) == ("PNG", "RGB", (156,) * 3)  # 40000 / 257 = 155.6
+
+
+@pytest.mark.skipif(not AVIF, reason="this Pillow has no AVIF")
+def test_avif_becomes_upright_png(tmp_path: Path) -> None:
+    root = tmp_path / "photos"
+    for i, orientation in enumerate((1, 6, 8)):  # AVIF stores the turn as one of its own, which Pillow tells as EXIF
+        picture(root / f"{i}.avif", size=(64, 48), orientation=orientation, model="phone")
+    assert find_photos(root)[1] == ()
+    assert stage(root, tmp_path / "images") == ["converted", "turned", "turned"]
+    for i, size in enumerate(((64, 48), (48, 64), (48, 64))):
+        with Image.open(root / f"{i}.avif") as theirs, Image.open(tmp_path / "images" / f"{i}.avif.png") as ours:
+            assert (ours.format, ours.size) == ("PNG", size)
+            upright = np.asarray(ImageOps.exif_transpose(theirs), float)
+            assert np.abs(np.asarray(ours, float) - upright).mean() == 0
+            assert ours.getexif()[ExifTags.Base.Model] == "phone"
 
 
 def test_link_makes_hard_links_of_what_needs_no_change(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from gs2d.data.transforms import read_blender, read_nerfstudio
 from gs2d.errors import DataError
 
 FORMATS = ("blender", "nerfstudio", "dtu", "colmap")
-_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic")
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic")
 DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures
 
 

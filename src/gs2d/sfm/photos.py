@@ -10,18 +10,20 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, features
 
 from gs2d.errors import DataError
 from gs2d.images import natural_key, read_image
 
 JPEG, PNG = (".jpg", ".jpeg"), (".png",)
-CONVERTED = (".bmp", ".tif", ".tiff", ".webp")
+AVIF = (".avif",) if "avif" in features.modules and features.check("avif") else ()  # Pillow 11.3 and newer
+CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF)
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv")
-RAWS = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+UNREAD = (".heic", ".heif", ".avif")  # the last by an older Pillow
+RAWS = (*UNREAD, ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 _KINDS = {
     suffix: kind
-    for kind, suffixes in (("photo", JPEG + PNG + CONVERTED), ("video", VIDEOS), ("raw", RAWS))
+    for kind, suffixes in (("raw", RAWS), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))
     for suffix in suffixes
 }
 FEWEST = 3  # two photographs give no point that a third confirms
@@ -152,7 +154,7 @@ def _frames_command(video: Path) -> str:
 
 def _raw_remedy(path: Path) -> str:
     kind = path.suffix.lower()
-    if kind in (".heic", ".heif", ".avif"):
+    if kind in UNREAD:
         return f"{kind[1:].upper()} is not decoded here; convert to JPEG (magick mogrify -format jpg *{path.suffix})"
     return f"raw files ({kind}) are not developed here; export JPEG or PNG from your photo program"
 
