@@ -204,6 +204,10 @@ def test_overwrite_begins_anew_and_a_failure_keeps_the_old_run(
     out = started(room, tmp_path)
     assert run(words_for(room.photos, out, "--resume", "--quiet")) == 0
     mesh = (out / "mesh.ply").read_bytes()
+    (out / "capture").rename(tmp_path / "elsewhere")
+    assert run(words_for(room.photos, out, "--resume", "--quiet")) == 2
+    assert "holds a run without the cameras of `gs2d reconstruct`" in one_line(capsys.readouterr().err)
+    (tmp_path / "elsewhere").rename(out / "capture")
     assert run(words_for(room.photos, out, "--quiet")) == 2
     assert "already holds a run; continue it with --resume" in one_line(capsys.readouterr().err)
     photos = tmp_path / "other"

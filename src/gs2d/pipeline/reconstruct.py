@@ -176,6 +176,11 @@ def _check(options: ReconstructOptions) -> Quality:
         remove_made(make_folder(training.cache))
     if options.resume and (out / CAPTURE / POSES_JSON).exists():
         return quality
+    if options.resume and is_run(out):
+        raise RunError(
+            f"{out} holds a run without the cameras of `gs2d reconstruct` in {CAPTURE}/; go on with gs2d train, choose "
+            "another --out, or begin anew with --overwrite"
+        )
     check_installed()
     check_poses_options(options.poses_options)
     _check_photos(options)
