@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gs2d.errors import DivergedError
 from gs2d.geometry import quats_to_matrices
+from gs2d.kernels import screen_signal
 from gs2d.recipe import GradDensify
 from gs2d.train.rows import append_rows
 from gs2d.train.state import Moments, Statistics, TrainState
@@ -29,7 +30,7 @@ class DensifyCounts:
 
 
 @torch.no_grad()
-def accumulate(statistics: Statistics, signal: Tensor, radii: Tensor) -> None:
+def accumulate(statistics: Statistics, signal: Tensor, radii: Tensor, *, native: bool = False) -> None:
     """Add one view.
 
     Parameters
@@ -40,7 +41,11 @@ def accumulate(statistics: Statistics, signal: Tensor, radii: Tensor) -> None:
         Gradient of the screen probe: signed in columns 0:2, absolute in 2:4.
     radii : Tensor [N] px
         Splats with radius 0 are not counted.
+    native : bool
+        By the CPU library: one pass, the same to rounding.
     """
+    if native:
+        return screen_signal.accumulate(statistics.signed, statistics.absolute, statistics.count, signal, radii)
     seen = radii > 0
     zero = torch.zeros_like(statistics.signed)
     statistics.signed += torch.where(seen, torch.linalg.vector_norm(signal[:, :2], dim=1), zero)

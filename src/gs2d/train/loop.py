@@ -299,7 +299,8 @@ class Trainer:
         assert state.statistics is not None
         assert result.signal is not None
         assert result.radii is not None
-        accumulate(state.statistics, result.signal, result.radii if cancel is None else result.radii * (1 - cancel))
+        seen = result.radii if cancel is None else result.radii * (1 - cancel)
+        accumulate(state.statistics, result.signal, seen, native=self.backend.name == "cpu")
         if densify.densifies(iteration):
             try:
                 counts = densify_and_prune(state, densify, iteration=iteration, extent=self.scene.extent, white=white)
