@@ -2,7 +2,8 @@
 
 ::
 
-    python -m benchmarks.iteration [--splats 20000] [--size 400] [--threads 2] [--repeats 60] [--json FILE]
+    python -m benchmarks.iteration [--recipe 2dgs-r] [--splats 20000] [--size 400] [--threads 2] [--repeats 60]
+        [--json FILE]
 
 The splats are the synthetic room, rendered from four places and then disturbed, so that there is something to
 learn; nothing is densified, so every iteration of a stage does the same work. The multiply-add probe runs before and
@@ -31,8 +32,8 @@ from gs2d.camera import Camera
 from gs2d.data.scene import Scene, View
 from gs2d.kernels.library import Library, prepare
 from gs2d.protocols import GENERIC
-from gs2d.recipe import Recipe, Stage
-from gs2d.recipes import two_dgs_r
+from gs2d.recipe import Stage
+from gs2d.recipes import get_recipe
 from gs2d.render.api import rasterize
 from gs2d.splats import Splats
 from gs2d.train.loop import Trainer
@@ -65,14 +66,14 @@ class StageTime:
     extra_ms_of_first_by_view: float
 
 
-def iteration_times(workload: Workload, library: Library, repeats: int) -> dict[str, StageTime]:
-    """Time of an iteration of each stage, on torch's number of threads."""
+def iteration_times(workload: Workload, library: Library, repeats: int, name: str = "2dgs-r") -> dict[str, StageTime]:
+    """Time of an iteration of each stage of a recipe, on torch's number of threads."""
     scene = make_scene(workload.splats, workload.cameras)
     generator = torch.Generator().manual_seed(2)
     start = workload.splats.clone()
     start.sh0 += 0.2 * torch.randn(start.sh0.shape, generator=generator)
-    recipe = two_dgs_r()
-    recipe = Recipe("bench", tuple(steady(stage) for stage in recipe.stages))
+    recipe = get_recipe(name)
+    recipe = replace(recipe, name="bench", stages=tuple(steady(stage) for stage in recipe.stages))
     trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=TrainState(start, generator))
     result = {}
     for index, stage in enumerate(recipe.stages):
@@ -88,26 +89,35 @@ def iteration_times(workload: Workload, library: Library, repeats: int) -> dict[
     return result
 
 
-def run(count: int, size: int, threads: int, repeats: int) -> dict[str, object]:
+def run(count: int, size: int, threads: int, repeats: int, recipe: str = "2dgs-r") -> dict[str, object]:
     """Median and best milliseconds of an iteration of each stage."""
     torch.set_num_threads(threads)
     library = prepare()
-    times = iteration_times(room_workload(count, size, size), library, repeats)
+    times = iteration_times(room_workload(count, size, size), library, repeats, recipe)
     result = {name: asdict(row.timing) | {"fma_gflops": row.fma_gflops} for name, row in times.items()}
-    facts = {"splats": count, "size": size, "threads": threads, "variant": library.variant, "iteration_ms": result}
-    return facts | {"stage2_fill_ms_by_view": times["appearance"].extra_ms_of_first_by_view}
+    facts = {
+        "recipe": recipe,
+        "splats": count,
+        "size": size,
+        "threads": threads,
+        "variant": library.variant,
+        "iteration_ms": result,
+    }
+    filled = times.get("appearance")
+    return facts if filled is None else facts | {"stage2_fill_ms_by_view": filled.extra_ms_of_first_by_view}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recipe", default="2dgs-r")
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--size", type=int, default=400)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=60)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args(arguments)
-    row = run(args.splats, args.size, args.threads, args.repeats)
+    row = run(args.splats, args.size, args.threads, args.repeats, args.recipe)
     print(json.dumps(row, indent=2))
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)

@@ -21,6 +21,7 @@ from gs2d.recipe import (
     Stage,
     validate,
 )
+from gs2d.recipe_multiview import MultiView
 
 L1 = (LossTerm("l1", 1.0),)
 
@@ -144,6 +145,33 @@ def test_exposures_are_checked_like_the_stages(field: str, value: float, message
         validate(recipe)
     assert message in str(caught.value)
     assert validate(replace(one(), exposure=Exposure()))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("patches", 0, "recipe 'r': multiview.patches must be an integer >= 1, got 0"),
+        ("radius", 1.5, "multiview.radius must be an integer >= 1"),
+        ("texture", 0.0, "multiview.texture must be positive"),
+        ("opacity", 1.0, "multiview.opacity must be below 1"),
+        ("occluded", float("inf"), "multiview.occluded must be a finite number"),
+        ("max_angle", 120.0, "multiview.max_angle must be at most 90 degrees, got 120.0"),
+        ("min_baseline", 1.0, "multiview.min_baseline must be below max_baseline, got 1.0 and 1.0"),
+    ],
+)
+def test_comparisons_of_views_are_checked_like_the_stages(field: str, value: float, message: str) -> None:
+    compared = replace(one(losses=(*L1, LossTerm("multiview_photometric", 0.1))), multiview=MultiView())
+    with pytest.raises(RecipeError) as caught:
+        validate(replace(compared, multiview=replace(MultiView(), **{field: value})))
+    assert message in str(caught.value)
+    assert validate(compared)
+
+
+def test_losses_of_two_views_and_how_they_are_compared_come_together() -> None:
+    with pytest.raises(RecipeError, match="multiview is null, but loss 'multiview_geometric' needs it"):
+        validate(one(losses=(*L1, LossTerm("multiview_geometric", 0.1))))
+    with pytest.raises(RecipeError, match="multiview is set, but no loss is multiview_photometric or"):
+        validate(replace(one(), multiview=MultiView()))
 
 
 def test_a_group_may_be_written_by_an_action_of_the_same_stage() -> None:

@@ -8,7 +8,8 @@ import pytest
 
 from gs2d.errors import RecipeError
 from gs2d.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
-from gs2d.recipes import RECIPES, TABLES, get_recipe
+from gs2d.recipe_multiview import MultiView
+from gs2d.recipes import MULTIVIEW_WEIGHT, RECIPES, TABLES, get_recipe, with_multiview
 
 
 def weights(stage: Stage) -> dict[str, tuple[float | None, int]]:
@@ -162,6 +163,30 @@ def test_silhouettes_are_kept_wherever_opacity_or_geometry_learns() -> None:
     assert weights(surface) == weights(plain[0]) | {"silhouette": (0.1, 0)}
     assert appearance == plain[1]  # colours alone: alpha cannot change, and views can be cached
     assert weights(refine) == weights(plain[2]) | {"silhouette": (0.1, 0)}
+
+
+@pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
+def test_views_are_compared_by_the_recipes_that_say_so_with_normal_consistency_and_without_densification(
+    base: str,
+) -> None:
+    plain, comparing = get_recipe(base), get_recipe(f"{base}-multiview")
+    assert plain.multiview is None
+    assert comparing.multiview == MultiView()
+    starts = {"surface": 15_000, "continue": 0, "refine": 0}
+    for before, after in zip(plain.stages, comparing.stages, strict=True):
+        expected = weights(before)
+        if before.name in starts:  # not in stage 2, which trains colours alone
+            expected |= {"multiview_photometric": (MULTIVIEW_WEIGHT, starts[before.name])}
+        assert weights(after) == expected
+        assert replace(after, losses=before.losses) == before
+    assert [name for name in RECIPES if get_recipe(name).multiview] == [
+        f"{x}-multiview" for x in ("2dgs", "2dgs-60k", "2dgs-r")
+    ]
+
+
+def test_without_normal_consistency_there_is_no_stage_to_compare_views_in() -> None:
+    with pytest.raises(RecipeError, match="multiview is set, but no loss"):
+        validate(with_multiview(get_recipe("2dgs-no-nc")))
 
 
 @pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])

@@ -94,6 +94,14 @@ def test_a_factor_must_be_positive_and_finite(factor: float) -> None:
         scale_schedule(get_recipe("2dgs"), factor)
 
 
+def test_views_are_compared_from_the_scaled_end_of_densification_on() -> None:
+    for factor in (1.0, 0.1, 0.05, 0.03):
+        surface = scale_schedule(get_recipe("2dgs-r-multiview"), factor).stages[0]
+        (start,) = (term.start for term in surface.losses if term.kind == "multiview_photometric")
+        assert surface.densify is not None
+        assert start == surface.densify.stop == round(15_000 * factor)
+
+
 def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
     recipe = get_recipe("2dgs-exposure")
     # start: 500 of 30,000; a tenth of the schedule waits 200, not 50; at most a sixth of its 3000, 1200 or 300.

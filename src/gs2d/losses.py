@@ -18,6 +18,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
+from gs2d import losses_multiview as multiview
 from gs2d import losses_reference as reference
 from gs2d.camera import Camera
 from gs2d.check import check_shapes
@@ -25,8 +26,10 @@ from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.kernels import ops
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda import ops as cuda_ops
+from gs2d.losses_multiview import Neighbour, TwoViews
 from gs2d.losses_reference import normals_from_depth
 from gs2d.recipe import LossTerm
+from gs2d.recipe_multiview import MULTIVIEW_KINDS
 from gs2d.render.camera_gradient import turning_normals
 from gs2d.render.types import RenderOutput
 
@@ -112,6 +115,8 @@ class LossInputs:
         What FUSED_LOSSES are made of; None for the reference.
     silhouette : Tensor [H, W] or None
         Alpha of the photograph, in [0, 1], if it has one.
+    neighbour : Neighbour or None
+        The second view of the losses that compare two.
     """
 
     output: RenderOutput
@@ -122,6 +127,20 @@ class LossInputs:
     weights: Mapping[str, float] = field(default_factory=dict)
     fused: FusedOperations | None = None
     silhouette: Tensor | None = None
+    neighbour: Neighbour | None = None
+    _compared: dict[str, TwoViews] = field(default_factory=dict)
+
+    def two_views(self, depth_kind: str) -> TwoViews:
+        """The view beside its neighbour, by mean or median depth; shared by the losses that ask."""
+        if self.neighbour is None:
+            raise RecipeError("losses of two views need a neighbour, got none; pass one or take a recipe without them")
+        if depth_kind not in self._compared:
+            depth, output, here = self.output.depth(depth_kind), self.output, self.neighbour.here
+            hit = (output.alpha.detach() > self.neighbour.settings.opacity) & (depth.detach() > 0)
+            self._compared[depth_kind] = TwoViews(
+                depth, output.normal, hit & here.textured, self.camera, self.neighbour, self.mask
+            )
+        return self._compared[depth_kind]
 
     @cached_property
     def fused_photometric(self) -> tuple[Tensor, Tensor]:
@@ -168,6 +187,8 @@ LOSSES: Mapping[str, LossFunction] = MappingProxyType(
         "normal_consistency_per_splat": lambda x, depth: reference.normal_consistency_per_splat(*_normals(x, depth)),
         "distortion": lambda x, _: reference.distortion(x.output.distortion, x.mask),
         "silhouette": _silhouette,
+        "multiview_photometric": lambda x, depth: multiview.photometric(x.two_views(depth)),
+        "multiview_geometric": lambda x, depth: multiview.geometric(x.two_views(depth)),
     }
 )
 """Every kind of loss in plain torch, unweighted."""
@@ -180,6 +201,7 @@ FUSED_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
         "normal_consistency_per_splat": lambda x, depth: _fused_normals(x, depth, "normal_consistency_per_splat"),
         "distortion": lambda x, _: _fused(x).masked_mean(x.output.distortion, x.mask),
         "silhouette": _silhouette,  # one subtraction and a mean: not worth an operation of its own
+        **{kind: LOSSES[kind] for kind in MULTIVIEW_KINDS},  # a few thousand patches
     }
 )
 """The same kinds as fused operations."""
@@ -201,6 +223,7 @@ def compute_losses(
     backend_name: str,
     target_cache: TargetMaps | None = None,
     silhouette: Tensor | None = None,
+    neighbour: Neighbour | None = None,
 ) -> dict[str, Tensor]:
     """Weighted values of the active terms; their sum is the loss.
 
@@ -225,6 +248,8 @@ def compute_losses(
         Of this target: spares the native SSIM one blur of four. It never changes the value.
     silhouette : Tensor [H, W], optional
         Alpha of the photograph, for the loss of that name.
+    neighbour : Neighbour, optional
+        A second view, for the losses that compare two.
 
     Returns
     -------
@@ -264,7 +289,7 @@ def compute_losses(
             weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
     mean = target_cache.mean if target_cache is not None else None
     fused = _fused_operations(backend_name, output.color.device)
-    inputs = LossInputs(output, target, mask, camera, mean, weights, fused, silhouette)
+    inputs = LossInputs(output, target, mask, camera, mean, weights, fused, silhouette, neighbour)
     values: dict[str, Tensor] = {}
     for term, weight in active:
         value = weight * functions[term.kind](inputs, term.depth or depth_kind)

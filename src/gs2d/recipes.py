@@ -27,10 +27,12 @@ from gs2d.recipe import (
     Recipe,
     Stage,
 )
+from gs2d.recipe_multiview import MultiView
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
 SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned
 NC_START, DISTORTION_START = 7_000, 3_000  # official: active when iteration > start
+MULTIVIEW_WEIGHT = 0.3  # docs/decisions.md, "Two views"
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
 # reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
@@ -147,6 +149,26 @@ def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
     return replace(recipe, name=name or f"{recipe.name}-exposure", stages=tuple(stages), exposure=Exposure())
 
 
+def with_multiview(
+    recipe: Recipe, photometric: float = MULTIVIEW_WEIGHT, geometric: float = 0.0, *, name: str | None = None
+) -> Recipe:
+    """The recipe with losses of two views in the stages with normal consistency, once nothing is densified any more.
+
+    Not in the paper. The photometric weight is the one that PGSR publishes; why the geometric term is off, and why they
+    wait for the end of densification: docs/decisions.md.
+    """
+
+    def extended(stage: Stage) -> Stage:
+        starts = [term.start for term in stage.losses if term.kind == "normal_consistency" and term.weight]
+        start = max([*starts, 0 if stage.densify is None else stage.densify.stop])
+        weights = {"multiview_photometric": photometric, "multiview_geometric": geometric} if starts else {}
+        terms = (LossTerm(kind, weight, start) for kind, weight in weights.items() if weight > 0)
+        return replace(stage, losses=(*stage.losses, *terms))
+
+    stages = tuple(extended(stage) for stage in recipe.stages)
+    return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=MultiView())
+
+
 def _normal_consistency(weight: float, start: int) -> tuple[LossTerm, ...]:
     return (LossTerm("normal_consistency", weight, start),) if weight > 0 else ()
 
@@ -245,6 +267,8 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
     for base, build in bases.items():
         about = f"{base} with a refined pose for each photograph (`gs2d train --refine-poses`)"
         add(f"{base}-poses", about, partial(with_poses, build()))
+        about = f"{base} with patches of neighbouring photographs compared, for better surfaces of textured things"
+        add(f"{base}-multiview", about, partial(with_multiview, build()))
 
 
 RECIPES: Mapping[str, NamedRecipe] = MappingProxyType(_registry())

@@ -60,12 +60,19 @@ def cpu_backend() -> Backend:
         pytest.skip(str(error))
 
 
-@pytest.mark.parametrize("exposure", [None, Exposure(start=2, horizon=10)], ids=["plain", "exposure"])
+VARIANTS = {
+    "plain": train_toys.short(),
+    "exposure": replace(train_toys.short(), exposure=Exposure(start=2, horizon=10)),
+    "multiview": train_toys.compared(),
+}
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
 def test_three_stages_give_the_cpu_backends_scene_within_rounding(
-    emulated: Backend, scene: Scene, exposure: Exposure | None
+    emulated: Backend, scene: Scene, variant: str
 ) -> None:
     """19 iterations with densifications, a reset, ranking, a clone and frozen rows; decisions and counts are equal."""
-    recipe = replace(train_toys.short(), exposure=exposure)
+    recipe = VARIANTS[variant]
     results = [
         train_toys.train(scene, recipe, backend=backend, stage2_cache_bytes=0) for backend in (cpu_backend(), emulated)
     ]
@@ -156,18 +163,21 @@ def quiet(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=(longer[0], *recipe.stages[1:]))
 
 
-@pytest.mark.parametrize("stage", [0, 1, 2])
+@pytest.mark.parametrize(("stage", "variant"), [(0, "plain"), (0, "multiview"), (1, "plain"), (2, "plain")])
 def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
-    emulated: Backend, scene: Scene, stage: int, monkeypatch: pytest.MonkeyPatch
+    emulated: Backend, scene: Scene, stage: int, variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe = quiet(train_toys.short()) if stage == 0 else train_toys.short()
+    recipe = quiet(VARIANTS[variant]) if stage == 0 else VARIANTS[variant]
     monkeypatch.setattr(loop, "waits", lambda device: True)
     monkeypatch.setattr(views, "waits", lambda device: True)
     trainer = Trainer(scene, recipe, GENERIC, backend=emulated, progress_every=1000, target_bytes=1 << 20)
     in_stage(trainer, stage)
     trainer.step()
     for index in range(len(scene.train)):
-        trainer._targets[index]  # each photograph is taken in once
+        target = trainer._targets[index]  # each photograph is taken in once
+        if variant == "multiview":
+            trainer.state.step = 6  # the next iteration compares
+            trainer._whole._photographs.of(index, target)
     with watched(monkeypatch) as seen:
         trainer.step()
         trainer.step()
@@ -190,12 +200,12 @@ def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
         trainer.step()
 
 
-@pytest.mark.parametrize("slack", [1.25, 0.5])
+@pytest.mark.parametrize(("slack", "variant"), [(1.25, "plain"), (0.5, "plain"), (0.5, "multiview")])
 def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
-    emulated: Backend, scene: Scene, slack: float, monkeypatch: pytest.MonkeyPatch
+    emulated: Backend, scene: Scene, slack: float, variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With room for half of the pairs every iteration that may be cut short is, changes nothing, and is done again."""
-    recipe = train_toys.short()
+    recipe = VARIANTS[variant]
     kept = train_toys.train(scene, recipe, backend=replace(emulated, rasterize=lambda *a: cuda.rasterize(*a)))[0]
     monkeypatch.setattr(cuda_budget, "SLACK", slack)
     monkeypatch.setattr(cuda_budget, "STEP", 1)

@@ -63,7 +63,7 @@ from gs2d.train.initialise import initial_splats
 from gs2d.train.state import TrainState
 
 backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize, device="cuda:0")
-recipe, scene, generator = train_toys.short(), train_toys.make_scene(), torch.Generator()
+recipe, scene, generator = train_toys.compared(), train_toys.make_scene(), torch.Generator()
 start = initial_splats(scene, sh_degree=recipe.sh_degree, random_points=50, near=0.2, generator=generator)
 loop.validate = lambda recipe: recipe  # entry actions look at values: the groups that they write are made below
 loop.Trainer._check_parameters = lambda *_: None
@@ -71,7 +71,8 @@ torch.Tensor.backward = lambda self: None  # torch's engine wants a real device:
 
 def quiet(stage):
     densify = stage.densify and replace(stage.densify, start=10**5, stop=10**6, reset_at=(), cap_every=0)
-    return replace(stage, densify=densify, iterations=10**4, on_enter=())
+    losses = tuple(replace(term, start=0) for term in stage.losses)  # two views are compared too
+    return replace(stage, densify=densify, iterations=10**4, on_enter=(), losses=losses)
 
 recipe = replace(recipe, stages=tuple(quiet(stage) for stage in recipe.stages))
 with FakeTensorMode(allow_non_fake_inputs=True):

@@ -13,7 +13,8 @@ from gs2d.errors import BackendError
 from gs2d.geometry import camera_extent
 from gs2d.protocols import GENERIC
 from gs2d.recipe import GradDensify, Rates, Recipe
-from gs2d.recipes import appearance, refine, surface
+from gs2d.recipe_multiview import MultiView
+from gs2d.recipes import appearance, refine, surface, with_multiview
 from gs2d.render.api import rasterize
 from gs2d.render.backend import get_backend
 from gs2d.render.types import RasterSettings
@@ -108,6 +109,19 @@ def short(absgs: bool = False) -> Recipe:
             replace(refine(), iterations=5),
         ),
     )
+
+
+WIDE = MultiView(
+    patches=40, radius=1, texture=0.001, opacity=0.02, occluded=50.0, neighbours=2, max_angle=75.0, max_baseline=2.0
+)
+
+
+def compared() -> Recipe:
+    """``short`` with both losses of two views, in stage 1 after the last densification but one."""
+    recipe = with_multiview(short(), 0.15, 0.03)
+    first = recipe.stages[0]
+    losses = tuple(replace(t, start=6) if t.kind.startswith("multiview") else t for t in first.losses)
+    return replace(recipe, stages=(replace(first, losses=losses), *recipe.stages[1:]), multiview=WIDE)
 
 
 def backends() -> list[str]:

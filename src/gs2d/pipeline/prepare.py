@@ -96,6 +96,7 @@ class Job:
             "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
+            **({} if self.recipe.multiview is None else {"multiview": recipe["multiview"]}),
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -343,7 +344,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         if name == "protocol" and isinstance(old, dict):
             old, value = _training_facts(old), _training_facts(value)
         if name == "recipe" and isinstance(old, dict):
-            old = {"exposure": None, "poses": None, **old}  # runs of before there were such
+            old = {"exposure": None, "poses": None, "multiview": None, **old}  # runs of before there were such
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]

@@ -22,6 +22,10 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
             f"poses: a motion for each training camera after iteration {p.start:,}, rate {p.rate:g} to "
             f"{p.rate_final:g} (rad, shares of the extent) over {p.horizon:,} iterations, while all splats move"
         )
+    if recipe.multiview is not None:
+        m = recipe.multiview
+        where = f"one of {m.neighbours} nearby views within {m.max_angle:g} degrees"
+        yield f"views compared: {m.patches:,} patches of {m.side}x{m.side} px with {where}"
     for number, stage in enumerate(recipe.stages, start=1):
         yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
         for line in _describe_stage(stage):

@@ -21,22 +21,23 @@ class PairBudget:
     The first rendering of a size waits for the number of pairs. Later ones take SLACK times the largest number so far,
     which is slowly forgotten, and wait for nothing; if that is too little, the pairs farthest away are left out, which
     ``overflow`` says on the device at once, and ``cut_short`` on the host afterwards. So an update that reads
-    ``overflow`` does nothing, and the caller renders that view again with ``exact`` set.
+    ``overflow`` does nothing, and the caller renders again with ``exact`` set. Both speak of all renderings since the
+    last ``cut_short``: an iteration may render two views.
 
     Attributes
     ----------
     exact : bool
         The next renderings wait for the number.
     overflow : Tensor [] int32 or None
-        On the device: whether the last rendering lacks pairs. None where it was exact.
+        On the device: whether a rendering lacks pairs. None where all were exact.
     """
 
     def __init__(self) -> None:
         self.exact = False
         self.overflow: Tensor | None = None
         self._largest: dict[int, float] = {}  # by the number of tiles
-        self._asked: tuple[int, int] | None = None  # tiles and room of the last rendering, if its number is not known
-        self._host: Tensor | None = None
+        self._asked: list[tuple[int, int]] = []  # tiles and room of the renderings whose numbers are not known
+        self._host: list[Tensor] = []  # those numbers, as many as were ever asked for at a time
         self._event: Any = None
 
     def room(self, tiles: int) -> int | None:
@@ -49,28 +50,28 @@ class PairBudget:
     def learn(self, tiles: int, pairs: int) -> None:
         """The number of pairs of a rendering, once it is known."""
         self._largest[tiles] = max(pairs, self._largest.get(tiles, 0) * (1 - FORGET))
-        self.overflow = self._asked = None
 
     def ask(self, tiles: int, room: int, pairs: Tensor) -> None:
         """The number of pairs [] int64 of a rendering with ``room``, to be looked at later."""
-        self.overflow = (pairs > room).to(torch.int32)
-        self._asked = (tiles, room)
-        if self._host is None:
-            self._host = torch.empty((), dtype=torch.int64, pin_memory=pairs.is_cuda)
-            self._event = torch.cuda.Event() if pairs.is_cuda else None
-        self._host.copy_(pairs, non_blocking=True)
-        if self._event is not None:
+        lacks = (pairs > room).to(torch.int32)
+        self.overflow = lacks if self.overflow is None else self.overflow | lacks
+        if len(self._host) == len(self._asked):
+            self._host.append(torch.empty((), dtype=torch.int64, pin_memory=pairs.is_cuda))
+        self._host[len(self._asked)].copy_(pairs, non_blocking=True)
+        self._asked.append((tiles, room))
+        if pairs.is_cuda:
+            self._event = self._event or torch.cuda.Event()
             self._event.record(torch.cuda.current_stream(pairs.device))
 
     def cut_short(self) -> bool:
-        """Whether the last rendering lacked pairs; waits until its number is known, not until it is done."""
-        if self._asked is None or self._host is None:
-            return False
-        if self._event is not None:
+        """Whether a rendering lacked pairs; waits until their numbers are known, not until they are done."""
+        asked, self._asked, self.overflow = self._asked, [], None
+        if asked and self._event is not None:
             self._event.synchronize()
-        (tiles, room), pairs = self._asked, int(self._host.numpy())
-        self.learn(tiles, pairs)
-        return pairs > room
+        numbers = [int(number.numpy()) for number in self._host[: len(asked)]]
+        for (tiles, _), pairs in zip(asked, numbers, strict=True):
+            self.learn(tiles, pairs)
+        return any(pairs > room for (_, room), pairs in zip(asked, numbers, strict=True))
 
 
 def room_for(pairs: Tensor, tiles: int, budget: PairBudget | None) -> int:

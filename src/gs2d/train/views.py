@@ -17,12 +17,15 @@ from gs2d.errors import DivergedError
 from gs2d.exposure import expose, identity
 from gs2d.kernels import adam
 from gs2d.losses import compute_losses
+from gs2d.losses_multiview import Neighbour
 from gs2d.protocols import Protocol
 from gs2d.recipe import Recipe, Stage
+from gs2d.recipe_multiview import MULTIVIEW_KINDS
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
+from gs2d.train.multiview import Photographs, draw_turn, find_neighbours, is_compared
 from gs2d.train.poses import pose_rate
 from gs2d.train.state import TrainState
 from gs2d.train.targets import Target, TargetSource
@@ -88,6 +91,9 @@ class WholeViews:
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
         self._targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
+        if recipe.multiview is not None:
+            self._neighbours = find_neighbours(scene, recipe.multiview)
+            self._photographs = Photographs(scene.train, recipe.multiview)
 
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
         """The rasterizer's constants at an iteration (1-based)."""
@@ -113,8 +119,25 @@ class WholeViews:
         settings = self.settings(stage, iteration)
         rows = None if gather else _learning_rows(state, stage)  # the signal is of every splat
         output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
-        losses, gradients = self.differentiate(state, stage, iteration, index, camera, output, dict(leaves.items()))
+        neighbour = self._neighbour_of(state, stage, iteration, index)
+        given = (index, camera, output, dict(leaves.items()), neighbour)
+        losses, gradients = self.differentiate(state, stage, iteration, *given)
         return Evaluated(losses, gradients, None if probe is None else _gradient(probe), output.radii)
+
+    @torch.no_grad()
+    def _neighbour_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Neighbour | None:
+        """The view that view ``index`` is compared with in an iteration, rendered; None: with none."""
+        settings = self.recipe.multiview
+        if settings is None or not is_compared(stage, iteration):
+            return None
+        turn = draw_turn(self.recipe, state.stage, iteration, self._neighbours[index], settings)
+        if turn is None:
+            return None
+        camera, other = self.camera(state, turn.neighbour), turn.neighbour
+        bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False)
+        depth = rasterize(state.splats, camera, bare, backend=self.backend).depth(self.protocol.depth)
+        here, there = (self._photographs.of(i, self._targets[i]) for i in (index, other))
+        return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 
     def differentiate(
         self,
@@ -125,6 +148,7 @@ class WholeViews:
         camera: Camera,
         output: RenderOutput,
         leaves: Mapping[str, Tensor],
+        neighbour: Neighbour | None = None,
     ) -> tuple[dict[str, float | Tensor], dict[str, Tensor]]:
         """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
 
@@ -148,12 +172,13 @@ class WholeViews:
             target.image,
             target.mask,
             camera,
-            self.protocol.resolve(stage.losses),
+            [t for t in self.protocol.resolve(stage.losses) if neighbour is not None or t.kind not in MULTIVIEW_KINDS],
             iteration=iteration,
             depth_kind=self.protocol.depth,
             backend_name=self.backend.name,
             target_cache=target.maps,
             silhouette=target.silhouette,
+            neighbour=neighbour,
         )
         if transform is not None:
             assert self.recipe.exposure is not None

@@ -1,0 +1,77 @@
+"""How far the sparse points of a capture lie from the mesh of a run: a surface check where no ground truth is.
+
+::
+
+    python -m benchmarks.points RUN [RUN ...]
+
+Structure from motion observed these points, to within about its reprojection error, and training starts from them. The
+unit is the width of a pixel of the training photographs at the point, in the view that sees it from nearest. Points
+outside the mesh's box do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.data.scene import Scene
+from gs2d.evaluate.distance import distances_to_mesh
+from gs2d.io.ply import read_mesh
+from gs2d.io.run import MESH, open_run
+from gs2d.pipeline.prepare import reload_job
+
+WITHIN = (0.5, 1.0, 2.0, 5.0)  # px
+
+
+@dataclass(frozen=True)
+class Row:
+    """Distances of one run, px."""
+
+    points: int
+    median: float
+    mean: float  # of distances limited to 10
+    within: dict[float, float]  # shares
+
+
+def pixel_widths(points: np.ndarray, scene: Scene) -> np.ndarray:
+    """Width of a pixel at each point [P] wu, in the training view that sees it from nearest; infinite if none does."""
+    widths = np.full(len(points), np.inf)
+    for view in scene.train:
+        pixels, depth = view.camera.project(points)
+        seen = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels <= (view.camera.width, view.camera.height)).all(axis=1)
+        widths[seen] = np.minimum(widths[seen], depth[seen] / view.camera.fx)
+    return widths
+
+
+def measure(run: Path) -> Row:
+    """Distances of the points of a run's capture to its mesh."""
+    job = reload_job(open_run(run), lambda event: None)
+    if job.scene.points is None:
+        raise SystemExit(f"{run}: its capture has no points")
+    mesh = read_mesh(run / MESH)
+    points = np.asarray(job.scene.points.points, dtype=np.float64)
+    widths = pixel_widths(points, job.scene)
+    inside = (points >= mesh.vertices.min(axis=0)).all(axis=1) & (points <= mesh.vertices.max(axis=0)).all(axis=1)
+    kept = inside & np.isfinite(widths)
+    px = distances_to_mesh(points[kept], mesh) / widths[kept]
+    within = {limit: float((px < limit).mean()) for limit in WITHIN}
+    return Row(int(kept.sum()), float(np.median(px)), float(np.minimum(px, 10).mean()), within)
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    print("| run | points | median, px | mean (at most 10), px | " + " | ".join(f"< {w:g} px" for w in WITHIN) + " |")
+    print("|---" * (4 + len(WITHIN)) + "|")
+    for run in parser.parse_args().runs:
+        row = measure(run)
+        shares = " | ".join(f"{100 * share:.1f} %" for share in row.within.values())
+        print(f"| {run} | {row.points:,} | {row.median:.3f} | {row.mean:.3f} | {shares} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""What a recipe says about comparing two photographs of the same surface. Pure Python; never imports torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gs2d.recipe_checks import integer, number, require
+
+MULTIVIEW_KINDS = ("multiview_photometric", "multiview_geometric")
+"""Losses that need a second view."""
+
+
+@dataclass(frozen=True)
+class MultiView:
+    """How training views are compared with a neighbour of theirs (``losses_multiview.py``, ``train/multiview.py``).
+
+    Attributes
+    ----------
+    patches : int
+        Pixels asked in an iteration.
+    radius : int
+        px. A patch has 2 radius + 1 pixels a side.
+    texture : float
+        Least standard deviation of grey, in [0, 1], over a patch that is asked: below, noise decides.
+    opacity : float
+        Least rendered alpha of a pixel that is asked.
+    occluded : float
+        px. A pixel that comes back so far from itself through the neighbour's depth is hidden there: it does not count.
+    neighbours : int
+        Nearest training views that each view is compared with, one of them in an iteration.
+    max_angle : float
+        Degrees. Largest angle between the optical axes of neighbours.
+    min_baseline, max_baseline : float
+        Distance between the cameras of neighbours, as a share of the distance to what they look at.
+    """
+
+    patches: int = 2048
+    radius: int = 3
+    texture: float = 0.02
+    opacity: float = 0.9
+    occluded: float = 1.0
+    neighbours: int = 4
+    max_angle: float = 45.0
+    min_baseline: float = 0.05
+    max_baseline: float = 1.0
+
+    @property
+    def side(self) -> int:
+        """Pixels along a patch."""
+        return 2 * self.radius + 1
+
+
+def check_multiview(where: str, multiview: MultiView | None, kinds: Sequence[str]) -> None:
+    """Raise RecipeError for a value that cannot be trained with, or losses (their kinds) that lack it."""
+    asked = [kind for kind in kinds if kind in MULTIVIEW_KINDS]
+    if multiview is None:
+        require(
+            not asked, f"{where} is null, but loss {asked[0] if asked else ''!r} needs it; take a recipe *-multiview"
+        )
+        return
+    require(bool(asked), f"{where} is set, but no loss is {' or '.join(MULTIVIEW_KINDS)}; take a recipe *-multiview")
+    for name in ("patches", "radius", "neighbours"):
+        integer(f"{where}.{name}", getattr(multiview, name), low=1)
+    for name in ("texture", "opacity", "occluded", "max_angle", "min_baseline", "max_baseline"):
+        value = number(f"{where}.{name}", getattr(multiview, name), low=0.0)
+        require(value > 0 or name == "min_baseline", f"{where}.{name} must be positive, got {value}")
+    require(
+        multiview.opacity < 1, f"{where}.opacity must be below 1, which no rendering reaches, got {multiview.opacity}"
+    )
+    require(multiview.max_angle <= 90, f"{where}.max_angle must be at most 90 degrees, got {multiview.max_angle}")
+    require(
+        multiview.min_baseline < multiview.max_baseline,
+        f"{where}.min_baseline must be below max_baseline, got {multiview.min_baseline} and {multiview.max_baseline}",
+    )

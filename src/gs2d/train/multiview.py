@@ -1,0 +1,116 @@
+"""Which views are compared with which, their photographs as patches, and what an iteration draws.
+
+Nothing here is part of the state: neighbours follow from the cameras, and the draws of an iteration from the recipe's
+seed, the stage and the iteration alone. So a resume, and an iteration that a GPU does again, draw the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gs2d.camera import Camera
+from gs2d.data.scene import Scene, View
+from gs2d.errors import DataError
+from gs2d.losses_multiview import Photograph, prepare
+from gs2d.recipe import Recipe, Stage
+from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView
+from gs2d.train.targets import Target
+
+SAMPLES = 2000  # points that say how far away is what a camera looks at
+
+
+def is_compared(stage: Stage, iteration: int) -> bool:
+    """Whether a stage compares views at an iteration."""
+    return any(term.kind in MULTIVIEW_KINDS and term.weight and iteration > term.start for term in stage.losses)
+
+
+def find_neighbours(scene: Scene, settings: MultiView) -> tuple[tuple[int, ...], ...]:
+    """Indices of the neighbours of each training view, nearest first; none where there is none.
+
+    Raises
+    ------
+    DataError
+        If no view has one.
+    """
+    cameras = [view.camera for view in scene.train]
+    points = _sample_points(scene)
+    centers = np.stack([camera.center for camera in cameras])
+    forwards = np.stack([camera.forward for camera in cameras])
+    least_cosine = np.cos(np.radians(settings.max_angle))
+    found = []
+    for camera in cameras:
+        reach = _distance_of(camera, points, scene.extent)
+        baselines = np.linalg.norm(centers - camera.center, axis=1) / reach
+        fits = (baselines >= settings.min_baseline) & (baselines <= settings.max_baseline) & (baselines > 0)
+        fits &= forwards @ camera.forward >= least_cosine - 1e-9
+        order = np.argsort(baselines, kind="stable")
+        found.append(tuple(int(i) for i in order[fits[order]][: settings.neighbours]))
+    if not any(found):
+        raise DataError(
+            f"no training view of {scene.name} has a neighbour within multiview.max_angle = {settings.max_angle:g} "
+            f"degrees and baselines of {settings.min_baseline:g} to {settings.max_baseline:g} of the distance; "
+            "take a recipe without multiview, or --set multiview.max_angle=..."
+        )
+    return tuple(found)
+
+
+def _sample_points(scene: Scene) -> np.ndarray:
+    """Points [P, 3] of the scene: some of its own, else spread over its bounds."""
+    if scene.points is not None and len(scene.points) > 0:
+        points = np.asarray(scene.points.points, dtype=np.float64)
+        points = points[np.isfinite(points).all(axis=1)]
+        return points[:: max(1, len(points) // SAMPLES)]
+    unit = np.random.Generator(np.random.Philox(0)).random((SAMPLES, 3))
+    return np.asarray(scene.bounds[0] + unit * (scene.bounds[1] - scene.bounds[0]))
+
+
+def _distance_of(camera: Camera, points: np.ndarray, extent: float) -> float:
+    """Median depth of the points in a camera's picture, wu; the scene's extent where there are none."""
+    pixels, depth = camera.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels <= (camera.width, camera.height)).all(axis=1)
+    return float(np.median(depth[inside])) if inside.any() else extent
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What an iteration draws: the neighbour of its view, and a number in [0, 1) for each patch."""
+
+    neighbour: int
+    draws: torch.Tensor
+
+
+def draw_turn(
+    recipe: Recipe, stage: int, iteration: int, neighbours: tuple[int, ...], settings: MultiView
+) -> Turn | None:
+    """The draws of an iteration (from 1) of a stage; None for a view without neighbours."""
+    if not neighbours:
+        return None
+    generator = np.random.Generator(np.random.Philox(key=[recipe.seed, (stage << 40) + iteration]))
+    neighbour = neighbours[int(generator.integers(len(neighbours)))]
+    return Turn(neighbour, torch.from_numpy(generator.random(settings.patches)))
+
+
+class Photographs:
+    """Photographs of the training views as patches; the first that fit in ``limit_bytes`` are kept."""
+
+    def __init__(self, views: tuple[View, ...], settings: MultiView, *, limit_bytes: int = 1 << 29) -> None:
+        self._views, self._settings, self._room = views, settings, limit_bytes
+        self._kept: dict[int, Photograph] = {}
+
+    def of(self, index: int, target: Target) -> Photograph:
+        """That of view ``index``, whose target is given."""
+        kept = self._kept.get(index)
+        if kept is not None:
+            return kept
+        alpha, usable = self._views[index].alpha(), target.mask
+        if alpha is not None:
+            opaque = torch.as_tensor(alpha >= 1).to(target.image.device, non_blocking=True)
+            usable = opaque if usable is None else usable & opaque
+        made = prepare(target.image, usable, self._settings)
+        if made.nbytes <= self._room:
+            self._kept[index] = made
+            self._room -= made.nbytes
+        return made

@@ -1,0 +1,55 @@
+"""Runs that compare views: from the command's recipe to the run folder, stopped and resumed, and refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ball_runs import SMALL, Stop, comparable, options
+from gs2d.errors import DataError
+from gs2d.pipeline.events import Event, Step, ignore
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare import prepare
+from gs2d.pipeline.train import train
+
+WIDE = (  # for few cameras, far apart, and pictures of a few pixels
+    *("multiview.max_angle=80", "multiview.max_baseline=2", "multiview.radius=1", "multiview.occluded=50"),
+    *("multiview.opacity=0.05", "multiview.texture=0.001", "multiview.patches=50"),
+)
+
+
+def comparing(capture: Path, out: Path, **changes: Any) -> TrainOptions:
+    made = options(capture, out, recipe="2dgs-r-multiview", overrides=(*SMALL, *WIDE))
+    return replace(made, **changes)
+
+
+def test_a_run_that_compares_views_resumes_to_the_same_bytes_and_logs_its_loss(capture: Path, tmp_path: Path) -> None:
+    whole = train(comparing(capture, tmp_path / "whole"))
+    logged = [line["losses"] for line in whole.events.read() if line["kind"] == "step"]
+    assert any(losses.get("multiview_photometric", 0) > 0 for losses in logged)
+
+    def listen(event: Event) -> None:
+        if isinstance(event, Step) and event.done >= 25 and "loss" in event.detail:  # views are compared from 15 on
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(comparing(capture, tmp_path / "run"), listen)
+    resumed = train(comparing(capture, tmp_path / "run", resume=True))
+    assert comparable(resumed) == comparable(whole)
+
+
+def test_cameras_that_all_look_elsewhere_are_refused_and_leave_nothing(capture: Path, tmp_path: Path) -> None:
+    narrow = (*SMALL, "multiview.max_angle=0.1")
+    with pytest.raises(DataError, match="no training view of ball has a neighbour within multiview.max_angle = 0.1"):
+        train(comparing(capture, tmp_path / "run", overrides=narrow))
+    assert not (tmp_path / "run").exists()
+
+
+def test_how_views_are_compared_decides_which_stages_are_shared(capture: Path, tmp_path: Path) -> None:
+    job = prepare(comparing(capture, tmp_path / "a"), ignore)
+    other = prepare(comparing(capture, tmp_path / "b", overrides=(*SMALL, *WIDE[:-1])), ignore)
+    assert job.stage_key(0) != other.stage_key(0)
+    assert job.stage_key(0) == prepare(comparing(capture, tmp_path / "c"), ignore).stage_key(0)

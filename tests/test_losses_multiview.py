@@ -1,0 +1,224 @@
+"""Losses of two views: a plane whose depth and normal are known, seen by two cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d.camera import Camera, look_at
+from gs2d.geometry import moved
+from gs2d.losses_multiview import (
+    Neighbour,
+    TwoViews,
+    _sample,
+    _Sampled,
+    choose_pixels,
+    geometric,
+    photometric,
+    prepare,
+)
+from gs2d.recipe_multiview import MultiView
+
+SETTINGS = MultiView(patches=40, radius=2, texture=0.01, occluded=4.0)
+PLANE_NORMAL = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+
+
+def camera_at(*eye: float, **changes: float) -> Camera:
+    """48 x 40 px, principal point off the centre, looking at the origin."""
+    made = look_at(np.array(eye), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=48, height=40, fx=50.0, fy=47.0)
+    return replace(made, **({"cx": 22.5, "cy": 21.0} | changes))
+
+
+HERE, THERE = camera_at(0.0, 0.1, 2.0), camera_at(0.5, 0.2, 1.9, cx=26.0, cy=18.5, fx=53.0)
+
+
+def plane_depth(camera: Camera) -> Tensor:
+    """Depth [H, W] of the plane through the origin."""
+    j, i = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(i - camera.cx) / camera.fx, (j - camera.cy) / camera.fy, np.ones_like(i)], axis=-1)
+    return torch.as_tensor(-(camera.center @ PLANE_NORMAL) / (rays @ camera.rotation @ PLANE_NORMAL))
+
+
+def plane_photograph(camera: Camera) -> Tensor:
+    """A smooth texture on the plane, as the camera sees it [H, W, 3]."""
+    j, i = np.mgrid[: camera.height, : camera.width] + 0.5
+    z = plane_depth(camera).numpy()
+    points = np.stack([(i - camera.cx) / camera.fx * z, (j - camera.cy) / camera.fy * z, z], axis=-1)
+    x, y, _ = np.moveaxis((points - camera.T_cam_world[:3, 3]) @ camera.rotation, -1, 0)
+    grey = 0.5 + 0.2 * np.sin(9 * x + 4 * y) + 0.2 * np.sin(7 * y - 3 * x * y) + 0.1 * np.sin(17 * x)
+    return torch.as_tensor(grey)[..., None].expand(-1, -1, 3)
+
+
+@dataclass(frozen=True)
+class Case:
+    """The plane's images for the first view, and its neighbour."""
+
+    depth: Tensor
+    normal: Tensor
+    neighbour: Neighbour
+
+    def views(self, depth: Tensor | None = None, normal: Tensor | None = None) -> TwoViews:
+        depth = self.depth if depth is None else depth
+        normal = self.normal if normal is None else normal
+        return TwoViews(depth, normal, self.neighbour.here.textured, HERE, self.neighbour)
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    photographs = [prepare(plane_photograph(camera), None, SETTINGS) for camera in (HERE, THERE)]
+    draws = torch.rand(SETTINGS.patches, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    neighbour = Neighbour(*photographs, THERE, plane_depth(THERE), draws, SETTINGS)
+    normal = torch.as_tensor(PLANE_NORMAL).expand(HERE.height, HERE.width, 3)
+    return Case(plane_depth(HERE), normal, neighbour)
+
+
+def test_at_the_true_plane_patches_look_alike_and_pixels_come_back_to_themselves(case: Case) -> None:
+    views = case.views()
+    ncc, known = views.similarity
+    error, back = views.round_trip
+    assert known.sum() > 25
+    assert float(ncc[known].min()) > 0.99  # what is missing is bilinear sampling of a curved texture
+    assert float(error[back].max()) < 1e-2  # and of a depth that is not linear in the pixel
+    assert float(photometric(views)) < 0.003
+    assert float(geometric(views)) < 0.003
+
+
+@pytest.mark.parametrize("offset", [-0.02, 0.02])
+def test_the_gradient_points_to_the_true_depth(case: Case, offset: float) -> None:
+    for loss in (photometric, geometric):
+        depth = (case.depth + offset).requires_grad_()
+        loss(case.views(depth)).backward()
+        assert depth.grad is not None
+        touched = depth.grad[depth.grad != 0]
+        right = (touched.sign() == np.sign(offset)).double().mean()  # a step against the gradient goes back
+        assert float(right) > 0.9, (loss.__name__, float(right))
+
+
+def test_the_gradient_points_to_the_true_normal(case: Case) -> None:
+    tilt = torch.tensor([0.5, 0.3, 0.0], dtype=torch.float64)  # a small one hardly moves a patch of 5 px
+    normal = (case.normal + tilt).clone().requires_grad_()
+    photometric(case.views(normal=normal)).backward()
+    assert normal.grad is not None
+    touched = normal.grad.any(dim=2)
+    right = (normal.grad * (normal.detach() - case.normal)).sum(dim=2)[touched] > 0
+    assert touched.sum() > 25
+    assert float(right.double().mean()) > 0.9
+
+
+def test_gradients_are_those_of_finite_differences(case: Case) -> None:
+    index, chosen = choose_pixels(case.neighbour.here.textured, case.neighbour.draws)
+    g = torch.Generator().manual_seed(1)
+    d = case.depth.flatten()[index] + 0.01 * torch.randn(len(index), generator=g, dtype=torch.float64)
+    n = case.normal.reshape(-1, 3)[index] * 0.8 + 0.05 * torch.randn(len(index), 3, generator=g, dtype=torch.float64)
+    assert chosen.all()
+
+    def values(d: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
+        depth = case.depth.flatten().index_put((index,), d).view_as(case.depth)
+        normal = case.normal.reshape(-1, 3).index_put((index,), n).view_as(case.normal)
+        views = case.views(depth, normal)
+        views.__dict__["weights"] = weights
+        return photometric(views), geometric(views)
+
+    weights = torch.rand(len(index), generator=g, dtype=torch.float64)  # they have no gradient: any constant
+    assert torch.autograd.gradcheck(values, (d.requires_grad_(), n.requires_grad_()), eps=1e-7, atol=1e-6)
+
+
+def test_a_view_without_a_pixel_to_ask_has_loss_zero_and_no_gradient() -> None:
+    camera, draws = replace(HERE, width=3, height=3), torch.rand(5)
+    photograph = prepare(torch.rand(3, 3, 3), None, MultiView(patches=5))  # smaller than a patch of 7 px
+    neighbour = Neighbour(photograph, photograph, camera, torch.ones(3, 3), draws, MultiView(patches=5))
+    depth, normal = torch.ones(3, 3, requires_grad=True), torch.full((3, 3, 3), torch.nan, requires_grad=True)
+    views = TwoViews(depth, normal, photograph.textured, camera, neighbour)
+    loss = photometric(views) + geometric(views)
+    assert loss.item() == 0
+    assert all(not g.any() for g in torch.autograd.grad(loss, (depth, normal)))
+
+
+def test_pixels_are_asked_once_each_and_evenly_and_all_of_them_where_they_are_few() -> None:
+    candidates = torch.zeros(6, 7, dtype=torch.bool)
+    candidates[1:5, 2:6] = True  # 16 pixels
+    where = set(candidates.flatten().nonzero().flatten().tolist())
+    g, seen = torch.Generator().manual_seed(0), torch.zeros(42)
+    for _ in range(400):
+        index, chosen = choose_pixels(candidates, torch.rand(4, generator=g))
+        assert chosen.all()
+        assert len(set(index.tolist())) == 4
+        assert set(index.tolist()) <= where
+        seen[index] += 1
+    assert float(seen[candidates.flatten()].min()) > 60  # 100 each
+    index, chosen = choose_pixels(candidates, torch.rand(200, generator=g))
+    assert set(index[chosen].tolist()) == where
+    assert int(chosen.sum()) == 16
+    assert not choose_pixels(torch.zeros(6, 7, dtype=torch.bool), torch.rand(4))[1].any()
+
+
+def test_the_mean_runs_over_all_pixels_that_are_not_masked_whatever_the_number_asked(case: Case) -> None:
+    depth = case.depth + 0.02
+    everything = replace(case.neighbour, draws=torch.full((2000,), 0.5, dtype=torch.float64))
+    views = TwoViews(depth, case.normal, everything.here.textured, HERE, everything)
+    whole, count = photometric(views), views.depth.numel()
+    ncc, known = views.similarity
+    assert whole.item() == pytest.approx(((1 - ncc) * views.weights)[known].sum().item() / count)
+    half = torch.arange(count).view(depth.shape) % 2 == 0
+    masked = TwoViews(depth, case.normal, everything.here.textured & half, HERE, everything, half)
+    assert photometric(masked).item() == pytest.approx(whole.item(), rel=0.05)  # half of the sum, half of the pixels
+    g = torch.Generator().manual_seed(0)
+    few = [replace(everything, draws=torch.rand(60, generator=g, dtype=torch.float64)) for _ in range(20)]
+    sampled = [photometric(TwoViews(depth, case.normal, everything.here.textured, HERE, n)).item() for n in few]
+    assert float(np.mean(sampled)) == pytest.approx(whole.item(), rel=0.1)
+
+
+def test_a_camera_that_learns_gets_the_gradient_of_finite_differences(case: Case) -> None:
+    start = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.02], dtype=torch.float64)
+
+    def values(motion: Tensor) -> tuple[Tensor, Tensor]:
+        views = TwoViews(case.depth, case.normal, case.neighbour.here.textured, moved(HERE, motion), case.neighbour)
+        views.__dict__["weights"] = torch.ones(SETTINGS.patches, dtype=torch.float64)
+        return photometric(views), geometric(views)
+
+    assert torch.autograd.gradcheck(values, (start.requires_grad_(),), eps=1e-7, atol=1e-6)
+    still = TwoViews(case.depth, case.normal, case.neighbour.here.textured, HERE, case.neighbour)
+    held = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    learning = TwoViews(case.depth, case.normal, case.neighbour.here.textured, moved(HERE, held), case.neighbour)
+    torch.testing.assert_close(photometric(learning), photometric(still))
+
+
+def test_a_gpu_samples_photographs_like_a_cpu() -> None:
+    g = torch.Generator().manual_seed(4)
+    image = torch.rand(7, 9, generator=g, dtype=torch.float64)
+    u, v, given = (2 * torch.rand(3, 20, 5, generator=g, dtype=torch.float64) - 1).unbind()
+    value, pull = _sample(image, u, v)
+    sampled = _Sampled.at(image, u, v)
+    torch.testing.assert_close(sampled.value, value)
+    inside = (u.abs() < 1 - 1 / 9) & (v.abs() < 1 - 1 / 7)  # between pixel centres: nothing beyond them counts
+    for by, derivative in zip(pull(given), (sampled.by_u, sampled.by_v), strict=True):
+        torch.testing.assert_close(by[inside], (derivative * given)[inside])
+    one = torch.rand(1, 1, dtype=torch.float64)
+    assert _Sampled.at(one, u, v).value.eq(one).all()
+
+
+def test_values_and_gradients_have_the_same_bits_for_any_number_of_threads() -> None:
+    g = torch.Generator().manual_seed(3)
+    settings, size = MultiView(patches=3000, occluded=100.0), 120
+    here, there = (replace(c, width=size, height=size, fx=150.0, fy=150.0, cx=60.0, cy=60.0) for c in (HERE, THERE))
+    photographs = [prepare(torch.rand(size, size, 3, generator=g), None, settings) for _ in range(2)]
+    normal = torch.as_tensor(PLANE_NORMAL).float() + 0.05 * torch.randn(size, size, 3, generator=g)
+    depth = plane_depth(here).float() * (1 + 0.01 * torch.rand(size, size, generator=g))
+    neighbour = Neighbour(*photographs, there, plane_depth(there).float(), torch.rand(3000, generator=g), settings)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            leaves = depth.clone().requires_grad_(), normal.clone().requires_grad_()
+            views = TwoViews(*leaves, photographs[0].textured, here, neighbour)
+            loss = photometric(views) + geometric(views)
+            found.append([loss.detach(), *torch.autograd.grad(loss, leaves)])
+    finally:
+        torch.set_num_threads(before)
+    assert (found[0][1] != 0).sum() > 2000
+    for others in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], others, strict=True))

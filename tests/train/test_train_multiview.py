@@ -1,0 +1,175 @@
+"""Training that compares views: who is compared with whom, what is drawn, resume to the same bytes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_train_resume import reload, saved
+from train_toys import VIEWS, WIDE, compared, same, short
+
+from gs2d.camera import look_at
+from gs2d.data.scene import Scene, View
+from gs2d.errors import DataError
+from gs2d.protocols import GENERIC
+from gs2d.recipe_multiview import MultiView
+from gs2d.recipes import with_multiview
+from gs2d.render.api import rasterize
+from gs2d.train.loop import Trainer
+from gs2d.train.multiview import Photographs, draw_turn, find_neighbours
+from gs2d.train.targets import Targets
+
+
+def ring(angles: list[float], distance: float = 3.0) -> Scene:
+    """Cameras around the origin, at these angles in degrees, without points."""
+    views = []
+    for k, a in enumerate(np.radians(angles)):
+        eye, up = distance * np.array([np.cos(a), np.sin(a), 0.0]), np.array([0.0, 0.0, 1.0])
+        camera = look_at(eye, np.zeros(3), up, width=20, height=20, fx=20.0)
+        views.append(View.from_arrays(f"{k}", camera, np.zeros((20, 20, 3), np.uint8)))
+    bounds = np.array([[-1.0] * 3, [1.0] * 3])
+    return Scene("ring", "blender", train=tuple(views), test=(), points=None, extent=3.3, bounds=bounds)
+
+
+# -- neighbours ---------------------------------------------------------------------------------------------------
+def test_neighbours_are_the_nearest_views_within_the_angle_and_the_baselines() -> None:
+    # From 0 degrees: 1 is too near (baseline 2 sin(0.5) = 0.017 of the distance), 60 looks another way.
+    settings = MultiView(neighbours=3, max_angle=45.0, min_baseline=0.05, max_baseline=1.0)
+    found = find_neighbours(ring([0, 1, 30, 10, 60, 20]), settings)
+    assert found[0] == (3, 5, 2)
+    assert found[4] == (2, 5)  # 30 degrees away and 40; 50 is too many
+    assert find_neighbours(ring([0, 1, 30, 10, 60, 20]), replace(settings, neighbours=1))[0] == (3,)
+    assert find_neighbours(ring([0, 1, 30, 10]), replace(settings, max_baseline=0.3))[0] == (3,)  # 30: 0.52
+
+
+def test_two_cameras_at_one_place_are_no_neighbours() -> None:
+    found = find_neighbours(ring([0, 0, 20]), MultiView(min_baseline=0.0))
+    assert found[:2] == ((2,), (2,))
+
+
+def test_a_view_may_have_no_neighbour_but_not_every_view() -> None:
+    assert find_neighbours(ring([0, 20, 180]), MultiView())[2] == ()
+    with pytest.raises(DataError, match="no training view of ring has a neighbour .* --set multiview.max_angle"):
+        find_neighbours(ring([0, 120, 240]), MultiView())
+
+
+def test_a_scene_without_neighbours_is_refused_before_anything_is_trained(scene: Scene) -> None:
+    with pytest.raises(DataError, match="has a neighbour"):  # six views, 60 degrees apart
+        Trainer(scene, with_multiview(short()), GENERIC, backend="reference")
+
+
+# -- draws --------------------------------------------------------------------------------------------------------
+def test_an_iteration_draws_from_the_seed_the_stage_and_the_iteration_alone() -> None:
+    recipe, neighbours = compared(), (3, 5, 7)
+
+    def drawn(seed: int, stage: int, iteration: int) -> tuple[int, torch.Tensor]:
+        turn = draw_turn(replace(recipe, seed=seed), stage, iteration, neighbours, WIDE)
+        assert turn is not None
+        return turn.neighbour, turn.draws
+
+    first, again = drawn(0, 0, 9), drawn(0, 0, 9)
+    assert first[0] == again[0]
+    assert torch.equal(first[1], again[1])
+    for other in ((1, 0, 9), (0, 2, 9), (0, 0, 10)):
+        assert not torch.equal(first[1], drawn(*other)[1]), other
+    assert {drawn(0, 0, i)[0] for i in range(40)} == set(neighbours)
+    assert draw_turn(recipe, 0, 9, (), WIDE) is None
+    assert drawn(2**63 - 1, 2, 10**6)[1].shape == (WIDE.patches,)  # the largest seed there is
+
+
+def test_the_state_s_generator_draws_what_it_draws_without(scene: Scene) -> None:
+    with_, without = Trainer(scene, compared(), GENERIC, backend="reference"), None
+    without = Trainer(scene, short(), GENERIC, backend="reference")
+    for trainer in (with_, without):
+        trainer.enter(0)
+        for _ in range(2):
+            trainer.step()
+    assert torch.equal(with_.state.generator.get_state(), without.state.generator.get_state())
+    assert same(with_.splats, without.splats)  # nothing is compared yet
+
+
+# -- photographs --------------------------------------------------------------------------------------------------
+def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> None:
+    rng = np.random.default_rng(0)
+    camera = ring([0]).train[0].camera
+    image = rng.integers(0, 255, (20, 20, 4), dtype=np.uint8)
+    image[..., 3] = 255
+    image[4, 6, 3] = 254
+    mask = np.ones((20, 20), bool)
+    mask[15, 12] = False
+    view = View.from_arrays("0", camera, image, mask)
+    target = Targets((view,), (1.0, 1.0, 1.0), use_masks=True, with_maps=False)[0]
+    settings = MultiView(radius=2)
+    clear = Photographs((view,), settings).of(0, target).clear.numpy()
+    expected = np.zeros((20, 20), bool)
+    expected[2:-2, 2:-2] = True
+    expected[2:7, 4:9] = False
+    expected[13:18, 10:15] = False
+    assert np.array_equal(clear, expected)
+
+
+def test_photographs_beyond_the_room_are_made_anew(scene: Scene) -> None:
+    targets = Targets(scene.train, (0.0, 0.0, 0.0), use_masks=False, with_maps=False)
+    kept, none = Photographs(scene.train, WIDE), Photographs(scene.train, WIDE, limit_bytes=0)
+    for index in (0, 1, 0):
+        a, b = (photographs.of(index, targets[index]) for photographs in (kept, none))
+        assert torch.equal(a.grey, b.grey)
+        assert torch.equal(a.textured, b.textured)
+    assert kept.of(0, targets[0]) is kept.of(0, targets[0])
+    assert none.of(0, targets[0]) is not none.of(0, targets[0])
+
+
+# -- training -----------------------------------------------------------------------------------------------------
+def test_both_losses_are_there_once_they_have_started_and_move_depths(scene: Scene, backend: str) -> None:
+    trainer = Trainer(scene, compared(), GENERIC, backend=backend)
+    trainer.enter(0)
+    whole, stage = trainer._whole, trainer.recipe.stages[0]
+    before, after = (whole.evaluate(trainer.state, stage, iteration, 0) for iteration in (6, 7))
+    assert set(after.losses) - set(before.losses) == {"multiview_photometric", "multiview_geometric"}
+    assert after.losses["multiview_photometric"] > 0
+    assert after.losses["multiview_geometric"] > 0
+    only = replace(stage, losses=tuple(t for t in stage.losses if not t.kind.startswith("multiview")))
+    plain = whole.evaluate(trainer.state, only, 7, 0)
+    assert not torch.equal(after.gradients["means"], plain.gradients["means"])
+    assert torch.equal(after.gradients["sh0"], plain.gradients["sh0"])  # colours are not asked
+
+
+def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str) -> None:
+    whole = Trainer(scene, compared(), GENERIC, backend=backend)
+    end = whole.run()
+    assert not same(end, Trainer(scene, short(), GENERIC, backend=backend).run())
+    for stage, stop in ((0, 8), (2, 3)):
+        trainer = Trainer(scene, compared(), GENERIC, backend=backend)
+        for index in range(stage):
+            trainer.enter(index)
+            for _ in range(trainer.recipe.stages[index].iterations):
+                trainer.step()
+            trainer._finish(trainer.recipe.stages[index])
+        trainer.enter(stage)
+        for _ in range(stop):
+            trainer.step()
+        state = reload(saved(trainer))
+        assert same(Trainer(scene, compared(), GENERIC, backend=backend, state=state).run(), end), stage
+
+
+def test_a_view_without_neighbours_trains_without_these_losses(scene: Scene) -> None:
+    lonely = replace(scene, train=(*scene.train[:2], scene.train[4]))  # at 0, 60 and 240 degrees
+    trainer = Trainer(lonely, compared(), GENERIC, backend="reference")
+    trainer.enter(0)
+    assert trainer._whole._neighbours == ((1,), (0,), ())
+    found = trainer._whole.evaluate(trainer.state, trainer.recipe.stages[0], 9, 2)
+    assert set(found.losses) == {"l1", "ssim", "normal_consistency"}
+    assert VIEWS == 6
+
+
+def test_the_neighbour_s_depth_is_rendered_as_the_splats_are_now(scene: Scene) -> None:
+    trainer = Trainer(scene, compared(), GENERIC, backend="reference")
+    trainer.enter(0)
+    neighbour = trainer._whole._neighbour_of(trainer.state, trainer.recipe.stages[0], 9, 0)
+    assert neighbour is not None
+    with torch.no_grad():
+        expected = rasterize(trainer.splats, neighbour.camera, trainer.settings, backend="reference").depth_mean
+    assert torch.equal(neighbour.depth, expected)
+    assert not neighbour.depth.requires_grad
