@@ -267,6 +267,9 @@ def test_the_page_says_what_is_done(job: Job) -> None:
     assert viewer.texts[-1] == (
         "**training 2dgs-r** 1,200/6,000<br>surface 1,200/3,000  52,787 splats<br>PSNR 24.32 dB"
     )
+    viewer.switches["pause training"](True)
+    live.on_event(Step(1210, "surface 1,210/3,000"))  # returns: the pause comes when the clock is stopped
+    viewer.switches["pause training"](False)
     live.close("**finished**")
     assert viewer.texts[-1] == "**finished**"
 

@@ -72,7 +72,8 @@ class Live(Watch):
         if failure is not None and not self._told:
             self._told = True
             self._tell(Notice(f"the viewer stopped, training goes on: {type(failure).__name__}: {failure}"))
-        self.turn()
+        if not (isinstance(event, Step) and event.detail):  # those of training have their turn off the clock
+            self.turn()
 
     def on_training_event(self, event: train_events.Event, state: TrainState) -> None:
         """Copy the splats if it is time to; the state is whole at every event."""

@@ -180,6 +180,8 @@ def train_stages(
         recorder.on_training_event(event)
         watch.scored(recorder.psnr)
         watch.on_training_event(event, trainer.state)
+        if isinstance(event, events.Progress):  # on a GPU the only time when nothing is under way
+            between()
 
     def between() -> None:
         if watch.waiting:
