@@ -15,6 +15,7 @@ from gs2d.recipe import (
     Exposure,
     GradDensify,
     LossTerm,
+    PoseRefinement,
     RankByError,
     Rates,
     Recipe,
@@ -172,6 +173,29 @@ def test_losses_of_two_views_and_how_they_are_compared_come_together() -> None:
         validate(one(losses=(*L1, LossTerm("multiview_geometric", 0.1))))
     with pytest.raises(RecipeError, match="multiview is set, but no loss is multiview_photometric or"):
         validate(replace(one(), multiview=MultiView()))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("rate", 0.0, "recipe 'r': poses.rate must be positive, got 0.0 (poses=null leaves cameras alone)"),
+        ("beta2", 1.0, "poses.beta1 and recipe 'r': poses.beta2 must be below 1"),
+        ("horizon", 0, "poses.horizon must be an integer >= 1"),
+        ("start", -1, "poses.start must be an integer >= 0"),
+    ],
+)
+def test_poses_are_checked_like_the_stages(field: str, value: float, message: str) -> None:
+    moving = replace(one(), stages=(Stage("s", 1, train={"means": "all"}, losses=L1),))
+    with pytest.raises(RecipeError) as caught:
+        validate(replace(moving, poses=replace(PoseRefinement(), **{field: value})))
+    assert message in str(caught.value)
+    assert validate(replace(moving, poses=PoseRefinement()))
+
+
+def test_poses_need_a_stage_that_moves_all_splats() -> None:
+    still = replace(one(), stages=(Stage("s", 1, train={"sh0": "all"}, losses=L1),), poses=PoseRefinement())
+    with pytest.raises(RecipeError, match="poses learn while the means of all splats do, and no stage trains those"):
+        validate(still)
 
 
 def test_a_group_may_be_written_by_an_action_of_the_same_stage() -> None:

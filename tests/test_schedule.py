@@ -114,3 +114,17 @@ def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
         0.01: (300, 50),
     }
     assert all(e is not None and (e.rate, e.rate_final, e.prior) == (0.05, 0.001, 0.001) for e in facts.values())
+
+
+def test_poses_take_longer_steps_where_they_have_fewer_turns() -> None:
+    facts = {factor: scale_schedule(get_recipe("2dgs-poses"), factor).poses for factor in (1.0, 0.25, 0.01)}
+    assert {f: (p.horizon, p.start) for f, p in facts.items() if p is not None} == {
+        1.0: (30_000, 500),
+        0.25: (7_500, 200),
+        0.01: (300, 50),
+    }
+    for factor, poses in facts.items():
+        assert poses is not None
+        assert poses.rate * math.sqrt(factor) == pytest.approx(5e-4)
+        assert poses.rate_final / poses.rate == pytest.approx(0.01)
+    assert poses.rate_at(50) == 0 < poses.rate_at(51)

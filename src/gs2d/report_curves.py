@@ -234,6 +234,23 @@ def _figure(
     return svg_text(figure)
 
 
+def plot_by_photograph(height: float) -> tuple[Any, Any]:
+    """Figure and plain axes for something of each training photograph, in their order."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.2, height), layout="constrained")
+    FigureCanvasSVG(figure)
+    axes = figure.add_subplot()
+    axes.set_xlabel("training photograph, by name", fontsize=8, color=INK)
+    axes.tick_params(colors=INK, labelsize=8)
+    axes.grid(True, color=INK, alpha=0.18, linewidth=0.6)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(INK)
+    return figure, axes
+
+
 def svg_text(figure: Any) -> str:
     import matplotlib
 

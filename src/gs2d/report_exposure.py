@@ -10,7 +10,7 @@ import numpy as np
 
 from gs2d.errors import DataError
 from gs2d.io.files import read_json
-from gs2d.report_curves import INK, svg_text
+from gs2d.report_curves import INK, plot_by_photograph, svg_text
 from gs2d.report_html import drawing, escape, missing
 
 GREY = 0.5  # the scene's colour whose picture is shown
@@ -67,22 +67,11 @@ def _gains(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _plot(gains: np.ndarray) -> str:
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.2, 2.7), layout="constrained")
-    FigureCanvasSVG(figure)
-    axes = figure.add_subplot()
+    figure, axes = plot_by_photograph(2.7)
     axes.axhline(1.0, color=INK, linewidth=0.8)
     for k, (name, color) in enumerate(_CHANNELS.items()):
         axes.plot(
             np.arange(1, len(gains) + 1), gains[:, k], "o-", color=color, markersize=2.5, linewidth=0.8, label=name
         )
-    axes.set_xlabel("training photograph, by name", fontsize=8, color=INK)
-    axes.tick_params(colors=INK, labelsize=8)
-    axes.grid(True, color=INK, alpha=0.18, linewidth=0.6)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(INK)
     axes.legend(fontsize=8, frameon=False, labelcolor=INK, ncols=3)
     return svg_text(figure)

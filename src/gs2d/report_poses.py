@@ -10,7 +10,7 @@ import numpy as np
 
 from gs2d.errors import DataError
 from gs2d.io.files import read_json
-from gs2d.report_curves import INK, svg_text
+from gs2d.report_curves import INK, plot_by_photograph, svg_text
 from gs2d.report_html import drawing, escape, missing
 
 MEASURES = ("pixels", "degrees", "shift")
@@ -67,18 +67,7 @@ def _moved(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _plot(pixels: np.ndarray) -> str:
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.2, 2.4), layout="constrained")
-    FigureCanvasSVG(figure)
-    axes = figure.add_subplot()
+    figure, axes = plot_by_photograph(2.4)
     axes.bar(np.arange(1, len(pixels) + 1), pixels, color="#3f86d6")
-    axes.set_xlabel("training photograph, by name", fontsize=8, color=INK)
     axes.set_ylabel("px", fontsize=8, color=INK)
-    axes.tick_params(colors=INK, labelsize=8)
-    axes.grid(True, axis="y", color=INK, alpha=0.18, linewidth=0.6)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(INK)
     return svg_text(figure)

@@ -51,7 +51,7 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
         stages=tuple(_scale_stage(stage, factor) for stage in recipe.stages),
         init_points=min(recipe.init_points, points),
         exposure=None if recipe.exposure is None else _scale_views(recipe.exposure, factor),
-        poses=None if recipe.poses is None else _scale_views(recipe.poses, factor),
+        poses=None if recipe.poses is None else _scale_poses(recipe.poses, factor),
     )
 
 
@@ -60,6 +60,12 @@ def _scale_views(learned: OfViews, factor: float) -> OfViews:
     horizon = _scaled(learned.horizon, factor)
     least = min(learned.start, VIEWS_WAIT, horizon // 6)
     return replace(learned, horizon=horizon, start=max(least, round(learned.start * factor)))
+
+
+def _scale_poses(poses: PoseRefinement, factor: float) -> PoseRefinement:
+    """A camera moves when its photograph has its turn: with fewer turns it takes longer steps."""
+    longer = 1 / math.sqrt(factor)
+    return replace(_scale_views(poses, factor), rate=poses.rate * longer, rate_final=poses.rate_final * longer)
 
 
 def _scale_stage(stage: Stage, factor: float) -> Stage:

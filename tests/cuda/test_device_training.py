@@ -30,7 +30,7 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
 from gs2d.protocols import GENERIC
-from gs2d.recipe import Exposure, Recipe
+from gs2d.recipe import Exposure, PoseRefinement, Recipe
 from gs2d.render import cuda, cuda_budget, cuda_passes
 from gs2d.render.backend import Backend, get_backend
 from gs2d.render.types import RasterSettings
@@ -63,6 +63,7 @@ def cpu_backend() -> Backend:
 VARIANTS = {
     "plain": train_toys.short(),
     "exposure": replace(train_toys.short(), exposure=Exposure(start=2, horizon=10)),
+    "poses": replace(train_toys.short(), poses=PoseRefinement(start=2, horizon=10)),
     "multiview": train_toys.compared(),
 }
 

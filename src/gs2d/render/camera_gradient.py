@@ -136,7 +136,10 @@ def _color_products(to_splats: Tensor, shN: Tensor, gradient: Tensor, degree: in
         piece = rows[start : start + PIECE]
         colors = np.take(shN.numpy(), piece, axis=0).transpose(1, 2, 0)[:count]  # [K-1, 3, P]
         upstream = given[piece].T
-        planes = np.ascontiguousarray(sum(colors[:, c] * upstream[c] for c in range(3)))
+        planes = colors[:, 0] * upstream[0]
+        for c in (1, 2):
+            planes += colors[:, c] * upstream[c]
+        planes = np.ascontiguousarray(planes)
         x, y, z = np.ascontiguousarray(to_splats.numpy()[piece].T)
         length = np.sqrt(x * x + y * y + z * z)
         values = np.stack(harmonics(x / length, y / length, z / length, degree))
