@@ -46,7 +46,7 @@ class Camera:
         if hasattr(given, "requires_grad"):  # a torch tensor: this module does without torch
             object.__setattr__(self, "pose", given if given.requires_grad else None)
             given = given.detach().cpu().numpy()
-        T = np.asarray(given, dtype=np.float64)
+        T = np.array(given, dtype=np.float64)  # a copy: a camera stays where it is when an optimizer moves its pose
         if T.shape != (4, 4):
             raise ShapeError(f"T_cam_world must be [4, 4], got {list(T.shape)}")
         if not (np.isfinite(T).all() and np.allclose(T[3], (0, 0, 0, 1), atol=1e-6)):
@@ -68,12 +68,17 @@ class Camera:
                 f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
                 f"fx={self.fx}, fy={self.fy}"
             )
-        if self.pose is not None and not np.array_equal(T, self.pose.detach().cpu().numpy()):
+        object.__setattr__(self, "T_cam_world", T)
+        if not self.is_at_pose:
             raise ShapeError(
                 "pose must be the tensor that T_cam_world was made of, got another; give the new T_cam_world as a "
                 "tensor, or with pose=None"
             )
-        object.__setattr__(self, "T_cam_world", T)
+
+    @property
+    def is_at_pose(self) -> bool:
+        """Whether ``pose``, if there is one, still holds the numbers of ``T_cam_world``."""
+        return self.pose is None or np.array_equal(self.T_cam_world, self.pose.detach().cpu().numpy())
 
     @property
     def K(self) -> np.ndarray:

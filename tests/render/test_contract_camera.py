@@ -5,6 +5,7 @@ The judge is autograd straight through the reference, whose formulas take a came
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,7 @@ from gs2d.losses import compute_losses
 from gs2d.losses_reference import normal_consistency, normal_consistency_per_splat
 from gs2d.recipe import LossTerm
 from gs2d.render import camera_gradient, reference
-from gs2d.render.api import rasterize
+from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backend import Backend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
@@ -257,3 +258,15 @@ def test_a_backend_by_name_takes_a_learning_camera_too() -> None:
     lens, pose = learning(camera)
     rasterize(splats, lens, backend=get_backend("reference")).color.sum().backward()
     assert pose.grad is not None
+
+
+@pytest.mark.parametrize("drawing", [rasterize, splat_errors], ids=["rasterize", "splat_errors"])
+def test_20_a_pose_that_has_moved_on_without_its_camera_is_refused(cpu: Backend, drawing: Callable[..., object]) -> None:
+    splats, camera, _ = scene(0)
+    lens, pose = learning(camera)
+    with torch.no_grad():
+        pose[0, 3] += 0.1  # as an optimizer's step does
+    image = [torch.zeros(camera.height, camera.width, 3)] if drawing is splat_errors else []
+    with pytest.raises(ShapeError, match="make a camera of the new one"):
+        drawing(splats.to(dtype=torch.float32), lens, *image, backend=cpu)
+    drawing(splats.to(dtype=torch.float32), replace(lens, T_cam_world=pose), *image, backend=cpu)

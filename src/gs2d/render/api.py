@@ -225,6 +225,12 @@ def _check_types(splats: object, camera: object, settings: object, **tensors: ob
     for name, tensor in {**vars(splats), **tensors}.items():
         if not isinstance(tensor, Tensor) and tensor is not None:
             raise ShapeError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
+    assert isinstance(camera, Camera)
+    if not camera.is_at_pose:
+        raise ShapeError(
+            "the camera must stand where its pose is, got a pose that has changed since the camera was made (by an "
+            "optimizer?); make a camera of the new one: replace(camera, T_cam_world=camera.pose)"
+        )
 
 
 def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> RasterSettings:
