@@ -261,7 +261,7 @@ def test_a_backend_by_name_takes_a_learning_camera_too() -> None:
 
 
 @pytest.mark.parametrize("drawing", [rasterize, splat_errors], ids=["rasterize", "splat_errors"])
-def test_20_a_pose_that_has_moved_on_without_its_camera_is_refused(cpu: Backend, drawing: Callable[..., object]) -> None:
+def test_20_a_pose_that_moved_on_without_its_camera_is_refused(cpu: Backend, drawing: Callable[..., object]) -> None:
     splats, camera, _ = scene(0)
     lens, pose = learning(camera)
     with torch.no_grad():
