@@ -17,9 +17,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from gs2d.check import check_shapes
-from gs2d.errors import BackendError
 from gs2d.kernels import exposure as native
-from gs2d.kernels.library import Library, prepare
+from gs2d.kernels.library import library_for
 
 RIDGE = 1e-4  # of a fit, per pixel: keeps what a picture says nothing about at the identity
 
@@ -80,7 +79,7 @@ class _Expose(torch.autograd.Function):
         background: Tensor | None,
         clipped: Tensor | None,
     ) -> Tensor:
-        ctx.library = _library(color)
+        ctx.library = library_for(color)
         arguments = (color, transform, coverage, background, clipped)
         image, over = _exposed(*arguments) if ctx.library is None else native.exposed(ctx.library, *arguments)
         ctx.save_for_backward(color, transform, coverage, background, over)
@@ -92,16 +91,6 @@ class _Expose(torch.autograd.Function):
         arguments = (upstream, *ctx.saved_tensors)
         gradients = _gradients(*arguments) if ctx.library is None else native.gradients(ctx.library, *arguments)
         return (*gradients, None, None, None)
-
-
-def _library(color: Tensor) -> Library | None:
-    """The native library for pictures that it can read, where it was built: a tenth of torch's time."""
-    if not color.is_cpu or color.dtype != torch.float32:
-        return None
-    try:
-        return prepare()
-    except BackendError:  # only the reference backend is there, which is torch anyway
-        return None
 
 
 def _exposed(

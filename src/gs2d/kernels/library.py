@@ -139,6 +139,19 @@ def prepare() -> Library:
     return library
 
 
+def library_for(tensor: torch.Tensor) -> Library | None:
+    """``prepare()`` for a tensor that it can read; None for others, and where no library was built.
+
+    For what torch computes too, only slower: without the library the cpu backend is not there, and torch is the other.
+    """
+    if not tensor.is_cpu or tensor.dtype != torch.float32:
+        return None
+    try:
+        return prepare()
+    except BackendError:
+        return None
+
+
 def describe_library() -> str:
     """One line for ``gs2d doctor``: instruction set, pixels per vector, threads."""
     library = prepare()

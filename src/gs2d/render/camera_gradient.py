@@ -11,18 +11,17 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gs2d.kernels import camera as native
+from gs2d.kernels.library import library_for
 from gs2d.render.types import RenderOutput
-from gs2d.sh import C0, harmonics, num_coefficients, sh_basis
+from gs2d.sh import C0, num_coefficients, sh_basis
 from gs2d.splats import Splats
 
 __all__ = ["carried", "turning_normals", "with_world_normals"]
-
-PIECE = 4096  # rows
 
 
 def carried(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
@@ -95,7 +94,7 @@ class _TurnNormals(torch.autograd.Function):
         pose, normal = ctx.saved_tensors
         to_pose = None
         if ctx.needs_input_grad[0]:
-            torque = ctx.sign * _axial(_products(normal.reshape(-1, 3), gradient.reshape(-1, 3)))
+            torque = ctx.sign * _turned(normal.reshape(-1, 3), gradient.reshape(-1, 3))
             to_pose = _of_pose(pose, torch.zeros_like(torque), torque)  # without a force: the same about every point
         return to_pose, gradient if ctx.needs_input_grad[1] else None, None
 
@@ -108,44 +107,21 @@ def _wrench(
     ``gradients`` are those of the means, of the quaternions and, where ``degree`` > 0, of ``sh0``.
     """
     T = pose.detach().double().cpu()
-    to_splats = means - (-T[:3, :3].T @ T[:3, 3]).to(means)  # [N, 3]
-    force = _products(means.new_ones(1, 1).expand(len(means), 1), gradients[0])[0]
+    center = -T[:3, :3].T @ T[:3, 3]
+    library = library_for(means)
+    if library is not None:
+        colors = (shN, gradients[2], degree) if degree > 0 else None
+        return native.wrench(library, center, means, gradients[0], (quats, gradients[1]), colors)
+    to_splats = means - center.to(means)  # [N, 3]
+    force = gradients[0].sum(dim=0).double().cpu()
     products = _products(quats, gradients[1])  # [4, 4]
     turned = (products[0, 1:] - products[1:, 0] + _axial(products[1:, 1:])) / 2
-    torque = _axial(_products(to_splats, gradients[0])) + turned
+    torque = _turned(to_splats, gradients[0]) + turned
     if degree > 0:  # a turn of the camera about its centre changes no direction in which a colour is seen
-        by_harmonics = _color_products(to_splats, shN, gradients[2][:, 0] / C0, degree)
-        torque = torque - torch.einsum("akj,kj->a", turns_of_harmonics(degree), by_harmonics)
+        weights = (shN[:, : num_coefficients(degree) - 1] * (gradients[2] / C0)).sum(dim=2)  # [N, K-1]
+        values = sh_basis(torch.nn.functional.normalize(to_splats, dim=1), degree)[:, 1:]
+        torque = torque - torch.einsum("akj,kj->a", turns_of_harmonics(degree), _products(weights, values))
     return force, torque
-
-
-def _color_products(to_splats: Tensor, shN: Tensor, gradient: Tensor, degree: int) -> Tensor:
-    """Sum over splats of <sh_k, dL/dcolour> Y_j(g) [K-1, K-1], k and j of one degree; float64 on the CPU.
-
-    On the host numpy works on planes, in pieces that stay in the cache: torch would wake its threads for each step,
-    and the order of its sums would be theirs.
-    """
-    count = num_coefficients(degree) - 1
-    if not _on_host(shN):
-        weights = (shN[:, :count] * gradient[:, None]).sum(dim=2)  # [N, K-1]
-        return _products(weights, sh_basis(torch.nn.functional.normalize(to_splats, dim=1), degree)[:, 1:])
-    given = gradient.numpy()
-    rows = np.flatnonzero(given.any(axis=1))  # of a photograph most splats are hidden, or out of the picture
-    total = np.zeros((count, count))
-    for start in range(0, len(rows), PIECE):
-        piece = rows[start : start + PIECE]
-        colors = np.take(shN.numpy(), piece, axis=0).transpose(1, 2, 0)[:count]  # [K-1, 3, P]
-        upstream = given[piece].T
-        planes = colors[:, 0] * upstream[0]
-        for c in (1, 2):
-            planes += colors[:, c] * upstream[c]
-        planes = np.ascontiguousarray(planes)
-        x, y, z = np.ascontiguousarray(to_splats.numpy()[piece].T)
-        length = np.sqrt(x * x + y * y + z * z)
-        values = np.stack(harmonics(x / length, y / length, z / length, degree))
-        for of_degree in (slice(n * n - 1, n * (n + 2)) for n in range(1, degree + 1)):
-            total[of_degree, of_degree] += np.einsum("kp,jp->kj", planes[of_degree], values[of_degree])
-    return torch.from_numpy(total)
 
 
 @cache
@@ -186,8 +162,12 @@ def _of_pose(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:
     return gradient.to(pose)
 
 
-def _on_host(tensor: Tensor) -> bool:
-    return tensor.device.type == "cpu"
+def _turned(vectors: Tensor, gradients: Tensor) -> Tensor:
+    """Derivative by a turn [3] of vectors [N, 3], float64 on the CPU."""
+    library = library_for(vectors)
+    if library is not None:
+        return native.wrench(library, vectors.new_zeros(3), vectors, gradients)[1]
+    return _axial(_products(vectors, gradients))
 
 
 def _axial(products: Tensor) -> Tensor:
@@ -197,10 +177,4 @@ def _axial(products: Tensor) -> Tensor:
 
 def _products(left: Tensor, right: Tensor) -> Tensor:
     """Sum over rows of left_i right_j [p, q], float64 on the CPU, of tensors [N, p] and [N, q]."""
-    if not _on_host(left):
-        return (left.T @ right).double().cpu()
-    total = np.zeros((left.shape[1], right.shape[1]))
-    for start in range(0, len(left), PIECE):
-        planes = [np.ascontiguousarray(rows[start : start + PIECE].numpy().T) for rows in (left, right)]
-        total += np.einsum("ip,jp->ij", *planes)
-    return torch.from_numpy(total)
+    return (left.T @ right).double().cpu()
