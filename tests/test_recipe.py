@@ -152,7 +152,9 @@ def test_exposures_are_checked_like_the_stages(field: str, value: float, message
     ("field", "value", "message"),
     [
         ("patches", 0, "recipe 'r': multiview.patches must be an integer >= 1, got 0"),
+        ("patches", 10**11, "multiview.patches must be at most 1000000, got 100000000000"),
         ("radius", 1.5, "multiview.radius must be an integer >= 1"),
+        ("radius", 1000, "multiview.radius must be at most 50"),
         ("texture", 0.0, "multiview.texture must be positive"),
         ("opacity", 1.0, "multiview.opacity must be below 1"),
         ("occluded", float("inf"), "multiview.occluded must be a finite number"),
@@ -179,6 +181,7 @@ def test_losses_of_two_views_and_how_they_are_compared_come_together() -> None:
     ("field", "value", "message"),
     [
         ("rate", 0.0, "recipe 'r': poses.rate must be positive, got 0.0 (poses=null leaves cameras alone)"),
+        ("rate", 1e30, "recipe 'r': poses.rate must be at most 1 (rad, extents), got 1e+30"),
         ("beta2", 1.0, "poses.beta1 and recipe 'r': poses.beta2 must be below 1"),
         ("horizon", 0, "poses.horizon must be an integer >= 1"),
         ("start", -1, "poses.start must be an integer >= 0"),

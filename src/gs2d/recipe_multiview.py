@@ -9,6 +9,7 @@ from gs2d.recipe_checks import integer, number, require
 
 MULTIVIEW_KINDS = ("multiview_photometric", "multiview_geometric")
 """Losses that need a second view."""
+LARGEST = {"patches": 1_000_000, "radius": 50}  # more is a slip, and ends out of memory
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,9 @@ def check_multiview(where: str, multiview: MultiView | None, kinds: Sequence[str
     require(bool(asked), f"{where} is set, but no loss is {' or '.join(MULTIVIEW_KINDS)}; take a recipe *-multiview")
     for name in ("patches", "radius", "neighbours"):
         integer(f"{where}.{name}", getattr(multiview, name), low=1)
+    for name, largest in LARGEST.items():
+        value = getattr(multiview, name)
+        require(value <= largest, f"{where}.{name} must be at most {largest}, got {value}")
     for name in ("texture", "opacity", "occluded", "max_angle", "min_baseline", "max_baseline"):
         value = number(f"{where}.{name}", getattr(multiview, name), low=0.0)
         require(value > 0 or name == "min_baseline", f"{where}.{name} must be positive, got {value}")

@@ -93,6 +93,9 @@ def check_poses(where: str, poses: PoseRefinement) -> None:
     for name in ("rate", "rate_final", "eps"):
         value = number(f"{where}.{name}", getattr(poses, name), low=0.0)
         require(value > 0, f"{where}.{name} must be positive, got {value} (poses=null leaves cameras alone)")
+    for name in ("rate", "rate_final"):
+        value = getattr(poses, name)
+        require(value <= 1, f"{where}.{name} must be at most 1 (rad, extents), got {value}")
     for name in ("beta1", "beta2"):
         number(f"{where}.{name}", getattr(poses, name), low=0.0)
     require(max(poses.beta1, poses.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
