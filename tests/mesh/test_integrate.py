@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,8 +120,10 @@ def test_the_backend_that_is_asked_for_is_the_one_that_runs() -> None:
         fusion_backend("gpu")
 
 
-def test_without_the_native_library_auto_is_numpy_and_cpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gs2d.kernels.library.available_variants", lambda: ())
+def test_without_the_native_library_auto_is_numpy_and_cpu_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gs2d.kernels.library.FOLDER", tmp_path)
     assert fusion_backend("auto") == "reference"
     with pytest.raises(BackendError, match="native CPU library"):
         fuse(views(1), LIMITS, backend="cpu")
