@@ -116,6 +116,21 @@ def test_rows_that_are_not_there_change_nothing(native: Library, rows: list[int]
     assert equal(good, before)
 
 
+def test_what_would_be_read_beyond_an_end_is_refused(native: Library) -> None:
+    good = attribute(6, (3,), native.dtype)
+    rows = torch.arange(2)
+    bad = {
+        r"compact gradient must be \[2, 3\], got \[2, 1\]": replace(
+            good, rows=rows, compact=True, gradient=good.gradient[:2, :1]
+        ),
+        r"rows must be int64 \[M\], got torch.int64 \[1, 2\]": replace(good, rows=rows[None]),
+        r"trained must be bool \[6\], got torch.bool \[6, 1\]": replace(good, trained=torch.ones(6, 1).bool()),
+    }
+    for words, update in bad.items():
+        with pytest.raises(ShapeError, match=words):
+            adam_step([update], **BETAS, library=native)
+
+
 def test_other_dtypes_are_refused(native: Library) -> None:
     update = attribute(5, (3,), torch.float32)
     with pytest.raises(ShapeError, match="gradient must be torch.float32 on the cpu, got torch.float64"):

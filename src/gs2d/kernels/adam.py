@@ -56,16 +56,19 @@ def check_update(update: AdamUpdate) -> None:
     for name in ("parameter", "mean", "square"):
         if not getattr(update, name).is_contiguous():
             raise ShapeError(f"{name} must be contiguous to be changed in place")
-    if update.trained is not None and update.rows is not None:
+    trained, rows = update.trained, update.rows
+    if trained is not None and rows is not None:
         raise ShapeError("an AdamUpdate takes trained or rows, got both")
-    if update.trained is not None and (update.trained.dtype != torch.bool or len(update.trained) != len(parameter)):
-        raise ShapeError(
-            f"trained must be bool [{len(parameter)}], got {update.trained.dtype} {list(update.trained.shape)}"
-        )
-    if update.rows is not None and update.rows.dtype != torch.int64:
-        raise ShapeError(f"rows must be int64, got {update.rows.dtype}")
-    if update.compact and (update.rows is None or len(update.gradient) != len(update.rows)):
+    if trained is not None and (trained.dtype != torch.bool or trained.shape != parameter.shape[:1]):
+        raise ShapeError(f"trained must be bool [{len(parameter)}], got {trained.dtype} {list(trained.shape)}")
+    if rows is not None and (rows.dtype != torch.int64 or rows.dim() != 1):
+        raise ShapeError(f"rows must be int64 [M], got {rows.dtype} {list(rows.shape)}")
+    if update.compact and rows is None:
         raise ShapeError("a compact gradient needs rows, one for each of its own")
+    if update.compact and rows is not None and update.gradient.shape != (len(rows), *parameter.shape[1:]):
+        raise ShapeError(
+            f"a compact gradient must be {[len(rows), *parameter.shape[1:]]}, got {list(update.gradient.shape)}"
+        )
 
 
 def bias_corrections(update: AdamUpdate, beta1: float, beta2: float) -> tuple[float, float]:
