@@ -116,8 +116,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ratios = {name: float(rows[1][name]) / float(rows[0][name]) for name in ("best", "quarter", "median")}
     print("after / before: " + ", ".join(f"{name} {ratio:.3f}" for name, ratio in ratios.items()))
     if args.json is not None:
-        facts = {name: getattr(args, name) for name in ("splats", "size", "threads", "stage", "rounds", "each")}
-        args.json.write_text(json.dumps(facts | {"rows": rows, "after_over_before": ratios}, indent=2) + "\n")
+        from benchmarks.timing import machine
+
+        names = ("splats", "size", "threads", "stage", "rounds", "each")
+        facts: dict[str, object] = {name: getattr(args, name) for name in names}
+        facts |= {"machine": machine(), "rows": rows, "after_over_before": ratios}
+        args.json.write_text(json.dumps(facts, indent=2) + "\n")
 
 
 if __name__ == "__main__":
