@@ -229,6 +229,11 @@ def test_a_lost_or_damaged_file_of_poses_is_named_with_its_remedy(run: RunFolder
         copy.file(POSES).write_text(json.dumps({"frames": frames}))
         with pytest.raises(RunError, match=r"poses.json must hold .*--resume"):
             evaluate_run(copy.path)
+    stretched = json.loads(run.file(POSES).read_text())
+    stretched["frames"][0]["T_cam_world"][0] = [9.0, 9.0, 9.0, 9.0]
+    copy.file(POSES).write_text(json.dumps(stretched))
+    with pytest.raises(RunError, match=r"poses.json must hold rigid motions.*--resume"):
+        evaluate_run(copy.path)
     copy.file(POSES).unlink()
     with pytest.raises(RunError, match=r"poses.json must hold .*--resume"):
         evaluate_run(copy.path)

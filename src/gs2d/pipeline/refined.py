@@ -12,7 +12,7 @@ import torch
 
 from gs2d.camera import Camera
 from gs2d.data import Scene, View
-from gs2d.errors import DataError, RunError
+from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.geometry import focus_point, moved
 from gs2d.io.files import read_json, write_json
 from gs2d.io.run import POSES, SPLATS, RunFolder
@@ -144,7 +144,13 @@ def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
             f"{run.file(POSES)} must hold a pose for each training photograph, got none for {missing[0]}; continue "
             f"with `gs2d train ... --out {run.path} --resume`, which writes it again"
         )
-    return scene.with_poses(poses)
+    try:
+        return scene.with_poses(poses)
+    except ShapeError as error:
+        raise RunError(
+            f"{run.file(POSES)} must hold rigid motions, got another: {error}; continue with `gs2d train ... --out "
+            f"{run.path} --resume`, which writes it again"
+        ) from error
 
 
 def aligned(
