@@ -34,9 +34,10 @@ def poses_section(path: Path, last_stage: Mapping[str, Any]) -> str:
         f"Each training camera was moved to where the scene looks like its photograph: by {mean[0]:.2f} pixels in the "
         f"mean, most in {escape(names[most])} ({far[most, 0]:.2f} pixels). That is {mean[1]:.3f} degrees and "
         f"{100 * mean[2]:.3f} % of the scene's extent; a turn and a shift may cancel in the picture. Training views "
-        "are scored and drawn, and the surface is fused, from there. Test views keep the cameras of the capture, and "
-        "nothing is fitted to test photographs."
+        "are scored and drawn, and the surface is fused, from there."
     )
+    if last_stage.get("test"):
+        words += " Test views keep the cameras of the capture, and nothing is fitted to test photographs."
     title = "How far each camera was moved, pixels at the distance of the scene's middle"
     plot = drawing(_plot(far[:, 0]), title)
     return f'<p>{words}</p>{_aligned(last_stage)}<div class="curves">{plot}</div>'

@@ -30,6 +30,7 @@ from gs2d.pipeline.scoring import score_views
 from gs2d.pipeline.texture import _views
 from gs2d.pipeline.train import train
 from gs2d.recipes import get_recipe
+from gs2d.report_poses import poses_section
 from tiny import ball_cameras
 
 EARLY = (*SMALL, "poses.start=5", "poses.rate=0.01")  # so that 60 iterations show something
@@ -247,3 +248,11 @@ def test_the_report_shows_how_far_the_cameras_moved(run: RunFolder) -> None:
     frames = [frame for frame in json.loads(run.file(POSES).read_text())["frames"] if frame["split"] == "train"]
     most = max(frames, key=lambda frame: frame["moved"]["pixels"])
     assert f"most in {most['name']} ({most['moved']['pixels']:.2f} pixels)" in page
+
+
+def test_the_report_speaks_of_test_views_where_there_are_some(tmp_path: Path) -> None:
+    moved = {"pixels": 1.0, "degrees": 0.1, "shift": 0.01}
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps({"frames": [{"name": "a.png", "split": "train", "moved": moved}]}))
+    assert "Test views keep the cameras of the capture" in poses_section(path, {"test": {"psnr": 30.0}})
+    assert "Test views" not in poses_section(path, {"test": None})
