@@ -15,7 +15,7 @@ from ball_runs import SMALL, Stop, comparable, options
 from gs2d.camera import Camera
 from gs2d.data import load_scene, toy
 from gs2d.data.toy_poses import TRUTH, disturbed
-from gs2d.errors import RunError
+from gs2d.errors import RecipeError, RunError
 from gs2d.evaluate.images import mean_metrics
 from gs2d.geometry import camera_extent, common_motion, moved, similarity_motions
 from gs2d.io.run import POSES, RunFolder
@@ -256,3 +256,12 @@ def test_the_report_speaks_of_test_views_where_there_are_some(tmp_path: Path) ->
     path.write_text(json.dumps({"frames": [{"name": "a.png", "split": "train", "moved": moved}]}))
     assert "Test views keep the cameras of the capture" in poses_section(path, {"test": {"psnr": 30.0}})
     assert "Test views" not in poses_section(path, {"test": None})
+
+
+@pytest.mark.parametrize(("option", "field"), [("--exposure", "exposure"), ("--refine-poses", "poses")])
+def test_an_option_and_an_override_that_takes_it_back_contradict_each_other(option: str, field: str) -> None:
+    with pytest.raises(RecipeError, match=f"{option} and --set {field}=null contradict each other"):
+        build_recipe("2dgs-r", schedule_scale=0.1, seed=0, overrides=(f"{field}=null",), **{field: True})  # type: ignore[arg-type]
+    assert (
+        getattr(build_recipe(f"2dgs-{field}", schedule_scale=0.1, seed=0, overrides=(f"{field}=null",)), field) is None
+    )

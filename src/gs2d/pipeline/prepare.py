@@ -126,7 +126,11 @@ def build_recipe(
         raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
     value = with_exposure(value) if exposure else value
     value = with_poses(value) if poses else value
-    return validate(apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides))
+    value = apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides)
+    for option, wanted, field in (("--exposure", exposure, "exposure"), ("--refine-poses", poses, "poses")):
+        if wanted and getattr(value, field) is None:
+            raise RecipeError(f"{option} and --set {field}=null contradict each other, got both; leave one out")
+    return validate(value)
 
 
 def check_train_options(options: TrainOptions) -> Recipe:
