@@ -40,7 +40,7 @@ class Reconstruct(TrainingCommon):
     """A folder of photographs to cameras, splats, a mesh and a report: `gs2d poses` and `gs2d train` in one."""
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder of photographs, with or without sub-folders; it is only read."""
+    """Folder of photographs, with or without sub-folders, or a video; it is only read."""
     out: Annotated[Path, arg(metavar="RUN")]
     """Run folder to make; the photographs with their cameras go to its sub-folder `capture`."""
     quality: Literal["draft", "normal", "full"] = "normal"
@@ -63,7 +63,7 @@ class Poses(Finding, Common):
     """Photographs without cameras to a capture that `gs2d train` reads: structure from motion, by COLMAP."""
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder of photographs, with or without sub-folders; it is only read."""
+    """Folder of photographs, with or without sub-folders, or a video; it is only read."""
     out: Annotated[Path, arg(metavar="CAPTURE")]
     """Capture folder to make: images/, sparse/0, poses.json, poses.png. It appears when all is done."""
     threads: int | None = None

@@ -92,5 +92,7 @@ class Finding:
     """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
     feature_size: int = 1600
     """Longer side on which features are found, px: larger is slower and a little more accurate."""
+    frames: int = 100
+    """Frames to take of a video, each the sharpest of its stretch (needs ffmpeg); photographs are all taken."""
     link: bool = False
     """Hard links instead of copies of the photographs: no disk is used."""

@@ -25,6 +25,7 @@ def poses(command: c.Poses, console: Console) -> None:
         neighbours=command.neighbours,
         max_size=command.max_size,
         feature_size=command.feature_size,
+        frames=command.frames,
         link=command.link,
         threads=command.threads,
         seed=command.seed,

@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.data import load_scene
-from gs2d.errors import RunError
+from gs2d.errors import DataError, RunError
 from gs2d.io.files import write_json
 from gs2d.io.run import make_folder, now, remove_made
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.options import paths_of
+from gs2d.sfm.frames import MOST_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
 from gs2d.sfm.outcome import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
-from gs2d.sfm.photos import Photo, camera_groups, find_photos, read_photos
+from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, read_photos
 from gs2d.sfm.picture import write_picture
 from gs2d.sfm.solve import Facts, Group, Request, check_installed, read_facts, solve
 from gs2d.sfm.stage import stage_photos
@@ -32,8 +33,9 @@ MATCHINGS = ("auto", "exhaustive", "sequential", "similar")
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 SHARED_ENOUGH = 8  # photographs of one camera that tell more than its focal length and one distortion
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
-    "cameras", "camera_model", "matching", "overlap", "neighbours", "max_size", "feature_size", "seed"
+    "cameras", "camera_model", "matching", "overlap", "neighbours", "max_size", "feature_size", "frames", "seed"
 )  # fmt: skip
+FRAMES = "frames"  # of a video, in the workplace, until they are in the capture
 SMALLEST_SIDE, MOST_THREADS = 64, 1024
 _DOUBTFUL_SHARE, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
 
@@ -45,7 +47,7 @@ class PosesOptions:
     Attributes
     ----------
     photos, out : Path
-        The folder of photographs, which is only read, and the capture to make.
+        The folder of photographs or the video, which is only read, and the capture to make.
     cameras : "auto", "one" or "each"
         Which photographs share a camera: those of the same folder, size, camera, lens and focal length; all; none.
     camera_model : str
@@ -58,6 +60,8 @@ class PosesOptions:
         Longer side of the photographs in the capture, px; None keeps all pixels.
     feature_size : int
         Longer side on which features are found, px.
+    frames : int
+        Frames to take of a video; of a folder of photographs all are taken.
     link : bool
         Hard links instead of copies.
     threads : int or None
@@ -75,6 +79,7 @@ class PosesOptions:
     neighbours: int = 40
     max_size: int | None = None
     feature_size: int = 1600
+    frames: int = 100
     link: bool = False
     threads: int | None = None
     seed: int = 0
@@ -96,22 +101,23 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     started = time.monotonic()
     check_installed()
     check_poses_options(options)
-    paths, notes = find_photos(options.photos)
-    for note in notes:
-        on_event(Notice(note))
+    video = look_into(options.photos) if is_video(options.photos) else None
+    paths = [] if video else _folder_of(options.photos, on_event)
     out = options.out.resolve()
     check_out(options.out, options.photos, overwrite=options.overwrite)
     threads = options.threads or _cores()
-    reading = read_photos(paths, options.photos, threads=threads)
-    photos = list(counted(reading, "reading photographs", len(paths), on_event))
-    sizes = [photo.size_within(options.max_size) for photo in photos]
-    groups = camera_groups(photos, sizes, options.cameras)
     made = make_folder(out.parent)
     try:
         with workplace(out) as work:
             check_out(options.out, options.photos, overwrite=options.overwrite)  # a killed command's capture is back
+            root = work / FRAMES if video else options.photos
+            paths = _frames_of(video, root, options.frames, on_event) if video else paths
+            reading = read_photos(paths, root, threads=threads)
+            photos = list(counted(reading, "reading photographs", len(paths), on_event))
+            sizes = [photo.size_within(options.max_size) for photo in photos]
+            groups = camera_groups(photos, sizes, options.cameras)
             capture = work / "capture"
-            staged = _stage(photos, capture / IMAGES, options, threads, on_event)
+            staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
             request = _request(options, work, photos, sizes, groups, threads)
             done = solve(request, _progress(on_event))
             pieces = [read_piece(capture / SPARSE / str(i), facts) for i, facts in enumerate(done)]
@@ -133,6 +139,36 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     return {"capture": str(options.out), **result}
 
 
+def _folder_of(photos: Path, on_event: OnEvent) -> list[Path]:
+    """The photographs of a folder; what is not used is told."""
+    paths, notes = find_photos(photos)
+    for note in notes:
+        on_event(Notice(note))
+    return paths
+
+
+def _frames_of(video: Video, folder: Path, count: int, on_event: OnEvent) -> list[Path]:
+    """Frames of a video as photographs in a folder of their own.
+
+    Raises
+    ------
+    DataError
+        It does not decode, or has too few frames.
+    """
+    if video.hdr is not None:
+        on_event(Notice(f"{video.path} is an HDR video ({video.hdr}): colours are taken as they are, a little flat"))
+    looking = sharpness_of(video)
+    with contextlib.closing(looking):
+        sharpness = list(counted(looking, "looking for sharp frames", video.frames, on_event))
+    if len(sharpness) < FEWEST:
+        raise DataError(f"{video.path} must have {FEWEST} frames or more, got {len(sharpness)}; is the file whole?")
+    numbers = choose(sharpness, count)
+    on_event(Phase("taking frames", 0))
+    frames = take(video, numbers, folder)
+    on_event(Notice(f"{len(frames)} of {len(sharpness):,} frames were taken, the sharpest of each stretch (--frames)"))
+    return frames
+
+
 def check_poses_options(options: PosesOptions) -> None:
     """Raise RunError for an option that means nothing."""
     for name, allowed in (
@@ -146,6 +182,7 @@ def check_poses_options(options: PosesOptions) -> None:
     numbers = (
         ("max_size", SMALLEST_SIDE, 1 << 16),
         ("feature_size", SMALLEST_SIDE, 1 << 16),
+        ("frames", FEWEST, MOST_FRAMES),
         ("overlap", 1, 1000),
         ("neighbours", 1, 10_000),
         ("threads", 1, MOST_THREADS),
@@ -161,9 +198,12 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _stage(photos: Sequence[Photo], folder: Path, options: PosesOptions, threads: int, on_event: OnEvent) -> list[str]:
-    """Put the photographs into the capture; what was done to each."""
-    copying = stage_photos(photos, folder, max_size=options.max_size, link=options.link, threads=threads)
+def _stage(
+    photos: Sequence[Photo], folder: Path, options: PosesOptions, threads: int, on_event: OnEvent, *, ours: bool
+) -> list[str]:
+    """Put the photographs into the capture; what was done to each. Those that are ``ours`` need no second copy."""
+    link = options.link or ours
+    copying = stage_photos(photos, folder, max_size=options.max_size, link=link, threads=threads)
     with contextlib.closing(copying):  # after Ctrl-C nothing is written any more
         staged = list(counted(copying, "copying photographs", len(photos), on_event))
     counts = Counter(staged)

@@ -24,6 +24,7 @@ from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run
 from gs2d.pipeline.train import check_viewer, train
 from gs2d.render.backend import get_backend
+from gs2d.sfm.frames import is_video, look_into
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.solve import check_installed
 from gs2d.sfm.workplace import POSES_JSON, POSES_PNG, hidden_workplace
@@ -59,7 +60,7 @@ class ReconstructOptions:
     Attributes
     ----------
     photos, out : Path
-        The folder of photographs, which is only read, and the run folder.
+        The folder of photographs or the video, which is only read, and the run folder.
     quality : str
         A name of ``QUALITIES``: it sets schedule and picture size by the device of the backend.
     schedule_scale : float or None
@@ -151,6 +152,8 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
 
 def _title(photos: Path) -> str:
     """What the report is called."""
+    if is_video(photos):
+        return photos.stem
     return photos.parent.name if photos.name.lower() in NO_NAMES and photos.parent.name else photos.name
 
 
@@ -194,7 +197,7 @@ def _check(options: ReconstructOptions) -> Quality:
 def _check_photos(options: ReconstructOptions) -> None:
     """Refuse a folder that is no folder of photographs without cameras, or that the run would lie in."""
     photos, out = options.photos, options.out
-    find_photos(photos)
+    look_into(photos) if is_video(photos) else find_photos(photos)
     folder, run = photos.resolve(), out.resolve()
     if run == folder or folder in run.parents or run in folder.parents:
         raise RunError(f"--out {out} must lie beside the photographs, not in their folder or above it ({photos})")
@@ -238,12 +241,11 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
     try:
         if poses["photos"] != str(options.photos.resolve()):
             raise RunError(f"{capture} was made of {poses['photos']}, not of {options.photos}; {again}")
+        asked = {"frames": PosesOptions.frames, **poses["asked"]}  # a capture of before there were videos
         for name in ASKED_FOR:
-            if poses["asked"][name] != getattr(wanted, name):
+            if asked[name] != getattr(wanted, name):
                 option = f"--{name.replace('_', '-')}"
-                raise RunError(
-                    f"{capture} was made with {option} {poses['asked'][name]}, now {getattr(wanted, name)}; {again}"
-                )
+                raise RunError(f"{capture} was made with {option} {asked[name]}, now {getattr(wanted, name)}; {again}")
         if options.photos.is_dir():  # their folder is not needed any more
             before = {row["source"] for row in poses["photographs"]}
             now = {path.relative_to(options.photos).as_posix() for path in find_photos(options.photos)[0]}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
-import shlex
 import struct
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,12 +15,23 @@ from PIL import ExifTags, Image, features
 
 from gs2d.errors import DataError
 from gs2d.images import natural_key, read_image
+from gs2d.sfm.frames import VIDEOS
+
+
+def _reads_heif() -> bool:
+    """Let Pillow read HEIC by a package that the user has; none is asked for, because their wheels hold LGPL code."""
+    for name in ("pi_heif", "pillow_heif"):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name).register_heif_opener()
+            return True
+    return False
+
 
 JPEG, PNG = (".jpg", ".jpeg"), (".png",)
 AVIF = (".avif",) if "avif" in features.modules and features.check("avif") else ()  # Pillow 11.3 and newer
-CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF)
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv")
-UNREAD = (".heic", ".heif", ".avif")  # the last by an older Pillow
+HEIF = (".heic", ".heif") if _reads_heif() else ()
+CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF, *HEIF)
+UNREAD = (".heic", ".heif", ".avif")  # without a package for them, by an older Pillow
 RAWS = (*UNREAD, ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 _KINDS = {
     suffix: kind
@@ -91,7 +103,7 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
         No folder, a video, formats that are not read, or too few photographs.
     """
     if root.is_file():
-        raise DataError(_not_a_folder(root))
+        raise DataError(f"{root} must be a folder of photographs or a video, got another file; give its folder")
     if not root.is_dir():
         raise DataError(f"{root} must be a folder of photographs, got no such folder")
     sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "raw": [], "mask": [], "other": []}
@@ -103,7 +115,7 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
     photos, videos, raws, masks, others = sorted_out.values()
     notes = [f"{_some(raws, root)} not read: {_raw_remedy(raws[0])}"] if raws else []
     if videos:
-        notes.append(f"{_some(videos, root)} not read: a video; {_frames_command(videos[0])}")
+        notes.append(f"{_some(videos, root)} not read: a video; give it alone, or put frames of it here")
     if masks:
         notes.append(f"{_some(masks, root)} not read: put {_MASKS}/ beside images/ of the capture, for training")
     if others:
@@ -138,22 +150,10 @@ def _some(paths: Sequence[Path], root: Path) -> str:
     return f"{first} was" if len(paths) == 1 else f"{first} and {len(paths) - 1} more were"
 
 
-def _not_a_folder(path: Path) -> str:
-    if path.suffix.lower() in VIDEOS:
-        return f"{path} must be a folder of photographs, got a video; {_frames_command(path)}"
-    return f"{path} must be a folder of photographs, got a file; give its folder"
-
-
-def _frames_command(video: Path) -> str:
-    folder = shlex.quote(video.stem)
-    return (
-        f"take frames from it: mkdir {folder}; ffmpeg -i {shlex.quote(video.name)} -vf fps=2 -q:v 2 {folder}/%05d.jpg; "
-        f"then gs2d poses {folder} --out CAPTURE --matching sequential"
-    )
-
-
 def _raw_remedy(path: Path) -> str:
     kind = path.suffix.lower()
+    if kind in (".heic", ".heif"):
+        return f"pip install pi-heif (its wheel holds LGPL code) to have {kind[1:].upper()} read, or convert to JPEG"
     if kind in UNREAD:
         return f"{kind[1:].upper()} is not decoded here; convert to JPEG (magick mogrify -format jpg *{path.suffix})"
     return f"raw files ({kind}) are not developed here; export JPEG or PNG from your photo program"

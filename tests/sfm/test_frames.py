@@ -1,0 +1,154 @@
+"""Frames of a video as photographs: which are chosen, by what ffmpeg writes, and what is said where there is none."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from cli_runs import one_line
+from gs2d.cli import run
+from gs2d.errors import DataError
+from gs2d.io.files import read_json
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.poses import PosesOptions, find_poses
+from gs2d.pipeline.reconstruct import ReconstructOptions
+from gs2d.sfm.frames import Video, choose, is_video, look_into, sharpness_of, take
+from room_photos import write_room
+
+real = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ffmpeg on this machine")
+
+
+def write_video(path: Path, pictures: list[Image.Image], *options: str) -> Path:
+    """A video of these pictures, at odd times: phones have no fixed rate."""
+    folder = path.with_suffix(".pictures")
+    folder.mkdir(parents=True)
+    for i, picture in enumerate(pictures):
+        picture.save(folder / f"{i}.png")
+    times = "setpts='(N+0.4*mod(N,3))/(10*TB)'"
+    words = ["ffmpeg", "-v", "error", "-r", "10", "-start_number", "0", "-i", "%d.png", "-vf", times]
+    subprocess.run([*words, "-vsync", "0", "-c:v", "mpeg4", "-q:v", "2", *options, str(path)], check=True, cwd=folder)
+    return path
+
+
+def pattern(number: int, size: tuple[int, int] = (96, 64)) -> Image.Image:
+    """Noise under a grey level that tells the number."""
+    noise = np.random.default_rng(number).integers(-20, 20, (size[1], size[0], 1))
+    return Image.fromarray(np.clip(20 + 9 * number + noise, 0, 255).astype(np.uint8).repeat(3, axis=2))
+
+
+def test_the_sharpest_of_each_stretch_is_chosen_and_every_frame_where_there_are_few() -> None:
+    assert choose([1, 5, 2, 9, 3, 3, 0, 4], 4) == [1, 3, 4, 7]
+    assert choose([1, 5, 2, 9, 3, 3, 0], 3) == [1, 3, 4]  # stretches of 2, 2 and 3
+    assert choose([1, 2, 3], 3) == choose([1, 2, 3], 9) == [0, 1, 2]
+    numbers = choose(list(np.random.default_rng(0).random(1000)), 77)
+    assert len(numbers) == 77
+    assert max(np.diff(numbers)) <= 2 * 13
+
+
+@real
+def test_the_frames_that_are_written_are_those_that_were_judged_sharpest(tmp_path: Path) -> None:
+    sharp = {1, 5, 6, 11}
+    pictures = [pattern(i) if i in sharp else pattern(i).filter(ImageFilter.GaussianBlur(2)) for i in range(12)]
+    video = look_into(write_video(tmp_path / "50 % of -it.mp4", pictures))
+    assert (video.frames, video.hdr) == (12, None)
+    numbers = choose(list(sharpness_of(video)), 4)
+    assert numbers == sorted(sharp)
+    taken = take(video, numbers, tmp_path / "100 %d" / "frames")
+    assert [path.name for path in taken] == [f"frame_{number:06d}.jpg" for number in numbers]
+    for path, number in zip(taken, numbers, strict=True):
+        with Image.open(path) as file:
+            assert (file.format, file.size) == ("JPEG", (96, 64))
+            assert np.asarray(file).mean() == pytest.approx(np.asarray(pictures[number]).mean(), abs=3)
+
+
+@real
+def test_a_video_that_was_filmed_upright_gives_upright_frames(tmp_path: Path) -> None:
+    flat = write_video(tmp_path / "flat.mp4", [pattern(i) for i in range(4)])
+    turned = tmp_path / "turned.mp4"
+    words = ["ffmpeg", "-v", "error", "-i", str(flat), "-c", "copy", "-metadata:s:v:0", "rotate=90", str(turned)]
+    subprocess.run(words, check=True)
+    probe = ["ffprobe", "-v", "error", "-show_entries", "stream_side_data=rotation", "-of", "csv=p=0", str(turned)]
+    if "90" not in subprocess.run(probe, capture_output=True, text=True).stdout:
+        pytest.skip("this ffmpeg writes no rotation")
+    with Image.open(take(look_into(turned), [0], tmp_path / "frames")[0]) as file:
+        assert file.size == (64, 96)
+
+
+@real
+def test_broken_videos_are_one_line(tmp_path: Path) -> None:
+    noise = tmp_path / "noise.mp4"
+    noise.write_bytes(np.random.default_rng(0).bytes(4096))
+    with pytest.raises(DataError, match=r"noise.mp4 must be a video that ffmpeg reads, got .*Invalid data") as caught:
+        look_into(noise)
+    assert "\n" not in str(caught.value)
+    whole = write_video(tmp_path / "whole.mp4", [pattern(i) for i in range(2)])
+    with pytest.raises(DataError, match=r"whole.mp4 must have 3 frames or more, got 2"):
+        find_poses(PosesOptions(photos=whole, out=tmp_path / "capture"))
+    assert not (tmp_path / "capture").exists()
+    assert not list(tmp_path.glob(".*"))
+    with pytest.raises(DataError, match=r"ffmpeg took 2 of 3 frames of .*whole.mp4; is the file whole"):
+        take(look_into(whole), [0, 1, 2], tmp_path / "frames")
+
+
+def test_without_ffmpeg_the_line_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pycolmap")
+    (tmp_path / "walk.MOV").write_bytes(b"?")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for command, folder in (("poses", "capture"), ("reconstruct", "run")):
+        assert run([command, str(tmp_path / "walk.MOV"), "--out", str(tmp_path / folder)]) == 2
+        assert "there is no ffmpeg on the PATH; install it (apt install ffmpeg" in one_line(capsys.readouterr().err)
+        assert not (tmp_path / folder).exists()
+    with pytest.raises(DataError, match=r"gone.mp4 must be a video or a folder of photographs, got no such file"):
+        look_into(tmp_path / "gone.mp4")
+
+
+def test_a_folder_may_be_called_like_a_video(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").mkdir()
+    assert not is_video(tmp_path / "a.mp4")
+    assert is_video(tmp_path / "b.mp4")
+    options = ReconstructOptions(photos=tmp_path / "room.mp4", out=tmp_path / "run")
+    assert options.train_options.title == "room"
+
+
+@real
+def test_a_video_becomes_a_capture_with_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pycolmap")
+    write_room(tmp_path / "room", 10)
+    photos = [Image.open(path).convert("RGB") for path in sorted((tmp_path / "room").rglob("*.jpg"))]
+    blurred = [photo.filter(ImageFilter.GaussianBlur(4)) for photo in photos]
+    video = write_video(
+        tmp_path / "room.mp4", [picture for pair in zip(blurred, photos, strict=True) for picture in pair]
+    )
+    said: list[Event] = []
+    result = find_poses(
+        PosesOptions(photos=video, out=tmp_path / "capture", frames=len(photos), threads=2), said.append
+    )
+    assert (result["count"], result["asked"]["frames"]) == (len(photos), len(photos))
+    assert result["placed"] == len(photos)
+    assert len(result["cameras"]) == 1
+    names = [row["name"] for row in result["photographs"]]
+    assert names == [f"frame_{2 * i + 1:06d}.jpg" for i in range(len(photos))]
+    assert sorted(path.name for path in (tmp_path / "capture/images").iterdir()) == names
+    assert f"{len(photos)} of {2 * len(photos)} frames were taken" in "".join(
+        e.text for e in said if isinstance(e, Notice)
+    )
+    assert read_json(tmp_path / "capture/poses.json")["photos"] == str(video.resolve())
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_hdr_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "hdr.mov"
+    path.write_bytes(b"?")
+    answer = subprocess.CompletedProcess(
+        [], 0, '{"streams": [{"nb_read_packets": "7", "color_transfer": "arib-std-b67"}]}', ""
+    )
+    monkeypatch.setattr("gs2d.sfm.frames.shutil.which", lambda name: name)
+    monkeypatch.setattr("gs2d.sfm.frames.subprocess.run", lambda *_, **__: answer)
+    assert look_into(path) == Video(path, 7, "HLG")
