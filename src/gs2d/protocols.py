@@ -193,7 +193,10 @@ GENERIC = Protocol(
 PROTOCOLS: Mapping[str, Protocol] = MappingProxyType(
     {p.name: p for p in (DTU, TNT, TNT_LARGE, NERF_SYNTHETIC, MIP_NERF_360, GENERIC)}
 )
-_BY_FORMAT = MappingProxyType({"blender": NERF_SYNTHETIC, "dtu": DTU, "colmap": GENERIC, "nerfstudio": GENERIC})
+_BY_FORMAT = MappingProxyType(
+    {"blender": NERF_SYNTHETIC, "dtu": DTU}
+    | dict.fromkeys(("colmap", "nerfstudio", "opensfm", "metashape", "alicevision"), GENERIC)
+)
 
 
 def get_protocol(name: str) -> Protocol:

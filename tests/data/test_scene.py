@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_writers import ring, small_blender, small_colmap, small_dtu, small_nerfstudio, tree_hash
+from foreign_writers import small_alicevision, small_metashape, small_opensfm
 
 from gs2d.data import ImageCache, Picture, PointCloud, View, detect_format, load_scene
 from gs2d.errors import DataError, ShapeError
@@ -18,6 +19,9 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "nerfstudio": small_nerfstudio,
     "dtu": small_dtu,
     "colmap": small_colmap,
+    "opensfm": small_opensfm,
+    "metashape": small_metashape,
+    "alicevision": small_alicevision,
 }
 
 
@@ -39,11 +43,11 @@ def test_the_format_is_detected_and_nothing_is_written(tmp_path: Path, format: s
 
 
 def test_formats_are_looked_for_in_the_documented_order_and_can_be_named(tmp_path: Path) -> None:
-    for format in ("colmap", "dtu", "nerfstudio", "blender"):
+    for format in ("alicevision", "metashape", "opensfm", "colmap", "dtu", "nerfstudio", "blender"):
         WRITERS[format](tmp_path)
         assert detect_format(tmp_path) == format
     assert load_scene(tmp_path, format="colmap").format == "colmap"
-    with pytest.raises(DataError, match="format must be auto or one of blender, nerfstudio, dtu, colmap, got nerf"):
+    with pytest.raises(DataError, match="format must be auto or one of blender, nerfstudio, .*, got nerf"):
         load_scene(tmp_path, format="nerf")
 
 

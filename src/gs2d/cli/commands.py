@@ -79,10 +79,11 @@ class Train(Training, TrainingCommon):
     """Posed photographs to splats, mesh and report."""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder of the capture: COLMAP, Blender or nerfstudio transforms, DTU."""
+    """Folder of the capture: COLMAP, Blender or nerfstudio transforms, DTU, OpenSfM or OpenDroneMap, Metashape,
+    Meshroom."""
     out: Annotated[Path, arg(metavar="RUN")]
     """Run folder to make."""
-    format: Literal["auto", "blender", "nerfstudio", "dtu", "colmap"] = "auto"
+    format: Literal["auto", "blender", "nerfstudio", "dtu", "colmap", "opensfm", "metashape", "alicevision"] = "auto"
     """Format of the capture."""
     downscale: int = 1
     """Shrink the photographs by this integer, area-filtered."""

@@ -6,8 +6,11 @@ tangential ones (OpenCV and COLMAP write them the same way):
 
 perspective  s = (1 + n1 r^2 + n2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
              x' = x s + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y s + 2 p2 x y + p1 (r^2 + 2 y^2)
-fisheye      t = atan(r);  (x', y') = (x, y) t (1 + n1 t^2 + n2 t^4 + ...) / r
+fisheye      t = atan(r);  (x', y') = (x, y) t (1 + n1 t^2 + n2 t^4 + ...) / r, plus the tangential terms above of
+             (x, y) t / r (Metashape, OpenSfM's fisheye62)
 fov          (x', y') = (x, y) atan(2 r tan(w/2)) / (w r)
+
+A sensor whose axes are not at right angles (Metashape's b2) shears what the lens made: x' + skew y'.
 """
 
 from __future__ import annotations
@@ -48,17 +51,22 @@ class Lens:
     divisor : tuple of float
         d1, d2, ...
     tangential : tuple of 2 floats
-        p1, p2.
+        p1, p2 ("perspective" and "fisheye").
+    skew : float
+        Shear of the sensor, in units of fx.
     """
 
     kind: str
     radial: tuple[float, ...] = ()
     divisor: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
+    skew: float = 0.0
 
     @property
     def is_identity(self) -> bool:
         """True if nothing bends, so that images need no undistortion."""
+        if self.skew:
+            return False
         if self.kind == "perspective":
             return not (any(self.radial) or any(self.divisor) or any(self.tangential))
         return self.kind == "fov" and abs(self.radial[0]) < 1e-9
@@ -69,13 +77,12 @@ class Lens:
         r2 = x * x + y * y
         scale = self._radial_scale(np.sqrt(r2))
         p1, p2 = self.tangential
-        return np.stack(
-            [
-                x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-            ],
-            axis=-1,
-        )
+        u, v = x * scale, y * scale
+        if self.kind == "fisheye" and (p1 or p2):  # of the bent point
+            r = np.maximum(np.sqrt(r2), 1e-12)
+            x, y, r2 = x * np.arctan(r) / r, y * np.arctan(r) / r, np.arctan(r) ** 2
+        u, v = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), v + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+        return np.stack([u + self.skew * v if self.skew else u, v], axis=-1)
 
     def _radial_scale(self, r: np.ndarray) -> np.ndarray:
         if self.kind == "perspective":

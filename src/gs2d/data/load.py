@@ -6,16 +6,19 @@ import os
 import shlex
 from pathlib import Path
 
+from gs2d.data.alicevision import read_alicevision, scene_file
 from gs2d.data.capture import build_scene
 from gs2d.data.colmap import MODEL_FOLDERS, model_folder, read_colmap
 from gs2d.data.dtu import CAMERA_FILES, read_dtu
 from gs2d.data.layouts import missing_lines
+from gs2d.data.metashape import camera_file, read_metashape
+from gs2d.data.opensfm import read_opensfm, reconstruction_file
+from gs2d.data.photographs import SUFFIXES
 from gs2d.data.scene import Scene
 from gs2d.data.transforms import read_blender, read_nerfstudio
 from gs2d.errors import DataError
 
-FORMATS = ("blender", "nerfstudio", "dtu", "colmap")
-_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic")
+FORMATS = ("blender", "nerfstudio", "dtu", "colmap", "opensfm", "metashape", "alicevision")
 DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures
 
 
@@ -36,6 +39,12 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         return "dtu"
     if model_folder(root) is not None:
         return "colmap"
+    if reconstruction_file(root) is not None:
+        return "opensfm"
+    if camera_file(root) is not None:
+        return "metashape"
+    if scene_file(root) is not None:
+        return "alicevision"
     held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
     if not held:
         raise DataError(f"{root} must hold a capture, got an empty folder")
@@ -49,14 +58,15 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         )
     raise DataError(
         f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
-        f"(DTU), or cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP); "
+        f"(DTU), cameras.bin and images.bin (or .txt) in {', '.join(MODEL_FOLDERS)} (COLMAP), reconstruction.json "
+        "(OpenSfM, OpenDroneMap), cameras.xml (Metashape) or cameras.sfm (Meshroom); "
         f"got {', '.join(held[:8])}{' ...' if len(held) > 8 else ''}{hint}"
     )
 
 
 def _photographs(folder: Path) -> int:
     """Files of a folder that are photographs by their names."""
-    return sum(path.suffix.lower() in _PHOTOGRAPHS for path in folder.iterdir()) if folder.is_dir() else 0
+    return sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) if folder.is_dir() else 0
 
 
 def _folder(path: str | os.PathLike[str]) -> Path:
@@ -113,6 +123,12 @@ def load_scene(
         capture = read_nerfstudio(root)
     elif format == "dtu":
         capture = read_dtu(root)
+    elif format == "opensfm":
+        capture = read_opensfm(root)
+    elif format == "metashape":
+        capture = read_metashape(root)
+    elif format == "alicevision":
+        capture = read_alicevision(root)
     else:
         capture = read_colmap(root, downscale)
     return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes)

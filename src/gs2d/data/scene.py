@@ -140,7 +140,7 @@ class Scene:
     name : str
         The folder's name.
     format : str
-        "blender", "nerfstudio", "dtu" or "colmap".
+        One of ``gs2d.data.FORMATS``.
     train, test : tuple of View
         Sorted by name. ``test`` is empty where all views train.
     points : PointCloud or None

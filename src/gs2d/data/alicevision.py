@@ -1,0 +1,198 @@
+"""Captures of Meshroom (AliceVision): its scene as JSON (``cameras.sfm``, ``sfm.json``) and the photographs.
+
+Conventions (AliceVision's sfmDataIO and camera modules, and its own export to COLMAP): ``rotation`` is the world-to-
+camera matrix column by column, ``center`` the place of the camera; x right, y down, z ahead. What a number means
+depends on the version of the file: the principal point is relative to the middle of the image from 1.2.1 on and to its
+corner before; the focal length is in pixels before 1.2.2 and in millimetres of a sensor of ``sensorWidth`` since;
+``pixelRatio`` is fx / fy before 1.2.5 and fy / fx since. Numbers are written as text.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.colmap import find_mask
+from gs2d.data.fields import entries, real, reals, required, whole
+from gs2d.data.foreign_points import points_beside
+from gs2d.data.lens import Intrinsics, Lens
+from gs2d.data.photographs import Photographs
+from gs2d.data.scene import PointCloud
+from gs2d.errors import DataError
+from gs2d.io.files import read_json
+
+#: distortion -> (kind of lens, number of its parameters); in older files it is in the name of the type
+_LENSES: Mapping[str, tuple[str, int]] = {
+    "none": ("perspective", 0),
+    "radialk1": ("perspective", 1),
+    "radialk3": ("perspective", 3),
+    "brown": ("perspective", 5),
+    "fisheye4": ("fisheye", 4),
+    "fisheye1": ("fov", 1),
+}
+_OLD_TYPES = {"pinhole": "none", "radial1": "radialk1", "radial3": "radialk3"} | {
+    name: name for name in ("brown", "fisheye4", "fisheye1")
+}
+_FILES = ("cameras.sfm", "sfm.json", "cameras.json")
+_HEAD = 4096  # bytes in which a file says what it is
+
+
+def scene_file(root: Path) -> Path | None:
+    """The file of a folder that holds a scene of AliceVision with poses: ``cameras.sfm`` first; None without one."""
+    files = [root / name for name in _FILES] + sorted(root.glob("*.sfm"))
+    return next((path for path in files if _is_scene(path)), None)
+
+
+def _is_scene(path: Path) -> bool:
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD)
+    except OSError:
+        return False  # not there, a folder, or not ours to read
+    return b'"version"' in head and any(word in head for word in (b'"views"', b'"featuresFolders"', b'"intrinsics"'))
+
+
+def read_alicevision(root: Path) -> Capture:
+    """Read the views that have a pose; the others, and views of rigs, are skipped and named.
+
+    Photographs are at the paths that the file names, else found by name in ``images`` or elsewhere below the folder;
+    masks in ``masks`` (white = keep). Points are those of the file (``structure``), else of a PLY file beside.
+
+    Raises
+    ------
+    DataError
+        No such file or a broken one, or a camera that no pinhole image can hold; names the file and the entry.
+    """
+    path = scene_file(root)
+    if path is None:
+        raise DataError(f"{root} must hold cameras.sfm or sfm.json of Meshroom, got no such file")
+    data = entries(read_json(path), str(path))
+    version = _version(data, path)
+    poses = {
+        str(pose.get("poseId")): pose for pose in _list(data, "poses", path)
+    }  # views share the pose of a rig or a stack of exposures
+    cameras = {str(camera.get("intrinsicId")): camera for camera in _list(data, "intrinsics", path)}
+    if not poses:
+        raise DataError(
+            f"{path} must hold poses, got none; take the file of the node StructureFromMotion (cameras.sfm), or of "
+            "ConvertSfMFormat with SfM File Format json"
+        )
+    photographs, masks = Photographs([root / "images", root]), root / "masks"
+    frames: list[Frame] = []
+    skipped: list[str] = []
+    for index, view in enumerate(_list(data, "views", path)):
+        written = str(required(view, "path", f"{path}: view {index}"))
+        where, label = f"{path}: view {written}", written.replace("\\", "/").rsplit("/", 1)[-1]
+        pose = poses.get(str(view.get("poseId", view.get("viewId"))))
+        if pose is None or "rigId" in view:
+            skipped.append(f"{label}: " + ("of a rig, which is not read" if pose else "not placed by Meshroom"))
+            continue
+        found = _photograph(written, photographs, where)
+        if found is None:
+            skipped.append(f"{label}: listed in {path.name}, but there is no such file")
+            continue
+        key = str(view.get("intrinsicId"))
+        if key not in cameras:
+            raise DataError(f"{path}: intrinsics must hold {key} of view {label}, got {sorted(cameras)[:9]}")
+        k = _intrinsics(cameras[key], version, f"{path}: intrinsic {key}")
+        frames.append(Frame(found[0], found[1], k, _pose(pose, where), mask=find_mask(masks, found[0])))
+    points, notes = _points(data, path), list[str]()
+    if points is None:
+        points, notes = points_beside(root, frames)
+    return Capture("alicevision", tuple(frames), points, skipped=tuple(skipped), notes=tuple(notes))
+
+
+def _version(data: Mapping[str, Any], path: Path) -> tuple[int, ...]:
+    value = required(data, "version", str(path))
+    if not isinstance(value, list) or len(value) != 3:
+        raise DataError(f"{path}: version must be 3 numbers, got {json.dumps(value)[:40]}")
+    return tuple(whole(part, f"{path}: version") for part in value)
+
+
+def _list(data: Mapping[str, Any], key: str, path: Path) -> Sequence[Mapping[str, Any]]:
+    """A list of objects; an empty one is written as an empty text."""
+    value = data.get(key) or []
+    if not isinstance(value, list):
+        raise DataError(f"{path}: {key} must be a list, got {type(value).__name__}")
+    return [entries(item, f"{path}: {key} {index}") for index, item in enumerate(value)]
+
+
+def _photograph(written: str, photographs: Photographs, where: str) -> tuple[str, Path] | None:
+    """By its name below the capture, else where the file says it is: the same machine."""
+    found = photographs.find(written, where)
+    if found is None and Path(written).is_absolute() and Path(written).is_file():
+        return Path(written).name, Path(written)
+    return found
+
+
+def _pose(pose: Mapping[str, Any], where: str) -> np.ndarray:
+    """T_cam_world [4, 4]."""
+    inner = entries(required(pose, "pose", where), f"{where}: pose")
+    transform = entries(required(inner, "transform", where), f"{where}: transform")
+    # Column by column, so that rows are the columns: the camera-to-world rotation.
+    columns = reals(required(transform, "rotation", where), 9, f"{where}: rotation").reshape(3, 3)
+    center = reals(required(transform, "center", where), 3, f"{where}: center")
+    return pose_from_camera_to_world(np.column_stack([columns, center]), f"{where}: transform", opengl=False)
+
+
+def _intrinsics(camera: Mapping[str, Any], version: tuple[int, ...], where: str) -> Intrinsics:
+    kind = str(required(camera, "type", where))
+    model = str(camera.get("distortionType", "none")) if kind == "pinhole" else _OLD_TYPES.get(kind, kind)
+    undistortion = str(camera.get("undistortionType", "none"))
+    if model not in _LENSES or undistortion != "none":
+        raise DataError(
+            f"{where} is of type {kind} with distortion {model} and undistortion {undistortion}, which is not read "
+            f"here (known: {', '.join(_LENSES)}); give the folder of Meshroom's node PrepareDenseScene or "
+            "ExportColmap"
+        )
+    width, height = (whole(required(camera, side, where), f"{where}: {side}") for side in ("width", "height"))
+    fx, fy = _focal(camera, version, width, where)
+    if not (min(fx, fy) > 0 and min(width, height) > 0):
+        raise DataError(f"{where} must have a positive size and focal length, got {width}x{height}, {fx:g}, {fy:g}")
+    center = reals(required(camera, "principalPoint", where), 2, f"{where}: principalPoint")
+    if version >= (1, 2, 1):
+        center = center + np.array((width, height)) / 2
+    shape, count = _LENSES[model]
+    written = camera.get("distortionParams") or []
+    lens = None
+    if count and written:  # without parameters the lens was not estimated
+        value = tuple(reals(written, count, f"{where}: distortionParams").tolist())
+        lens = Lens(shape, value[:3], (), (value[3], value[4])) if model == "brown" else Lens(shape, value)
+    return Intrinsics(
+        width, height, fx, fy, float(center[0]), float(center[1]), None if lens is None or lens.is_identity else lens
+    )
+
+
+def _focal(camera: Mapping[str, Any], version: tuple[int, ...], width: int, where: str) -> tuple[float, float]:
+    """fx, fy in pixels."""
+    if version < (1, 2, 0):
+        f = real(required(camera, "pxFocalLength", where), f"{where}: pxFocalLength")
+        return f, f
+    if version < (1, 2, 2):
+        both = reals(required(camera, "pxFocalLength", where), 2, f"{where}: pxFocalLength")
+        return float(both[0]), float(both[1])
+    sensor = real(camera.get("sensorWidth", 36.0), f"{where}: sensorWidth")
+    ratio = real(camera.get("pixelRatio", 1.0), f"{where}: pixelRatio")
+    if not (sensor > 0 and ratio > 0):
+        raise DataError(f"{where} must have a positive sensorWidth and pixelRatio, got {sensor:g}, {ratio:g}")
+    fx = real(required(camera, "focalLength", where), f"{where}: focalLength") / sensor * width
+    return fx, fx / ratio if version < (1, 2, 5) else fx * ratio
+
+
+def _points(data: Mapping[str, Any], path: Path) -> PointCloud | None:
+    landmarks = _list(data, "structure", path)
+    if not landmarks:
+        return None
+    try:
+        points = np.array([row["X"] for row in landmarks], dtype=np.float64)
+        colors = np.array([row.get("color", (128, 128, 128)) for row in landmarks], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"{path}: structure must have X and color, 3 numbers each, got another entry") from error
+    if points.shape != (len(landmarks), 3) or colors.shape != points.shape:
+        raise DataError(f"{path}: structure must have X and color, 3 numbers each, got {list(points.shape)}")
+    return PointCloud(points, np.clip(np.rint(np.nan_to_num(colors)), 0, 255).astype(np.uint8))

@@ -1,0 +1,241 @@
+"""Captures of Agisoft Metashape: the cameras of ``File > Export > Export Cameras`` (XML) and the photographs.
+
+Conventions (Metashape's manual, appendix "Camera models"; its support on ``camera.transform``): a camera's transform
+takes camera to chunk coordinates, with x right, y down, z ahead; the transform of its component (or chunk) is a
+similarity that takes those to the world. Pixels have their origin in the corner of the image. Of (x, y) = (X/Z, Y/Z),
+for a fisheye (x, y) t / r with t = atan(r):
+
+x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y     (p1 and p2 are OpenCV's p2 and p1)
+y' = y (1 + ...)                               + p2 (r^2 + 2 y^2) + 2 p1 x y
+u = w / 2 + cx + x' (f + b1) + y' b2,   v = h / 2 + cy + y' f
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.colmap import find_mask
+from gs2d.data.fields import real, reals, whole
+from gs2d.data.foreign_points import points_beside
+from gs2d.data.lens import Intrinsics, Lens
+from gs2d.data.photographs import Photographs
+from gs2d.errors import DataError
+
+_KINDS = {"frame": "perspective", "fisheye": "fisheye"}
+_HEAD = 4096  # bytes in which an XML file says what it is
+_EARTH = (6.2e6, 6.5e6)  # m from the centre of the Earth: cameras there are in geocentric coordinates
+_AXES = (6378137.0, 6378137.0, 6356752.314245)  # m, WGS 84
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_world = scale R x + t."""
+
+    scale: float
+    R: np.ndarray  # [3, 3]
+    t: np.ndarray  # [3]
+
+
+_SAME = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+def camera_file(root: Path) -> Path | None:
+    """The XML file of a folder that holds Metashape's cameras: ``cameras.xml``, else the first by name; or None."""
+    files = sorted(root.glob("*.xml"), key=lambda path: (path.name.lower() != "cameras.xml", path.name))
+    return next((path for path in files if _is_of_metashape(path)), None)
+
+
+def _is_of_metashape(path: Path) -> bool:
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD)
+    except OSError:
+        return False  # a folder, or not ours to read
+    return b"<document" in head and b"<chunk" in head
+
+
+def read_metashape(root: Path) -> Capture:
+    """Read Metashape's cameras; those without a place, switched off or of another component are skipped and named.
+
+    Photographs are in ``images`` or elsewhere below the folder and found by their labels, with or without ending; masks
+    in ``masks`` (white = keep); sparse points in a PLY file beside (``foreign_points.points_beside``).
+
+    Raises
+    ------
+    DataError
+        No such file or a broken one, or a camera that no pinhole image can hold; names the file and the entry.
+    """
+    path = camera_file(root)
+    if path is None:
+        raise DataError(f"{root} must hold cameras.xml of Metashape (File > Export > Export Cameras), got no such file")
+    chunk, notes = _chunk(path)
+    sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    photographs, masks = Photographs([root / "images", root]), root / "masks"
+    listed = [camera for group in chunk.iterfind("cameras") for camera in group.iter("camera")]
+    placed, skipped = _placed(listed)
+    component, more = _component(placed)
+    frames, lost = [], [*skipped, *more]
+    world = _world(chunk, component, path)
+    poses = [
+        (camera, label, _camera_to_world(camera, world, f"{path}: camera {label}"))
+        for camera, label in placed
+        if camera.get("component_id") == component
+    ]
+    poses, moved = _off_the_globe(poses)
+    for camera, label, M in poses:
+        where = f"{path}: camera {label}"
+        found = photographs.find(label, where)
+        if found is None:
+            lost.append(f"{label}: listed in {path.name}, but there is no such file")
+            continue
+        key = camera.get("sensor_id", "")
+        if key not in sensors:
+            raise DataError(f"{path} must hold sensor {key!r} of camera {label}, got {sorted(sensors)[:9]}")
+        k = _intrinsics(sensors[key], f"{path}: sensor {key}")
+        T = pose_from_camera_to_world(M, f"{where}: transform", opengl=False)
+        frames.append(Frame(found[0], found[1], k, T, mask=find_mask(masks, found[0])))
+    points, said = points_beside(root, frames)
+    return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *said))
+
+
+def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:
+    """The chunk with most cameras, and a note where there are several."""
+    try:
+        text = path.read_bytes()
+        if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+            raise DataError(f"{path} must be XML as Metashape writes it, got one with definitions of its own")
+        document = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise DataError(f"{path} must be XML, got: {error}; is the file complete?") from error
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    chunks = [chunk for chunk in document.iter("chunk") if chunk.find("cameras") is not None]
+    if not chunks:
+        raise DataError(f"{path} must hold a chunk with cameras, got none; export the cameras again (Agisoft XML)")
+    counts = [sum(1 for _ in chunk.iter("camera")) for chunk in chunks]
+    best = int(np.argmax(counts))
+    if len(chunks) == 1:
+        return chunks[0], []
+    return chunks[best], [f"{path.name} holds {len(chunks)} chunks: the one of {counts[best]} cameras is read"]
+
+
+def _placed(listed: Sequence[ElementTree.Element]) -> tuple[list[tuple[ElementTree.Element, str]], list[str]]:
+    """(cameras that are on and have a place, with their labels; sentences about the others)."""
+    placed, skipped = [], []
+    for camera in listed:
+        label = camera.get("label") or camera.get("id") or "without a label"
+        if camera.get("enabled", "true").lower() in ("false", "0"):
+            skipped.append(f"{label}: switched off in Metashape")
+        elif camera.find("transform") is None:
+            skipped.append(f"{label}: not aligned in Metashape")
+        else:
+            placed.append((camera, label))
+    return placed, skipped
+
+
+def _component(placed: Sequence[tuple[ElementTree.Element, str]]) -> tuple[str | None, list[str]]:
+    """The component with most cameras: others have no known place relative to it."""
+    counts = Counter(camera.get("component_id") for camera, _ in placed)
+    if not counts:
+        return None, []
+    best = counts.most_common(1)[0][0]
+    others = [f"{label}: in another component" for camera, label in placed if camera.get("component_id") != best]
+    return best, others
+
+
+def _world(chunk: ElementTree.Element, component: str | None, path: Path) -> Similarity:
+    """The similarity of a component, or of the chunk where the component has none."""
+    own = next((c for c in chunk.iterfind("components/component") if c.get("id") == component), None)
+    transform = None if own is None else own.find("transform")
+    transform = chunk.find("transform") if transform is None else transform
+    if transform is None:
+        return _SAME
+    where = f"{path}: transform of the chunk"
+
+    def numbers(name: str, count: int) -> np.ndarray | None:
+        text = transform.findtext(name)
+        return None if text is None else reals(text, count, f"{where}: {name}")
+
+    R, t, scale = numbers("rotation", 9), numbers("translation", 3), numbers("scale", 1)
+    if scale is not None and scale[0] <= 0:
+        raise DataError(f"{where}: scale must be positive, got {scale[0]:g}")
+    return Similarity(
+        1.0 if scale is None else float(scale[0]),
+        np.eye(3) if R is None else R.reshape(3, 3),
+        np.zeros(3) if t is None else t,
+    )
+
+
+def _camera_to_world(camera: ElementTree.Element, world: Similarity, where: str) -> np.ndarray:
+    """[4, 4]: a rotation and a place; the similarity's scale moves the place only."""
+    M = reals(camera.findtext("transform") or "", 16, f"{where}: transform").reshape(4, 4)
+    moved = np.eye(4)
+    moved[:3, :3] = world.R @ M[:3, :3]
+    moved[:3, 3] = world.scale * world.R @ M[:3, 3] + world.t
+    return moved
+
+
+Poses = list[tuple[ElementTree.Element, str, np.ndarray]]
+
+
+def _off_the_globe(poses: Poses) -> tuple[Poses, list[str]]:
+    """Geocentric poses in metres east, north and up of the mean camera: 32 bits cannot hold the others."""
+    if not poses:
+        return poses, []
+    middle = np.mean([M[:3, 3] for _, _, M in poses], axis=0)
+    if not _EARTH[0] < np.linalg.norm(middle) < _EARTH[1]:
+        return poses, []
+    up = middle / np.square(_AXES)  # the normal of the ellipsoid
+    up /= np.linalg.norm(up)
+    east = np.cross((0.0, 0.0, 1.0), up)
+    east /= max(float(np.linalg.norm(east)), 1e-12)
+    local = np.eye(4)
+    local[:3, :3] = np.stack([east, np.cross(up, east), up])
+    local[:3, 3] = -local[:3, :3] @ middle
+    note = "the chunk is geocentric: the scene is in metres east, north and up of the mean camera"
+    return [(camera, label, local @ M) for camera, label, M in poses], [note]
+
+
+def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
+    """The adjusted calibration of a sensor, else its first."""
+    every = sensor.findall("calibration")
+    calibration = next((c for c in every if c.get("class") == "adjusted"), every[0] if every else None)
+    if calibration is None:
+        raise DataError(f"{where} must have a calibration, got none; align the photographs, then export again")
+    kind = calibration.get("type") or sensor.get("type") or "frame"
+    if kind not in _KINDS:
+        raise DataError(
+            f"{where} is of type {kind}, which no pinhole image holds (known: {', '.join(_KINDS)}); "
+            "export undistorted photographs from Metashape and their cameras"
+        )
+    size = calibration.find("resolution")
+    size = sensor.find("resolution") if size is None else size
+    if size is None:
+        raise DataError(f"{where} must have a resolution, got none; export the cameras again")
+    width, height = (whole(size.get(side), f"{where}: {side}") for side in ("width", "height"))
+    names = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
+    value: Mapping[str, float] = {
+        name: real(calibration.findtext(name, "0").strip(), f"{where}: {name}") for name in names
+    }
+    fx, fy = value["f"] + value["b1"], value["f"]
+    if not (min(fx, fy) > 0 and min(width, height) > 0):
+        raise DataError(
+            f"{where} must have a positive size and focal length f, got {width}x{height}, {fy:g}; "
+            "export the cameras with Metashape 1.2 or newer"
+        )
+    if value["p3"] or value["p4"]:
+        raise DataError(
+            f"{where} has the coefficients p3 and p4, which cannot be undistorted here; "
+            "switch them off in Optimize Cameras, or export undistorted photographs and their cameras"
+        )
+    radial = tuple(value[f"k{i}"] for i in (1, 2, 3, 4))
+    lens = Lens(_KINDS[kind], radial, (), (value["p2"], value["p1"]), value["b2"] / fx)
+    center = (width / 2 + value["cx"], height / 2 + value["cy"])
+    return Intrinsics(width, height, fx, fy, *center, None if lens.is_identity else lens)
