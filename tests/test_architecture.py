@@ -46,6 +46,7 @@ FLOORS = {
     "mesh": 6,
     "report": 6,
     "view": 6,
+    "page": 6,
     "pipeline": 7,
     "cli": 8,
 }

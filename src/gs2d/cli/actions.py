@@ -23,6 +23,7 @@ def execute(command: Common, console: Console) -> None:
         c.Mesh: mesh,
         c.Render: render,
         c.View: view,
+        c.Page: page,
         c.Evaluate: evaluate,
         c.Export: export,
         c.Report: report,
@@ -187,6 +188,16 @@ def view(command: c.View, console: Console) -> None:
         serve(viewer, console.on_event)
     finally:
         viewer.close()
+
+
+def page(command: c.Page, console: Console) -> None:
+    """``gs2d page``."""
+    from gs2d.pipeline.page import page_run
+
+    result = page_run(command.path, command.out, sh_degree=command.sh_degree, on_event=console.on_event)
+    console.close()
+    console.say(f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB; open it in a browser")
+    console.result(result)
 
 
 def evaluate(command: c.Evaluate, console: Console) -> None:

@@ -169,6 +169,18 @@ class View(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Page(Common):
+    """Write the splats as one HTML file that any browser draws exactly: no server, no network, to mail or to host."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Run folder, or a PLY file of splats."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """HTML file (default: scene.html in the run, or beside the PLY file)."""
+    sh_degree: int = 3
+    """How far colours may depend on the direction; less is a smaller file: 80, 64, 48 or 32 bytes a splat."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evaluate(Common):
     """Score a trained run: PSNR, SSIM, LPIPS; with a ground truth also Chamfer distance and F-score of the mesh."""
 
@@ -292,7 +304,8 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor, Info
+    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Page, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor,
+    Info
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
@@ -302,6 +315,7 @@ Command = (
     | Annotated[Mesh, subcommand("mesh")]
     | Annotated[Render, subcommand("render")]
     | Annotated[View, subcommand("view")]
+    | Annotated[Page, subcommand("page")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Report, subcommand("report")]

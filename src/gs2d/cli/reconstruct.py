@@ -20,7 +20,8 @@ def reconstruct(command: c.Reconstruct, console: Console) -> None:
     run = run_all(reconstruct_options(command), console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console, extra={"poses": read_json(run.path / CAPTURE / POSES_JSON)})
-    console.say(f"look at it: gs2d view {shlex.quote(str(run.path))}")
+    name = shlex.quote(str(run.path))
+    console.say(f"look at it: gs2d view {name}; one file to pass on: gs2d page {name}")
 
 
 def reconstruct_options(command: c.Reconstruct) -> ReconstructOptions:

@@ -91,7 +91,7 @@ def open_viewer(path: Path, options: ViewOptions = ViewOptions(), on_event: OnEv
             viewer.add_mesh(*mesh)
         if content.views:
             viewer.add_cameras(shots(content.views, content.settings, on_event))
-        first = content.cameras[0] if content.cameras else _from_aside(frame, up)
+        first = content.cameras[0] if content.cameras else from_aside(frame, up)
         viewer.look_from(first, frame.origin)
     except BaseException:
         viewer.close()
@@ -121,7 +121,7 @@ def frame_around(cameras: Sequence[Camera], centers: np.ndarray) -> Frame:
     return Frame(middle, unit if unit > 1e-12 and math.isfinite(unit) else 1.0)
 
 
-def _from_aside(frame: Frame, up: np.ndarray) -> Camera:
+def from_aside(frame: Frame, up: np.ndarray) -> Camera:
     """Where to look from where nobody stood."""
     aside = np.array([2.0, -2.5, 1.5]) * frame.unit
     return look_at(frame.origin + aside, frame.origin, up, width=4, height=3, fx=4.0)
@@ -144,7 +144,7 @@ def _of_run(path: Path, on_event: OnEvent) -> _Content:
     name = definition.get("title") or definition["scene"]["name"]
     if job is None:
         backend = get_backend("auto")
-        return _Content(name, stages, (), _settings(splats), backend, "median", mesh)
+        return _Content(name, stages, (), settings_without_run(splats), backend, "median", mesh)
     return _Content(name, stages, job.scene.train, job.settings, job.backend, job.protocol.depth, mesh)
 
 
@@ -156,11 +156,11 @@ def _of_file(path: Path) -> _Content:
     if not path.exists():
         raise DataError(f"expected a run folder or a PLY file of splats at {path}, found nothing; check the path")
     splats = read_splats(path)
-    settings, backend = _settings(splats), get_backend("auto")
+    settings, backend = settings_without_run(splats), get_backend("auto")
     return _Content(path.name, {FINAL: lambda: splats}, (), settings, backend, "median", lambda _: None)
 
 
-def _settings(splats: Splats) -> RasterSettings:
+def settings_without_run(splats: Splats) -> RasterSettings:
     """Of splats without a run: over white, near plane at a hundredth of what they spread over."""
     spread = float((splats.means - splats.means.median(dim=0).values).norm(dim=1).median()) if len(splats) else 1.0
     near = max(0.01 * spread, 1e-9)

@@ -1,0 +1,234 @@
+"""A page that draws splats exactly, in one file: HTML, WebGL 2 shaders and the splats themselves, for any browser.
+
+It needs no server, no network and no library: it can be mailed, or put on any web space. The files that it is made of
+lie in ``page_files``; its shaders follow the rasterizer's contract (``render/api.py``), with the browser's float32 and
+with attributes that are stored as below.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.camera import Camera
+from gs2d.disk import atomic_write
+from gs2d.errors import DataError
+from gs2d.render.types import CROSSING, RasterSettings
+from gs2d.splats import Splats
+
+PARTS = {  # script elements: id -> file, type
+    "splat-vert": ("splat.vert", "x-shader/x-vertex"),
+    "splat-frag": ("splat.frag", "x-shader/x-fragment"),
+    "final-vert": ("final.vert", "x-shader/x-vertex"),
+    "final-frag": ("final.frag", "x-shader/x-fragment"),
+    "sorter": ("sorter.js", "text/plain"),
+}
+MOST_SPLATS = 5_000_000  # rows of 2048 texels, 3 a splat: what a texture of 8192 rows, which any GPU has, can hold
+CLIPPED = 1e-4  # of the SH coefficients of one place may be cut off: the steps of the others are smaller then
+WORD_BYTES = 32  # of a splat, without its SH coefficients above degree 0
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Where the page may be looked at from: a camera and what it is called."""
+
+    name: str
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """Splats as the page stores them.
+
+    Attributes
+    ----------
+    count : int
+    origin : ndarray [3] float64
+        The means are relative to it, so that float32 keeps their digits.
+    degree : int
+    scales : list of 15 floats
+        What the value 127 of an 8-bit SH coefficient means, by its place (degree 1 to 3, in order).
+    data : bytes
+        Per splat 8 words: mean (3 x float32), log scales (2 x float16), unit quaternion w x y z (4 x 16-bit signed,
+        32767 = 1), SH of degree 0 (3 x float16), opacity (float16). Then per splat its other SH coefficients, 8-bit
+        signed, coefficient by coefficient in red, green, blue, filled up to 16 bytes.
+    """
+
+    count: int
+    origin: np.ndarray
+    degree: int
+    scales: list[float]
+    data: bytes
+
+    @property
+    def stored(self) -> int:
+        """Texels of 16 bytes that the SH coefficients of a splat take."""
+        return texels_of(self.degree)
+
+
+def texels_of(degree: int) -> int:
+    """Texels of 16 bytes that hold the coefficients above degree 0."""
+    return math.ceil(3 * ((degree + 1) ** 2 - 1) / 16)
+
+
+@torch.no_grad()
+def pack(splats: Splats, origin: np.ndarray, degree: int, alpha_min: float) -> Packed:
+    """Splats as the page stores them; those that nobody can see (not finite, fainter than ``alpha_min``) are left out.
+
+    Raises
+    ------
+    DataError
+        Too many.
+    """
+    splats = splats.to("cpu", torch.float64)
+    rows = [tensor.reshape(len(tensor), -1) for _, tensor in splats.items() if tensor.numel()]
+    seen = splats.opacities >= alpha_min
+    for tensor in rows:
+        seen &= tensor.isfinite().all(dim=1)
+    seen &= splats.quats.norm(dim=1) > 0
+    splats = splats.rows(seen)
+    count, degree = len(splats), min(degree, splats.sh_degree)
+    if count > MOST_SPLATS:
+        raise DataError(f"a page holds at most {MOST_SPLATS:,} splats, got {count:,}; train with a smaller max_splats")
+    words = np.zeros((count, WORD_BYTES // 4), np.uint32)
+    words[:, :3] = (splats.means.numpy() - origin).astype(np.float32).view(np.uint32)
+    words[:, 3] = _halves(splats.log_scales)
+    quats = torch.nn.functional.normalize(splats.quats, dim=1).numpy()
+    words[:, 4:6] = np.round(quats * 32767).astype(np.int16).view(np.uint32)
+    light = torch.cat([splats.sh0.reshape(count, 3), splats.opacities[:, None]], dim=1)
+    words[:, 6], words[:, 7] = _halves(light[:, :2]), _halves(light[:, 2:])
+    scales, harmonics = _harmonics(splats.shN.numpy(), degree)
+    return Packed(count, origin, degree, scales, words.tobytes() + harmonics.tobytes())
+
+
+def _halves(pairs: torch.Tensor) -> np.ndarray:
+    """Two columns as one column of words of two 16-bit floats."""
+    limited = pairs.clamp(-65000, 65000).numpy().astype(np.float16)
+    return np.ascontiguousarray(limited).view(np.uint32)[:, 0]
+
+
+def _harmonics(shN: np.ndarray, degree: int) -> tuple[list[float], np.ndarray]:
+    """Scales by place, and the coefficients [N, 16 * texels] int8."""
+    count, places = len(shN), (degree + 1) ** 2 - 1
+    used = shN[:, :places]  # [N, K, 3]
+    scales = np.zeros(15)
+    if used.size:
+        scales[:places] = np.quantile(np.abs(used), 1 - CLIPPED, axis=(0, 2))
+    steps = np.where(scales > 0, scales, 1.0)[:places, None]
+    stored = np.zeros((count, 16 * texels_of(degree)), np.int8)
+    stored[:, : 3 * places] = np.clip(np.round(used / steps * 127), -127, 127).reshape(count, -1)
+    return [float(scale) for scale in scales], stored
+
+
+def write_page(
+    path: str | os.PathLike[str],
+    splats: Splats,
+    views: Sequence[Seen],
+    settings: RasterSettings,
+    *,
+    title: str,
+    focus: np.ndarray,
+    unit: float,
+    up: np.ndarray,
+    sh_degree: int = 3,
+) -> dict[str, Any]:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : path
+    splats : Splats
+    views : sequence of Seen
+        At least one; the page opens at the first.
+    settings : RasterSettings
+        As they were trained with.
+    title : str
+    focus : ndarray [3] wu
+        What is turned round.
+    unit : float, wu
+        About how far away it is seen from.
+    up : ndarray [3]
+        Unit.
+    sh_degree : int
+        Of the stored coefficients at most: 45, 24, 9 or 0 bytes a splat.
+
+    Returns
+    -------
+    dict
+        ``splats`` stored, ``sh_degree``, and ``bytes`` of the file.
+
+    Raises
+    ------
+    DataError, DiskError
+    """
+    packed = pack(splats, focus, min(sh_degree, settings.sh_degree), settings.alpha_min)
+    shade = "#" + "".join(f"{round(255 * part):02x}" for part in settings.background)
+    is_dark = sum(settings.background) < 1.5
+    zipped = base64.b64encode(gzip.compress(packed.data, 6, mtime=0)).decode()
+    values = {
+        "title": html.escape(title),
+        "count": f"{packed.count:,}",
+        "background": shade,
+        "ink": "#eee" if is_dark else "#222",
+        "paper": "rgba(0,0,0,.55)" if is_dark else "rgba(255,255,255,.75)",
+        "facts": json.dumps(_facts(packed, views, settings, unit, up), allow_nan=False).replace("<", "\\u003c"),
+        "parts": "\n".join(_part(name, *part) for name, part in PARTS.items()),
+        "splats": zipped,
+        "viewer": _text("viewer.js"),
+    }
+    text = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _text("page.html"))
+    with atomic_write(Path(path)) as file:
+        file.write(text.encode())
+    return {"splats": packed.count, "sh_degree": packed.degree, "bytes": len(text.encode())}
+
+
+def _text(name: str) -> str:
+    return (files("gs2d") / "page_files" / name).read_text(encoding="utf-8").strip()
+
+
+def _part(name: str, file: str, kind: str) -> str:
+    return f'<script type="{kind}" id="{name}">\n{_text(file)}\n</script>'
+
+
+def _facts(
+    packed: Packed, views: Sequence[Seen], settings: RasterSettings, unit: float, up: np.ndarray
+) -> Mapping[str, Any]:
+    """What the page is told beside the splats; places are relative to the packed origin."""
+    return {
+        "splats": packed.count,
+        "degree": packed.degree,
+        "stored": packed.stored,
+        "scales": packed.scales,
+        "near": settings.near,
+        "alphaMin": settings.alpha_min,
+        "alphaMax": settings.alpha_max,
+        "lowpass": settings.lowpass_px,
+        "crossing": CROSSING.index(settings.crossing),
+        "crossingCutoff": settings.error_cutoff,
+        "background": list(settings.background),
+        "focus": [0.0, 0.0, 0.0],
+        "unit": unit,
+        "up": up.tolist(),
+        "cameras": [_camera(view, packed.origin) for view in views],
+    }
+
+
+def _camera(view: Seen, origin: np.ndarray) -> dict[str, Any]:
+    camera = view.camera
+    shift = camera.rotation @ origin + camera.T_cam_world[:3, 3]
+    lens = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    size = {"w": camera.width, "h": camera.height}
+    return {"name": view.name, **size, **lens, "R": camera.rotation.flatten().tolist(), "t": shift.tolist()}

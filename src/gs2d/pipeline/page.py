@@ -1,0 +1,86 @@
+"""``gs2d page``: the splats of a run, or of a file, as one file for any browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.data import View
+from gs2d.errors import DataError, RunError
+from gs2d.io.ply import read_splats
+from gs2d.io.run import is_run, open_run
+from gs2d.page import Seen, write_page
+from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
+from gs2d.pipeline.jobs import finished_splats
+from gs2d.pipeline.paths import up_direction
+from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.view import frame_around, from_aside, settings_without_run
+
+PAGE = "scene.html"
+MOST_VIEWS = 100  # photographs that one can step through
+SUFFIXES = (".html", ".htm")
+LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
+
+
+def page_run(path: Path, out: Path | None, *, sh_degree: int = 3, on_event: OnEvent = ignore) -> dict[str, Any]:
+    """Write the page of a run or of a PLY file of splats.
+
+    Parameters
+    ----------
+    path : Path
+    out : Path or None
+        None: ``scene.html`` in the run, or beside the file.
+    sh_degree : int
+        0 to 3: how much of the colours' dependence on the direction is stored.
+
+    Returns
+    -------
+    dict
+        ``file``, ``splats``, ``sh_degree``, ``views``, ``bytes``.
+
+    Raises
+    ------
+    RunError, DataError, DiskError
+    """
+    path = Path(path)
+    of_run = path.is_dir() or is_run(path)
+    out = (path / PAGE if of_run else path.with_suffix(".html")) if out is None else Path(out)
+    if out.suffix.lower() not in SUFFIXES:
+        raise RunError(f"--out must name an .html file, which is what is written, got {out}")
+    if not 0 <= sh_degree <= 3:
+        raise RunError(f"--sh-degree must be 0, 1, 2 or 3, got {sh_degree}")
+    job: Job | None = None
+    if of_run:
+        run = open_run(path)
+        splats = finished_splats(run)
+        definition = run.definition()
+        title = definition.get("title") or definition["scene"]["name"]
+        try:
+            job = reload_job(run, on_event)
+        except (RunError, DataError) as error:
+            on_event(Notice(f"without the cameras of the photographs: {error}"))
+    else:
+        if not path.exists():
+            raise DataError(f"expected a run folder or a PLY file of splats at {path}, found nothing; check the path")
+        splats, title = read_splats(path), path.stem
+    views = [] if job is None else _some(job.scene.train)
+    cameras = [view.camera for view in views]
+    frame = frame_around(cameras, splats.means.cpu().numpy())
+    up = up_direction(cameras) if cameras else np.array([0.0, 0.0, 1.0])
+    seen = [Seen(view.name, view.camera) for view in views] or [Seen("from aside", from_aside(frame, up))]
+    settings = settings_without_run(splats) if job is None else job.settings
+    on_event(Phase("writing the page", 0))
+    written = write_page(
+        *(out, splats, seen, settings), title=title, focus=frame.origin, unit=frame.unit, up=up, sh_degree=sh_degree
+    )
+    if written["bytes"] > LARGE:
+        on_event(Notice(f"{written['bytes'] / 1e6:.0f} MB are much for a page: --sh-degree 1 or 0 makes it smaller"))
+    return {"file": str(out), "views": len(seen), **written}
+
+
+def _some(views: tuple[View, ...]) -> list[View]:
+    """At most so many, evenly."""
+    count = min(len(views), MOST_VIEWS)
+    return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]

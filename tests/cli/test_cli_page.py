@@ -1,0 +1,73 @@
+"""``gs2d page``."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from cli_runs import one_line
+from gs2d.cli import run
+from gs2d.io.ply import write_splats
+from gs2d.splats import Splats
+
+
+def some_splats(count: int) -> Splats:
+    rows = torch.Generator().manual_seed(0)
+    sizes = ((3,), (4,), (2,), (), (1, 3), (15, 3))
+    return Splats(*(torch.randn(count, *size, generator=rows) for size in sizes))
+
+
+def test_a_file_of_splats_becomes_a_page_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_splats(tmp_path / "cloud.ply", some_splats(50))
+    assert run(["page", str(tmp_path / "cloud.ply"), "--sh-degree", "1", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["file"] == str(tmp_path / "cloud.html")
+    assert (result["sh_degree"], result["views"]) == (1, 1)
+    assert result["bytes"] == (tmp_path / "cloud.html").stat().st_size
+
+
+def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    assert run(["page", str(tmp_path / "run")]) == 0
+    assert f"{tmp_path / 'run/scene.html'}: " in capsys.readouterr().out
+    text = (tmp_path / "run/scene.html").read_text()
+    facts = json.loads(text.split('id="facts">')[1].split("</script>")[0])
+    assert [camera["name"] for camera in facts["cameras"]] == [f"train/r_{i}.png" for i in range(len(facts["cameras"]))]
+    assert len(facts["cameras"]) > 1
+    assert run(["page", str(tmp_path / "run"), "--out", str(tmp_path / "b.HTML"), "--sh-degree", "0", "--quiet"]) == 0
+    assert (tmp_path / "b.HTML").stat().st_size < len(text)
+
+
+def test_a_run_without_its_photographs_is_seen_from_aside(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    definition = json.loads((tmp_path / "run/run.json").read_text())
+    definition["scene"]["path"] = "/nowhere"
+    (tmp_path / "run/run.json").write_text(json.dumps(definition))
+    assert run(["page", str(tmp_path / "run"), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["views"] == 1
+    assert "without the cameras of the photographs" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "expected a run folder or a PLY file of splats at"),
+        (["cloud.ply", "--out", "cloud.png"], "--out must name an .html file, which is what is written, got cloud.png"),
+        (["cloud.ply", "--sh-degree", "4"], "--sh-degree must be 0, 1, 2 or 3, got 4"),
+    ],
+)
+def test_what_cannot_become_a_page_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_splats(tmp_path / "cloud.ply", some_splats(5))
+    assert run(["page", *words]) == 2
+    assert message in one_line(capsys.readouterr().err)
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.ply"]

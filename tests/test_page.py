@@ -1,0 +1,266 @@
+"""The page that draws splats in a browser: what it stores, what it is made of, its pictures where there is Chromium."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import math
+import re
+import shutil
+import struct
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gs2d.camera import Camera, look_at
+from gs2d.errors import DataError
+from gs2d.page import MOST_SPLATS, Seen, pack, texels_of, write_page
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
+from gs2d.report_images import normal_picture
+from gs2d.splats import Splats
+
+ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
+CAMERA = look_at(ORIGIN + np.array([0.3, -4.0, 0.8]), ORIGIN, np.array([0.0, 0.0, 1.0]), width=120, height=80, fx=100.0)
+SETTINGS = RasterSettings(near=0.2, background=(0.2, 0.5, 0.9))
+node = pytest.mark.skipif(shutil.which("node") is None, reason="there is no node on this machine")
+CHROMIUM = next((found for name in ("chromium", "google-chrome", "chrome") if (found := shutil.which(name))), None)
+
+
+def some_splats(count: int = 400, seed: int = 0) -> Splats:
+    """A cloud around ORIGIN with every degree of colour; some splats reach behind the camera."""
+    torch.manual_seed(seed)
+    means = torch.randn(count, 3, dtype=torch.float64) * 0.9
+    means[:5] = torch.tensor([0.3, -3.6, 0.8]) + 0.1 * torch.randn(5, 3)  # close to the camera: they cross its plane
+    log_scales = torch.randn(count, 2) * 0.5 - 2.0
+    log_scales[:5] = 0.0
+    return Splats(
+        means + torch.from_numpy(ORIGIN),
+        torch.randn(count, 4).double(),
+        log_scales.double(),
+        (torch.randn(count) * 2).double(),
+        (torch.randn(count, 1, 3) * 0.7).double(),
+        (torch.randn(count, 15, 3) * 0.2).double(),
+    )
+
+
+def unpacked(data: bytes, count: int, degree: int, scales: list[float]) -> Splats:
+    """What the page's bytes mean, read as its documentation says, relative to the origin."""
+    words, rest = data[: 32 * count], np.frombuffer(data[32 * count :], np.int8).reshape(count, -1)
+    means, log_scales, quats, light = [], [], [], []
+    for i in range(count):
+        *mean, a, b, w, x, y, z, red, green, blue, opacity = struct.unpack_from("<3f2e4h4e", words, 32 * i)
+        means.append(mean)
+        log_scales.append([a, b])
+        quats.append([w / 32767, x / 32767, y / 32767, z / 32767])
+        light.append([red, green, blue, opacity])
+    colors = torch.tensor(light, dtype=torch.float64)
+    places = (degree + 1) ** 2 - 1
+    shN = torch.from_numpy(rest[:, : 3 * places] / 127.0).reshape(count, places, 3)
+    return Splats(
+        torch.tensor(means, dtype=torch.float64),
+        torch.tensor(quats, dtype=torch.float64),
+        torch.tensor(log_scales, dtype=torch.float64),
+        torch.logit(colors[:, 3].clamp(max=1 - 1e-9)),
+        colors[:, None, :3],
+        shN * torch.tensor(scales[:places], dtype=torch.float64)[:, None],
+    )
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(((a - b) ** 2).mean()))
+
+
+def at_origin(camera: Camera) -> Camera:
+    T = camera.T_cam_world.copy()
+    T[:3, 3] += camera.rotation @ ORIGIN
+    return replace(camera, T_cam_world=T)
+
+
+@pytest.mark.parametrize(("degree", "least"), [(3, 50.0), (1, 50.0), (0, 50.0)])
+def test_what_is_stored_renders_as_the_splats_do(degree: int, least: float) -> None:
+    splats, settings = some_splats(), replace(SETTINGS, sh_degree=degree)
+    packed = pack(splats, ORIGIN, degree, settings.alpha_min)
+    assert (packed.degree, packed.stored) == (degree, texels_of(degree))
+    stored = unpacked(packed.data, packed.count, degree, packed.scales)
+    with torch.no_grad():
+        before = rasterize(splats, CAMERA, settings, backend="reference")
+        after = rasterize(stored, at_origin(CAMERA), settings, backend="reference")
+    assert psnr(before.color.numpy(), after.color.numpy()) > least
+    assert float((before.normal - after.normal).abs().mean()) < 1e-3
+
+
+def test_what_nobody_can_see_is_left_out() -> None:
+    splats = some_splats(20)
+    splats.means[3, 1] = math.nan
+    splats.quats[4] = 0
+    splats.opacity_logits[5] = -20
+    splats.shN[6, 0, 0] = math.inf
+    packed = pack(splats, ORIGIN, 3, 1 / 255)
+    faint = int((splats.opacities < 1 / 255).sum()) - 1
+    assert packed.count == 20 - 4 - faint
+    assert all(math.isfinite(scale) for scale in packed.scales)
+
+
+def test_a_few_outliers_do_not_coarsen_the_colours_of_all() -> None:
+    splats = some_splats(20_000)
+    splats.shN[0] = 100.0
+    assert max(pack(splats, ORIGIN, 3, 0.0).scales) < 2.0
+
+
+def test_more_splats_than_a_texture_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert MOST_SPLATS * 3 <= 2048 * 8192
+    monkeypatch.setattr("gs2d.page.MOST_SPLATS", 10)
+    splats = some_splats(11)
+    splats.opacity_logits[:] = 0
+    with pytest.raises(DataError, match="a page holds at most 10 splats, got 11"):
+        pack(splats, ORIGIN, 3, 1 / 255)
+
+
+class Scripts(HTMLParser):
+    """The scripts of a page by their ids, and everything that it would load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: dict[str, str] = {}
+        self.loads: list[str] = []
+        self.title = self._id = ""
+        self._in_title = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.loads += [value for name, value in attrs if name in ("src", "href", "data", "action") and value]
+        self._id = str(given.get("id", "main")) if tag == "script" else ""
+        self._in_title = tag == "title"
+
+    def handle_data(self, data: str) -> None:
+        if self._id:
+            self.texts[self._id] = self.texts.get(self._id, "") + data
+        if self._in_title:
+            self.title += data
+
+    def handle_endtag(self, tag: str) -> None:
+        self._id, self._in_title = "", False
+
+
+def page_of(path: Path, **changes: Any) -> Scripts:
+    arguments: dict[str, Any] = {
+        "title": "a <b> & {{facts}}",
+        "focus": ORIGIN,
+        "unit": 4.0,
+        "up": np.array([0, 0, 1.0]),
+    }
+    settings = changes.pop("settings", SETTINGS)
+    views = [Seen("</script>.png", CAMERA), Seen("2.png", CAMERA)]
+    write_page(path, some_splats(), views, settings, **{**arguments, **changes})
+    page = Scripts()
+    page.feed(path.read_text())
+    return page
+
+
+def test_the_page_is_one_file_that_loads_nothing_and_holds_what_it_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "scene.html"
+    page = page_of(path)
+    text = path.read_text()
+    assert page.loads == []
+    assert page.title == "a <b> & {{facts}}"
+    assert not re.search(r"https?://", text)
+    assert "default-src 'none'" in text
+    assert set(page.texts) == {
+        "facts",
+        "splat-vert",
+        "splat-frag",
+        "final-vert",
+        "final-frag",
+        "sorter",
+        "splats",
+        "main",
+    }
+    facts = json.loads(page.texts["facts"])
+    assert [camera["name"] for camera in facts["cameras"]] == ["</script>.png", "2.png"]
+    assert np.allclose(facts["cameras"][0]["t"], at_origin(CAMERA).T_cam_world[:3, 3])
+    packed = pack(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
+    assert gzip.decompress(base64.b64decode(page.texts["splats"])) == packed.data
+    assert (facts["splats"], facts["stored"], facts["background"]) == (packed.count, 3, [0.2, 0.5, 0.9])
+    names = set(re.findall(r"uniform \w+ ([\w, ]+);", page.texts["splat-vert"].replace("[15]", "")))
+    told = {name.strip() for line in names for name in line.split(",")}
+    for name in told - {"splats"}:
+        assert name in page.texts["main"], f"nobody sets the shader's {name}"
+    again = tmp_path / "again.html"
+    page_of(again)
+    assert again.read_bytes() == path.read_bytes()
+
+
+@node
+def test_the_scripts_are_javascript_and_the_sorter_sorts_exactly(tmp_path: Path) -> None:
+    page = page_of(tmp_path / "scene.html")
+    (tmp_path / "main.js").write_text(page.texts["main"])
+    subprocess.run(["node", "--check", str(tmp_path / "main.js")], check=True)
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=(500, 3)).astype(np.float32)
+    means[100:200] = means[:100]  # equal depths: later rows are drawn first, because rule 2 has them behind
+    ahead = np.array([0.6, 0.0, 0.8, 1.5], np.float32)
+    given = json.dumps({"means": means.flatten().tolist(), "ahead": ahead.astype(float).tolist()})
+    (tmp_path / "sorter.js").write_text(
+        page.texts["sorter"].replace('"use strict";', "")
+        + f";const given = {given}; globalThis.postMessage = (m) => console.log(JSON.stringify([...m.order]));"
+        "onmessage({data: {means: Float32Array.from(given.means)}});"
+        "onmessage({data: {ahead: given.ahead, near: 0.2}});"
+    )
+    done = subprocess.run(["node", str(tmp_path / "sorter.js")], capture_output=True, text=True, check=True)
+    depth = (means.astype(float) @ ahead[:3].astype(float) + float(ahead[3])).astype(np.float32)
+    front = np.flatnonzero(depth > 0.2)
+    assert json.loads(done.stdout) == front[np.argsort(depth[front], kind="stable")][::-1].tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+@pytest.mark.parametrize("crossing", ["draw", "cull", "box"])
+def test_a_browser_draws_what_the_rasterizer_draws(tmp_path: Path, crossing: str) -> None:
+    settings, splats = replace(SETTINGS, crossing=crossing), some_splats()
+    page_of(tmp_path / "scene.html", settings=settings)
+    with torch.no_grad():
+        output = rasterize(splats, CAMERA, settings, backend="reference")
+    ours = output.color.clamp(0, 1).numpy()
+    assert psnr(screenshot(tmp_path, "view=0&bare"), ours) > 48
+    if crossing == "draw":
+        text = (
+            (tmp_path / "scene.html")
+            .read_text()
+            .replace("let shown = 0, here, target, kind = 0;", "let shown = 0, here, target, kind = 1;")
+        )
+        (tmp_path / "scene.html").write_text(text)
+        normals = normal_picture(output.normal.numpy(), output.alpha.numpy())
+        assert (
+            psnr(screenshot(tmp_path, "bare"), normals) > 35
+        )  # the reference's normals where two faces cancel are noise
+
+
+def screenshot(folder: Path, fragment: str) -> np.ndarray:
+    """The page [H, W, 3] as Chromium draws it without a GPU."""
+    picture = folder / "page.png"
+    words = [
+        "--headless=new",
+        "--no-sandbox",
+        "--use-gl=angle",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+    ]
+    words += ["--hide-scrollbars", f"--window-size={CAMERA.width},{CAMERA.height}", "--timeout=12000"]
+    words += [
+        f"--user-data-dir={folder / 'profile'}",
+        f"--screenshot={picture}",
+        f"file://{folder / 'scene.html'}#{fragment}",
+    ]
+    assert CHROMIUM is not None
+    subprocess.run([CHROMIUM, *words], check=True, capture_output=True, timeout=120)
+    with Image.open(picture) as file:
+        return np.asarray(file.convert("RGB")) / 255
