@@ -20,7 +20,7 @@ import torch
 
 from gs2d.camera import Camera, look_at
 from gs2d.errors import BackendError, DataError
-from gs2d.io.ply import write_splats
+from gs2d.io.splat_formats import LAYOUTS, write_layout
 from gs2d.io.textured import glb_bytes, glb_turn, write_textured
 from gs2d.pipeline.view import ViewOptions, open_viewer
 from gs2d.sh import rgb_to_sh0
@@ -258,11 +258,13 @@ def test_a_missing_package_is_one_line_with_the_remedy(monkeypatch: pytest.Monke
         open_viewer(tmp_path)
 
 
-def test_a_file_of_splats_is_served_on_this_machine_until_the_viewer_is_closed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("layout", ["2dgs", "spz"])
+def test_a_file_of_splats_is_served_on_this_machine_until_the_viewer_is_closed(tmp_path: Path, layout: str) -> None:
     pytest.importorskip("viser", reason="viser is not installed (extra `view`)")
-    write_splats(tmp_path / "a.ply", splats_at([[0.0, 0, 0], [1, 0, 0]], [[0.1, 0.2], [0.3, 0.1]]))
+    path = tmp_path / f"a{LAYOUTS[layout].ending}"
+    write_layout(path, splats_at([[0.0, 0, 0], [1, 0, 0]], [[0.1, 0.2], [0.3, 0.1]]), layout)
     threads = set(threading.enumerate())
-    viewer = open_viewer(tmp_path / "a.ply", ViewOptions(threads=1))
+    viewer = open_viewer(path, ViewOptions(threads=1))
     try:
         assert set(viewer.nodes) == {"splats"}
         assert viewer.url == f"http://127.0.0.1:{viewer.port}"
@@ -277,9 +279,15 @@ def test_a_file_of_splats_is_served_on_this_machine_until_the_viewer_is_closed(t
     assert not [thread.name for thread in left if thread.name == "gs2d view"]
 
 
+def test_three_dimensional_gaussians_are_no_scene_to_look_at(shared: Callable[[str], Path]) -> None:
+    pytest.importorskip("viser", reason="viser is not installed (extra `view`)")
+    with pytest.raises(DataError, match="flat splats were expected, got 3D Gaussians with three scales"):
+        open_viewer(shared("gaussians_plush_dog") / "point_cloud_29999_clean.compressed.ply")
+
+
 def test_nothing_or_a_mesh_is_no_scene_to_look_at(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed (extra `view`)")
-    with pytest.raises(DataError, match="expected a run folder or a PLY file of splats"):
+    with pytest.raises(DataError, match="expected a run folder or a file of splats"):
         open_viewer(tmp_path / "nothing.ply")
     mesh = TexturedMesh(np.eye(3), np.eye(3), np.array([[0, 1, 2]]), np.zeros((3, 2)), np.zeros((4, 4, 3), np.uint8))
     write_textured(tmp_path / "mesh.glb", mesh)

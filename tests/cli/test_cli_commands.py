@@ -166,6 +166,39 @@ def test_info_describes_a_run_a_capture_and_a_ply(
     assert facts["run"]["definition"]["recipe"]["name"] == "2dgs-r"
 
 
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [
+        ("a.ply", "3dgs (three"),
+        ("a.compressed.ply", "compressed PLY"),
+        ("a.spz", "SPZ version 3"),
+        ("a.splat", ".splat"),
+    ],
+)
+def test_the_ending_of_an_export_is_its_format_and_info_reads_it(
+    trained: Path, tmp_path: Path, name: str, layout: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["export", str(trained), "--out", str(tmp_path / name), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert run(["info", str(tmp_path / name), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["splats"], facts["bytes"]) == (result["splats"], result["bytes"])
+    assert facts["layout"].startswith(layout)
+    assert facts["shape"] == "flat"
+
+
+def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["export", str(trained), "--out", str(tmp_path / "a.ply"), "--layout", "spz"]) == 2
+    assert "--out must name a .spz file, which is what layout spz is, got" in capsys.readouterr().err
+    assert run(["export", str(trained), "--out", str(tmp_path / "a.spz"), "--layout", "3dgs"]) == 2
+    assert "--out must name a .ply file, which is what layout 3dgs is, got" in capsys.readouterr().err
+    assert run(["export", str(trained), "--out", str(tmp_path / "a.usd")]) == 2
+    assert "--out must name a .ply file" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_quiet_prints_nothing_and_json_prints_only_json(
     capture: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -234,8 +234,10 @@ def export(command: c.Export, console: Console) -> None:
 
     result = export_run(command.run, command.out, command.layout)
     console.say(
-        f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, layout {command.layout}"
+        f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, layout {result['layout']}"
     )
+    for note in result["notes"]:
+        console.say(note)
     console.result(result)
 
 
@@ -315,7 +317,7 @@ def doctor(_command: c.Doctor, console: Console) -> None:
 def info(command: c.Info, console: Console) -> None:
     """``gs2d info``."""
     from gs2d.io.run import is_run, open_run
-    from gs2d.pipeline.describe import describe_capture, describe_ply
+    from gs2d.pipeline.describe import describe_capture, describe_file
 
     path: Path = command.path
     if is_run(path):
@@ -323,8 +325,11 @@ def info(command: c.Info, console: Console) -> None:
         show_run(path, run.metrics(), console, definition=run.definition())
         return
     if not path.exists():
-        raise DataError(f"expected a run folder, a capture or a PLY file at {path}, found nothing; check the path")
-    facts = describe_capture(path) if path.is_dir() else describe_ply(path)
+        raise DataError(
+            f"expected a run folder, a capture or a file of splats, a mesh or points at {path}, found nothing; "
+            "check the path"
+        )
+    facts = describe_capture(path) if path.is_dir() else describe_file(path)
     for name, value in facts.items():
         for part in value if isinstance(value, list) else [value]:
             console.say(f"{name}: {part}")

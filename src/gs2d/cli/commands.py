@@ -159,7 +159,7 @@ class View(Common):
     """Look at a trained run in the browser: splats, mesh and cameras, served from this machine only."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Run folder, or a PLY file of splats."""
+    """Run folder, or a file of flat splats: PLY (compressed too), .spz or .splat."""
     port: int | None = None
     """Port of the page (default: the first free one from 8080 on)."""
     host: str = "127.0.0.1"
@@ -207,9 +207,10 @@ class Export(Common):
     run: RunPath
     """Run folder."""
     out: Annotated[Path, arg(metavar="FILE")]
-    """PLY file to write."""
-    layout: Literal["2dgs", "3dgs"] = "3dgs"
-    """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open."""
+    """File to write; by its ending .ply is 3dgs, .compressed.ply compressed, .spz spz, .splat splat."""
+    layout: Literal["2dgs", "3dgs", "compressed", "spz", "splat"] | None = None
+    """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open; compressed:
+    PlayCanvas's and SuperSplat's PLY; spz: Niantic's, the smallest; splat: antimatter15's, one colour a splat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,10 +298,10 @@ class Doctor(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Common):
-    """Show what a run folder, a capture or a PLY file holds."""
+    """Show what a run folder, a capture or a file of splats, mesh or points holds."""
 
     path: Annotated[Positional[Path], arg(metavar="PATH")]
-    """Run folder, capture folder or PLY file."""
+    """Run folder, capture folder, or file: PLY, .spz or .splat."""
 
 
 COMMANDS: tuple[type[Common], ...] = (

@@ -6,7 +6,6 @@ whose third scale we write as ``log 1e-6``: a disk with no thickness, its normal
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import dataclass
 
@@ -14,12 +13,12 @@ import numpy as np
 import torch
 
 from gs2d.errors import DataError
+from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians
 from gs2d.io.obj import read_obj
 from gs2d.io.ply_format import PlyElement, PlyFile, PlyList, read_ply, write_ply
 from gs2d.splats import Splats
 from gs2d.triangles import Mesh
 
-FLAT_LOG_SCALE = math.log(1e-6)  # wu, the thickness viewers are told
 _ROT = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", *_ROT)
 
@@ -85,8 +84,29 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
     DataError
         If the file is no PLY, is broken, or is of another kind: 3DGS (three scales), compressed, a mesh, points.
     """
-    file = read_ply(path)
-    vertex = _splat_element(path, file)
+    vertex = _splat_element(path, read_ply(path))
+    return Splats(**_attributes(path, vertex, ("scale_0", "scale_1")))
+
+
+def read_gaussians(path: str | os.PathLike[str]) -> Gaussians:
+    """Read 3DGS splats, which have three scales (extra properties are passed over).
+
+    Raises
+    ------
+    DataError
+        If the file is no PLY, is broken, or has no three scales.
+    """
+    vertex = read_ply(path).elements.get("vertex")
+    wanted = (*_FIXED, "scale_2")
+    missing = [name for name in wanted if vertex is None or not isinstance(vertex.properties.get(name), np.ndarray)]
+    if vertex is None or missing:
+        raise DataError(f"{path}: 3DGS splats were expected, the properties {', '.join(missing)} are missing")
+    a = {name: t.numpy() for name, t in _attributes(path, vertex, ("scale_0", "scale_1", "scale_2")).items()}
+    return Gaussians(**{**a, "sh0": a["sh0"][:, 0]})
+
+
+def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...]) -> dict[str, torch.Tensor]:
+    """The fields of Splats of the rows of an element."""
     names = set(vertex.properties)
     n_rest = sum(name.startswith("f_rest_") for name in names)
     degree = round((1 + n_rest / 3) ** 0.5) - 1
@@ -100,14 +120,14 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
             table[:, i] = _scalar(vertex, name)
         return torch.from_numpy(table)
 
-    return Splats(
-        means=columns("x", "y", "z"),
-        quats=columns(*_ROT),
-        log_scales=columns("scale_0", "scale_1"),
-        opacity_logits=columns("opacity")[:, 0].contiguous(),
-        sh0=columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :].contiguous(),
-        shN=columns(*rest).reshape(vertex.count, 3, n_rest // 3).transpose(1, 2).contiguous(),
-    )
+    return {
+        "means": columns("x", "y", "z"),
+        "quats": columns(*_ROT),
+        "log_scales": columns(*scales),
+        "opacity_logits": columns("opacity")[:, 0].contiguous(),
+        "sh0": columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :].contiguous(),
+        "shN": columns(*rest).reshape(vertex.count, 3, n_rest // 3).transpose(1, 2).contiguous(),
+    }
 
 
 def ply_kind(path: str | os.PathLike[str]) -> str:

@@ -1,4 +1,4 @@
-"""What a capture or a PLY file holds, in a few facts."""
+"""What a capture or a file holds, in a few facts."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 from gs2d.data import detect_format, load_scene
 from gs2d.data.layouts import missing_lines
-from gs2d.io.ply import ply_kind, read_mesh, read_points, read_splats
-from gs2d.io.ply_format import read_ply
+from gs2d.io.ply import ply_kind, read_mesh, read_points
+from gs2d.io.splat_formats import is_splat_file, read_splat_file
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
@@ -39,22 +39,22 @@ def describe_capture(path: Path) -> dict[str, Any]:
     return facts
 
 
-def describe_ply(path: Path) -> dict[str, Any]:
-    """Facts of a PLY file: splats of either layout, a mesh or points.
+def describe_file(path: Path) -> dict[str, Any]:
+    """Facts of a file: splats of any layout, a mesh or points.
 
     Raises
     ------
     DataError
-        The file is no PLY, is broken, or holds compressed splats.
+        The file is none of these, or is broken.
     """
-    kind, size = ply_kind(path), path.stat().st_size
-    if kind == "3dgs":
-        count = read_ply(path).elements["vertex"].count
-        return {"splats": count, "layout": "3dgs (three scales, for viewers)", "bytes": size}
+    size = path.stat().st_size
+    kind = "splats" if is_splat_file(path) else ply_kind(path)
     if kind == "mesh":
         mesh = read_mesh(path)
         return {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "bytes": size}
     if kind == "points":
         return {"points": len(read_points(path).points), "bytes": size}
-    splats = read_splats(path)  # names a compressed file
-    return {"splats": len(splats), "layout": "2dgs", "SH degree": splats.sh_degree, "bytes": size}
+    file = read_splat_file(path)
+    shape = {} if kind == "2dgs" else {"shape": "flat" if file.disks is not None else "3D, which gs2d does not draw"}
+    gaussians = file.gaussians
+    return {"splats": len(gaussians), "layout": file.kind, **shape, "SH degree": gaussians.sh_degree, "bytes": size}

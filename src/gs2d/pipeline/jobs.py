@@ -16,7 +16,7 @@ from gs2d.disk import check_writable
 from gs2d.errors import DataError, RunError
 from gs2d.evaluate.lpips import load_lpips
 from gs2d.images import write_image
-from gs2d.io.ply import read_mesh, read_splats, write_splats
+from gs2d.io.ply import read_mesh, read_splats
 from gs2d.io.run import (
     LOCK,
     MESH,
@@ -30,6 +30,7 @@ from gs2d.io.run import (
     open_run,
     remove_made,
 )
+from gs2d.io.splat_formats import LAYOUTS, layout_of, write_layout
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
@@ -83,16 +84,23 @@ def open_job(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFol
     return run, job, splats.to(job.backend.device)
 
 
-def checked_output(path: Path, out: Path) -> Path:
+def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") -> Path:
     """``out``, if it may be written: a PLY by its name, and not the splats of the run, from which all else is made.
+
+    Parameters
+    ----------
+    ending : str
+        That of its name.
+    what : str
+        What needs that ending, for the error.
 
     Raises
     ------
     RunError
     """
     path, out = Path(path), Path(out)
-    if out.suffix.lower() != ".ply":
-        raise RunError(f"--out must name a .ply file, which is what is written, got {out}")
+    if out.suffix.lower() != ending:
+        raise RunError(f"--out must name a {ending} file, which is what {what or 'is written'}, got {out}")
     if out.resolve() == (path / SPLATS).resolve():
         raise RunError(f"--out {out} is the splats of the run, which stay as they are; choose another name")
     return out
@@ -304,19 +312,23 @@ def evaluate_run(
     return result
 
 
-def export_run(path: Path, out: Path, layout: str) -> dict[str, Any]:
-    """Write the splats of a run in another layout.
+def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, Any]:
+    """Write the splats of a run in another layout (``io.splat_formats.LAYOUTS``; None: by the ending of ``out``).
 
     Raises
     ------
-    RunError, DiskError
+    RunError, DataError, DiskError
     """
-    path, out = Path(path), checked_output(path, out)
+    layout = layout or layout_of(Path(out)) or "3dgs"
+    if layout not in LAYOUTS:
+        raise RunError(f"--layout must be one of {', '.join(LAYOUTS)}, got {layout}")
+    path, out = Path(path), checked_output(path, out, LAYOUTS[layout].ending, f"layout {layout} is")
     if out.resolve() == (path / MESH).resolve():
         raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
     splats = finished_splats(open_run(path))
-    write_splats(out, splats, layout=layout)
-    return {"file": str(out), "splats": len(splats), "bytes": out.stat().st_size, "layout": layout}
+    notes = write_layout(out, splats, layout)
+    size = out.stat().st_size
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes)}
 
 
 def report_run(path: Path) -> Path:

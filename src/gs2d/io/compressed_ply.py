@@ -1,0 +1,210 @@
+"""Compressed PLY of PlayCanvas and SuperSplat: 16 bytes a splat, and a byte an SH coefficient.
+
+Splats are in chunks of 256 that lie together. A chunk has the smallest and largest position, log scale and colour of
+its splats; a splat has shares of the way between them: position and log scales in 11, 10 and 11 bits, colour and
+opacity in 8 each, its rotation in 32 bits (which component of (w, x, y, z) is the largest, and 10 bits of each other).
+SH coefficients are 256 steps from -4 to 4. After what SplatTransform and SuperSplat (PlayCanvas, MIT) read and write.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from gs2d.errors import DataError
+from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
+from gs2d.sh import C0
+
+_CHUNK = 256
+_BITS = (11, 10, 11)
+_SMALLEST = 1e-5  # a range below it is one value
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_SPAN = {
+    "position": ("x", "y", "z"),
+    "scale": ("scale_x", "scale_y", "scale_z"),
+    "color": ("r", "g", "b"),
+}
+
+
+def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> tuple[str, ...]:
+    """Write a compressed PLY, atomically, in Morton order.
+
+    Returns
+    -------
+    tuple of str
+        What the format could not hold, one sentence each.
+
+    Raises
+    ------
+    DiskError
+        If the file could not be written.
+    """
+    n = len(gaussians)
+    g = gaussians.rows(_morton_order(gaussians.means))
+    chunks = -(-n // _CHUNK)
+    values = {
+        "position": g.means.astype(np.float64),
+        "scale": np.clip(g.log_scales.astype(np.float64), -20.0, 20.0),
+        "color": 0.5 + C0 * g.sh0.astype(np.float64),
+    }
+    ends = [f"{end}_{x}" for names in _SPAN.values() for end in ("min", "max") for x in names]
+    chunk = np.zeros(chunks, dtype=[(end, "<f4") for end in ends])
+    shares = {}
+    for what, names in _SPAN.items():
+        low, high, shares[what] = _shares(values[what], chunks)
+        for axis, x in enumerate(names):
+            chunk[f"min_{x}"], chunk[f"max_{x}"] = low[:, axis], high[:, axis]
+    vertex = np.zeros(n, dtype=[(name, "<u4") for name in _PACKED])
+    vertex["packed_position"] = _pack(shares["position"], _BITS)
+    vertex["packed_rotation"] = _packed_quats(g.quats)
+    vertex["packed_scale"] = _pack(shares["scale"], _BITS)
+    opacity = sigmoid(g.opacity_logits)[:, None]
+    vertex["packed_color"] = _pack(np.concatenate([shares["color"], opacity], axis=1), (8, 8, 8, 8))
+    elements = {"chunk": chunk, "vertex": vertex}
+    if g.shN.shape[1]:
+        rest = g.shN.transpose(0, 2, 1).reshape(n, 3 * g.shN.shape[1])  # by channel, as in a plain PLY
+        sh = np.zeros(n, dtype=[(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])
+        for i in range(rest.shape[1]):
+            sh[f"f_rest_{i}"] = np.clip(np.floor((rest[:, i] / 8.0 + 0.5) * 256.0), 0, 255)
+        elements["sh"] = sh
+    write_ply(path, elements, comments=("written by gs2d",))
+    steep = int((np.abs(g.shN) > 4.0).any(axis=(1, 2)).sum()) if g.shN.size else 0
+    return (f"{steep} of {n} splats have SH coefficients beyond 4, which is what the format holds",) if steep else ()
+
+
+def _morton_order(means: np.ndarray) -> np.ndarray:
+    """An order in which neighbours in the list are neighbours in space: bits of x, y and z in turn."""
+    if not len(means):
+        return np.zeros(0, dtype=int)
+    low, high = means.min(axis=0), means.max(axis=0)
+    cell = ((means - low) / np.maximum(high - low, 1e-30) * ((1 << 21) - 1)).astype(np.uint64)
+    code = np.zeros(len(means), np.uint64)
+    for bit in range(21):
+        for axis in range(3):
+            code |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def _shares(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(smallest [C, 3], largest [C, 3], shares of the way [N, 3] in [0, 1])."""
+    starts = np.arange(chunks) * _CHUNK
+    if not chunks:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3))
+    low = np.minimum.reduceat(values, starts).astype(np.float32).astype(np.float64)
+    high = np.maximum.reduceat(values, starts).astype(np.float32).astype(np.float64)
+    at = np.arange(len(values)) // _CHUNK
+    span = (high - low)[at]
+    share = np.where(span < _SMALLEST, 0.0, (values - low[at]) / np.where(span < _SMALLEST, 1.0, span))
+    return low, high, np.clip(share, 0.0, 1.0)
+
+
+def _pack(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Numbers in [0, 1] in so many bits each, the first highest, in one word [N]."""
+    word = np.zeros(len(shares), np.uint32)
+    for column, count in zip(shares.T, bits, strict=True):
+        most = (1 << count) - 1
+        word = (word << np.uint32(count)) | np.clip(np.floor(column * most + 0.5), 0, most).astype(np.uint32)
+    return word
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    q = unit_quats(quats)
+    rows, largest = np.arange(len(q)), np.abs(q).argmax(axis=1)
+    q *= np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
+    word = largest.astype(np.uint32)
+    for i in range(4):
+        field = np.clip(np.floor((q[:, i] * np.sqrt(0.5) + 0.5) * 1023.0 + 0.5), 0, 1023).astype(np.uint32)
+        word = np.where(largest == i, word, (word << np.uint32(10)) | field)
+    return np.asarray(word)
+
+
+def read_compressed_ply(path: str | os.PathLike[str]) -> Gaussians:
+    """Read a compressed PLY, in the order of the file.
+
+    Raises
+    ------
+    DataError
+        If the file is no PLY, is broken, or its elements do not fit each other.
+    """
+    file = read_ply(path)
+    vertex, chunk = _elements(path, file)
+    n = vertex.count
+    packed = [_column(path, vertex, name).astype(np.uint32) for name in _PACKED]
+    at = np.arange(n) // _CHUNK
+    position = _between(path, chunk, "position", _unpack(packed[0], _BITS), at)
+    scale = _between(path, chunk, "scale", _unpack(packed[2], _BITS), at)
+    rgba = _unpack(packed[3], (8, 8, 8, 8))
+    color = _between(path, chunk, "color", rgba[:, :3], at) if "min_r" in chunk.properties else rgba[:, :3]
+    return Gaussians(
+        position.astype(np.float32),
+        _quats(packed[1]),
+        scale.astype(np.float32),
+        logit_of_byte(to_byte(255.0 * rgba[:, 3])),
+        ((color - 0.5) / C0).astype(np.float32),
+        _sh(path, file.elements.get("sh"), n),
+    )
+
+
+def _elements(path: object, file: PlyFile) -> tuple[PlyElement, PlyElement]:
+    vertex, chunk = file.elements.get("vertex"), file.elements.get("chunk")
+    if vertex is None or chunk is None:
+        raise DataError(f"{path}: a compressed PLY with chunks and vertices was expected, got {sorted(file.elements)}")
+    if chunk.count != -(-vertex.count // _CHUNK):
+        raise DataError(
+            f"{path}: {-(-vertex.count // _CHUNK)} chunks for {vertex.count} splats were expected, got {chunk.count}; "
+            "export the file again"
+        )
+    return vertex, chunk
+
+
+def _column(path: object, element: PlyElement, name: str) -> np.ndarray:
+    values = element.properties.get(name)
+    if not isinstance(values, np.ndarray):
+        raise DataError(f"{path}: the property {name} of a compressed PLY is missing; export the file again")
+    return values
+
+
+def _between(path: object, chunk: PlyElement, what: str, shares: np.ndarray, at: np.ndarray) -> np.ndarray:
+    low, high = (
+        np.stack([_column(path, chunk, f"{end}_{x}").astype(np.float64) for x in _SPAN[what]], axis=1)
+        for end in ("min", "max")
+    )
+    return np.asarray(low[at] * (1.0 - shares) + high[at] * shares)
+
+
+def _unpack(word: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    columns = []
+    for count in reversed(bits):
+        most = np.uint32((1 << count) - 1)
+        columns.append((word & most) / float(most))
+        word = word >> np.uint32(count)
+    return np.stack(columns[::-1], axis=1)
+
+
+def _quats(word: np.ndarray) -> np.ndarray:
+    largest = (word >> np.uint32(30)).astype(int)
+    q = np.zeros((len(word), 4))
+    for i in (3, 2, 1, 0):
+        stored = largest != i
+        value = ((word & np.uint32(1023)) / 1023.0 - 0.5) / np.sqrt(0.5)
+        q[stored, i] = value[stored]
+        word = np.where(stored, word >> np.uint32(10), word)
+    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(0.0, 1.0 - np.square(q).sum(axis=1)))
+    return q.astype(np.float32)
+
+
+def _sh(path: object, element: PlyElement | None, n: int) -> np.ndarray:
+    """[N, K-1, 3]: bytes are the middles of their steps, 0 and 255 the ends."""
+    if element is None:
+        return np.zeros((n, 0, 3), np.float32)
+    count = sum(name.startswith("f_rest_") for name in element.properties)
+    if count not in (9, 24, 45) or element.count != n:
+        raise DataError(
+            f"{path}: 9, 24 or 45 SH coefficients for {n} splats were expected, got {count} for {element.count}; "
+            "export the file again"
+        )
+    rest = np.stack([_column(path, element, f"f_rest_{i}") for i in range(count)], axis=1).astype(np.float64)
+    share = np.where(rest == 0, 0.0, np.where(rest == 255, 1.0, (rest + 0.5) / 256.0))
+    return ((share - 0.5) * 8.0).astype(np.float32).reshape(n, 3, count // 3).transpose(0, 2, 1)

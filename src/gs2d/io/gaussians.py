@@ -1,0 +1,109 @@
+"""Splats as other tools' files have them: 3D Gaussians with three scales, as arrays."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+from gs2d.errors import DataError
+from gs2d.splats import Splats
+
+FLAT_LOG_SCALE = math.log(1e-6)  # wu, the thickness that files of three scales are told
+_THIN = 0.25  # third scale / larger of the others: of disks that a file of few bits made thicker
+_FLAT = 0.99  # share of the Gaussians that must be disks
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """Attributes of N Gaussians before activation, float32.
+
+    Attributes
+    ----------
+    means : ndarray [N, 3] wu
+    quats : ndarray [N, 4]
+        (w, x, y, z).
+    log_scales : ndarray [N, 3]
+        log of the standard deviations along the columns of the rotation.
+    opacity_logits : ndarray [N]
+    sh0 : ndarray [N, 3]
+    shN : ndarray [N, K-1, 3]
+        Higher SH coefficients, by degree, then order.
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh0: np.ndarray
+    shN: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of the coefficients."""
+        return round(float(1 + self.shN.shape[1]) ** 0.5) - 1
+
+    @classmethod
+    def of(cls, splats: Splats) -> Gaussians:
+        """Disks as Gaussians with a third scale of 1e-6 along their normals."""
+        a = {name: tensor.detach().to("cpu", torch.float32).numpy() for name, tensor in splats.items()}
+        flat = np.full((len(splats), 1), FLAT_LOG_SCALE, np.float32)
+        scales = np.concatenate([a["log_scales"], flat], axis=1)
+        return cls(a["means"], a["quats"], scales, a["opacity_logits"], a["sh0"].reshape(-1, 3), a["shN"])
+
+    def rows(self, index: np.ndarray) -> Gaussians:
+        """The rows of an index or a mask."""
+        return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether nearly all are disks with their normals along the third axis, as ours are."""
+        thickest = self.log_scales[:, 2] - self.log_scales[:, :2].max(axis=1, initial=-np.inf)
+        return bool((thickest <= math.log(_THIN)).mean() >= _FLAT) if len(self) else True
+
+    def disks(self, path: str | os.PathLike[str]) -> Splats:
+        """The disks of a file ``path`` that flat splats were written to.
+
+        Raises
+        ------
+        DataError
+            They are not flat.
+        """
+        if not self.is_flat:
+            raise DataError(
+                f"{os.fspath(path)}: flat splats were expected, got 3D Gaussians with three scales; give splats of a "
+                "gs2d or 2DGS run"
+            )
+        tensors = [torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for a in (
+            self.means, self.quats, self.log_scales[:, :2], self.opacity_logits, self.sh0[:, None, :], self.shN
+        )]  # fmt: skip
+        return Splats(*tensors)
+
+
+def unit_quats(quats: np.ndarray) -> np.ndarray:
+    """Quaternions [N, 4] of length 1, float64; zero becomes no rotation."""
+    q = quats.astype(np.float64)
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(length > 0, q / np.where(length > 0, length, 1.0), (1.0, 0.0, 0.0, 0.0))
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    """1 / (1 + exp(-x)), float64, without overflow."""
+    return 0.5 + 0.5 * np.tanh(0.5 * x.astype(np.float64))
+
+
+def logit_of_byte(alpha: np.ndarray) -> np.ndarray:
+    """Opacity logits, float32, of 8 bits; 0 and 255 are half a step inside, for their logits are infinite."""
+    o = np.clip(alpha.astype(np.float64) / 255.0, 0.5 / 255.0, 254.5 / 255.0)
+    return np.asarray(np.log(o / (1.0 - o))).astype(np.float32)
+
+
+def to_byte(x: np.ndarray) -> np.ndarray:
+    """The nearest whole number of 0 to 255."""
+    return np.asarray(np.clip(np.floor(x + 0.5), 0, 255)).astype(np.uint8)

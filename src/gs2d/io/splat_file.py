@@ -1,0 +1,75 @@
+"""``.splat`` files of antimatter15/splat: 32 bytes a splat, without view-dependent colour.
+
+A record is position (3 float32), scales (3 float32, not their logarithms), colour and opacity (4 bytes of 255ths) and
+rotation (4 bytes: 128 w + 128, then x, y, z). Large opaque splats are first: viewers show the file while it loads.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.errors import DataError
+from gs2d.io.files import atomic_write
+from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
+from gs2d.sh import C0
+
+_RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+
+
+def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a ``.splat`` file, atomically: the most important first, colours of degree 0 alone.
+
+    Raises
+    ------
+    DiskError
+        If the file could not be written.
+    """
+    opacity = sigmoid(gaussians.opacity_logits)
+    importance = gaussians.log_scales.sum(axis=1, dtype=np.float64) + np.log(np.maximum(opacity, 1e-300))
+    order = np.argsort(-importance, kind="stable")
+    g = gaussians.rows(order)
+    rows = np.empty(len(g), dtype=_RECORD)
+    rows["position"] = g.means
+    rows["scales"] = np.exp(g.log_scales.astype(np.float64))
+    rows["rgba"][:, :3] = to_byte(255.0 * (0.5 + C0 * g.sh0.astype(np.float64)))
+    rows["rgba"][:, 3] = to_byte(255.0 * opacity[order])
+    rows["rotation"] = to_byte(128.0 * unit_quats(g.quats) + 128.0)
+    with atomic_write(path) as file:
+        file.write(rows.tobytes())
+
+
+def read_splat(path: str | os.PathLike[str]) -> Gaussians:
+    """Read a ``.splat`` file, which says nothing of itself: its size and its numbers are checked.
+
+    Raises
+    ------
+    DataError
+        Missing, no whole number of records, or numbers that are no splats.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    if len(data) % _RECORD.itemsize:
+        raise DataError(
+            f"{os.fspath(path)}: a .splat file of {_RECORD.itemsize} bytes a splat was expected, got {len(data)} bytes "
+            "in all; copy or export the file again"
+        )
+    rows = np.frombuffer(data, dtype=_RECORD)
+    numbers = np.concatenate([rows["position"], rows["scales"]], axis=1)
+    if not (np.isfinite(numbers).all() and (rows["scales"] >= 0).all()):
+        raise DataError(f"{os.fspath(path)}: finite positions and positive scales were expected; is it a .splat file?")
+    with np.errstate(divide="ignore"):
+        log_scales = np.maximum(np.log(rows["scales"]), -80.0)
+    color = rows["rgba"][:, :3].astype(np.float64) / 255.0
+    return Gaussians(
+        rows["position"].copy(),
+        unit_quats((rows["rotation"].astype(np.float64) - 128.0) / 128.0).astype(np.float32),
+        log_scales,
+        logit_of_byte(rows["rgba"][:, 3]),
+        ((color - 0.5) / C0).astype(np.float32),
+        np.zeros((len(rows), 0, 3), np.float32),
+    )

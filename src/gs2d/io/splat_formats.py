@@ -1,0 +1,98 @@
+"""Splats in every format that is written, by name, and what a file of splats holds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.errors import DataError
+from gs2d.io.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.io.gaussians import Gaussians
+from gs2d.io.ply import ply_kind, read_gaussians, read_splats, write_splats
+from gs2d.io.splat_file import read_splat, write_splat
+from gs2d.io.spz import read_spz, write_spz
+from gs2d.splats import Splats
+
+Writer = Callable[[Path, Splats], tuple[str, ...] | None]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A format of splats: its name's ending, and a writer that says what the format could not hold."""
+
+    ending: str
+    write: Writer
+
+
+LAYOUTS: Mapping[str, Layout] = {
+    "2dgs": Layout(".ply", lambda path, splats: write_splats(path, splats, layout="2dgs")),
+    "3dgs": Layout(".ply", lambda path, splats: write_splats(path, splats, layout="3dgs")),
+    "compressed": Layout(".ply", lambda path, splats: write_compressed_ply(path, Gaussians.of(splats))),
+    "spz": Layout(".spz", lambda path, splats: write_spz(path, Gaussians.of(splats))),
+    "splat": Layout(".splat", lambda path, splats: write_splat(path, Gaussians.of(splats))),
+}
+_BY_ENDING = ((".compressed.ply", "compressed"), (".ply", "3dgs"), (".spz", "spz"), (".splat", "splat"))
+
+
+@dataclass(frozen=True, eq=False)
+class SplatFile:
+    """What a file of splats holds: the kind of file in words, and its Gaussians (flat where ``disks`` are there)."""
+
+    kind: str
+    gaussians: Gaussians
+    disks: Splats | None
+
+
+def layout_of(path: Path) -> str | None:
+    """The layout that a file is written in by its name, or None."""
+    name = path.name.lower()
+    return next((layout for ending, layout in _BY_ENDING if name.endswith(ending)), None)
+
+
+def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
+    """Write splats in a layout of ``LAYOUTS``, atomically; what it could not hold, one sentence each.
+
+    Raises
+    ------
+    DataError, DiskError
+    """
+    return LAYOUTS[layout].write(path, splats) or ()
+
+
+def is_splat_file(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is one of splats that are no PLY, by its ending."""
+    return str(path).lower().endswith((".spz", ".splat"))
+
+
+def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
+    """Read splats of any format that is written here, and 3DGS.
+
+    Raises
+    ------
+    DataError
+        Missing, broken, or no splats.
+    """
+    if str(path).lower().endswith(".spz"):
+        gaussians, version = read_spz(path)
+        return _told(f"SPZ version {version}", gaussians, path)
+    if str(path).lower().endswith(".splat"):
+        return _told(".splat", read_splat(path), path)
+    kind = ply_kind(path)
+    if kind == "compressed":
+        return _told("compressed PLY", read_compressed_ply(path), path)
+    if kind == "3dgs":
+        return _told("3dgs (three scales, for viewers)", read_gaussians(path), path)
+    splats = read_splats(path)  # names another kind
+    return SplatFile("2dgs", Gaussians.of(splats), splats)
+
+
+def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> SplatFile:
+    for name in ("means", "log_scales", "quats", "sh0", "shN", "opacity_logits"):
+        values = getattr(gaussians, name)
+        if not np.isfinite(values).all():
+            raise DataError(f"{os.fspath(path)}: finite numbers were expected, got NaN or infinity in its {name}")
+    return SplatFile(kind, gaussians, gaussians.disks(path) if gaussians.is_flat else None)

@@ -1,0 +1,210 @@
+"""SPZ, Niantic's compressed splats (version 3; version 2 is read too): gzip over a header and one stream an attribute.
+
+From the format's documentation (github.com/nianticlabs/spz, README). All little-endian: magic, version, count (u32
+each), SH degree, fractional bits, flags, reserved (u8 each); then positions (24-bit fixed point), opacities, colours,
+log scales in 16ths above -10, rotations, SH coefficients (coefficient by coefficient, r g b), 8 bits each.
+Its coordinates are right, up, back, where PLY's are taken to be right, down, front: y and z change sign on the way.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.errors import DataError
+from gs2d.io.files import atomic_write
+from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
+
+_MAGIC = 0x5053474E  # "NGSP"
+_HEADER = struct.Struct("<IIIBBBB")
+_LARGEST = (1 << 23) - 1  # of 24 bits with a sign
+_EXTENDED = 0x2  # flag: vendors' records follow the header
+_FINEST = 20  # fractional bits
+_STEPS = 64  # of a position in the size of a typical splat
+_COLOR = 0.15  # of 255: colours beyond black and white are kept
+_SH1_STEP, _SH_STEP = (
+    2,
+    4,
+)  # of 255: 7 bits for degree 1, 6 for the others; Niantic's library has 5 and 4 (see decisions)
+_ROOT = np.sqrt(0.5)  # no component but the largest exceeds it
+_WORDS = (1 << 9) - 1
+#: What (x, -y, -z) makes of the harmonics of degree 1 to 3
+_FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+_TURN = np.array([1.0, -1.0, -1.0], np.float32)
+
+
+def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> tuple[str, ...]:
+    """Write SPZ version 3, atomically; the same bytes for the same splats.
+
+    The step of positions is at most a 64th of the size of the median splat, if the farthest leaves bits for it.
+
+    Returns
+    -------
+    tuple of str
+        What the format could not hold, one sentence each.
+
+    Raises
+    ------
+    DataError
+        A position beyond 2^23 units.
+    DiskError
+        If the file could not be written.
+    """
+    g = gaussians
+    farthest = float(np.abs(g.means).max()) if len(g) else 0.0
+    bits = _fractional_bits(g, farthest)
+    if farthest > _LARGEST:
+        raise DataError(f"SPZ holds positions up to {_LARGEST} units, got {farthest:.4g}; use --layout 3dgs")
+    header = _HEADER.pack(_MAGIC, 3, len(g), g.sh_degree, bits, 0, 0)
+    packed = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS)  # gzip with no time of writing
+    with atomic_write(path) as file:
+        for part in (header, *(array.tobytes() for array in _streams(g, bits))):
+            file.write(packed.compress(part))
+        file.write(packed.flush())
+    return _losses(g)
+
+
+def _fractional_bits(g: Gaussians, farthest: float) -> int:
+    size = float(np.median(g.log_scales.max(axis=1))) if len(g) else 0.0
+    bits = int(np.clip(np.ceil((np.log(_STEPS) - size) / np.log(2.0)), 0, _FINEST))
+    while bits and farthest * (1 << bits) > _LARGEST:
+        bits -= 1
+    return bits
+
+
+def _streams(g: Gaussians, bits: int) -> list[np.ndarray]:
+    """The attributes in their order, uint8."""
+    fixed = np.rint(g.means.astype(np.float64) * _TURN * (1 << bits)).astype("<i4")
+    positions = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
+    sh = np.rint(g.shN * _FLIP[: g.shN.shape[1], None] * 128.0).astype(np.int64) + 128
+    step = np.where(np.arange(g.shN.shape[1]) < 3, _SH1_STEP, _SH_STEP)[:, None]
+    sh = np.clip((sh + step // 2) // step * step, 0, 255).astype(np.uint8)
+    return [
+        np.ascontiguousarray(positions),
+        to_byte(255.0 * sigmoid(g.opacity_logits)),
+        to_byte(255.0 * (_COLOR * g.sh0.astype(np.float64) + 0.5)),
+        to_byte((g.log_scales.astype(np.float64) + 10.0) * 16.0),
+        _packed_quats(g.quats),
+        sh,
+    ]
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    """32 bits each [N]: the index of the largest of (x, y, z, w), then sign and 9 bits of each of the others."""
+    q = unit_quats(quats)[:, [1, 2, 3, 0]] * (*_TURN, 1.0)
+    rows, largest = np.arange(len(q)), np.abs(q).argmax(axis=1)
+    q *= np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
+    word = largest.astype(np.uint32)
+    for i in range(4):
+        magnitude = np.minimum(np.floor(_WORDS * np.abs(q[:, i]) / _ROOT + 0.5), _WORDS).astype(np.uint32)
+        field = ((q[:, i] < 0).astype(np.uint32) << np.uint32(9)) | magnitude
+        word = np.where(largest == i, word, (word << np.uint32(10)) | field)
+    return word.astype("<u4")
+
+
+def _losses(g: Gaussians) -> tuple[str, ...]:
+    thin = int((g.log_scales[:, :2] < -10.0 - 1 / 32).any(axis=1).sum())
+    wide = int((g.log_scales > 255 / 16 - 10.0 + 1 / 32).any(axis=1).sum())
+    steep = int((np.abs(g.shN) > 1.0).any(axis=(1, 2)).sum()) if g.shN.size else 0
+    every = (
+        (thin, "are smaller than 4.5e-5 units, which is what SPZ holds, and were made so large"),
+        (wide, "are larger than 379 units, which is what SPZ holds, and were made so small"),
+        (steep, "have SH coefficients beyond 1, which is what SPZ holds: their colours change less with the view"),
+    )
+    return tuple(f"{count} of {len(g)} splats {text}" for count, text in every if count)
+
+
+def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
+    """Read SPZ of version 2 or 3: (Gaussians, version).
+
+    Raises
+    ------
+    DataError
+        Missing, of another kind or version, or cut short.
+    """
+    unpack, tail = _opened(path)
+    header = _unpacked(path, unpack, tail, _HEADER.size)
+    magic, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
+    if magic != _MAGIC or version not in (2, 3) or degree > 3 or bits > 23 or flags & _EXTENDED:
+        raise DataError(
+            f"{os.fspath(path)}: SPZ of version 2 or 3 with SH degree 0 to 3 and no extensions was expected, got "
+            f"version {version}, degree {degree}, flags {flags}; convert it to a PLY"
+        )
+    wide, coefficients = 4 if version == 3 else 3, (degree + 1) ** 2 - 1
+    sizes = [9, 1, 3, 3, wide, 3 * coefficients]
+    data = _unpacked(path, unpack, unpack.unconsumed_tail, count * sum(sizes))
+    _unpacked(path, unpack, unpack.unconsumed_tail, 1, or_end=True)  # its checksum
+    parts, at = [], 0
+    for size in sizes:
+        parts.append(np.frombuffer(data, np.uint8, count * size, at).reshape(count, size))
+        at += count * size
+    positions, alphas, colors, scales, rotations, sh = parts
+    low = positions.reshape(count, 3, 3).astype(np.int32)
+    fixed = low[..., 0] | (low[..., 1] << 8) | (low[..., 2] << 16)
+    fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
+    shN = (sh.reshape(count, coefficients, 3).astype(np.float32) - 128.0) / 128.0 * _FLIP[:coefficients, None]
+    gaussians = Gaussians(
+        (fixed / float(1 << bits) * _TURN).astype(np.float32),
+        _quats(rotations) if version == 3 else _old_quats(rotations),
+        scales.astype(np.float32) / 16.0 - 10.0,
+        logit_of_byte(alphas[:, 0]),
+        ((colors.astype(np.float64) / 255.0 - 0.5) / _COLOR).astype(np.float32),
+        shN,
+    )
+    return gaussians, int(version)
+
+
+def _opened(path: str | os.PathLike[str]) -> tuple[Any, bytes]:
+    """A decompressor and what it is to read."""
+    try:
+        packed = Path(path).read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    if packed[:4] == struct.pack("<I", _MAGIC):
+        raise DataError(f"{os.fspath(path)}: SPZ of version 2 or 3 was expected, got a later one; convert it to a PLY")
+    return zlib.decompressobj(16 + zlib.MAX_WBITS), packed
+
+
+def _unpacked(path: str | os.PathLike[str], unpack: Any, packed: bytes, size: int, *, or_end: bool = False) -> bytes:
+    """The next ``size`` bytes, or the end of the file where that will do; never more, whatever it would grow to."""
+    try:
+        data = bytes(unpack.decompress(packed, size)) if size else b""
+    except zlib.error as error:
+        raise DataError(f"{os.fspath(path)}: SPZ was expected, its gzip is broken ({error}); copy it again") from error
+    if len(data) < size and not (or_end and unpack.eof):
+        raise DataError(
+            f"{os.fspath(path)}: SPZ was expected, the file ends early ({size} more bytes were announced, {len(data)} "
+            "are left); copy or export it again"
+        )
+    return data
+
+
+def _quats(rotations: np.ndarray) -> np.ndarray:
+    word = rotations.copy().view("<u4")[:, 0].astype(np.uint32)
+    largest = (word >> np.uint32(30)).astype(int)
+    q = np.zeros((len(word), 4))
+    for i in (3, 2, 1, 0):
+        value = _ROOT * (word & np.uint32(_WORDS)) / _WORDS
+        value = np.where((word >> np.uint32(9)) & np.uint32(1), -value, value)
+        stored = largest != i
+        q[stored, i] = value[stored]
+        word = np.where(stored, word >> np.uint32(10), word)
+    return _ours(q, largest)
+
+
+def _old_quats(rotations: np.ndarray) -> np.ndarray:
+    q = np.zeros((len(rotations), 4))
+    q[:, :3] = rotations / 127.5 - 1.0
+    return _ours(q, np.full(len(q), 3))
+
+
+def _ours(q: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of (x, y, z, w) of which one component is 0 and follows from the others."""
+    q[np.arange(len(q)), left_out] = np.sqrt(np.maximum(0.0, 1.0 - np.square(q).sum(axis=1)))
+    q *= (*_TURN, 1.0)
+    return q[:, [3, 0, 1, 2]].astype(np.float32)

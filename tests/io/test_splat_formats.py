@@ -1,0 +1,381 @@
+"""Splats for other tools: .splat, SPZ and compressed PLY, against decoders written here and files of other programs."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from gs2d.errors import DataError, DiskError
+from gs2d.io import compressed_ply
+from gs2d.io.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid, unit_quats
+from gs2d.io.ply import read_gaussians, write_splats
+from gs2d.io.ply_format import read_ply, write_ply
+from gs2d.io.splat_file import read_splat, write_splat
+from gs2d.io.splat_formats import LAYOUTS, layout_of, read_splat_file, write_layout
+from gs2d.io.spz import read_spz, write_spz
+from gs2d.sh import sh_basis
+from gs2d.splats import Splats
+
+C0 = 0.28209479177387814
+
+
+def a_scene(n: int = 700, degree: int = 3, seed: int = 1) -> Splats:
+    """Splats as training makes them: small disks in a box of 4 units."""
+    g = torch.Generator().manual_seed(seed)
+    k = (degree + 1) ** 2 - 1
+    return Splats(
+        means=torch.rand((n, 3), generator=g) * 4 - 1,
+        quats=torch.randn((n, 4), generator=g),
+        log_scales=torch.randn((n, 2), generator=g) * 0.7 - 4.5,
+        opacity_logits=torch.randn((n,), generator=g) * 3,
+        sh0=torch.randn((n, 1, 3), generator=g) * 0.8,
+        shN=torch.randn((n, k, 3), generator=g).clamp(-3, 3) * 0.2,
+    )
+
+
+def turned_by(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Degrees between rotations."""
+    dot = np.abs((unit_quats(a) * unit_quats(b)).sum(axis=1))
+    return np.degrees(2 * np.arccos(np.clip(dot, 0, 1)))
+
+
+# -- .splat ----------------------------------------------------------------------------------------------------
+def test_a_splat_record_is_32_bytes_of_the_documented_fields(tmp_path: Path) -> None:
+    splats = a_scene(3, degree=1)
+    splats.quats[:] = torch.tensor([[2.0, 0, 0, 0], [0, 0, -3.0, 0], [0.5, 0.5, 0.5, 0.5]])
+    splats.log_scales[:] = torch.log(torch.tensor([[0.1, 0.2], [0.5, 0.4], [0.3, 0.3]]))
+    splats.opacity_logits[:] = torch.tensor([0.0, 9.0, -1.0])
+    splats.sh0[:, 0] = (torch.tensor([[0.2, 0.4, 0.6], [0.0, 1.0, 2.0], [0.5, -1.0, 0.698]]) - 0.5) / C0
+    write_splat(tmp_path / "a.splat", Gaussians.of(splats))
+    data = (tmp_path / "a.splat").read_bytes()
+    assert len(data) == 96
+    # s_u s_v o: 0.01, 0.2, 0.024
+    for i, row in zip((1, 2, 0), range(3), strict=True):
+        fields = struct.unpack("<6f8B", data[32 * row : 32 * row + 32])
+        np.testing.assert_array_equal(np.float32(fields[:3]), splats.means[i].numpy())
+        np.testing.assert_allclose(fields[3:6], [*splats.scales[i].numpy(), 1e-6], rtol=1e-6)
+    rgba = [struct.unpack("<4B", data[32 * row + 24 : 32 * row + 28]) for row in range(3)]
+    assert rgba == [(0, 255, 255, 255), (128, 0, 178, 69), (51, 102, 153, 128)]
+    rotations = [struct.unpack("<4B", data[32 * row + 28 : 32 * row + 32]) for row in range(3)]
+    assert rotations == [(128, 128, 0, 128), (192, 192, 192, 192), (255, 128, 128, 128)]
+
+
+def test_a_splat_file_comes_back_within_its_bits_and_without_sh(tmp_path: Path) -> None:
+    splats = a_scene()
+    write_splat(tmp_path / "a.splat", Gaussians.of(splats))
+    back = read_splat(tmp_path / "a.splat")
+    order = np.argsort(-(splats.log_scales.sum(1) + splats.opacities.log()).numpy(), kind="stable")
+    same = Gaussians.of(splats).rows(order)
+    np.testing.assert_array_equal(back.means, same.means)
+    np.testing.assert_allclose(back.log_scales, same.log_scales, atol=1e-6)
+    assert np.abs(sigmoid(back.opacity_logits) - sigmoid(same.opacity_logits)).max() <= 0.5001 / 255
+    shown = np.clip(0.5 + C0 * same.sh0, 0, 1)
+    assert np.abs(0.5 + C0 * back.sh0 - shown).max() <= 0.5001 / 255
+    assert turned_by(back.quats, same.quats).max() < 1.0
+    assert (back.sh_degree, back.is_flat) == (0, True)
+
+
+# -- SPZ -------------------------------------------------------------------------------------------------------
+def decode_spz(path: Path) -> dict[str, np.ndarray]:
+    """By the documentation of the format, one splat after the other, in its own coordinates (right, up, back)."""
+    data = gzip.decompress(path.read_bytes())
+    magic, version, n, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", data[:16])
+    assert (magic.to_bytes(4, "little"), version, flags, reserved) == (b"NGSP", 3, 0, 0)
+    k = (degree + 1) ** 2 - 1
+    at = 16
+    position, alpha, color, scale, rotation, sh = [], [], [], [], [], []
+    for i in range(n):
+        raw = data[at + 9 * i : at + 9 * i + 9]
+        position.append([int.from_bytes(raw[3 * a : 3 * a + 3], "little", signed=True) / 2**bits for a in range(3)])
+    at += 9 * n
+    alpha = [data[at + i] / 255 for i in range(n)]
+    at += n
+    color = [[(data[at + 3 * i + a] / 255 - 0.5) / 0.15 for a in range(3)] for i in range(n)]
+    at += 3 * n
+    scale = [[data[at + 3 * i + a] / 16 - 10 for a in range(3)] for i in range(n)]
+    at += 3 * n
+    for i in range(n):
+        word = int.from_bytes(data[at + 4 * i : at + 4 * i + 4], "little")
+        largest, rest = word >> 30, [(word >> shift) & 1023 for shift in (20, 10, 0)]
+        values = [(-1 if field >> 9 else 1) * (field & 511) / 511 / math.sqrt(2) for field in rest]
+        values.insert(largest, math.sqrt(max(0.0, 1 - sum(v * v for v in values))))
+        rotation.append([values[3], *values[:3]])  # stored x y z w
+    at += 4 * n
+    sh = [[[(data[at + 3 * (k * i + j) + c] - 128) / 128 for c in range(3)] for j in range(k)] for i in range(n)]
+    assert len(data) == at + 3 * k * n
+    names = ("position", "alpha", "color", "scale", "rotation", "sh")
+    every = (position, alpha, color, scale, rotation, np.reshape(sh, (n, k, 3)))
+    return {name: np.array(values, dtype=float) for name, values in zip(names, every, strict=True)} | {"bits": bits}
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spz_holds_what_its_documentation_says_within_its_bits(tmp_path: Path, degree: int) -> None:
+    splats = a_scene(300, degree)
+    g = Gaussians.of(splats)
+    assert write_spz(tmp_path / "a.spz", g) == ()
+    d = decode_spz(tmp_path / "a.spz")
+    flip = np.array([1, -1, -1])  # right, down, front -> right, up, back
+    assert np.abs(d["position"] - g.means * flip).max() <= 0.5 / 2 ** d["bits"] + 1e-7
+    assert np.exp(-4.5) / 128 < 1 / 2 ** d["bits"] <= np.exp(-4.0) / 64
+    assert np.abs(d["alpha"] - splats.opacities.numpy()).max() <= 0.5001 / 255
+    assert np.abs(d["color"] - g.sh0).max() <= 0.5001 / 255 / 0.15
+    assert np.abs(d["scale"][:, :2] - g.log_scales[:, :2]).max() <= 0.5001 / 16
+    assert (d["scale"][:, 2] == -10).all()  # the thinnest that it holds
+    # The frame of each splat, turned by the flip on both sides: the same covariance in flipped coordinates.
+    expected = unit_quats(g.quats) * (1, 1, -1, -1)
+    assert turned_by(d["rotation"], expected).max() < 0.25
+    if degree:
+        # 7 bits for degree 1 and 6 for the others: half a step and what rounding to 128ths adds.
+        direction = torch.nn.functional.normalize(
+            torch.randn((50, 3), generator=torch.Generator().manual_seed(0)), dim=1
+        )
+        ours = torch.einsum("dk,nkc->dnc", sh_basis(direction, degree)[:, 1:], splats.shN).numpy()
+        turned = sh_basis(direction * torch.tensor([1.0, -1.0, -1.0]), degree)[:, 1:].numpy()
+        theirs = np.einsum("dk,nkc->dnc", turned, d["sh"])
+        bound = np.abs(turned) @ np.where(np.arange(d["sh"].shape[1]) < 3, 1.5, 2.5) / 128
+        assert (np.abs(ours - theirs).max(axis=(1, 2)) <= bound + 1e-6).all()
+
+
+def test_spz_comes_back_in_the_same_coordinates(tmp_path: Path) -> None:
+    splats = a_scene()
+    g = Gaussians.of(splats)
+    write_spz(tmp_path / "a.spz", g)
+    back, version = read_spz(tmp_path / "a.spz")
+    assert version == 3
+    assert np.abs(back.means - g.means).max() <= 0.5 * np.exp(-4.0) / 64  # the median splat is smaller
+    assert np.abs(back.log_scales[:, :2] - g.log_scales[:, :2]).max() <= 0.5001 / 16
+    assert turned_by(back.quats, g.quats).max() < 0.25
+    assert np.abs(back.shN - g.shN).max() <= 2.51 / 128
+    assert np.abs(back.sh0 - g.sh0).max() <= 0.5001 / 255 / 0.15
+    first = (tmp_path / "a.spz").read_bytes()
+    write_spz(tmp_path / "b.spz", g)
+    assert (tmp_path / "b.spz").read_bytes() == first  # no time of writing in it
+
+
+def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
+    """One splat, by hand: position (1, 2, -3) up and back, a quarter turn about x."""
+    x = round(math.sqrt(0.5) * 127.5 + 127.5)
+    body = b"".join(int(v * 4096).to_bytes(3, "little", signed=True) for v in (1, -2, 3))
+    body += bytes([255, 128, 128, 128, 160, 96, 0, x, 128, 128]) + bytes([128 + 64] + [128] * 8)
+    data = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 1, 12, 0, 0) + body
+    (tmp_path / "a.spz").write_bytes(gzip.compress(data))
+    g, version = read_spz(tmp_path / "a.spz")
+    assert version == 2
+    np.testing.assert_allclose(g.means, [[1, 2, -3]])
+    np.testing.assert_allclose(g.log_scales, [[0, -4, -10]])
+    np.testing.assert_allclose(g.quats, [[math.sqrt(0.5), math.sqrt(0.5), 0, 0]], atol=0.006)
+    np.testing.assert_allclose(g.shN[0], [[-0.5, 0, 0], [0, 0, 0], [0, 0, 0]])  # y changes sign
+    assert sigmoid(g.opacity_logits)[0] == pytest.approx(254.5 / 255)
+
+
+def test_spz_says_what_it_could_not_hold(tmp_path: Path) -> None:
+    splats = a_scene(10)
+    splats.log_scales[:2] = -12.0
+    splats.log_scales[2, 0] = 7.0
+    splats.shN[3, 0, 0] = 1.5
+    notes = write_spz(tmp_path / "a.spz", Gaussians.of(splats))
+    assert [note.split(",")[0] for note in notes] == [
+        "2 of 10 splats are smaller than 4.5e-5 units",
+        "1 of 10 splats are larger than 379 units",
+        "1 of 10 splats have SH coefficients beyond 1",
+    ]
+    splats.means[0, 0] = 1e7
+    with pytest.raises(DataError, match="SPZ holds positions up to 8388607 units, got 1e"):
+        write_spz(tmp_path / "b.spz", Gaussians.of(splats))
+    assert not (tmp_path / "b.spz").exists()
+    splats.means[0, 0] = 5e5  # far out: fewer bits behind the point
+    write_spz(tmp_path / "b.spz", Gaussians.of(splats))
+    assert abs(read_spz(tmp_path / "b.spz")[0].means[0, 0] - 5e5) <= 0.1
+
+
+# -- compressed PLY --------------------------------------------------------------------------------------------
+def test_a_file_of_supersplat_is_read_as_the_plain_one_beside_it(shared: Callable[[str], Path]) -> None:
+    name = shared("gaussians_plush_dog") / "point_cloud_29999_clean"
+    plain, packed = read_gaussians(f"{name}.ply"), read_compressed_ply(f"{name}.compressed.ply")
+    distance, match = cKDTree(plain.means).query(packed.means)
+    assert len(np.unique(match)) == len(plain) == len(packed)
+    same = plain.rows(match)
+    assert distance.max() < 2e-4
+    assert np.abs(packed.log_scales - same.log_scales).max() < 0.006
+    assert turned_by(packed.quats, same.quats).max() < 0.25
+    assert np.abs(sigmoid(packed.opacity_logits) - sigmoid(same.opacity_logits)).max() <= 0.5001 / 255
+    assert np.abs(packed.sh0 - same.sh0).max() < 0.025
+    assert np.abs(packed.shN - same.shN).max() <= 1 / 64
+    assert (packed.sh_degree, packed.is_flat, plain.is_flat) == (3, False, False)
+
+
+def test_our_words_are_those_of_supersplat_for_the_same_splats(
+    shared: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = shared("gaussians_plush_dog") / "point_cloud_29999_clean"
+    plain, theirs = read_gaussians(f"{name}.ply"), read_ply(f"{name}.compressed.ply")
+    match = cKDTree(plain.means).query(read_compressed_ply(f"{name}.compressed.ply").means)[1]
+    monkeypatch.setattr(compressed_ply, "_morton_order", lambda means: np.arange(len(means)))
+    write_compressed_ply(tmp_path / "a.ply", plain.rows(match))
+    ours = read_ply(tmp_path / "a.ply")
+    assert list(ours.elements) == list(theirs.elements)
+    for element in theirs.elements:
+        a, b = ours.elements[element].properties, theirs.elements[element].properties
+        assert list(a) == list(b)
+        for key in b:
+            differ = np.asarray(a[key]).astype(float) != np.asarray(b[key]).astype(float)
+            if element == "chunk":
+                np.testing.assert_allclose(a[key], b[key], rtol=1e-6, atol=1e-6)
+            else:
+                assert differ.mean() <= (1e-3 if element == "sh" else 0), key  # float32 there, float64 here
+
+
+def test_a_compressed_ply_comes_back_within_its_bits(tmp_path: Path) -> None:
+    splats = a_scene(1000)
+    g = Gaussians.of(splats)
+    write_compressed_ply(tmp_path / "a.compressed.ply", g)
+    back = read_compressed_ply(tmp_path / "a.compressed.ply")
+    match = cKDTree(g.means).query(back.means)[1]
+    same = g.rows(match)
+    assert len(np.unique(match)) == len(g)
+    # Neighbours share a chunk: its span is half of the scene's (4 units) and less, in 2047 or 1023 steps.
+    assert np.abs(back.means - same.means).max() <= 4 / 1023
+    assert np.abs(back.log_scales[:, :2] - same.log_scales[:, :2]).max() < 0.003
+    np.testing.assert_allclose(back.log_scales[:, 2], FLAT_LOG_SCALE, rtol=1e-6)
+    assert turned_by(back.quats, same.quats).max() < 0.25
+    assert np.abs(back.shN - same.shN).max() <= 1 / 64 + 1e-6
+    assert np.abs(sigmoid(back.opacity_logits) - sigmoid(same.opacity_logits)).max() <= 0.5001 / 255
+
+
+def test_neighbours_share_a_chunk(tmp_path: Path) -> None:
+    splats = a_scene(4096, degree=0)
+    write_compressed_ply(tmp_path / "a.ply", Gaussians.of(splats))
+    chunk = read_ply(tmp_path / "a.ply").elements["chunk"].properties
+    spans = [np.asarray(chunk[f"max_{a}"]) - np.asarray(chunk[f"min_{a}"]) for a in "xyz"]
+    assert np.mean(np.prod(spans, axis=0)) < 4**3 / 5  # 16 chunks; in any order it would be all of the box
+
+
+# -- all of them -----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("n", [0, 1, 257])
+def test_every_layout_is_read_back_as_flat_splats(tmp_path: Path, layout: str, n: int) -> None:
+    path = tmp_path / f"a{LAYOUTS[layout].ending}"
+    write_layout(path, a_scene(n, degree=2), layout)
+    file = read_splat_file(path)
+    assert len(file.gaussians) == n
+    assert file.disks is not None
+    assert file.gaussians.sh_degree == (0 if layout == "splat" else 2)
+
+
+def test_three_dimensional_gaussians_are_told_from_disks(tmp_path: Path, shared: Callable[[str], Path]) -> None:
+    file = read_splat_file(shared("gaussians_plush_dog") / "point_cloud_29999_clean.ply")
+    assert (file.kind, file.disks) == ("3dgs (three scales, for viewers)", None)
+    write_spz(tmp_path / "a.spz", file.gaussians)
+    file = read_splat_file(tmp_path / "a.spz")
+    assert (file.kind, file.disks) == ("SPZ version 3", None)
+    with pytest.raises(DataError, match=r"a\.spz: flat splats were expected, got 3D Gaussians with three scales"):
+        file.gaussians.disks(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [("a.ply", "3dgs"), ("a.Compressed.PLY", "compressed"), ("a.spz", "spz"), ("a.SPLAT", "splat"), ("a.obj", None)],
+)
+def test_the_ending_says_the_layout(name: str, layout: str | None) -> None:
+    assert layout_of(Path(name)) == layout
+
+
+def test_spz_is_a_tenth_of_the_plain_ply(tmp_path: Path) -> None:
+    splats = a_scene(2000)
+    write_splats(tmp_path / "a.ply", splats, layout="3dgs")
+    write_spz(tmp_path / "a.spz", Gaussians.of(splats))
+    write_compressed_ply(tmp_path / "a.compressed.ply", Gaussians.of(splats))
+    size = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
+    assert size["a.spz"] < size["a.ply"] / 5  # of random numbers; of a real scene a ninth
+    assert size["a.compressed.ply"] < size["a.ply"] / 3.9
+
+
+@pytest.mark.parametrize("layout", ["compressed", "spz", "splat"])
+def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, layout: str) -> None:
+    with pytest.raises(DiskError, match="the folder does not exist"):
+        write_layout(tmp_path / "no" / f"a{LAYOUTS[layout].ending}", a_scene(5), layout)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("layout", ["compressed", "spz", "splat"])
+@pytest.mark.parametrize("kept", [0, 1, 10, 200, -1])
+def test_a_file_cut_anywhere_is_one_line_that_names_it(tmp_path: Path, layout: str, kept: int) -> None:
+    path = tmp_path / f"cut{LAYOUTS[layout].ending}"
+    write_layout(path, a_scene(300), layout)
+    path.write_bytes(path.read_bytes()[:kept])
+    if layout == "splat" and kept == 0:
+        assert len(read_splat_file(path).gaussians) == 0  # it says nothing of itself
+        return
+    with pytest.raises(DataError, match="cut") as caught:
+        read_splat_file(path)
+    assert "\n" not in str(caught.value)
+
+
+def spz_with(path: Path, **changes: int) -> None:
+    fields = {"magic": 0x5053474E, "version": 3, "count": 1, "degree": 0, "bits": 12, "flags": 0, "reserved": 0}
+    header = struct.pack("<IIIBBBB", *(fields | changes).values())
+    path.write_bytes(gzip.compress(header + bytes(20)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"magic": 5}, "SPZ of version 2 or 3"),
+        ({"version": 1}, "got version 1"),
+        ({"version": 4}, "got version 4"),
+        ({"degree": 4}, "degree 4"),
+        ({"bits": 60}, "SPZ of version 2 or 3"),
+        ({"flags": 2}, "flags 2"),
+        ({"count": 4_000_000_000}, "the file ends early"),
+    ],
+)
+def test_a_header_of_spz_that_cannot_be_is_refused(tmp_path: Path, changes: dict[str, int], words: str) -> None:
+    spz_with(tmp_path / "a.spz", **changes)
+    with pytest.raises(DataError, match=words):
+        read_splat_file(tmp_path / "a.spz")
+    spz_with(tmp_path / "a.spz")
+    assert len(read_splat_file(tmp_path / "a.spz").gaussians) == 1
+
+
+def test_spz_of_a_later_version_which_is_no_gzip_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(b"NGSP\x04\0\0\0" + bytes(50))
+    with pytest.raises(DataError, match="SPZ of version 2 or 3 was expected, got a later one; convert it to a PLY"):
+        read_splat_file(tmp_path / "a.spz")
+    with pytest.raises(DataError, match="cannot read .*b.spz: No such file"):
+        read_splat_file(tmp_path / "b.spz")
+
+
+def test_a_compressed_ply_whose_parts_do_not_fit_is_named(tmp_path: Path) -> None:
+    write_compressed_ply(tmp_path / "a.ply", Gaussians.of(a_scene(300)))
+    parts = {
+        name: np.rec.fromarrays(list(e.properties.values()), names=list(e.properties))
+        for name, e in read_ply(tmp_path / "a.ply").elements.items()
+    }
+    write_ply(tmp_path / "b.ply", {**parts, "chunk": parts["chunk"][:1]})
+    with pytest.raises(DataError, match="2 chunks for 300 splats were expected, got 1"):
+        read_splat_file(tmp_path / "b.ply")
+    write_ply(tmp_path / "b.ply", {**parts, "sh": parts["sh"][:1]})
+    with pytest.raises(DataError, match="SH coefficients for 300 splats were expected, got 45 for 1"):
+        read_splat_file(tmp_path / "b.ply")
+    write_ply(tmp_path / "b.ply", {**parts, "chunk": parts["chunk"][["min_x", "max_x"]]})
+    with pytest.raises(DataError, match="the property min_y of a compressed PLY is missing"):
+        read_splat_file(tmp_path / "b.ply")
+    parts["chunk"]["min_x"][0] = np.nan
+    write_ply(tmp_path / "b.ply", parts)
+    with pytest.raises(DataError, match="finite numbers were expected, got NaN or infinity in its means"):
+        read_splat_file(tmp_path / "b.ply")
+
+
+def test_numbers_that_are_no_splats_are_named(tmp_path: Path) -> None:
+    (tmp_path / "a.splat").write_bytes(struct.pack("<6f8B", math.nan, 0, 0, 1, 1, 1, *range(8)))
+    with pytest.raises(DataError, match="finite positions and positive scales were expected; is it a .splat file"):
+        read_splat_file(tmp_path / "a.splat")
