@@ -12,6 +12,7 @@ import torch
 from cli_runs import one_line
 from gs2d.cli import run
 from gs2d.io.ply import write_splats
+from gs2d.io.splat_formats import LAYOUTS, write_layout
 from gs2d.splats import Splats
 
 
@@ -28,6 +29,17 @@ def test_a_file_of_splats_becomes_a_page_beside_it(tmp_path: Path, capsys: pytes
     assert result["file"] == str(tmp_path / "cloud.html")
     assert (result["sh_degree"], result["views"]) == (1, 1)
     assert result["bytes"] == (tmp_path / "cloud.html").stat().st_size
+
+
+@pytest.mark.parametrize(("layout", "degree"), [("spz", 3), ("compressed", 3), ("splat", 0)])
+def test_a_file_of_another_format_becomes_a_page_too(
+    tmp_path: Path, layout: str, degree: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"cloud{LAYOUTS[layout].ending}"
+    write_layout(path, some_splats(50), layout)
+    assert run(["page", str(path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["splats"], result["sh_degree"]) == (50, degree)
 
 
 def test_a_run_becomes_a_page_in_it(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -58,7 +70,7 @@ def test_a_run_without_its_photographs_is_seen_from_aside(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nowhere"], "expected a run folder or a PLY file of splats at"),
+        (["nowhere"], "expected a run folder or a file of splats at"),
         (["cloud.ply", "--out", "cloud.png"], "--out must name an .html file, which is what is written, got cloud.png"),
         (["cloud.ply", "--sh-degree", "4"], "--sh-degree must be 0, 1, 2 or 3, got 4"),
     ],

@@ -173,9 +173,9 @@ class Page(Common):
     """Write the splats as one HTML file that any browser draws exactly: no server, no network, to mail or to host."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Run folder, or a PLY file of splats."""
+    """Run folder, or a file of flat splats: PLY (compressed too), .spz or .splat."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
-    """HTML file (default: scene.html in the run, or beside the PLY file)."""
+    """HTML file (default: scene.html in the run, or beside the file)."""
     sh_degree: int = 3
     """How far colours may depend on the direction; less is a smaller file: 80, 64, 48 or 32 bytes a splat."""
 

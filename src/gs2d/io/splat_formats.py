@@ -90,6 +90,18 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
     return SplatFile("2dgs", Gaussians.of(splats), splats)
 
 
+def read_disks(path: str | os.PathLike[str]) -> Splats:
+    """The flat splats of a file of any format that is written here.
+
+    Raises
+    ------
+    DataError
+        Missing, broken, no splats, or 3D Gaussians.
+    """
+    file = read_splat_file(path)
+    return file.gaussians.disks(path) if file.disks is None else file.disks
+
+
 def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> SplatFile:
     for name in ("means", "log_scales", "quats", "sh0", "shN", "opacity_logits"):
         values = getattr(gaussians, name)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gs2d.data import View
 from gs2d.errors import DataError, RunError
-from gs2d.io.ply import read_splats
+from gs2d.io.splat_formats import read_disks
 from gs2d.io.run import is_run, open_run
 from gs2d.page import Seen, write_page
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
@@ -25,7 +25,7 @@ LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
 
 
 def page_run(path: Path, out: Path | None, *, sh_degree: int = 3, on_event: OnEvent = ignore) -> dict[str, Any]:
-    """Write the page of a run or of a PLY file of splats.
+    """Write the page of a run or of a file of splats.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def page_run(path: Path, out: Path | None, *, sh_degree: int = 3, on_event: OnEv
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:
         if not path.exists():
-            raise DataError(f"expected a run folder or a PLY file of splats at {path}, found nothing; check the path")
-        splats, title = read_splats(path), path.stem
+            raise DataError(f"expected a run folder or a file of splats at {path}, found nothing; check the path")
+        splats, title = read_disks(path), path.stem
     views = [] if job is None else _some(job.scene.train)
     cameras = [view.camera for view in views]
     frame = frame_around(cameras, splats.means.cpu().numpy())

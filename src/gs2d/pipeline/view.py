@@ -19,7 +19,7 @@ from gs2d.errors import DataError, RunError
 from gs2d.images import to_uint8
 from gs2d.io.ply import read_mesh
 from gs2d.io.run import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_run
-from gs2d.io.splat_formats import read_splat_file
+from gs2d.io.splat_formats import read_disks
 from gs2d.io.textured import glb_bytes, glb_turn
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.jobs import finished_splats
@@ -69,7 +69,7 @@ class _Content:
 
 
 def open_viewer(path: Path, options: ViewOptions = ViewOptions(), on_event: OnEvent = ignore) -> Viewer:
-    """Start to serve a run, or a PLY file of splats; ``close`` the viewer when it was looked at.
+    """Start to serve a run, or a file of splats; ``close`` the viewer when it was looked at.
 
     Raises
     ------
@@ -156,8 +156,7 @@ def _splats_of(checkpoint: Path) -> Splats:
 def _of_file(path: Path) -> _Content:
     if not path.exists():
         raise DataError(f"expected a run folder or a file of splats at {path}, found nothing; check the path")
-    file = read_splat_file(path)
-    splats = file.gaussians.disks(path) if file.disks is None else file.disks
+    splats = read_disks(path)
     settings, backend = settings_without_run(splats), get_backend("auto")
     return _Content(path.name, {FINAL: lambda: splats}, (), settings, backend, "median", lambda _: None)
 
