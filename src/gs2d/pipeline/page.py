@@ -9,8 +9,8 @@ import numpy as np
 
 from gs2d.data import View
 from gs2d.errors import DataError, RunError
-from gs2d.io.splat_formats import read_disks
 from gs2d.io.run import is_run, open_run
+from gs2d.io.splat_formats import read_disks
 from gs2d.page import Seen, write_page
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.jobs import finished_splats
