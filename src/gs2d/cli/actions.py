@@ -316,6 +316,7 @@ def doctor(_command: c.Doctor, console: Console) -> None:
 
 def info(command: c.Info, console: Console) -> None:
     """``gs2d info``."""
+    from gs2d.data.archive import is_archive
     from gs2d.io.run import is_run, open_run
     from gs2d.pipeline.describe import describe_capture, describe_file
 
@@ -329,7 +330,7 @@ def info(command: c.Info, console: Console) -> None:
             f"expected a run folder, a capture or a file of splats, a mesh or points at {path}, found nothing; "
             "check the path"
         )
-    facts = describe_capture(path) if path.is_dir() else describe_file(path)
+    facts = describe_capture(path) if path.is_dir() or is_archive(path) else describe_file(path)
     for name, value in facts.items():
         for part in value if isinstance(value, list) else [value]:
             console.say(f"{name}: {part}")

@@ -79,8 +79,8 @@ class Train(Training, TrainingCommon):
     """Posed photographs to splats, mesh and report."""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """Folder of the capture: COLMAP, Blender or nerfstudio transforms, DTU, OpenSfM or OpenDroneMap, Metashape,
-    Meshroom."""
+    """Folder of the capture, or a .zip of it: COLMAP, Blender or nerfstudio transforms, DTU, OpenSfM or OpenDroneMap,
+    Metashape, Meshroom."""
     out: Annotated[Path, arg(metavar="RUN")]
     """Run folder to make."""
     format: Literal["auto", "blender", "nerfstudio", "dtu", "colmap", "opensfm", "metashape", "alicevision"] = "auto"
@@ -301,7 +301,7 @@ class Info(Common):
     """Show what a run folder, a capture or a file of splats, mesh or points holds."""
 
     path: Annotated[Positional[Path], arg(metavar="PATH")]
-    """Run folder, capture folder, or file: PLY, .spz or .splat."""
+    """Run folder, capture (folder or .zip), or file: PLY, .spz or .splat."""
 
 
 COMMANDS: tuple[type[Common], ...] = (

@@ -6,18 +6,23 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.data import detect_format, load_scene
+from gs2d.data.archive import is_archive
 from gs2d.data.layouts import missing_lines
 from gs2d.io.ply import ply_kind, read_mesh, read_points
 from gs2d.io.splat_formats import is_splat_file, read_splat_file
+from gs2d.pipeline.archive import unpacked_for_a_look
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
-    """Facts of a capture folder.
+    """Facts of a capture: a folder, or a ZIP file, which is unpacked for a moment.
 
     Raises
     ------
     DataError
     """
+    if is_archive(path):
+        with unpacked_for_a_look(path) as root:
+            return {**describe_capture(root), "capture": str(path)}
     scene = load_scene(path, format=detect_format(path))
     sizes = sorted({(view.camera.width, view.camera.height) for view in scene.views})
     facts: dict[str, Any] = {

@@ -8,9 +8,11 @@ from dataclasses import replace
 
 import torch
 
+from gs2d.data.archive import is_archive
 from gs2d.errors import ProtocolError, RecipeError, RunError
 from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
+from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.options import MeshOptions, TrainOptions
@@ -46,6 +48,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     Gs2dError
         Anything that the user can mend.
     """
+    if is_archive(options.scene):
+        return train_archive(options, on_event, train)
     check_viewer(options)
     claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": options.allowed}
     check_claim(options.out, **claim)  # type: ignore[arg-type]

@@ -1,0 +1,199 @@
+"""Captures as ZIP files: what is unpacked, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import stat
+import struct
+import zipfile
+from collections import namedtuple
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from capture_writers import small_colmap, small_nerfstudio
+
+from gs2d.data import archive as module
+from gs2d.data import load_scene
+from gs2d.data.archive import capture_root, is_archive, read_archive, unpack
+from gs2d.errors import DataError, DiskError
+
+
+def pack(folder: Path, path: Path, prefix: str = "", separator: str = "/") -> Path:
+    """A ZIP file of a folder, its names behind ``prefix``."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for source in sorted(folder.rglob("*")):
+            if source.is_file():
+                file.writestr(
+                    prefix + source.relative_to(folder).as_posix().replace("/", separator), source.read_bytes()
+                )
+    return path
+
+
+def unpacked(path: Path, target: Path) -> Path:
+    unpack(read_archive(path), target)
+    return capture_root(target)
+
+
+@pytest.mark.parametrize("write", [small_colmap, small_nerfstudio])
+@pytest.mark.parametrize("prefix", ["", "garden/", "garden/garden/"])
+def test_a_capture_comes_out_of_its_archive_as_it_went_in(
+    tmp_path: Path, write: Callable[[Path], object], prefix: str
+) -> None:
+    write(tmp_path / "capture")
+    path = pack(tmp_path / "capture", tmp_path / "garden.zip", prefix)
+    assert is_archive(path)
+    root = unpacked(path, tmp_path / "out")
+    assert root.name == "garden"
+    before = load_scene(tmp_path / "capture")
+    after = load_scene(root)
+    assert [v.name for v in after.views] == [v.name for v in before.views]
+    for a, b in zip(after.views, before.views, strict=True):
+        assert (a.image() == b.image()).all()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["capture", "garden.zip", "out"]
+
+
+def test_names_of_windows_and_of_macos_are_understood(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    path = pack(tmp_path / "capture", tmp_path / "a.zip", "shots\\", "\\")
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr("__MACOSX/._shots", b"x")
+        file.writestr("shots/.DS_Store", b"x")
+        file.writestr("shots/B\u00e4ume.txt", b"trees")
+    # Python says that it wrote UTF-8; macOS does not say so: clear the flag in both headers.
+    data = path.read_bytes().replace(b"\x00\x08\x00\x00", b"\x00\x00\x00\x00")
+    path.write_bytes(data)
+    root = unpacked(path, tmp_path / "out")
+    assert len(load_scene(root).views) == 9
+    assert {p.name for p in root.iterdir()} == {"images", "transforms.json", "B\u00e4ume.txt"}
+
+
+def test_the_digest_is_of_the_contents(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    first = read_archive(pack(tmp_path / "capture", tmp_path / "a.zip")).digest
+    os.utime(tmp_path / "capture" / "transforms.json", (1, 1))
+    assert read_archive(pack(tmp_path / "capture", tmp_path / "b.zip")).digest == first
+    (tmp_path / "capture" / "transforms.json").write_text("{}")
+    assert read_archive(pack(tmp_path / "capture", tmp_path / "a.zip")).digest != first
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil.txt", "a/../../evil.txt", "/etc/evil.txt", "C:\\evil.txt", "..\\evil.txt", "\\evil.txt", "a/b:c"]
+)
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr("transforms.json", b"{}")
+        file.writestr(zipfile.ZipInfo(name), b"evil")
+    with pytest.raises(
+        DataError, match=r"a\.zip must hold names below it, got .*which leads elsewhere; do not trust it"
+    ):
+        read_archive(tmp_path / "a.zip")
+
+
+def test_a_link_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        info = zipfile.ZipInfo("images")
+        info.external_attr = (stat.S_IFLNK | 0o777) << 16
+        file.writestr(info, "/etc")
+    with pytest.raises(DataError, match="must hold files, got the link images; pack it without links"):
+        read_archive(tmp_path / "a.zip")
+
+
+def test_what_grows_beyond_reason_is_refused_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("transforms.json", b"\0" * 10_000_000)
+    read_archive(tmp_path / "a.zip")
+    monkeypatch.setattr(module, "_SMALL", 1_000_000)
+    with pytest.raises(DataError, match=r"got 0\.0 MB that unpack to 0 GB; unpack it yourself if it is to be so"):
+        read_archive(tmp_path / "a.zip")
+
+
+def test_a_full_disk_is_named_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    archive = read_archive(pack(tmp_path / "capture", tmp_path / "a.zip"))
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda _: usage(1000, 999, 1))
+    with pytest.raises(DiskError, match=r"cannot unpack .*a\.zip into .*: 0\.0 GB are needed; free some space"):
+        unpack(archive, tmp_path / "out")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.zip", "capture"]
+
+
+def test_a_file_that_is_damaged_is_named_and_nothing_is_left(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    path = pack(tmp_path / "capture", tmp_path / "a.zip")
+    with zipfile.ZipFile(path) as file:
+        info = file.getinfo("images/f_03.png")
+    data = bytearray(path.read_bytes())
+    names, extra = struct.unpack("<HH", data[info.header_offset + 26 : info.header_offset + 30])
+    data[info.header_offset + 30 + names + extra + 40] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"a\.zip: images/f_03\.png does not unpack: .*; copy or pack it again"):
+        unpack(read_archive(path), tmp_path / "out")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.zip", "capture"]
+
+
+def test_what_a_killed_command_left_is_no_hindrance(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    archive = read_archive(pack(tmp_path / "capture", tmp_path / "a.zip"))
+    (tmp_path / ".out.unpacking").mkdir()
+    (tmp_path / ".out.unpacking" / "half").write_text("x")
+    done: list[int] = []
+    unpack(archive, tmp_path / "out", done.append)
+    assert done == list(range(1, 11))
+    assert not (tmp_path / ".out.unpacking").exists()
+    assert not list((tmp_path / "out").rglob("half"))
+
+
+def encrypted(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("transforms.json", b"{}")
+    data = bytearray(path.read_bytes())
+    for signature, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        data[data.index(signature) + at] |= 1
+    path.write_bytes(data)
+
+
+def twice(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("a/b", b"1")
+        file.writestr("a\\b", b"2")
+
+
+def file_and_folder(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("a", b"1")
+        file.writestr("a/b", b"2")
+
+
+def cut(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("a", bytes(1000))
+    path.write_bytes(path.read_bytes()[:500])
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda path: path.write_text("no archive"), "must be a ZIP file, got: .*; was it copied whole"),
+        (cut, "must be a ZIP file, got: .*; was it copied whole"),
+        (lambda path: zipfile.ZipFile(path, "w").close(), "must hold a capture, got an empty archive"),
+        (encrypted, "must not be encrypted, got a password on transforms.json; unpack it yourself"),
+        (twice, "must hold each file once, got a/b more than once"),
+        (file_and_folder, "must hold each file once, got a more than once"),
+        (lambda path: path.mkdir(), "cannot read .*a.zip: Is a directory"),
+    ],
+)
+def test_what_is_no_sound_archive_is_one_line(tmp_path: Path, write: Callable[[Path], object], words: str) -> None:
+    write(tmp_path / "a.zip")
+    with pytest.raises(DataError, match=words) as caught:
+        read_archive(tmp_path / "a.zip")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_archive_without_a_capture_says_what_is_in_it(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr("holiday/readme.txt", b"hello")
+    with pytest.raises(DataError, match=r"holiday must hold transforms_train\.json .*; got readme\.txt"):
+        unpacked(tmp_path / "a.zip", tmp_path / "out")
