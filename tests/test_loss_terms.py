@@ -14,8 +14,10 @@ from gs2d.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.losses import FUSED_LOSSES, LOSSES, compute_losses, target_maps
 from gs2d.losses_multiview import Neighbour, prepare
+from gs2d.losses_priors import KnownDepths, Prior
 from gs2d.recipe import LossTerm
 from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView
+from gs2d.recipe_priors import PRIOR_KINDS
 from gs2d.render.types import RenderOutput
 from loss_images import make_camera, make_output
 
@@ -49,8 +51,15 @@ def one_loss(
         backend_name=backend,
         silhouette=target[..., 0],
         neighbour=one_neighbour(target, mask, camera),
+        prior=one_prior(target),
     )
     return losses[kind]
+
+
+def one_prior(target: Tensor) -> Prior:
+    """Depths and normals made of the colours of a target."""
+    known = torch.ones_like(target[..., 0])
+    return Prior(KnownDepths(0.5 + target[..., 1], known), torch.nn.functional.normalize(target, dim=2), opacity=0.2)
 
 
 def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:
@@ -123,7 +132,7 @@ def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked:
     target = torch.rand(height, width, 3, generator=g, dtype=torch.float64)
     mask = torch.rand(height, width, generator=g) < 0.85 if masked else None
     images = {name: image for name, image in vars(output).items() if name not in ("radii", "turning_normal")}
-    if kind == "normal_consistency":  # alpha is detached there, which finite differences cannot know
+    if kind in ("normal_consistency", *PRIOR_KINDS):  # alpha is detached there, which finite differences cannot know
         images["alpha"] = images["alpha"].detach()
 
     def loss(*values: Tensor) -> Tensor:

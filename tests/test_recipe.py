@@ -23,6 +23,7 @@ from gs2d.recipe import (
     validate,
 )
 from gs2d.recipe_multiview import MultiView
+from gs2d.recipe_priors import DepthPrior, NormalPrior
 
 L1 = (LossTerm("l1", 1.0),)
 
@@ -168,6 +169,49 @@ def test_comparisons_of_views_are_checked_like_the_stages(field: str, value: flo
         validate(replace(compared, multiview=replace(MultiView(), **{field: value})))
     assert message in str(caught.value)
     assert validate(compared)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        (
+            "source",
+            "lidar",
+            "depth_prior.source must be one of auto, sparse, sensor, relative; got 'lidar'",
+        ),
+        ("final", 0.0, "depth_prior.final must be in (0, 1], got 0.0"),
+        ("horizon", 0, "depth_prior.horizon must be an integer >= 1"),
+        ("opacity", 1.0, "depth_prior.opacity must be below 1"),
+        ("min_track", 1, "depth_prior.min_track must be an integer >= 2"),
+        ("max_error", 0.0, "depth_prior.max_error must be positive"),
+        ("unit", -1.0, "depth_prior.unit must be a finite number >= 0"),
+        ("unit", 0.0, "depth_prior.unit must be positive"),
+        ("space", "log", "depth_prior.space must be one of auto, disparity, depth"),
+        ("align", "prayer", "depth_prior.align must be one of points, rendered"),
+    ],
+)
+def test_known_depths_are_checked_like_the_stages(field: str, value: object, message: str) -> None:
+    known = replace(one(losses=(*L1, LossTerm("depth_prior", 0.1))), depth_prior=DepthPrior())
+    with pytest.raises(RecipeError) as caught:
+        validate(replace(known, depth_prior=replace(DepthPrior(), **{field: value})))
+    assert message in str(caught.value)
+    assert validate(known)
+
+
+@pytest.mark.parametrize(("kind", "value"), [("depth_prior", DepthPrior()), ("normal_prior", NormalPrior())])
+def test_a_loss_on_what_is_known_and_how_it_is_known_come_together(kind: str, value: object) -> None:
+    with pytest.raises(RecipeError, match=f"{kind} is null, but loss '{kind}' needs it"):
+        validate(one(losses=(*L1, LossTerm(kind, 0.1))))
+    with pytest.raises(RecipeError, match=f"{kind} is set, but no loss is '{kind}'; .*--{kind.replace('_', '-')}"):
+        validate(replace(one(), **{kind: value}))
+
+
+def test_the_weight_of_a_prior_falls_log_linearly_to_its_share() -> None:
+    prior = DepthPrior(final=0.01, horizon=100)
+    assert prior.share_at(0) == 1
+    assert prior.share_at(50) == pytest.approx(0.1)
+    assert prior.share_at(100) == prior.share_at(1000) == pytest.approx(0.01)
+    assert NormalPrior(final=1.0).share_at(7) == 1
 
 
 def test_losses_of_two_views_and_how_they_are_compared_come_together() -> None:

@@ -9,7 +9,17 @@ import pytest
 from gs2d.errors import RecipeError
 from gs2d.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
 from gs2d.recipe_multiview import MultiView
-from gs2d.recipes import MULTIVIEW_WEIGHT, RECIPES, TABLES, get_recipe, with_multiview
+from gs2d.recipe_priors import DepthPrior, NormalPrior
+from gs2d.recipes import (
+    DEPTH_WEIGHT,
+    MULTIVIEW_WEIGHT,
+    RECIPES,
+    TABLES,
+    get_recipe,
+    with_depth_prior,
+    with_multiview,
+    with_normal_prior,
+)
 
 
 def weights(stage: Stage) -> dict[str, tuple[float | None, int]]:
@@ -181,6 +191,23 @@ def test_views_are_compared_by_the_recipes_that_say_so_with_normal_consistency_a
         assert replace(after, losses=before.losses) == before
     assert [name for name in RECIPES if get_recipe(name).multiview] == [
         f"{x}-multiview" for x in ("2dgs", "2dgs-60k", "2dgs-r")
+    ]
+
+
+@pytest.mark.parametrize("base", ["2dgs", "2dgs-60k", "2dgs-r"])
+def test_known_depths_are_asked_by_the_recipes_that_say_so_while_all_splats_move(base: str) -> None:
+    plain, knowing = get_recipe(base), get_recipe(f"{base}-depth")
+    assert plain.depth_prior is None
+    assert knowing.depth_prior == DepthPrior()
+    for before, after in zip(plain.stages, knowing.stages, strict=True):
+        assert weights(after) == weights(before) | ({"depth_prior": (DEPTH_WEIGHT, 0)} if before.moves_all else {})
+        assert replace(after, losses=before.losses) == before
+    assert with_depth_prior(knowing) == knowing
+    both = with_normal_prior(knowing)
+    assert (both.name, both.normal_prior) == (f"{base}-depth-normals", NormalPrior())
+    assert validate(both) == with_normal_prior(both)
+    assert [name for name in RECIPES if get_recipe(name).depth_prior] == [
+        f"{x}-depth" for x in ("2dgs", "2dgs-60k", "2dgs-r")
     ]
 
 

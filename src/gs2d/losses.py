@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gs2d import losses_multiview as multiview
+from gs2d import losses_priors as priors
 from gs2d import losses_reference as reference
 from gs2d.camera import Camera
 from gs2d.check import check_shapes
@@ -27,9 +28,11 @@ from gs2d.kernels import ops
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda import ops as cuda_ops
 from gs2d.losses_multiview import Neighbour, TwoViews
+from gs2d.losses_priors import Prior
 from gs2d.losses_reference import normals_from_depth
 from gs2d.recipe import LossTerm
 from gs2d.recipe_multiview import MULTIVIEW_KINDS
+from gs2d.recipe_priors import PRIOR_KINDS
 from gs2d.render.camera_gradient import turning_normals
 from gs2d.render.types import RenderOutput
 
@@ -117,6 +120,8 @@ class LossInputs:
         Alpha of the photograph, in [0, 1], if it has one.
     neighbour : Neighbour or None
         The second view of the losses that compare two.
+    prior : Prior or None
+        What is known of the view beforehand.
     """
 
     output: RenderOutput
@@ -128,6 +133,7 @@ class LossInputs:
     fused: FusedOperations | None = None
     silhouette: Tensor | None = None
     neighbour: Neighbour | None = None
+    prior: Prior | None = None
     _compared: dict[str, TwoViews] = field(default_factory=dict)
 
     def two_views(self, depth_kind: str) -> TwoViews:
@@ -168,6 +174,18 @@ def _silhouette(inputs: LossInputs, _: str) -> Tensor:
     return reference.silhouette(inputs.output.alpha, inputs.silhouette, inputs.mask)
 
 
+def _depth_prior(inputs: LossInputs, depth_kind: str) -> Tensor:
+    if inputs.prior is None or inputs.prior.depth is None:
+        raise RecipeError("loss 'depth_prior' needs known depths, got none; pass them or take a recipe without it")
+    return priors.depth_prior(inputs.prior, inputs.output.depth(depth_kind), inputs.output.alpha, inputs.mask)
+
+
+def _normal_prior(inputs: LossInputs, _: str) -> Tensor:
+    if inputs.prior is None or inputs.prior.normal is None:
+        raise RecipeError("loss 'normal_prior' needs known normals, got none; pass them or take a recipe without it")
+    return priors.normal_prior(inputs.prior, inputs.output.normal, inputs.output.alpha, inputs.mask)
+
+
 def _fused(inputs: LossInputs) -> FusedOperations:
     assert inputs.fused is not None
     return inputs.fused
@@ -189,6 +207,8 @@ LOSSES: Mapping[str, LossFunction] = MappingProxyType(
         "silhouette": _silhouette,
         "multiview_photometric": lambda x, depth: multiview.photometric(x.two_views(depth)),
         "multiview_geometric": lambda x, depth: multiview.geometric(x.two_views(depth)),
+        "depth_prior": _depth_prior,
+        "normal_prior": _normal_prior,
     }
 )
 """Every kind of loss in plain torch, unweighted."""
@@ -202,6 +222,7 @@ FUSED_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
         "distortion": lambda x, _: _fused(x).masked_mean(x.output.distortion, x.mask),
         "silhouette": _silhouette,  # one subtraction and a mean: not worth an operation of its own
         **{kind: LOSSES[kind] for kind in MULTIVIEW_KINDS},  # a few thousand patches
+        **{kind: LOSSES[kind] for kind in PRIOR_KINDS},  # a few thousand points, or five passes over a picture
     }
 )
 """The same kinds as fused operations."""
@@ -224,6 +245,7 @@ def compute_losses(
     target_cache: TargetMaps | None = None,
     silhouette: Tensor | None = None,
     neighbour: Neighbour | None = None,
+    prior: Prior | None = None,
 ) -> dict[str, Tensor]:
     """Weighted values of the active terms; their sum is the loss.
 
@@ -250,6 +272,8 @@ def compute_losses(
         Alpha of the photograph, for the loss of that name.
     neighbour : Neighbour, optional
         A second view, for the losses that compare two.
+    prior : Prior, optional
+        What is known of the view, for the losses on known depths and normals.
 
     Returns
     -------
@@ -289,7 +313,7 @@ def compute_losses(
             weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
     mean = target_cache.mean if target_cache is not None else None
     fused = _fused_operations(backend_name, output.color.device)
-    inputs = LossInputs(output, target, mask, camera, mean, weights, fused, silhouette, neighbour)
+    inputs = LossInputs(output, target, mask, camera, mean, weights, fused, silhouette, neighbour, prior)
     values: dict[str, Tensor] = {}
     for term, weight in active:
         value = weight * functions[term.kind](inputs, term.depth or depth_kind)

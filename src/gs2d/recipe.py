@@ -15,6 +15,7 @@ from types import MappingProxyType
 
 from gs2d.recipe_checks import group, integer, number, one_of, require
 from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView, check_multiview
+from gs2d.recipe_priors import PRIOR_KINDS, DepthPrior, NormalPrior, check_priors
 from gs2d.recipe_views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
 from gs2d.recipe_views import PoseRefinement as PoseRefinement
 from gs2d.recipe_views import check_exposure, check_poses
@@ -24,6 +25,7 @@ ALL = MU + SIGMA + ALPHA + SH
 LOSS_KINDS = (
     *("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
     *MULTIVIEW_KINDS,
+    *PRIOR_KINDS,
 )
 LARGEST_SEED = 2**63 - 1  # torch takes no larger one
 DEPTH_KINDS = ("mean", "median")
@@ -38,7 +40,8 @@ class LossTerm:
     kind : str
         "l1", "ssim" (1 - SSIM), "normal_consistency", "normal_consistency_per_splat" (the paper's Eq. 7 form),
         "distortion", "silhouette" (alpha against that of the photographs, which must have one), or, in a recipe with
-        ``multiview``, "multiview_photometric" (1 - NCC of warped patches), "multiview_geometric" (round trip, px).
+        ``multiview``, "multiview_photometric" (1 - NCC of warped patches), "multiview_geometric" (round trip, px); with
+        ``depth_prior`` "depth_prior" (relative error of depth), with ``normal_prior`` "normal_prior" (1 - cosine).
     weight : float or None
         None, for "distortion" only: the protocol's weight (Table 1 of the paper writes it 100/10).
     start : int
@@ -238,8 +241,8 @@ class Recipe:
     """Stages in order, the seed of every random choice, and the start.
 
     ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
-    photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says. ``multiview``: how
-    views are compared, for the losses that do.
+    photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says. ``multiview``,
+    ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses that do.
     """
 
     name: str
@@ -250,6 +253,8 @@ class Recipe:
     exposure: Exposure | None = None
     poses: PoseRefinement | None = None
     multiview: MultiView | None = None
+    depth_prior: DepthPrior | None = None
+    normal_prior: NormalPrior | None = None
 
     @property
     def iterations(self) -> int:
@@ -279,7 +284,9 @@ def validate(recipe: Recipe) -> Recipe:
         check_poses(f"{where}: poses", recipe.poses)
         learns = any(stage.moves_all for stage in recipe.stages)
         require(learns, f"{where}: poses learn while the means of all splats do, and no stage trains those")
-    check_multiview(f"{where}: multiview", recipe.multiview, [t.kind for s in recipe.stages for t in s.losses])
+    kinds = [term.kind for stage in recipe.stages for term in stage.losses]
+    check_multiview(f"{where}: multiview", recipe.multiview, kinds)
+    check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
     names = [stage.name for stage in recipe.stages]
     for name in names:
         require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")

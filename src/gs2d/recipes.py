@@ -28,11 +28,13 @@ from gs2d.recipe import (
     Stage,
 )
 from gs2d.recipe_multiview import MultiView
+from gs2d.recipe_priors import DepthPrior, NormalPrior
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
 SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned
 NC_START, DISTORTION_START = 7_000, 3_000  # official: active when iteration > start
 MULTIVIEW_WEIGHT = 0.3  # docs/decisions.md, "Two views"
+DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions.md, "Priors"
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
 # reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
@@ -169,6 +171,36 @@ def with_multiview(
     return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=MultiView())
 
 
+def with_depth_prior(
+    recipe: Recipe, source: str = "auto", weight: float = DEPTH_WEIGHT, *, name: str | None = None
+) -> Recipe:
+    """The recipe with a loss on known depths in the stages that train the means of all splats (``NAME-depth``).
+
+    Not in the paper. For indoor rooms, walls without texture and few photographs (docs/guides/priors.md). A recipe that
+    has the loss keeps it, and takes the source where one is asked for.
+    """
+    if recipe.depth_prior is not None:
+        known = recipe.depth_prior if source == "auto" else replace(recipe.depth_prior, source=source)
+        return replace(recipe, depth_prior=known)
+    # The mean depth: its gradient reaches every splat of a pixel, that of the median one alone.
+    term = LossTerm("depth_prior", weight, depth="mean")
+    return replace(_in_stages(recipe, term), name=name or f"{recipe.name}-depth", depth_prior=DepthPrior(source))
+
+
+def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: str | None = None) -> Recipe:
+    """The recipe with a loss on known normals in the stages that train the means of all splats (``NAME-normals``)."""
+    if recipe.normal_prior is not None:
+        return recipe
+    term = LossTerm("normal_prior", weight)
+    return replace(_in_stages(recipe, term), name=name or f"{recipe.name}-normals", normal_prior=NormalPrior())
+
+
+def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
+    """The recipe with a loss in the stages that train the means of all splats."""
+    stages = (replace(stage, losses=(*stage.losses, term)) if stage.moves_all else stage for stage in recipe.stages)
+    return replace(recipe, stages=tuple(stages))
+
+
 def _normal_consistency(weight: float, start: int) -> tuple[LossTerm, ...]:
     return (LossTerm("normal_consistency", weight, start),) if weight > 0 else ()
 
@@ -269,6 +301,8 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
         add(f"{base}-poses", about, partial(with_poses, build()))
         about = f"{base} with patches of neighbouring photographs compared, for better surfaces of textured things"
         add(f"{base}-multiview", about, partial(with_multiview, build()))
+        about = f"{base} with known depths, of sparse points or of depth maps (`gs2d train --depth-prior`)"
+        add(f"{base}-depth", about, partial(with_depth_prior, build()))
 
 
 RECIPES: Mapping[str, NamedRecipe] = MappingProxyType(_registry())

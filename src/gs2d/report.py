@@ -17,12 +17,13 @@ import numpy as np
 
 from gs2d.camera import Camera
 from gs2d.disk import atomic_write
-from gs2d.io.run import EXPOSURE, MESH, POSES, RENDERS, REPORT, open_run
+from gs2d.io.run import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, open_run
 from gs2d.report_curves import curves, read_history
 from gs2d.report_exposure import exposure_section
 from gs2d.report_html import drawing, escape, facts, missing, page, table
 from gs2d.report_pictures import hero, mesh_section, view_sections
 from gs2d.report_poses import poses_section
+from gs2d.report_priors import priors_section
 from gs2d.report_surface import surface_scores
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
@@ -134,7 +135,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
 
 
 def _of_views(record: RunRecord) -> list[str]:
-    """The sections about exposures and poses, where the recipe learns them."""
+    """The sections about exposures, poses and priors, where the recipe has them."""
     recipe, last = record.definition.get("recipe"), record.stages[-1] if record.stages else {}
     learned: Mapping[str, Any] = recipe if isinstance(recipe, Mapping) else {}
     parts = []
@@ -142,6 +143,9 @@ def _of_views(record: RunRecord) -> list[str]:
         parts += ["<h2>Exposure of the photographs</h2>", exposure_section(record.path / EXPOSURE, last)]
     if learned.get("poses"):
         parts += ["<h2>Where the photographs were taken</h2>", poses_section(record.path / POSES, last)]
+    if learned.get("depth_prior") or learned.get("normal_prior"):
+        folder = record.path / RENDERS / PRIORS
+        parts += ["<h2>What was known of the photographs</h2>", priors_section(folder, record.stages)]
     return parts
 
 

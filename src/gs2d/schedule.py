@@ -1,10 +1,10 @@
 """Short runs that still behave: a recipe scaled by a factor.
 
-Scaled: stage lengths, loss starts, the SH interval, start and stop of densification, the horizons of the rates of means
-exposures and poses (so that rates end where they should). *Not* scaled: the densification interval, as long as ten
-densifications fit, the first iterations without exposures and poses, and opacity resets. A reset puts opacity at 0.01,
-below the 0.05 at which splats are pruned; Adam moves a logit by about its rate, 0.05, a step, and 1.65 are missing, so
-a splat needs dozens of views to come back.
+Scaled: stage lengths, loss starts, the SH interval, start and stop of densification, the horizons of the rates of
+means, exposures and poses (so that rates end where they should) and of the weights of priors. *Not* scaled: the
+densification interval, as long as ten densifications fit, the first iterations without exposures and poses, and opacity
+resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit by about its rate,
+0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back.
 Pure Python; never imports torch.
 """
 
@@ -16,6 +16,7 @@ from typing import TypeVar
 
 from gs2d.errors import RecipeError
 from gs2d.recipe import Exposure, GradDensify, PoseRefinement, Recipe, Stage
+from gs2d.recipe_priors import DepthPrior, NormalPrior
 
 MIN_DENSIFICATIONS = 10
 PRUNE_GRACE = 100  # iterations after a reset in which nothing is pruned for opacity
@@ -23,6 +24,7 @@ RESET_MARGIN = 200  # iterations of densification that a reset must leave
 MIN_INIT_POINTS = 10_000
 VIEWS_WAIT = 200  # iterations before exposures and poses are learned, where the schedule has them
 OfViews = TypeVar("OfViews", Exposure, PoseRefinement)
+Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the keyboard
 
 
@@ -52,7 +54,13 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
         init_points=min(recipe.init_points, points),
         exposure=None if recipe.exposure is None else _scale_views(recipe.exposure, factor),
         poses=None if recipe.poses is None else _scale_poses(recipe.poses, factor),
+        depth_prior=None if recipe.depth_prior is None else _scale_prior(recipe.depth_prior, factor),
+        normal_prior=None if recipe.normal_prior is None else _scale_prior(recipe.normal_prior, factor),
     )
+
+
+def _scale_prior(prior: Prior, factor: float) -> Prior:
+    return replace(prior, horizon=_scaled(prior.horizon, factor))
 
 
 def _scale_views(learned: OfViews, factor: float) -> OfViews:

@@ -56,6 +56,10 @@ class Training:
     """Every so many-th view, by name, is a test view; 0: all train (default: what the protocol says, mostly 8)."""
     refine_poses: bool = False
     """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
+    depth_prior: Literal["auto", "sparse", "sensor", "relative"] | None = None
+    """Train with known depths: of sparse points, or of maps in depths/, a sensor's or relative; auto: what is there."""
+    normal_prior: bool = False
+    """Train with known normals, of maps in normals/."""
     start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
     """Take the stages that this recipe shares with another run from that run."""
     cache: Annotated[Path | None, arg(metavar="DIR")] = None

@@ -16,6 +16,16 @@ from gs2d.camera import Camera
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import ImageCache, Picture
 from gs2d.data.lens import Intrinsics, source_positions, undistort_image, undistort_mask
+from gs2d.data.prior_maps import (
+    DEPTH_SUFFIXES,
+    DEPTHS,
+    NORMAL_SUFFIXES,
+    NORMALS,
+    MapFiles,
+    ObservedPoints,
+    PriorMaps,
+    find_map,
+)
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError, ShapeError
 from gs2d.geometry import camera_extent
@@ -52,6 +62,8 @@ class Frame:
     alpha_is_silhouette : bool
         The alpha channel says where the object is and the colour behind it is real (DTU as 2DGS ships it): alpha
         becomes the object mask and the picture stays opaque.
+    maps : MapFiles or None
+        Depth and normal maps.
     """
 
     name: str
@@ -62,13 +74,15 @@ class Frame:
     mask: Path | None = None
     object_mask: Path | None = None
     alpha_is_silhouette: bool = False
+    maps: MapFiles | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
     """A data set as its reader understood it (fields as in Scene).
 
-    ``downscaled_by`` is the factor by which the image files that were chosen are already smaller (``images_N``).
+    ``downscaled_by`` is the factor by which the image files that were chosen are already smaller (``images_N``);
+    ``home`` the folder that may hold the folders of maps, where it is not the root.
     """
 
     format: str
@@ -79,6 +93,8 @@ class Capture:
     downscaled_by: int = 1
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    home: Path | None = None
+    observe: Callable[[], ObservedPoints] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +234,7 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
     if len(set(names)) != len(names):
         twice = next(a for a, b in itertools.pairwise(names) if a == b)
         raise DataError(f"{root} must name each view once, got {twice} more than once")
+    frames, map_notes = _with_maps(frames, capture.home or root)
     views = [_view(frame, factor, cache, lens_maps) for frame in frames]
     train, test = _split(frames, views, capture.default_test_every, test_every, root)
     cameras = [view.camera for view in train]
@@ -234,8 +251,9 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=capture.skipped,
-        notes=capture.notes + _lens_notes(frames) + place_notes + point_notes + bound_notes,
+        notes=capture.notes + _lens_notes(frames) + map_notes + place_notes + point_notes + bound_notes,
         root=root,
+        observe=capture.observe,
     )
 
 
@@ -282,7 +300,28 @@ def _view(frame: Frame, factor: int, cache: ImageCache, lens_maps: LensMaps) -> 
         camera = Camera(k.width, k.height, k.fx, k.fy, k.cx, k.cy, frame.T_cam_world).downscaled(factor)
     except ShapeError as error:
         raise DataError(f"view {frame.name}: {error}") from error
-    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path)
+    maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera, lens_maps)
+    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps)
+
+
+def _with_maps(frames: list[Frame], home: Path) -> tuple[list[Frame], tuple[str, ...]]:
+    """The frames with the maps that lie in ``depths`` and ``normals``, and a note for each such folder."""
+    found: dict[str, list[Path | None]] = {}
+    for what, folder, suffixes in (("depth", DEPTHS, DEPTH_SUFFIXES), ("normal", NORMALS, NORMAL_SUFFIXES)):
+        if (home / folder).is_dir():
+            found[what] = [find_map(home / folder, frame.name, suffixes) for frame in frames]
+    for what, paths in found.items():
+        for index, path in enumerate(paths):
+            maps = frames[index].maps or MapFiles()
+            if path is not None and getattr(maps, what) is None:
+                frames[index] = replace(
+                    frames[index], maps=replace(maps, depth=path) if what == "depth" else replace(maps, normal=path)
+                )
+    return frames, tuple(
+        f"{what} maps: {sum(path is not None for path in paths)} of {len(frames)} views have one in {what}s "
+        f"(--{what}-prior uses them)"
+        for what, paths in found.items()
+    )
 
 
 def _split(

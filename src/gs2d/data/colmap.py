@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from gs2d.data.capture import Capture, Frame
 from gs2d.data.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images, read_points
 from gs2d.data.lens import Intrinsics, colmap_intrinsics
+from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError
 from gs2d.images import image_size
@@ -80,7 +82,33 @@ def read_colmap(root: Path, downscale: int) -> Capture:
         downscaled_by=factor,
         skipped=tuple(skipped),
         notes=tuple(notes),
+        home=home,
+        observe=partial(observed_points, folder, kind),
     )
+
+
+def observed_points(folder: Path, kind: str) -> ObservedPoints:
+    """Which points of a model each of its images was found to show.
+
+    Raises
+    ------
+    DataError
+        The model has no points, or a file is broken.
+    """
+    points = read_points(folder, kind)
+    if points is None or not len(points.ids):
+        raise DataError(f"{folder} must hold sparse points in points3D.{kind} for sparse depths, got none")
+    order = np.argsort(points.ids)
+    track = np.zeros(len(order), dtype=np.int64)
+    seen = {}
+    for image in read_images(folder, kind, observations=True):
+        assert image.point_ids is not None
+        ids = np.unique(image.point_ids[image.point_ids >= 0])
+        at = order[np.searchsorted(points.ids, ids, sorter=order).clip(max=len(order) - 1)]
+        rows = at[points.ids[at] == ids]
+        seen[image.name.replace("\\", "/")] = rows
+        track[rows] += 1
+    return ObservedPoints(points.xyz, points.error, track, seen)
 
 
 def model_points(folder: Path, kind: str) -> PointCloud | None:

@@ -12,6 +12,7 @@ import numpy as np
 from gs2d.camera import Camera
 from gs2d.check import check_shapes
 from gs2d.data.cache import ImageCache, Picture
+from gs2d.data.prior_maps import ObservedPoints, PriorMaps
 from gs2d.errors import DataError
 from gs2d.images import composite
 
@@ -32,6 +33,8 @@ class View:
         Shared by all views of a scene.
     path : Path or None
         The photograph's file.
+    maps : PriorMaps or None
+        Its depth and normal maps, where the capture has such.
     """
 
     name: str
@@ -39,6 +42,7 @@ class View:
     decode: Callable[[], Picture] = field(repr=False)
     cache: ImageCache = field(repr=False, default_factory=lambda: ImageCache(0))
     path: Path | None = None
+    maps: PriorMaps | None = None
 
     @classmethod
     def from_arrays(
@@ -56,7 +60,7 @@ class View:
     def at(self, T_cam_world: np.ndarray) -> View:
         """The same photograph, taken from elsewhere; its picture stays in the cache of this one."""
         camera = replace(self.camera, T_cam_world=T_cam_world)
-        return View(self.name, camera, self._picture, path=self.path)
+        return View(self.name, camera, self._picture, path=self.path, maps=self.maps)
 
     def image(self) -> np.ndarray:
         """The photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
@@ -157,6 +161,8 @@ class Scene:
         What loading decided that the user may want to know, one sentence each.
     root : Path or None
         The folder it came from.
+    observe : callable or None
+        Reads which sparse points each photograph was found to show, where the capture says so.
     """
 
     name: str
@@ -170,6 +176,7 @@ class Scene:
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     root: Path | None = None
+    observe: Callable[[], ObservedPoints] | None = None
 
     def with_poses(self, poses: Mapping[str, np.ndarray]) -> Scene:
         """The scene with training cameras moved: T_cam_world [4, 4] by the name of the view. Pictures are shared."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
 from gs2d.data.lens import Intrinsics, Lens
+from gs2d.data.prior_maps import MapFiles
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError
 from gs2d.images import image_size
@@ -108,10 +109,25 @@ def _read_frames(
             _required(entry, "transform_matrix", where), f"{where} ({name}): transform_matrix", opengl=True
         )
         intrinsics = frame_intrinsics({**meta, **entry}, image, f"{where} ({name})")
+        maps = _maps_of({**meta, **entry}, entry, root, where)
         inside = image.relative_to(root) if image.is_relative_to(root) else Path(*image.parts[1:])  # of another folder
-        frames.append(Frame(inside.as_posix(), image, intrinsics, pose, split, mask=mask))
+        frames.append(Frame(inside.as_posix(), image, intrinsics, pose, split, mask=mask, maps=maps))
     notes = [f"{missing_masks} masks named in {path.name} do not exist"] if missing_masks else []
     return frames, skipped, notes
+
+
+def _maps_of(both: Mapping[str, Any], entry: Mapping[str, Any], root: Path, where: str) -> MapFiles | None:
+    """The maps that a frame names (nerfstudio: ``depth_file_path``; ``normal_file_path``), as far as they exist."""
+    paths = {}
+    for what in ("depth", "normal"):
+        if entry.get(f"{what}_file_path") is not None:
+            path = root / _relative(entry[f"{what}_file_path"], f"{where}: {what}_file_path")
+            if path.is_file():
+                paths[what] = path
+    unit = both.get("depth_unit_scale_factor")
+    if unit is not None and (isinstance(unit, bool) or not isinstance(unit, int | float) or not 0 < unit < _LARGEST):
+        raise DataError(f"{where}: depth_unit_scale_factor must be a positive number, got {str(unit)[:40]!r}")
+    return MapFiles(**paths, unit=unit, metric="depth" in paths) if paths else None
 
 
 def _required(entry: Mapping[str, Any], key: str, where: str) -> Any:

@@ -38,6 +38,7 @@ from gs2d.io.files import read_json, write_json
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
+PRIORS = "priors"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT = "splats.ply", "mesh.ply", "mesh.glb", "report.html"
 EXPOSURE, POSES = "exposure.json", "poses.json"
 FORMAT = 1

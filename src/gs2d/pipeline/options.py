@@ -42,6 +42,10 @@ class TrainOptions:
         Learn an exposure and a white balance for each photograph (``recipes.with_exposure``).
     refine_poses : bool
         Learn where each photograph was taken from, beginning where the capture says (``recipes.with_poses``).
+    depth_prior : str or None
+        Train with known depths (``recipes.with_depth_prior``) of this source: "auto", "sparse", "sensor", "relative".
+    normal_prior : bool
+        Train with known normals (``recipes.with_normal_prior``).
     resume, overwrite : bool
         What to do with a run that is already in ``out``.
     start_from : Path or None
@@ -83,6 +87,8 @@ class TrainOptions:
     seed: int = 0
     exposure: bool = False
     refine_poses: bool = False
+    depth_prior: str | None = None
+    normal_prior: bool = False
     resume: bool = False
     overwrite: bool = False
     start_from: Path | None = None

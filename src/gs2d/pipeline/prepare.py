@@ -19,11 +19,12 @@ from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined import with_found_poses
 from gs2d.protocols import FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
 from gs2d.recipe import Recipe, validate
 from gs2d.recipe_json import apply_overrides, from_json, to_json
-from gs2d.recipes import get_recipe, with_exposure, with_poses
+from gs2d.recipes import get_recipe, with_depth_prior, with_exposure, with_normal_prior, with_poses
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.schedule import scale_schedule
@@ -96,7 +97,7 @@ class Job:
             "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
-            **({} if self.recipe.multiview is None else {"multiview": recipe["multiview"]}),
+            **{name: recipe[name] for name in ("multiview", "depth_prior", "normal_prior") if recipe[name] is not None},
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -114,6 +115,8 @@ def build_recipe(
     overrides: tuple[str, ...],
     exposure: bool = False,
     poses: bool = False,
+    depth_prior: str | None = None,
+    normal_prior: bool = False,
 ) -> Recipe:
     """The recipe as it will be trained: found, scaled, seeded, overridden, validated.
 
@@ -126,8 +129,15 @@ def build_recipe(
         raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
     value = with_exposure(value) if exposure else value
     value = with_poses(value) if poses else value
+    value = with_depth_prior(value, depth_prior) if depth_prior is not None else value
+    value = with_normal_prior(value) if normal_prior else value
     value = apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides)
-    for option, wanted, field in (("--exposure", exposure, "exposure"), ("--refine-poses", poses, "poses")):
+    for option, wanted, field in (
+        ("--exposure", exposure, "exposure"),
+        ("--refine-poses", poses, "poses"),
+        ("--depth-prior", depth_prior is not None, "depth_prior"),
+        ("--normal-prior", normal_prior, "normal_prior"),
+    ):
         if wanted and getattr(value, field) is None:
             raise RecipeError(f"{option} and --set {field}=null contradict each other, got both; leave one out")
     return validate(value)
@@ -147,6 +157,8 @@ def check_train_options(options: TrainOptions) -> Recipe:
         overrides=options.overrides,
         exposure=options.exposure,
         poses=options.refine_poses,
+        depth_prior=options.depth_prior,
+        normal_prior=options.normal_prior,
     )
     if options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
@@ -180,6 +192,7 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
+    digest = with_priors(digest, scene, recipe, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
         on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
@@ -348,11 +361,12 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         if name == "protocol" and isinstance(old, dict):
             old, value = _training_facts(old), _training_facts(value)
         if name == "recipe" and isinstance(old, dict):
-            old = {"exposure": None, "poses": None, "multiview": None, **old}  # runs of before there were such
+            later = ("exposure", "poses", "multiview", "depth_prior", "normal_prior")
+            old = {**dict.fromkeys(later), **old}  # runs of before there were such
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]
-            name = "scene: its photographs, cameras or points changed"
+            name = "scene: its photographs, cameras, points or maps changed"
         else:
             where = _difference(old, value)
         if old != value:

@@ -26,10 +26,27 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         m = recipe.multiview
         where = f"one of {m.neighbours} nearby views within {m.max_angle:g} degrees"
         yield f"views compared: {m.patches:,} patches of {m.side}x{m.side} px with {where}"
+    yield from _describe_priors(recipe)
     for number, stage in enumerate(recipe.stages, start=1):
         yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
         for line in _describe_stage(stage):
             yield f"     {line}"
+
+
+def _describe_priors(recipe: Recipe) -> Iterator[str]:
+    falls = "weight falls to {0.final:g} of itself over {0.horizon:,} iterations"
+    if recipe.depth_prior is not None:
+        d = recipe.depth_prior
+        fitted = "sparse points" if d.align == "points" else "what is rendered"
+        sources = {
+            "auto": "a sensor's maps, relative maps or sparse points, whichever the capture has first",
+            "sparse": f"sparse points of at least {d.min_track} photographs within {d.max_error:g} px",
+            "sensor": "maps in units of the capture times a factor",
+            "relative": f"maps of unknown scale and shift, fitted to {fitted}",
+        }
+        yield f"known depths: {sources[d.source]}; {falls.format(d)}"
+    if recipe.normal_prior is not None:
+        yield f"known normals: maps ({recipe.normal_prior.axes} axes); {falls.format(recipe.normal_prior)}"
 
 
 def _describe_stage(stage: Stage) -> Iterator[str]:

@@ -19,6 +19,7 @@ from gs2d.pipeline.exposure import Transforms, named
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
 from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.prior_scores import score_priors
 from gs2d.pipeline.restart import Start, put_in_cache
 from gs2d.pipeline.scoring import PeakGpuMemory, PeakMemory, mean_psnr, score_views, split_metrics
 from gs2d.recipe import CloneInPlace, Stage
@@ -219,6 +220,7 @@ class Recorder:
             entry |= split_metrics(scores, split)
         if self._at_entry:
             entry["after_clone"] = self._at_entry
+        entry |= score_priors(self._run, self._job, self._now(self._job.scene.train), state.splats)
         self._draw(stage.name)
         metrics = self._run.metrics()
         stages = [*metrics["stages"][:index], entry]

@@ -18,15 +18,18 @@ from gs2d.exposure import expose, identity
 from gs2d.kernels import adam
 from gs2d.losses import compute_losses
 from gs2d.losses_multiview import Neighbour
+from gs2d.losses_priors import Prior
 from gs2d.protocols import Protocol
 from gs2d.recipe import Recipe, Stage
 from gs2d.recipe_multiview import MULTIVIEW_KINDS
+from gs2d.recipe_priors import PRIOR_KINDS
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
 from gs2d.train.multiview import Photographs, draw_turn, find_neighbours, is_compared
 from gs2d.train.poses import pose_rate
+from gs2d.train.priors import Priors, has_priors
 from gs2d.train.state import TrainState
 from gs2d.train.targets import Target, TargetSource
 
@@ -94,6 +97,7 @@ class WholeViews:
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
             self._photographs = Photographs(scene.train, recipe.multiview)
+        self._priors = Priors(scene, recipe, device=backend.device) if has_priors(recipe) else None
 
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
         """The rasterizer's constants at an iteration (1-based)."""
@@ -162,6 +166,7 @@ class WholeViews:
             trainer looks at losses and parameters together, before anything is reported or saved.
         """
         target = self._targets[index]
+        prior = None if self._priors is None else self._priors.of(index, state.stage, iteration, output.color.dtype)
         transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
         if transform is not None:
             clipped, background = clipped_pixels(target), self._background
@@ -172,13 +177,14 @@ class WholeViews:
             target.image,
             target.mask,
             camera,
-            [t for t in self.protocol.resolve(stage.losses) if neighbour is not None or t.kind not in MULTIVIEW_KINDS],
+            [t for t in self.protocol.resolve(stage.losses) if _can_be_asked(t.kind, neighbour, prior)],
             iteration=iteration,
             depth_kind=self.protocol.depth,
             backend_name=self.backend.name,
             target_cache=target.maps,
             silhouette=target.silhouette,
             neighbour=neighbour,
+            prior=prior,
         )
         if transform is not None:
             assert self.recipe.exposure is not None
@@ -202,6 +208,13 @@ class WholeViews:
         if broken is not None:
             raise diverged(stage, iteration, f"the gradient of {broken}")
         return values, gradients
+
+
+def _can_be_asked(kind: str, neighbour: Neighbour | None, prior: Prior | None) -> bool:
+    """Whether a view has what a loss needs."""
+    if kind in PRIOR_KINDS:
+        return prior is not None and (prior.depth if kind == "depth_prior" else prior.normal) is not None
+    return neighbour is not None or kind not in MULTIVIEW_KINDS
 
 
 def clipped_pixels(target: Target) -> Tensor:

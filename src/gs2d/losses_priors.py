@@ -1,0 +1,193 @@
+"""Losses on depths and normals that are known beforehand: plain torch, any dtype and device (docs/math.md, "Priors").
+
+Depth errors are relative, |z / d - 1| for a rendered depth z and a known one d: the same weight in a scene of any size.
+What is known is constant; nothing here waits for a device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gs2d.losses_reference import masked_mean
+
+LEAST_POINTS = 100  # fewer points than these do not weigh as much as a whole picture
+FIT_PIXELS = 20_000  # of a relative map, at most, that its scale and shift are fitted by
+FIT_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class PointDepths:
+    """Sparse points in a picture.
+
+    Attributes
+    ----------
+    pixels : Tensor [M, 4] int64
+        The four pixels around each point, as places in the flattened picture.
+    weights : Tensor [M, 4]
+        Of their disparities: bilinear, which is exact on a plane.
+    depth : Tensor [M] wu
+    """
+
+    pixels: Tensor
+    weights: Tensor
+    depth: Tensor
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tensors."""
+        return self.pixels.nbytes + self.weights.nbytes + self.depth.nbytes
+
+
+@dataclass(frozen=True, eq=False)
+class KnownDepths:
+    """A depth map in units of the scene.
+
+    Attributes
+    ----------
+    disparity : Tensor [H, W], 1 / wu
+        0 where unknown.
+    known : Tensor [H, W]
+        1 where known, else 0.
+    """
+
+    disparity: Tensor
+    known: Tensor
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tensors."""
+        return self.disparity.nbytes + self.known.nbytes
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeDepths:
+    """A depth map of unknown scale and shift, for want of points fitted to what is rendered.
+
+    Attributes
+    ----------
+    values : Tensor [H, W]
+        Centred on 0 with deviation 1 (whatever the unit was); 0 where unknown.
+    known : Tensor [H, W]
+        1 where known, else 0.
+    space : "disparity" or "depth"
+        What it is linear in.
+    """
+
+    values: Tensor
+    known: Tensor
+    space: str
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tensors."""
+        return self.values.nbytes + self.known.nbytes
+
+
+Depths = PointDepths | KnownDepths | RelativeDepths
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of the view of an iteration.
+
+    Attributes
+    ----------
+    depth : PointDepths, KnownDepths, RelativeDepths or None
+    normal : Tensor [H, W, 3] or None
+        Unit normals in the world; 0 where unknown.
+    opacity : float
+        Least rendered alpha of a pixel whose depth is asked.
+    depth_share, normal_share : float
+        What is left of the weights of the losses.
+    """
+
+    depth: Depths | None = None
+    normal: Tensor | None = None
+    opacity: float = 0.5
+    depth_share: float = 1.0
+    normal_share: float = 1.0
+
+
+def depth_prior(prior: Prior, depth: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean relative error of a rendered depth [H, W], where something is known and something was hit.
+
+    Over all valid pixels for a map, unknown ones counting 0; over the points for points, as if there were LEAST_POINTS
+    at least. ``mask`` [H, W] bool: False = ignore this pixel.
+    """
+    known = prior.depth
+    assert known is not None
+    hit = (alpha.detach() > prior.opacity) & (depth.detach() > 0)
+    hit = hit if mask is None else hit & mask
+    if isinstance(known, PointDepths):
+        error = _of_points(known, depth, hit)
+    else:
+        if isinstance(known, RelativeDepths):
+            known = aligned(known, depth.detach(), hit)
+        error = masked_mean(torch.where(hit, depth * known.disparity - known.known, 0).abs(), mask)
+    return prior.depth_share * error
+
+
+def _of_points(points: PointDepths, depth: Tensor, hit: Tensor) -> Tensor:
+    if len(points.depth) == 0:
+        return depth.sum() * 0
+    at_points = depth.reshape(-1)[points.pixels]  # [M, 4]
+    seen = hit.reshape(-1)[points.pixels].all(dim=1)
+    # Disparity is linear in the picture of a plane, depth is not.
+    z = 1 / (points.weights / torch.where(seen[:, None], at_points, 1)).sum(dim=1)
+    return torch.where(seen, z / points.depth - 1, 0).abs().sum() / max(len(points.depth), LEAST_POINTS)
+
+
+@torch.no_grad()
+def aligned(map_: RelativeDepths, depth: Tensor, hit: Tensor) -> KnownDepths:
+    """A relative map in units of the scene, by a robust fit to a rendered depth [H, W] where that was ``hit``.
+
+    Nothing is known where the fit runs the other way, or where it gives no depth in front of the camera.
+    """
+    stride = max(1, int((depth.numel() / FIT_PIXELS) ** 0.5))
+    values, known, z = (t[::stride, ::stride].reshape(-1) for t in (map_.values, map_.known, depth))
+    usable = known * hit[::stride, ::stride].reshape(-1)
+    z = torch.where(usable > 0, z, 1)
+    scale, shift = fit_line(values, 1 / z if map_.space == "disparity" else z, usable)
+    line = scale * map_.values + shift
+    good = map_.known * ((line > 1e-3 * shift.abs()) & (scale > 0))  # the shift is the value in the middle of the map
+    safe = torch.where(good > 0, line, 1)
+    return KnownDepths(good * (safe if map_.space == "disparity" else 1 / safe), good)
+
+
+def fit_line(x: Tensor, y: Tensor, weights: Tensor, rounds: int = FIT_ROUNDS) -> tuple[Tensor, Tensor]:
+    """Scale and shift [] of y = scale x + shift, by least squares whose weights fall with the error (Cauchy's).
+
+    Parameters
+    ----------
+    x, y, weights : Tensor [M]
+    rounds : int
+        Solutions; the unit of errors is the mean absolute one of the last.
+    """
+    given, tiny = weights, torch.finfo(y.dtype).tiny
+    scale = shift = y.new_zeros(())
+    for _ in range(rounds):
+        total = weights.sum().clamp(min=tiny)
+        mean_x, mean_y = (weights * x).sum() / total, (weights * y).sum() / total
+        dx = x - mean_x
+        scale = (weights * dx * (y - mean_y)).sum() / (weights * dx * dx).sum().clamp(min=tiny)
+        shift = mean_y - scale * mean_x
+        error = (y - scale * x - shift).abs()
+        unit = (given * error).sum() / given.sum().clamp(min=tiny)
+        weights = given / (1 + (error / unit.clamp(min=tiny)) ** 2)
+    return scale, shift
+
+
+def normal_prior(prior: Prior, normal: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean over all valid pixels of alpha - <normal, N>, alpha detached, 0 where no N is known.
+
+    With rendered normals [H, W, 3] = sum w n this is the mean of sum w (1 - <n, N>): 1 - cosine, by blending weight.
+    """
+    known = prior.normal
+    assert known is not None
+    there = (known != 0).any(dim=2)
+    there = there if mask is None else there & mask
+    value = alpha.detach() - (torch.where(there[..., None], normal, 0) * known).sum(dim=2)
+    return prior.normal_share * masked_mean(torch.where(there, value, 0), mask)

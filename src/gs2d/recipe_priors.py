@@ -1,0 +1,116 @@
+"""What a recipe says about depths and normals that are known beforehand. Pure Python; never imports torch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gs2d.recipe_checks import integer, number, one_of, require
+
+PRIOR_KINDS = ("depth_prior", "normal_prior")
+"""Losses that need something known beforehand of a view."""
+SOURCES = ("auto", "sparse", "sensor", "relative")
+SPACES = ("auto", "disparity", "depth")
+ALIGNMENTS = ("points", "rendered")
+AXES = ("auto", "opencv", "opengl")
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """Where known depths come from and how far they are trusted (``train/priors.py``, ``losses_priors.py``).
+
+    Attributes
+    ----------
+    source : str
+        "sparse": points of the reconstruction that found the cameras; "sensor": depth maps in units of the capture
+        times a factor; "relative": depth maps of unknown scale and shift, one of each a view; "auto": by what the
+        capture has.
+    final, horizon : float, int
+        The weight of the loss falls log-linearly to this share of itself over so many iterations of the run, all
+        stages counted: photographs know better in the end.
+    opacity : float
+        Least rendered alpha of a pixel whose depth is asked.
+    min_track : int
+        Least photographs that a sparse point was found in.
+    max_error : float
+        px. Largest mean reprojection error of a sparse point.
+    unit : float or None
+        wu of a value 1 in a sensor's map. None: what the capture says, else a thousandth for whole numbers and 1 for
+        others, and, where cameras come from photographs, whose scale is arbitrary, what fits the sparse points.
+    space : str
+        What relative maps are linear in: "disparity" (1 / depth, larger is nearer) or "depth"; "auto": what fits the
+        sparse points better.
+    align : str
+        What scale and shift of a relative map are fitted to: the sparse "points" in it (where they are too few, and in
+        captures without any, what is rendered), or always what is "rendered", anew in each iteration.
+    """
+
+    source: str = "auto"
+    final: float = 0.01
+    horizon: int = 30_000
+    opacity: float = 0.5
+    min_track: int = 3
+    max_error: float = 2.0
+    unit: float | None = None
+    space: str = "auto"
+    align: str = "points"
+
+    def share_at(self, iteration: int) -> float:
+        """Share of the weight at an iteration of the run (1-based)."""
+        return _decayed(self.final, iteration / self.horizon)
+
+
+@dataclass(frozen=True)
+class NormalPrior:
+    """How normal maps of the photographs are read, and how far they are trusted.
+
+    Attributes
+    ----------
+    axes : str
+        Of the maps, in the camera's frame: "opencv" (x right, y down, z forward), "opengl" (x right, y up, z back), or
+        "auto": in which a surface that is seen faces the camera.
+    final, horizon : float, int
+        As of :class:`DepthPrior`.
+    """
+
+    axes: str = "auto"
+    final: float = 0.01
+    horizon: int = 30_000
+
+    def share_at(self, iteration: int) -> float:
+        """Share of the weight at an iteration of the run (1-based)."""
+        return _decayed(self.final, iteration / self.horizon)
+
+
+def _decayed(final: float, share: float) -> float:
+    """From 1 to ``final``, log-linear in [0, 1]."""
+    return math.exp(min(max(share, 0.0), 1.0) * math.log(final))
+
+
+def check_priors(where: str, depth: DepthPrior | None, normal: NormalPrior | None, kinds: Sequence[str]) -> None:
+    """Raise RecipeError for a value that cannot be trained with, losses (their kinds) that lack it, or none for it."""
+    for name, value in (("depth_prior", depth), ("normal_prior", normal)):
+        at, asked = f"{where}: {name}", name in kinds
+        require(value is not None or not asked, f"{at} is null, but loss {name!r} needs it; take a recipe without it")
+        if value is None:
+            continue
+        option = name.replace("_", "-")
+        require(asked, f"{at} is set, but no loss is {name!r}; take a recipe made with --{option}")
+        share = number(f"{at}.final", value.final, low=0.0)
+        require(0 < share <= 1, f"{at}.final must be in (0, 1], got {share}")
+        integer(f"{at}.horizon", value.horizon, low=1)
+    if normal is not None:
+        one_of(f"{where}: normal_prior.axes", normal.axes, AXES)
+    if depth is None:
+        return
+    at = f"{where}: depth_prior"
+    one_of(f"{at}.source", depth.source, SOURCES)
+    one_of(f"{at}.space", depth.space, SPACES)
+    one_of(f"{at}.align", depth.align, ALIGNMENTS)
+    opacity = number(f"{at}.opacity", depth.opacity, low=0.0)
+    require(opacity < 1, f"{at}.opacity must be below 1, which no rendering reaches, got {opacity}")
+    integer(f"{at}.min_track", depth.min_track, low=2)
+    require(number(f"{at}.max_error", depth.max_error, low=0.0) > 0, f"{at}.max_error must be positive, got 0")
+    if depth.unit is not None:
+        require(number(f"{at}.unit", depth.unit, low=0.0) > 0, f"{at}.unit must be positive, got 0")

@@ -1,0 +1,334 @@
+"""What is known beforehand of the training views: sparse points, depth maps in units of the scene, normals.
+
+Nothing here is part of the state: all of it follows from the capture and the recipe, so a resume knows the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gs2d.data.prior_maps import DepthMap, ObservedPoints
+from gs2d.data.scene import Scene, View
+from gs2d.errors import DataError
+from gs2d.losses_priors import Depths, KnownDepths, PointDepths, Prior, RelativeDepths, fit_line
+from gs2d.recipe import Recipe
+from gs2d.recipe_priors import DepthPrior, NormalPrior
+
+FIT_POINTS = 10  # in a map, at least, for its scale and shift
+ASKED_VIEWS = 20  # that say what a capture's maps are: their unit, their space
+FACING = 0.9  # share of normals that must face the camera
+
+
+def has_priors(recipe: Recipe) -> bool:
+    """Whether a recipe asks for something known beforehand."""
+    return recipe.depth_prior is not None or recipe.normal_prior is not None
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPlan:
+    """How the known depths of a capture are read.
+
+    Attributes
+    ----------
+    source : "sparse", "sensor" or "relative"
+    observed : ObservedPoints or None
+        None where they are not needed, or unknown.
+    unit : float or None
+        wu of a value 1 of all sensor maps; None: each file's own.
+    space : "disparity" or "depth"
+        What relative maps are linear in.
+    """
+
+    source: str
+    observed: ObservedPoints | None = None
+    unit: float | None = None
+    space: str = "disparity"
+
+
+def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
+    """Find out what a capture has, and how it is read.
+
+    Raises
+    ------
+    DataError
+        It has nothing of what is asked for.
+    """
+    mapped = [view for view in scene.train if view.maps is not None and view.maps.files.depth is not None]
+    source = settings.source
+    if source == "auto":
+        metric = any(view.maps is not None and view.maps.files.metric for view in mapped)
+        source = "sensor" if metric else "relative" if mapped else "sparse"
+    if source == "sparse":
+        if scene.observe is None:
+            raise DataError(
+                f"{scene.name} must say which sparse points its photographs show (COLMAP does), or have depth maps in "
+                "depths/ or depth_file_path, for known depths; got neither: train without --depth-prior"
+            )
+        found = scene.observe()
+        if not any(len(points_in(view, found, settings).depth) for view in scene.train):
+            raise DataError(
+                f"no training view of {scene.name} shows a sparse point of {settings.min_track} photographs or more "
+                f"with an error up to {settings.max_error:g} px; --set depth_prior.min_track=2 takes more"
+            )
+        return DepthPlan(source, found)
+    if not mapped:
+        raise DataError(
+            f"no training view of {scene.name} has a depth map; put them in {scene.root}/depths under the names of the "
+            "photographs (16-bit PNG or .npy), or name them as depth_file_path in transforms.json"
+        )
+    from_photographs = scene.format in ("colmap", "dtu")
+    asks = settings.unit is None and from_photographs if source == "sensor" else settings.align == "points"
+    observed = scene.observe() if asks and scene.observe is not None else None
+    if source == "sensor":
+        return DepthPlan(source, observed, settings.unit or _fitted_unit(mapped, observed, settings))
+    space = settings.space if settings.space != "auto" else _fitted_space(mapped, observed, settings)
+    return DepthPlan(source, observed, space=space)
+
+
+def _asked(mapped: list[View]) -> list[View]:
+    """Some of the views, spread evenly."""
+    return mapped[:: max(1, -(-len(mapped) // ASKED_VIEWS))]
+
+
+def _fitted_unit(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> float | None:
+    """What brings the maps to the points; None without points.
+
+    Raises
+    ------
+    DataError
+        Too few points lie on known pixels.
+    """
+    if observed is None:
+        return None
+    ratios = [depth / values for depth, values in (_pairs(view, observed, settings) for view in _asked(mapped))]
+    found = np.concatenate(ratios)
+    if len(found) < FIT_POINTS:
+        raise DataError(
+            f"the scale of the depth maps needs {FIT_POINTS} sparse points on known pixels, got {len(found)}; say it: "
+            "--set depth_prior.unit=... (units of the capture for a value of 1)"
+        )
+    return float(np.median(found))
+
+
+def _fitted_space(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> str:
+    """What the maps are linear in, by the median error of lines through the points; disparity without points."""
+    errors: dict[str, list[float]] = {"disparity": [], "depth": []}
+    for view in _asked(mapped) if observed is not None else ():
+        assert observed is not None
+        depth, values = _pairs(view, observed, settings)
+        for space, found in errors.items():
+            line = line_of(values, depth, space)
+            if line is None:
+                found.append(np.inf)
+                continue
+            on_line = line[0] * values + line[1]
+            with np.errstate(divide="ignore"):
+                z = 1 / np.maximum(on_line, 0) if space == "disparity" else on_line
+            found.append(float(np.median(np.abs(z / depth - 1))))
+    return "depth" if errors["depth"] and np.median(errors["depth"]) < np.median(errors["disparity"]) else "disparity"
+
+
+def _pairs(view: View, observed: ObservedPoints, settings: DepthPrior) -> tuple[np.ndarray, np.ndarray]:
+    """Depths [M] of the points of a view that lie on known pixels of its map, and the map's values there."""
+    assert view.maps is not None
+    return _values_at(points_in(view, observed, settings), view.maps.depth())
+
+
+def _values_at(points: PointsInView, map_: DepthMap) -> tuple[np.ndarray, np.ndarray]:
+    columns, rows = np.floor(points.pixels).astype(np.int64).T
+    values = map_.values[rows, columns].astype(np.float64)
+    return points.depth[values > 0], values[values > 0]
+
+
+def line_of(values: np.ndarray, depth: np.ndarray, space: str) -> tuple[float, float] | None:
+    """Scale > 0 and shift of a map's values to disparities or depths of points; None where there is no such line."""
+    if len(values) < FIT_POINTS:
+        return None
+    middle, spread = values.mean(), values.std()
+    if not spread > 1e-9 * abs(middle):
+        return None
+    x, y = torch.from_numpy((values - middle) / spread), torch.from_numpy(1 / depth if space == "disparity" else depth)
+    scale, shift = (float(number) for number in fit_line(x, y, torch.ones_like(x), rounds=20))
+    return (scale / spread, shift - scale * middle / spread) if scale > 0 else None
+
+
+@dataclass(frozen=True, eq=False)
+class PointsInView:
+    """Sparse points in a picture: ``pixels`` [M, 2] px and ``depth`` [M] wu."""
+
+    pixels: np.ndarray
+    depth: np.ndarray
+
+
+def points_in(view: View, observed: ObservedPoints, settings: DepthPrior) -> PointsInView:
+    """The points that a view was found to show, as far as the settings trust them, inside the outer pixel centres."""
+    rows = observed.seen.get(view.name, np.zeros(0, dtype=np.int64))
+    trusted = (observed.track[rows] >= settings.min_track) & (observed.error[rows] <= settings.max_error)
+    xyz = observed.points[rows[trusted]]
+    pixels, depth = view.camera.project(xyz[np.isfinite(xyz).all(axis=1)])
+    camera = view.camera
+    inside = (pixels >= 0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
+    inside &= depth > 0
+    return PointsInView(pixels[inside], depth[inside])
+
+
+class Priors:
+    """What is known of each training view, where the splats are; the first that fit in ``limit_bytes`` are kept.
+
+    Raises
+    ------
+    DataError
+        From the constructor, where a capture has nothing of what the recipe asks for.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        *,
+        device: torch.device | str = "cpu",
+        limit_bytes: int = 1 << 30,
+    ) -> None:
+        self._views, self._recipe, self._device = scene.train, recipe, device
+        self._room = limit_bytes
+        self._kept: dict[int, tuple[Depths | None, torch.Tensor | None]] = {}
+        self.plan = None if recipe.depth_prior is None else plan_depths(scene, recipe.depth_prior)
+        self.axes = None if recipe.normal_prior is None else plan_normals(scene, recipe.normal_prior)
+
+    def of(self, index: int, stage: int, iteration: int, dtype: torch.dtype) -> Prior:
+        """What is known of view ``index`` in an iteration (from 1) of a stage."""
+        recipe = self._recipe
+        depth, normal = self.known(index, dtype)
+        of_run = sum(earlier.iterations for earlier in recipe.stages[:stage]) + iteration
+        return Prior(
+            depth,
+            normal,
+            opacity=0.0 if recipe.depth_prior is None else recipe.depth_prior.opacity,
+            depth_share=0.0 if recipe.depth_prior is None else recipe.depth_prior.share_at(of_run),
+            normal_share=0.0 if recipe.normal_prior is None else recipe.normal_prior.share_at(of_run),
+        )
+
+    def known(self, index: int, dtype: torch.dtype) -> tuple[Depths | None, torch.Tensor | None]:
+        """Depths and normals [H, W, 3] (world) that are known of view ``index``, kept where there is room."""
+        kept = self._kept.get(index)
+        if kept is not None:
+            return kept
+        view = self._views[index]
+        depth = normal = None
+        if self.plan is not None:
+            assert self._recipe.depth_prior is not None
+            depth = known_depths(view, self.plan, self._recipe.depth_prior, dtype, self._device)
+        if self.axes is not None and view.maps is not None and view.maps.files.normal is not None:
+            normal = world_normals(view, self.axes, dtype).to(self._device)
+        nbytes = (0 if depth is None else depth.nbytes) + (0 if normal is None else normal.nbytes)
+        if nbytes <= self._room:
+            self._room -= nbytes
+            self._kept[index] = depth, normal
+        return depth, normal
+
+
+def known_depths(
+    view: View,
+    plan: DepthPlan,
+    settings: DepthPrior,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Depths | None:
+    """The known depths of a view; None where it has none."""
+
+    def tensor(array: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(array).to(device, dtype)
+
+    if plan.source == "sparse":
+        assert plan.observed is not None
+        points = points_in(view, plan.observed, settings)
+        pixels, weights, depth = _around(points, view.camera.width)
+        return PointDepths(torch.as_tensor(pixels).to(device), tensor(weights), tensor(depth)) if len(depth) else None
+    if view.maps is None or view.maps.files.depth is None:
+        return None
+    map_ = view.maps.depth()
+    values = map_.values.astype(np.float64)
+    known = values > 0
+    if not known.any():
+        return None
+    safe = np.where(known, values, 1)
+    if plan.source == "sensor":
+        unit = plan.unit or view.maps.files.unit or (1e-3 if map_.whole else 1.0)
+        return KnownDepths(tensor(known / (safe * unit)), tensor(known))
+    line = None
+    if plan.observed is not None:
+        depth, there = _values_at(points_in(view, plan.observed, settings), map_)
+        line = line_of(there, depth, plan.space)
+    if line is None:
+        middle, spread = values[known].mean(), values[known].std()
+        centred = np.where(known, (values - middle) / (spread if spread > 1e-9 * middle else 1), 0)
+        return RelativeDepths(tensor(centred), tensor(known), plan.space)
+    on_line = line[0] * safe + line[1]
+    good = known & (on_line > 1e-3 * np.median(on_line[known]))  # what is not has no depth in front of the camera
+    safe = np.where(good, on_line, 1)
+    return KnownDepths(tensor(good * (safe if plan.space == "disparity" else 1 / safe)), tensor(good))
+
+
+def _around(points: PointsInView, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The four pixels around each point [M, 4], their bilinear weights, and the depths [M]."""
+    at = points.pixels - 0.5
+    left, top = np.floor(at).astype(np.int64).T
+    u, v = (at - np.floor(at)).T
+    pixels = np.stack([top * width + left, top * width + left + 1, (top + 1) * width + left], axis=1)
+    pixels = np.concatenate([pixels, pixels[:, 2:] + 1], axis=1)
+    weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], axis=1)
+    return pixels, weights, points.depth
+
+
+# -- normals -------------------------------------------------------------------------------------------------------
+def plan_normals(scene: Scene, settings: NormalPrior) -> str:
+    """The axes of a capture's normal maps: "opencv" or "opengl".
+
+    Raises
+    ------
+    DataError
+        There are none, or they do not face the camera.
+    """
+    mapped = [view for view in scene.train if view.maps is not None and view.maps.files.normal is not None]
+    if not mapped:
+        raise DataError(
+            f"no training view of {scene.name} has a normal map; put them in {scene.root}/normals under the names of "
+            "the photographs (RGB of (n + 1) / 2, in the camera's frame), or leave out --normal-prior"
+        )
+    shares = {"opencv": [], "opengl": []}  # type: dict[str, list[float]]
+    for view in _asked(mapped):
+        assert view.maps is not None
+        normals = view.maps.normal()
+        for axes, found in shares.items():
+            facing = (_in_opencv(normals, axes) * rays(view)).sum(axis=2)[(normals != 0).any(axis=2)] < 0
+            found.append(float(facing.mean()) if facing.size else 1.0)
+    means = {axes: float(np.mean(found)) for axes, found in shares.items()}
+    chosen = max(means, key=means.__getitem__) if settings.axes == "auto" else settings.axes
+    if means[chosen] < FACING:
+        raise DataError(
+            f"normals of what is seen must face the camera; in the axes {chosen}, {means[chosen]:.0%} of those of "
+            f"{scene.name} do: are they in the camera's frame? (--set normal_prior.axes=opencv or opengl)"
+        )
+    return chosen
+
+
+def rays(view: View) -> np.ndarray:
+    """Directions (x, y, 1) of the pixels of a view [H, W, 3], OpenCV axes."""
+    camera = view.camera
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=2)
+
+
+def _in_opencv(normals: np.ndarray, axes: str) -> np.ndarray:
+    return normals * np.array((1, -1, -1) if axes == "opengl" else (1, 1, 1), dtype=np.float32)
+
+
+def world_normals(view: View, axes: str, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    """Known normals of a view in the world [H, W, 3]; 0 where unknown."""
+    assert view.maps is not None
+    normals = _in_opencv(view.maps.normal(), axes) @ view.camera.rotation
+    return torch.as_tensor(normals).to(dtype)

@@ -1,0 +1,173 @@
+"""Runs with known depths and normals: from the option to the run folder and the report, resumed, refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ball_runs import SMALL, Stop, comparable, options
+from gs2d.errors import DataError, RecipeError
+from gs2d.io.run import REPORT, RunFolder
+from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.prepare import build_recipe, prepare
+from gs2d.pipeline.train import train
+from tiny import RADIUS, SIZE, ball_cameras
+
+EAGER = (*SMALL, "depth_prior.opacity=0.05")
+
+
+@pytest.fixture(scope="module")
+def known(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ball with a sensor's depth maps in thousandths, and normals."""
+    folder = tmp_path_factory.mktemp("data") / "known"
+    shutil.copytree(capture, folder)
+    for split in ("depths", "normals"):
+        (folder / split / "train").mkdir(parents=True)
+    for i, camera in enumerate(ball_cameras(6)):
+        rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+        rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], -1)
+        center = camera.T_cam_world[:3, 3]  # of the ball, in the camera
+        a, b, c = (rays**2).sum(-1), rays @ center, center @ center - RADIUS**2
+        hit = b * b > a * c
+        z = np.where(hit, (b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, 0)
+        Image.fromarray(np.rint(1000 * z).astype(np.uint16)).save(folder / "depths" / "train" / f"r_{i}.png")
+        normals = (rays * z[..., None] - center) / RADIUS * (1, -1, -1)
+        encoded = np.where(hit[..., None], np.rint(127.5 * (normals + 1)), 0)
+        Image.fromarray(encoded.astype(np.uint8)).save(folder / "normals" / "train" / f"r_{i}.png")
+    return folder
+
+
+def knowing(capture: Path, out: Path, **changes: Any) -> TrainOptions:
+    made = options(capture, out, depth_prior="sensor", normal_prior=True, overrides=EAGER)
+    return replace(made, **changes)
+
+
+@pytest.fixture(scope="module")
+def run(known: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return train(knowing(known, tmp_path_factory.mktemp("runs") / "known"))
+
+
+def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
+    logged = [line["losses"] for line in run.events.read() if line["kind"] == "step"]
+    assert any(losses.get("depth_prior", 0) > 0 for losses in logged)
+    assert any(losses.get("normal_prior", 0) > 0 for losses in logged)
+    for stage in run.metrics()["stages"]:
+        assert 0 < stage["depth_prior"]["median"] < 1
+        assert 0 < stage["normal_prior"]["median"] < 180
+        assert len(stage["depth_prior"]["by_view"]) == 6
+        assert [view["name"] for view in stage["priors_shown"]] == [f"train/r_{k}.png" for k in (1, 3, 5)]
+    drawn = sorted(path.name for path in (run.path / "renders" / "priors").iterdir())
+    kinds = ("depth", "known-depth", "known-normal", "normal")
+    assert drawn == [f"train__r_{k}.{kind}.png" for k in (1, 3, 5) for kind in kinds]
+    report = run.file(REPORT).read_text()
+    assert "What was known of the photographs" in report
+    assert "rendered and known depth differ by" in report
+    assert "rendered normals" in report
+
+
+def test_a_run_without_priors_says_nothing_about_them(undisturbed: RunFolder) -> None:
+    assert not (undisturbed.path / "renders" / "priors").exists()
+    assert "What was known" not in undisturbed.file(REPORT).read_text()
+    assert not any("prior" in key for stage in undisturbed.metrics()["stages"] for key in stage)
+
+
+def test_a_stopped_run_resumes_to_the_same_bytes(run: RunFolder, known: Path, tmp_path: Path) -> None:
+    def listen(event: Event) -> None:
+        if isinstance(event, Step) and event.done >= 21 and "loss" in event.detail:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(knowing(known, tmp_path / "run"), listen)
+    assert comparable(train(knowing(known, tmp_path / "run", resume=True))) == comparable(run)
+
+
+def test_what_is_known_decides_which_stages_are_shared_and_is_said(known: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    job = prepare(knowing(known, tmp_path / "a"), lambda e: said.append(e.text) if isinstance(e, Notice) else None)
+    assert "known depths: maps of a sensor in 6 of 6 training views, 4" in " ".join(said)
+    assert "known normals: 6 of 6 training views, axes opengl" in said
+    assert "depth maps: 6 of 8 views have one in depths (--depth-prior uses them)" in said
+    plain = prepare(options(known, tmp_path / "b"), ignore)
+    assert job.stage_key(0) != plain.stage_key(0)
+    changed = tmp_path / "changed"
+    shutil.copytree(known, changed)
+    path = changed / "depths" / "train" / "r_0.png"
+    values = np.array(Image.open(path))
+    values[values > 0] += 1
+    Image.fromarray(values).save(path)
+    assert prepare(knowing(changed, tmp_path / "c"), ignore).pictures_digest != job.pictures_digest
+    assert prepare(options(changed, tmp_path / "d"), ignore).pictures_digest == plain.pictures_digest
+
+
+def test_maps_of_a_run_that_is_resumed_must_be_the_same(known: Path, tmp_path: Path) -> None:
+    from gs2d.errors import RunError
+
+    changed = tmp_path / "changed"
+    shutil.copytree(known, changed)
+
+    def listen(event: Event) -> None:
+        if isinstance(event, Step) and event.done >= 10 and "loss" in event.detail:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(knowing(changed, tmp_path / "run"), listen)
+    (changed / "depths" / "train" / "r_0.png").unlink()
+    with pytest.raises(RunError, match="its photographs, cameras, points or maps changed"):
+        train(knowing(changed, tmp_path / "run", resume=True))
+
+
+@pytest.mark.parametrize("source", ["auto", "relative"])
+def test_relative_maps_without_points_are_fitted_to_what_is_rendered(known: Path, tmp_path: Path, source: str) -> None:
+    said: list[str] = []
+    made = knowing(known, tmp_path / "run", depth_prior=source, normal_prior=False, recipe="2dgs")
+    found = train(made, lambda event: said.append(event.text) if isinstance(event, Notice) else None)
+    assert any("scale and shift by what is rendered in 6" in text for text in said)
+    assert found.metrics()["stages"][-1]["depth_prior"]["median"] >= 0
+
+
+def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(known: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(known, broken)
+    Image.fromarray(np.zeros((SIZE, SIZE, 3), np.uint8)).save(broken / "depths" / "train" / "r_4.png")
+    with pytest.raises(DataError, match=r"r_4.png must be a grey image of 16 bits"):
+        train(knowing(broken, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+    train(options(broken, tmp_path / "plain"))  # nobody asks for them
+
+
+def test_a_capture_without_depths_is_refused_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="or have depth maps in depths/ or depth_file_path"):
+        train(options(capture, tmp_path / "run", depth_prior="auto"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_option_is_the_named_recipe_and_takes_a_source() -> None:
+    rest: dict[str, Any] = {"schedule_scale": 0.1, "seed": 3, "overrides": ()}
+    flagged = build_recipe("2dgs-r", depth_prior="auto", **rest)
+    assert flagged == build_recipe("2dgs-r-depth", **rest)
+    assert flagged == build_recipe("2dgs-r-depth", depth_prior="auto", **rest)
+    assert flagged.depth_prior is not None
+    assert flagged.depth_prior.horizon == 3000
+    chosen = build_recipe("2dgs-r-depth", depth_prior="sparse", **rest).depth_prior
+    assert chosen == replace(flagged.depth_prior, source="sparse")
+    assert [any(t.kind == "depth_prior" for t in s.losses) for s in flagged.stages] == [True, False, True]
+    with pytest.raises(RecipeError, match="depth_prior is null, but loss 'depth_prior' needs it"):
+        build_recipe("2dgs", depth_prior="auto", **{**rest, "overrides": ("depth_prior=null",)})
+
+
+def test_a_run_made_before_there_were_priors_is_resumed(undisturbed: RunFolder, capture: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "old"
+    shutil.copytree(undisturbed.path, copy)
+    definition = json.loads((copy / "run.json").read_text())
+    assert definition["recipe"].pop("depth_prior", "absent") is None
+    assert definition["recipe"].pop("normal_prior", "absent") is None
+    (copy / "run.json").write_text(json.dumps(definition))
+    assert comparable(train(options(capture, copy, resume=True))) == comparable(undisturbed)

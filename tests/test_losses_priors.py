@@ -1,0 +1,184 @@
+"""Losses on known depths and normals: values worked by hand, gradients, fits of relative maps."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d.errors import RecipeError
+from gs2d.losses import compute_losses
+from gs2d.losses_priors import (
+    LEAST_POINTS,
+    Depths,
+    KnownDepths,
+    PointDepths,
+    Prior,
+    RelativeDepths,
+    aligned,
+    depth_prior,
+    fit_line,
+    normal_prior,
+)
+from gs2d.recipe import LossTerm
+from loss_images import make_camera, make_output
+
+HIT = torch.ones(4, 5, dtype=torch.float64)
+
+
+def known(depth: Tensor) -> KnownDepths:
+    """A map that knows the depths above 0."""
+    there = (depth > 0).to(depth)
+    return KnownDepths(there / torch.where(depth > 0, depth, 1), there)
+
+
+def points(pixels: list[list[int]], weights: list[list[float]], depth: list[float]) -> PointDepths:
+    return PointDepths(torch.tensor(pixels), torch.tensor(weights).double(), torch.tensor(depth).double())
+
+
+# -- values ---------------------------------------------------------------------------------------------------------
+def test_a_map_counts_relative_errors_over_all_pixels_and_unknown_ones_as_none() -> None:
+    depth, truth = torch.full((4, 5), 2.0).double(), torch.zeros(4, 5).double()
+    truth[0, 0], truth[1, 2], truth[3, 4] = 1.0, 2.0, 4.0  # errors 1, 0, 1/2; 17 pixels unknown
+    loss = depth_prior(Prior(known(truth)), depth, HIT)
+    assert loss.item() == pytest.approx(1.5 / 20)
+    assert depth_prior(Prior(known(truth), depth_share=0.25), depth, HIT).item() == pytest.approx(0.25 * 1.5 / 20)
+
+
+def test_pixels_that_are_hardly_covered_are_not_asked() -> None:
+    depth, alpha = torch.full((4, 5), 2.0).double(), HIT.clone()
+    alpha[0, 0], depth[1, 1] = 0.4, 0.0  # too thin, nothing hit
+    loss = depth_prior(Prior(known(torch.ones(4, 5).double()), opacity=0.5), depth, alpha)
+    assert loss.item() == pytest.approx(18 / 20)
+
+
+def test_a_point_between_pixels_is_compared_with_the_plane_through_them() -> None:
+    # On a plane disparity is linear: 1/2 and 1/4 at the pixels, 3/8 in the middle, so z = 8/3.
+    depth = torch.full((2, 2), 2.0).double()
+    depth[:, 1] = 4.0
+    middle = points([[0, 1, 2, 3]], [[0.25] * 4], [2.0])
+    assert depth_prior(Prior(middle), depth, HIT[:2, :2]).item() == pytest.approx((8 / 3 / 2 - 1) / LEAST_POINTS)
+
+
+def test_many_points_weigh_as_much_as_a_whole_picture_and_few_less() -> None:
+    depth = torch.full((2, 2), 2.0).double()
+    for count, expected in ((LEAST_POINTS // 2, 0.5), (LEAST_POINTS, 1.0), (3 * LEAST_POINTS, 1.0)):
+        many = points([[0, 1, 2, 3]] * count, [[1.0, 0, 0, 0]] * count, [1.0] * count)
+        assert depth_prior(Prior(many), depth, HIT[:2, :2]).item() == pytest.approx(expected)
+
+
+def test_a_point_at_the_edge_of_what_was_hit_is_not_asked() -> None:
+    depth, alpha = torch.full((2, 2), 2.0).double(), HIT[:2, :2].clone()
+    alpha[1, 1] = 0.0
+    asked = points([[0, 1, 2, 3], [0, 1, 2, 2]], [[0.25] * 4] * 2, [1.0, 1.0])
+    assert depth_prior(Prior(asked), depth, alpha).item() == pytest.approx(1 / LEAST_POINTS)
+    assert depth_prior(Prior(points([], [], [])), depth, alpha).item() == 0
+
+
+def test_normals_cost_one_minus_their_cosine_by_blending_weight() -> None:
+    normal, truth = torch.zeros(2, 2, 3).double(), torch.zeros(2, 2, 3).double()
+    alpha = torch.tensor([[1.0, 0.8], [0.5, 1.0]]).double()
+    normal[0, 0], truth[0, 0] = torch.tensor([0, 0, 1.0]), torch.tensor([0, 0, 1.0])  # 0
+    normal[0, 1], truth[0, 1] = torch.tensor([0.8, 0, 0]), torch.tensor([0, 1.0, 0])  # 0.8 (1 - 0)
+    normal[1, 0], truth[1, 0] = torch.tensor([0, 0, -0.5]), torch.tensor([0, 0, 1.0])  # 0.5 (1 + 1)
+    normal[1, 1] = torch.tensor([1.0, 0, 0])  # unknown
+    assert normal_prior(Prior(normal=truth), normal, alpha).item() == pytest.approx((0.8 + 1.0) / 4)
+
+
+# -- gradients ------------------------------------------------------------------------------------------------------
+def priors() -> dict[str, Depths]:
+    g = torch.Generator().manual_seed(4)
+    truth = 1 + torch.rand(6, 7, generator=g).double()
+    truth[torch.rand(6, 7, generator=g) < 0.2] = 0
+    at = torch.randint(0, 34, (9, 1), generator=g) + torch.tensor([0, 1, 7, 8])
+    weights = torch.rand(9, 4, generator=g).double()
+    weights /= weights.sum(dim=1, keepdim=True)
+    return {
+        "map": known(truth),
+        "points": PointDepths(at, weights, 1 + torch.rand(9, generator=g).double()),
+    }
+
+
+@pytest.mark.parametrize("kind", ["map", "points"])
+def test_gradients_of_depths_are_those_of_finite_differences(kind: str) -> None:
+    output = make_output(6, 7, seed=1)
+    prior = Prior(priors()[kind], depth_share=0.3)
+    assert torch.autograd.gradcheck(lambda z: depth_prior(prior, z, output.alpha), (output.depth_mean,), atol=1e-7)
+
+
+def test_gradients_of_normals_are_those_of_finite_differences() -> None:
+    output = make_output(6, 7, seed=2)
+    truth = torch.nn.functional.normalize(make_output(6, 7, seed=3).normal.detach(), dim=2)
+    truth[2, 3] = 0
+    prior = Prior(normal=truth)
+    assert torch.autograd.gradcheck(lambda n: normal_prior(prior, n, output.alpha), (output.normal,), atol=1e-7)
+
+
+def test_no_gradient_goes_into_alpha_or_into_the_fit_of_a_relative_map() -> None:
+    output, truth = make_output(6, 7), torch.rand(6, 7).double()
+    relative = RelativeDepths(truth, torch.ones_like(truth), "disparity")
+    (with_fit,) = torch.autograd.grad(
+        depth_prior(Prior(relative), output.depth_mean, output.alpha), [output.depth_mean], retain_graph=True
+    )
+    hit = (output.alpha > 0.5) & (output.depth_mean > 0)
+    fixed = aligned(relative, output.depth_mean.detach(), hit)
+    (constant,) = torch.autograd.grad(depth_prior(Prior(fixed), output.depth_mean, output.alpha), [output.depth_mean])
+    assert torch.equal(with_fit, constant)
+    loss = depth_prior(Prior(relative), output.depth_mean, output.alpha)
+    assert torch.autograd.grad(loss, [output.alpha], allow_unused=True) == (None,)
+
+
+# -- relative maps --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("space", ["disparity", "depth"])
+def test_a_relative_map_of_the_very_surface_costs_nothing(space: str) -> None:
+    depth = 1 + torch.rand(12, 13, generator=torch.Generator().manual_seed(0)).double()
+    values = 0.3 * (1 / depth if space == "disparity" else depth) + 0.2
+    relative = RelativeDepths(values, torch.ones_like(values), space)
+    assert depth_prior(Prior(relative), depth, torch.ones_like(depth)).item() == pytest.approx(0, abs=1e-12)
+
+
+def test_a_fifth_of_wrong_pixels_hardly_moves_the_fit() -> None:
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(500, generator=g).double()
+    y = 2 * x + 1
+    y[:100] += 5 * torch.rand(100, generator=g).double()
+    scale, shift = fit_line(x, y, torch.ones_like(x), rounds=20)
+    assert scale.item() == pytest.approx(2, abs=0.02)
+    assert shift.item() == pytest.approx(1, abs=0.04)
+    plain, _ = fit_line(x, y, torch.ones_like(x), rounds=1)
+    assert abs(plain.item() - 2) > 0.1
+
+
+def test_a_map_that_runs_the_other_way_says_nothing() -> None:
+    depth = 1 + torch.rand(12, 13).double()
+    relative = RelativeDepths(depth, torch.ones_like(depth), "disparity")  # larger where farther: no disparity
+    assert aligned(relative, depth, depth > 0).known.sum() == 0
+    assert depth_prior(Prior(relative), depth, torch.ones_like(depth)).item() == 0
+
+
+def test_where_nothing_was_hit_nothing_breaks() -> None:
+    nothing, relative = torch.zeros(4, 5).double().requires_grad_(), torch.rand(4, 5).double()
+    for prior in (known(HIT), RelativeDepths(relative, HIT, "depth"), points([[0, 1, 5, 6]], [[0.25] * 4], [1.0])):
+        loss = depth_prior(Prior(prior), nothing, torch.zeros(4, 5))
+        assert loss.item() == 0
+        (gradient,) = torch.autograd.grad(loss, [nothing])
+        assert (gradient == 0).all()
+
+
+# -- as losses of a recipe ------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", ["depth_prior", "normal_prior"])
+def test_a_loss_without_what_it_compares_with_is_refused(kind: str) -> None:
+    output, camera = make_output(6, 7), make_camera(7, 6)
+    for prior in (None, Prior()):
+        with pytest.raises(RecipeError, match=f"loss '{kind}' needs known .*, got none"):
+            compute_losses(
+                output,
+                torch.rand(6, 7, 3),
+                None,
+                camera,
+                [LossTerm(kind, 0.1)],
+                iteration=1,
+                depth_kind="mean",
+                backend_name="reference",
+                prior=prior,
+            )

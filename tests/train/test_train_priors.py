@@ -1,0 +1,311 @@
+"""Training with what is known of the views: what is read, how maps are fitted, that depths move, resume."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from test_train_resume import reload, saved
+from train_toys import SIZE, random_splats, same, short
+
+from gs2d.data.prior_maps import DepthMap, MapFiles, ObservedPoints
+from gs2d.data.scene import Scene
+from gs2d.errors import DataError
+from gs2d.losses_priors import KnownDepths, PointDepths, RelativeDepths
+from gs2d.protocols import GENERIC
+from gs2d.recipe import Rates, Recipe
+from gs2d.recipe_priors import DepthPrior, NormalPrior
+from gs2d.recipes import with_depth_prior, with_normal_prior
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
+from gs2d.train.loop import Trainer
+from gs2d.train.priors import known_depths, line_of, plan_depths, plan_normals, points_in, world_normals
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Maps in memory, with the face of ``PriorMaps``."""
+
+    values: np.ndarray
+    files: MapFiles
+    whole: bool = False
+
+    def depth(self) -> DepthMap:
+        return DepthMap(self.values.astype(np.float32), self.whole)
+
+    def normal(self) -> np.ndarray:
+        return self.values.astype(np.float32)
+
+
+def mapped(
+    scene: Scene, make: Callable[[int, np.ndarray], np.ndarray], *, whole: bool = False, **files: object
+) -> Scene:
+    """The scene with a depth map of each training view, made of the depths that its points were rendered at."""
+    truth, views = random_splats(80, seed=3), []
+    for index, view in enumerate(scene.train):
+        with torch.no_grad():
+            depth = rasterize(truth, view.camera, RasterSettings(), backend="reference").depth_mean.numpy()
+        maps = Maps(make(index, depth), MapFiles(depth="known", **files), whole)  # type: ignore[arg-type]
+        views.append(replace(view, maps=maps))  # type: ignore[arg-type]
+    return replace(scene, train=tuple(views))
+
+
+def observed(scene: Scene, error: float = 0.5, track: int = 4) -> Scene:
+    """The scene with all its points seen by every view."""
+    assert scene.points is not None
+    count = len(scene.points)
+    seen = {view.name: np.arange(count) for view in scene.train}
+    found = ObservedPoints(scene.points.points, np.full(count, error), np.full(count, track), seen)
+    return replace(scene, observe=lambda: found)
+
+
+def eager(recipe: Recipe) -> Recipe:
+    """Priors that ask nearly every pixel."""
+    assert recipe.depth_prior is not None
+    return replace(recipe, depth_prior=replace(recipe.depth_prior, opacity=0.05))
+
+
+# -- what is read ---------------------------------------------------------------------------------------------------
+def test_auto_takes_a_sensor_s_maps_then_relative_ones_then_points(scene: Scene) -> None:
+    def keep(_: int, depth: np.ndarray) -> np.ndarray:
+        return depth
+
+    both = observed(scene)
+    assert plan_depths(both, DepthPrior()).source == "sparse"
+    assert plan_depths(mapped(both, keep), DepthPrior()).source == "relative"
+    assert plan_depths(mapped(both, keep, metric=True), DepthPrior()).source == "sensor"
+    assert plan_depths(mapped(both, keep, metric=True), DepthPrior("sparse")).source == "sparse"
+
+
+def test_a_capture_without_anything_known_is_refused(scene: Scene) -> None:
+    with pytest.raises(DataError, match="ball must say which sparse points .* or have depth maps in depths/"):
+        Trainer(scene, with_depth_prior(short()), GENERIC, backend="reference")
+    with pytest.raises(DataError, match="no training view of ball has a depth map; put them in"):
+        Trainer(scene, with_depth_prior(short(), "sensor"), GENERIC, backend="reference")
+    with pytest.raises(DataError, match="no training view of ball has a normal map"):
+        Trainer(scene, with_normal_prior(short()), GENERIC, backend="reference")
+
+
+def test_points_of_few_photographs_or_large_errors_are_not_trusted(scene: Scene) -> None:
+    view = scene.train[0]
+    assert len(points_in(view, observed(scene).observe(), DepthPrior()).depth) > 30  # type: ignore[misc]
+    for doubtful in (observed(scene, error=2.5), observed(scene, track=2)):
+        with pytest.raises(DataError, match="no training view of ball shows a sparse point of 3 photographs"):
+            plan_depths(doubtful, DepthPrior())
+
+
+def test_points_are_where_the_camera_sees_them_with_the_pixels_around(scene: Scene) -> None:
+    both, view = observed(scene), scene.train[2]
+    plan = plan_depths(both, DepthPrior())
+    known = known_depths(view, plan, DepthPrior(), torch.float64)
+    assert isinstance(known, PointDepths)
+    rows, columns = known.pixels // SIZE, known.pixels % SIZE
+    x = (known.weights * (columns + 0.5)).sum(dim=1).numpy()
+    y = (known.weights * (rows + 0.5)).sum(dim=1).numpy()
+    assert scene.points is not None
+    pixels, depth = view.camera.project(scene.points.points)
+    places = {(round(a, 6), round(b, 6)): d for (a, b), d in zip(pixels.tolist(), depth.tolist(), strict=True)}
+    for a, b, d in zip(x.tolist(), y.tolist(), known.depth.tolist(), strict=True):
+        assert places[(round(a, 6), round(b, 6))] == pytest.approx(d)
+
+
+# -- units, scales and shifts ---------------------------------------------------------------------------------------
+def test_whole_numbers_are_thousandths_unless_the_capture_or_the_recipe_says_otherwise(scene: Scene) -> None:
+    plain = replace(scene, format="nerfstudio")
+
+    def disparity(whole: bool, unit: float | None, of_file: float | None) -> float:
+        made = mapped(plain, lambda _, depth: np.full_like(depth, 4.0), whole=whole, unit=of_file)
+        settings = DepthPrior("sensor", unit=unit)
+        known = known_depths(made.train[0], plan_depths(made, settings), settings)
+        assert isinstance(known, KnownDepths)
+        return float(known.disparity[0, 0])
+
+    assert disparity(True, None, None) == pytest.approx(250)
+    assert disparity(False, None, None) == pytest.approx(0.25)
+    assert disparity(True, None, 0.5) == pytest.approx(0.5)
+    assert disparity(True, 2.0, 0.5) == pytest.approx(0.125)
+
+
+def test_a_sensor_s_unit_is_fitted_to_the_points_where_cameras_come_from_photographs(scene: Scene) -> None:
+    made = mapped(observed(scene), lambda _, depth: 700 * depth, whole=True, metric=True)
+    assert plan_depths(made, DepthPrior()).unit == pytest.approx(1 / 700, rel=0.1)  # the points are noisy
+    assert plan_depths(made, DepthPrior(unit=0.3)).unit == 0.3
+    assert plan_depths(replace(made, format="blender"), DepthPrior()).unit is None
+    few = replace(made, train=made.train[:1])
+    assert few.observe is not None
+    nothing = replace(few.observe(), seen={})
+    with pytest.raises(DataError, match="needs 10 sparse points .*, got 0; say it: --set depth_prior.unit"):
+        plan_depths(replace(few, observe=lambda: nothing), DepthPrior("sensor"))
+
+
+@pytest.mark.parametrize("space", ["disparity", "depth"])
+def test_relative_maps_are_brought_to_the_points_and_tell_what_they_are_linear_in(scene: Scene, space: str) -> None:
+    def make(index: int, depth: np.ndarray) -> np.ndarray:
+        hit = depth > 0
+        value = 1 / np.where(hit, depth, 1) if space == "disparity" else depth
+        return np.where(hit, (50 + 30 * index) * value + 20 + index, 0)
+
+    rng = np.random.default_rng(0)
+    exact = mapped(scene, lambda _, depth: depth)
+    views = {}
+    rows, xyz = 0, []
+    for view in exact.train:  # points on the very surface of each view's map
+        depth = view.maps.values  # type: ignore[union-attr]
+        y, x = np.nonzero(depth)
+        chosen = rng.choice(len(x), 60, replace=False)
+        x, y = x[chosen], y[chosen]
+        c, z = view.camera, depth[y, x]
+        local = np.stack([(x + 0.5 - c.cx) / c.fx * z, (y + 0.5 - c.cy) / c.fy * z, z], axis=1)
+        xyz.append((local - c.T_cam_world[:3, 3]) @ c.rotation)
+        views[view.name] = np.arange(rows, rows + 60)
+        rows += 60
+    found = ObservedPoints(np.concatenate(xyz), np.full(rows, 0.3), np.full(rows, 5), views)
+    made = replace(mapped(scene, make), observe=lambda: found)
+    settings = DepthPrior("relative")
+    plan = plan_depths(made, settings)
+    assert plan.space == space
+    for view, true in zip(made.train, exact.train, strict=True):
+        known = known_depths(view, plan, settings, torch.float64)
+        assert isinstance(known, KnownDepths)
+        depth = torch.from_numpy(true.maps.values).double()  # type: ignore[union-attr]
+        there = known.known > 0
+        assert (depth[there] * known.disparity[there] - 1).abs().median() < 1e-4
+    rendered = replace(settings, align="rendered")
+    assert plan_depths(made, rendered).observed is None
+    assert isinstance(known_depths(made.train[0], plan_depths(made, rendered), rendered), RelativeDepths)
+
+
+def test_there_is_no_line_through_few_points_equal_values_or_the_wrong_way() -> None:
+    depth = np.linspace(1, 2, 20)
+    assert line_of(1 / depth, depth, "disparity") == pytest.approx((1, 0), abs=1e-6)
+    assert line_of(1 / depth[:9], depth[:9], "disparity") is None
+    assert line_of(np.full(20, 3.0), depth, "disparity") is None
+    assert line_of(depth, depth, "disparity") is None
+
+
+# -- normals --------------------------------------------------------------------------------------------------------
+def facing(scene: Scene, flip: tuple[int, int, int]) -> Scene:
+    """Normals that look straight at the camera, in other axes."""
+    towards = -np.array(flip) * np.array([0.0, 0.0, 1.0])
+    views = [
+        replace(view, maps=Maps(np.tile(towards, (SIZE, SIZE, 1)), MapFiles(normal="known")))  # type: ignore[arg-type]
+        for view in scene.train
+    ]
+    return replace(scene, train=tuple(views))
+
+
+def test_the_axes_of_normal_maps_are_those_in_which_surfaces_face_the_camera(scene: Scene) -> None:
+    for axes, flip in (("opencv", (1, 1, 1)), ("opengl", (1, -1, -1))):
+        made = facing(scene, flip)
+        assert plan_normals(made, NormalPrior()) == axes
+        normals = world_normals(made.train[1], axes, torch.float64)
+        assert np.allclose(normals[3, 4], -made.train[1].camera.forward)
+    with pytest.raises(DataError, match="must face the camera; in the axes opengl, 0% of those of ball do"):
+        plan_normals(facing(scene, (1, 1, 1)), NormalPrior(axes="opengl"))
+
+
+# -- training -------------------------------------------------------------------------------------------------------
+def cases(scene: Scene) -> dict[str, tuple[Scene, Recipe]]:
+    relative = mapped(scene, lambda _, depth: np.where(depth > 0, 3 / np.where(depth > 0, depth, 1) + 1, 0))
+    return {
+        "sparse": (observed(scene), with_depth_prior(short(), "sparse")),
+        "sensor": (mapped(scene, lambda _, depth: depth), with_depth_prior(short(), "sensor")),
+        "relative": (relative, with_depth_prior(short(), "relative")),
+    }
+
+
+@pytest.mark.parametrize("source", ["sparse", "sensor", "relative"])
+def test_known_depths_move_means_and_no_colours(scene: Scene, backend: str, source: str) -> None:
+    made, recipe = cases(scene)[source]
+    trainer = Trainer(made, eager(recipe), GENERIC, backend=backend)
+    trainer.enter(0)
+    stage = trainer.recipe.stages[0]
+    with_it = trainer._whole.evaluate(trainer.state, stage, 1, 0)
+    plain = replace(stage, losses=stage.losses[:-1])
+    without = trainer._whole.evaluate(trainer.state, plain, 1, 0)
+    assert set(with_it.losses) - set(without.losses) == {"depth_prior"}
+    assert with_it.losses["depth_prior"] > 0
+    assert not torch.equal(with_it.gradients["means"], without.gradients["means"])
+    assert torch.equal(with_it.gradients["sh0"], without.gradients["sh0"])
+
+
+def test_known_depths_bring_the_splats_nearer_to_the_surface(scene: Scene) -> None:
+    made, _ = cases(scene)["sensor"]
+    first = short().stages[0]
+    rates = Rates(means=5e-3, means_final=1e-3, means_horizon=40)
+    plain = Recipe("plain", (replace(first, iterations=40, densify=None, losses=first.losses[:2], rates=rates),))
+
+    def error(recipe: Recipe) -> float:
+        trainer, found = Trainer(made, recipe, GENERIC, backend="reference"), []
+        trainer.run()
+        for view in made.train:
+            with torch.no_grad():
+                output = rasterize(trainer.splats, view.camera, trainer.settings, backend="reference")
+            truth = torch.from_numpy(view.maps.values)  # type: ignore[union-attr]
+            there = (truth > 0) & (output.alpha > 0.5)
+            found.append(float((output.depth_mean / truth - 1).abs()[there].mean()))
+        return float(np.mean(found))
+
+    assert error(eager(with_depth_prior(plain, "sensor", 2.0))) < 0.85 * error(plain)
+
+
+def test_the_loss_falls_with_the_share_of_the_run(scene: Scene) -> None:
+    made, recipe = cases(scene)["sensor"]
+    recipe = eager(recipe)
+    assert recipe.depth_prior is not None
+    recipe = replace(recipe, depth_prior=replace(recipe.depth_prior, horizon=20, final=0.01))
+    trainer = Trainer(made, recipe, GENERIC, backend="reference")
+    trainer.enter(0)
+    stage, whole = trainer.recipe.stages[0], trainer._whole
+    first, later = (whole.evaluate(trainer.state, stage, iteration, 0).losses["depth_prior"] for iteration in (1, 3))
+    assert later / first == pytest.approx(0.01 ** (2 / 20))
+
+
+@pytest.mark.parametrize("source", ["sparse", "relative"])
+def test_a_resumed_training_gives_the_same_bytes(scene: Scene, backend: str, source: str) -> None:
+    made, recipe = cases(scene)[source]
+    recipe = eager(recipe)
+    end = Trainer(made, recipe, GENERIC, backend=backend).run()
+    assert not same(end, Trainer(scene, short(), GENERIC, backend=backend).run())
+    trainer = Trainer(made, recipe, GENERIC, backend=backend)
+    trainer.enter(0)
+    for _ in range(7):
+        trainer.step()
+    state = reload(saved(trainer))
+    assert same(Trainer(made, recipe, GENERIC, backend=backend, state=state).run(), end)
+
+
+def test_a_view_of_which_nothing_is_known_trains_without(scene: Scene) -> None:
+    made, recipe = cases(scene)["sensor"]
+    made = replace(made, train=(scene.train[0], *made.train[1:]))
+    trainer = Trainer(made, eager(recipe), GENERIC, backend="reference")
+    trainer.enter(0)
+    stage = trainer.recipe.stages[0]
+    for index, expected in ((0, False), (1, True)):
+        assert ("depth_prior" in trainer._whole.evaluate(trainer.state, stage, 1, index).losses) is expected
+
+
+def test_what_is_known_beyond_the_room_is_made_anew(scene: Scene) -> None:
+    from gs2d.train.priors import Priors
+
+    made, recipe = cases(scene)["sensor"]
+    kept, none = Priors(made, recipe), Priors(made, recipe, limit_bytes=0)
+    for index in (0, 1):
+        a, b = (p.known(index, torch.float32)[0] for p in (kept, none))
+        assert isinstance(a, KnownDepths)
+        assert isinstance(b, KnownDepths)
+        assert torch.equal(a.disparity, b.disparity)
+    assert kept.known(0, torch.float32)[0] is kept.known(0, torch.float32)[0]
+    assert none.known(0, torch.float32)[0] is not none.known(0, torch.float32)[0]
+
+
+def test_normals_are_trained_by_maps(scene: Scene, backend: str) -> None:
+    made = facing(scene, (1, -1, -1))
+    trainer = Trainer(made, with_normal_prior(short()), GENERIC, backend=backend)
+    trainer.enter(0)
+    stage = trainer.recipe.stages[0]
+    found = trainer._whole.evaluate(trainer.state, stage, 1, 0)
+    assert found.losses["normal_prior"] > 0
