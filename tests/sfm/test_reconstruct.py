@@ -56,7 +56,8 @@ def test_photographs_become_a_run_with_its_capture(
     assert "12 of 12 photographs have a place" in said.err
     assert "on pictures of 25x25 (--downscale 8)" in said.err
     assert re.search(r"training will take about \d+ s to \d+ s: \d+ iterations", said.err)
-    assert said.out.splitlines()[-1] == f"look at it: gs2d view '{out}'; one file to pass on: gs2d page '{out}'"
+    assert said.out.splitlines()[-1] == f"look at it: open scene.html in a browser, or gs2d view '{out}'"
+    assert (out / "scene.html").exists()
     assert {"capture", "splats.ply", "mesh.ply", "report.html"} <= {path.name for path in out.iterdir()}
     assert sorted(path.name for path in (out / "capture").iterdir()) == ["images", "poses.json", "poses.png", "sparse"]
     definition = open_run(out).definition()

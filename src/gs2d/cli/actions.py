@@ -367,7 +367,7 @@ def show_run(
     columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
     console.table("", columns, rows)
     _surface_table(metrics.get("surface"), console)
-    for name in ("report.html", "mesh.ply", "mesh.glb", "splats.ply"):
+    for name in ("report.html", "scene.html", "mesh.ply", "mesh.glb", "splats.ply"):
         if (path / name).exists():
             console.say(f"{path / name}")
     extra = (extra or {}) | ({} if definition is None else {"definition": definition})

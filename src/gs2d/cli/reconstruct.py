@@ -10,6 +10,7 @@ from gs2d.cli.actions import show_run, values
 from gs2d.cli.console import Console
 from gs2d.cli.options import Finding, Training
 from gs2d.io.files import read_json
+from gs2d.io.run import PAGE
 from gs2d.pipeline.reconstruct import CAPTURE, ReconstructOptions
 from gs2d.pipeline.reconstruct import reconstruct as run_all
 from gs2d.sfm.workplace import POSES_JSON
@@ -20,8 +21,7 @@ def reconstruct(command: c.Reconstruct, console: Console) -> None:
     run = run_all(reconstruct_options(command), console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console, extra={"poses": read_json(run.path / CAPTURE / POSES_JSON)})
-    name = shlex.quote(str(run.path))
-    console.say(f"look at it: gs2d view {name}; one file to pass on: gs2d page {name}")
+    console.say(f"look at it: open {PAGE} in a browser, or gs2d view {shlex.quote(str(run.path))}")
 
 
 def reconstruct_options(command: c.Reconstruct) -> ReconstructOptions:

@@ -7,6 +7,7 @@
       events.jsonl   one JSON object a line; after a resume it reads as if the run had never stopped
       checkpoints/   <stage number>-<stage>-<iteration>.pt (the last two), <stage number>-<stage>-end.pt (all)
       metrics.json  splats.ply  mesh.ply  mesh.glb (textured, if asked for)  renders/  report.html
+      scene.html     the splats as a page for any browser, if asked for
       exposure.json  poses.json  what was learned of each photograph, where the recipe learns it
       .lock          held by the process that trains; the kernel frees it when that process dies
 
@@ -39,7 +40,7 @@ from gs2d.io.files import read_json, write_json
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
 PRIORS = "priors"  # in RENDERS
-SPLATS, MESH, TEXTURED, REPORT = "splats.ply", "mesh.ply", "mesh.glb", "report.html"
+SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
 EXPOSURE, POSES = "exposure.json", "poses.json"
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
@@ -185,7 +186,7 @@ class RunFolder:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
         for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
-        for name in (EVENTS, METRICS, SPLATS, EXPOSURE, POSES, MESH, TEXTURED, REPORT, RUN_JSON):
+        for name in (EVENTS, METRICS, SPLATS, EXPOSURE, POSES, MESH, TEXTURED, REPORT, PAGE, RUN_JSON):
             self.file(name).unlink(missing_ok=True)
 
     def discard(self) -> None:

@@ -13,6 +13,7 @@ from gs2d.io.run import RunFolder, is_run, open_run
 from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
 from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.page import page_run
 from gs2d.pipeline.train import check_viewer, train, use_threads
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
@@ -108,4 +109,5 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
         on_event,
     )
     evaluate_run(run.path, EvaluateOptions(ground_truth=capture / TRUTH, match_poses=options.refine_poses), on_event)
+    page_run(run.path, on_event=on_event)
     return run

@@ -9,7 +9,7 @@ import numpy as np
 
 from gs2d.data import View
 from gs2d.errors import DataError, RunError
-from gs2d.io.run import is_run, open_run
+from gs2d.io.run import PAGE, is_run, open_run
 from gs2d.io.splat_formats import read_disks
 from gs2d.page import Seen, write_page
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
@@ -18,13 +18,12 @@ from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.view import frame_around, from_aside, settings_without_run
 
-PAGE = "scene.html"
 MOST_VIEWS = 100  # photographs that one can step through
 SUFFIXES = (".html", ".htm")
 LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
 
 
-def page_run(path: Path, out: Path | None, *, sh_degree: int = 3, on_event: OnEvent = ignore) -> dict[str, Any]:
+def page_run(path: Path, out: Path | None = None, *, sh_degree: int = 3, on_event: OnEvent = ignore) -> dict[str, Any]:
     """Write the page of a run or of a file of splats.
 
     Parameters
