@@ -439,6 +439,22 @@ def test_a_broken_file_is_one_line_that_names_it(tmp_path: Path, write: Callable
     assert str(tmp_path) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("my.psx", "got my.psx: in Metashape, File > Export > Export Cameras as Agisoft XML"),
+        ("sfm.abc", "got sfm.abc: take cameras.sfm of Meshroom's node"),
+        ("scene.RCPROJ", "got scene.RCPROJ: in RealityCapture, export the registration as COLMAP"),
+        ("a_0.xmp", "got 9 photographs without any; find them first: gs2d poses"),  # any photo editor writes such
+    ],
+)
+def test_a_project_of_another_tool_says_what_to_export(tmp_path: Path, name: str, words: str) -> None:
+    write_photographs(tmp_path, poses())
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(DataError, match=words):
+        load_scene(tmp_path)
+
+
 def test_a_rotation_of_the_chunk_is_checked(tmp_path: Path) -> None:
     bad = (CHUNK[0], CHUNK[1] * 2, CHUNK[2])
     small_metashape(tmp_path)

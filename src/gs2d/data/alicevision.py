@@ -18,7 +18,7 @@ import numpy as np
 
 from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
 from gs2d.data.colmap import find_mask
-from gs2d.data.fields import entries, real, reals, required, whole
+from gs2d.data.fields import entries, head, real, reals, required, whole
 from gs2d.data.foreign_points import points_beside
 from gs2d.data.lens import Intrinsics, Lens
 from gs2d.data.photographs import Photographs
@@ -39,7 +39,6 @@ _OLD_TYPES = {"pinhole": "none", "radial1": "radialk1", "radial3": "radialk3"} |
     name: name for name in ("brown", "fisheye4", "fisheye1")
 }
 _FILES = ("cameras.sfm", "sfm.json", "cameras.json")
-_HEAD = 4096  # bytes in which a file says what it is
 
 
 def scene_file(root: Path) -> Path | None:
@@ -49,12 +48,10 @@ def scene_file(root: Path) -> Path | None:
 
 
 def _is_scene(path: Path) -> bool:
-    try:
-        with open(path, "rb") as file:
-            head = file.read(_HEAD)
-    except OSError:
-        return False  # not there, a folder, or not ours to read
-    return b'"version"' in head and any(word in head for word in (b'"views"', b'"featuresFolders"', b'"intrinsics"'))
+    begins = head(path)
+    return b'"version"' in begins and any(
+        word in begins for word in (b'"views"', b'"featuresFolders"', b'"intrinsics"')
+    )
 
 
 def read_alicevision(root: Path) -> Capture:

@@ -1,8 +1,9 @@
-"""Numbers of other tools' files: JSON or text, of any kind until they are checked."""
+"""Other tools' files: what they begin with, and numbers of JSON or text, of any kind until they are checked."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,16 @@ import numpy as np
 from gs2d.errors import DataError
 
 _LARGEST = 1e300  # JSON has whole numbers of any size
+_HEAD = 4096  # bytes in which a file says what it is
+
+
+def head(path: Path) -> bytes:
+    """The first bytes of a file; none of what is not there, a folder, or not ours to read."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(_HEAD)
+    except OSError:
+        return b""
 
 
 def real(value: Any, where: str) -> float:

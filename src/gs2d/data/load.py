@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from gs2d.data.alicevision import read_alicevision, scene_file
-from gs2d.data.capture import build_scene
+from gs2d.data.capture import Capture, build_scene
 from gs2d.data.colmap import MODEL_FOLDERS, model_folder, read_colmap
 from gs2d.data.dtu import CAMERA_FILES, read_dtu
 from gs2d.data.layouts import missing_lines
@@ -19,6 +20,21 @@ from gs2d.data.transforms import read_blender, read_nerfstudio
 from gs2d.errors import DataError
 
 FORMATS = ("blender", "nerfstudio", "dtu", "colmap", "opensfm", "metashape", "alicevision")
+_READERS: Mapping[str, Callable[[Path], Capture]] = {
+    "blender": read_blender,
+    "nerfstudio": read_nerfstudio,
+    "dtu": read_dtu,
+    "opensfm": read_opensfm,
+    "metashape": read_metashape,
+    "alicevision": read_alicevision,
+}
+_PROJECTS = {  # files of other tools that do not hold cameras in the open
+    ".psx": "in Metashape, File > Export > Export Cameras as Agisoft XML (cameras.xml)",
+    ".mg": "take cameras.sfm of Meshroom's node StructureFromMotion, in its MeshroomCache",
+    ".abc": "take cameras.sfm of Meshroom's node StructureFromMotion, which lies beside it",
+    ".rcproj": "in RealityCapture, export the registration as COLMAP",
+    ".rsproj": "in RealityScan, export the registration as COLMAP",
+}
 DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures
 
 
@@ -48,6 +64,10 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
     if not held:
         raise DataError(f"{root} must hold a capture, got an empty folder")
+    project = next((name for name in held if os.path.splitext(name)[1].lower() in _PROJECTS), None)
+    if project is not None:
+        remedy = _PROJECTS[os.path.splitext(project)[1].lower()]
+        raise DataError(f"{root} must hold cameras that are written in the open, got {project}: {remedy}")
     lacking = missing_lines(root)
     hint = f"; as a scene of a known data set: {lacking[0]}" if lacking else ""
     photographs = next((folder for folder in (root, root / "images") if _photographs(folder)), None)
@@ -117,18 +137,5 @@ def load_scene(
         raise DataError(f"format must be auto or one of {', '.join(FORMATS)}, got {format}")
     if downscale < 1:
         raise DataError(f"downscale must be a whole number >= 1, got {downscale}")
-    if format == "blender":
-        capture = read_blender(root)
-    elif format == "nerfstudio":
-        capture = read_nerfstudio(root)
-    elif format == "dtu":
-        capture = read_dtu(root)
-    elif format == "opensfm":
-        capture = read_opensfm(root)
-    elif format == "metashape":
-        capture = read_metashape(root)
-    elif format == "alicevision":
-        capture = read_alicevision(root)
-    else:
-        capture = read_colmap(root, downscale)
+    capture = read_colmap(root, downscale) if format == "colmap" else _READERS[format](root)
     return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes)

@@ -22,14 +22,13 @@ import numpy as np
 
 from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
 from gs2d.data.colmap import find_mask
-from gs2d.data.fields import real, reals, whole
+from gs2d.data.fields import head, real, reals, whole
 from gs2d.data.foreign_points import points_beside
 from gs2d.data.lens import Intrinsics, Lens
 from gs2d.data.photographs import Photographs
 from gs2d.errors import DataError
 
 _KINDS = {"frame": "perspective", "fisheye": "fisheye"}
-_HEAD = 4096  # bytes in which an XML file says what it is
 _EARTH = (6.2e6, 6.5e6)  # m from the centre of the Earth: cameras there are in geocentric coordinates
 _AXES = (6378137.0, 6378137.0, 6356752.314245)  # m, WGS 84
 
@@ -49,16 +48,7 @@ _SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 def camera_file(root: Path) -> Path | None:
     """The XML file of a folder that holds Metashape's cameras: ``cameras.xml``, else the first by name; or None."""
     files = sorted(root.glob("*.xml"), key=lambda path: (path.name.lower() != "cameras.xml", path.name))
-    return next((path for path in files if _is_of_metashape(path)), None)
-
-
-def _is_of_metashape(path: Path) -> bool:
-    try:
-        with open(path, "rb") as file:
-            head = file.read(_HEAD)
-    except OSError:
-        return False  # a folder, or not ours to read
-    return b"<document" in head and b"<chunk" in head
+    return next((path for path in files if b"<document" in (begins := head(path)) and b"<chunk" in begins), None)
 
 
 def read_metashape(root: Path) -> Capture:

@@ -48,7 +48,7 @@ class Photographs:
             if len(best) > 1:
                 raise DataError(
                     f"{where} must name one photograph, got {name}, which may be {best[0]} or {best[1]}; "
-                    "keep only one of them below the capture"
+                    "keep only one of them below the capture, or let the camera's name tell its folder"
                 )
             return best[0].relative_to(folder).as_posix(), best[0]
         return None
