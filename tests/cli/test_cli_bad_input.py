@@ -82,9 +82,29 @@ def text_for_image(folder: Path) -> None:
     (folder / "train" / "r_1.png").write_text("not a picture")
 
 
+def cut_json_of_opensfm(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "reconstruction.json").write_text('[{"cameras": {')
+
+
+def xml_of_metashape_without_photographs(folder: Path) -> None:
+    folder.mkdir()
+    place = "<transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>"
+    cameras = f"<cameras><camera id='0' sensor_id='0' label='a'>{place}</camera></cameras>"
+    (folder / "cameras.xml").write_text(f"<document><chunk><sensors/>{cameras}</chunk></document>")
+
+
+def meshroom_before_its_poses(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "cameras.sfm").write_text('{"version": ["1", "2", "6"], "views": [], "intrinsics": []}')
+
+
 @pytest.mark.parametrize(
     ("make", "named"),
     [
+        (cut_json_of_opensfm, "reconstruction.json"),
+        (xml_of_metashape_without_photographs, "listed in cameras.xml"),
+        (meshroom_before_its_poses, "StructureFromMotion"),
         (missing, "capture"),
         (empty, "capture"),
         (truncated_images_bin, "images.bin"),

@@ -187,6 +187,20 @@ def test_the_ending_of_an_export_is_its_format_and_info_reads_it(
     assert facts["shape"] == "flat"
 
 
+def test_a_file_of_splats_is_exported_too(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spz, back = tmp_path / "a.spz", tmp_path / "b.ply"
+    assert run(["export", str(trained / "splats.ply"), "--out", str(spz), "--quiet"]) == 0
+    assert run(["export", str(trained), "--out", str(tmp_path / "c.spz"), "--quiet"]) == 0
+    assert spz.read_bytes() == (tmp_path / "c.spz").read_bytes()
+    assert run(["export", str(spz), "--out", str(back), "--layout", "2dgs", "--quiet"]) == 0
+    assert run(["info", str(back), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["layout"] == "2dgs"
+    assert run(["export", str(spz), "--out", str(spz)]) == 2
+    assert "is the file that is read" in capsys.readouterr().err
+    assert run(["info", str(trained / "run.json")]) == 2
+    assert "got a file of a capture; give its folder" in capsys.readouterr().err
+
+
 def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -205,7 +205,7 @@ class Export(Common):
     """Write the splats of a run in another layout."""
 
     run: RunPath
-    """Run folder."""
+    """Run folder, or a file of flat splats: PLY (compressed too), .spz or .splat."""
     out: Annotated[Path, arg(metavar="FILE")]
     """File to write; by its ending .ply is 3dgs, .compressed.ply compressed, .spz spz, .splat splat."""
     layout: Literal["2dgs", "3dgs", "compressed", "spz", "splat"] | None = None

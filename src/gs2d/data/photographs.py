@@ -9,7 +9,7 @@ from pathlib import Path
 from gs2d.errors import DataError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic")
-_NO_PHOTOGRAPHS = {"mask", "masks", "depthmaps", "undistorted"}  # pictures of the same names that are none
+_NO_PHOTOGRAPHS = {"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"}  # of the same names
 
 
 class Photographs:

@@ -8,9 +8,12 @@ from typing import Any
 from gs2d.data import detect_format, load_scene
 from gs2d.data.archive import is_archive
 from gs2d.data.layouts import missing_lines
+from gs2d.errors import DataError
 from gs2d.io.ply import ply_kind, read_mesh, read_points
 from gs2d.io.splat_formats import is_splat_file, read_splat_file
 from gs2d.pipeline.archive import unpacked_for_a_look
+
+_OF_CAPTURES = (".json", ".xml", ".sfm", ".npz", ".bin", ".txt")
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
@@ -52,6 +55,10 @@ def describe_file(path: Path) -> dict[str, Any]:
     DataError
         The file is none of these, or is broken.
     """
+    if path.suffix.lower() in _OF_CAPTURES:
+        raise DataError(
+            f"{path}: a file of splats, a mesh or points was expected, got a file of a capture; give its folder"
+        )
     size = path.stat().st_size
     kind = "splats" if is_splat_file(path) else ply_kind(path)
     if kind == "mesh":

@@ -30,7 +30,7 @@ from gs2d.io.run import (
     open_run,
     remove_made,
 )
-from gs2d.io.splat_formats import LAYOUTS, layout_of, write_layout
+from gs2d.io.splat_formats import LAYOUTS, layout_of, read_disks, write_layout
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
@@ -313,7 +313,12 @@ def evaluate_run(
 
 
 def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, Any]:
-    """Write the splats of a run in another layout (``io.splat_formats.LAYOUTS``; None: by the ending of ``out``).
+    """Write the splats of a run, or of a file of flat splats, in another layout.
+
+    Parameters
+    ----------
+    layout : str or None
+        A name of ``io.splat_formats.LAYOUTS``; None: by the ending of ``out``.
 
     Raises
     ------
@@ -325,7 +330,9 @@ def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, An
     path, out = Path(path), checked_output(path, out, LAYOUTS[layout].ending, f"layout {layout} is")
     if out.resolve() == (path / MESH).resolve():
         raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
-    splats = finished_splats(open_run(path))
+    if path.is_file() and out.resolve() == path.resolve():
+        raise RunError(f"--out {out} is the file that is read; choose another name")
+    splats = read_disks(path) if path.is_file() else finished_splats(open_run(path))
     notes = write_layout(out, splats, layout)
     size = out.stat().st_size
     return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes)}
