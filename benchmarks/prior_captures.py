@@ -223,11 +223,13 @@ def room_picture(mesh: Mesh, owner: np.ndarray, camera: Camera, rng: np.random.G
     u = np.take_along_axis(points, ((axis + 1) % 3)[..., None], axis=2)[..., 0]
     v = np.take_along_axis(points, ((axis + 2) % 3)[..., None], axis=2)[..., 0]
     speckles = np.random.default_rng(5).random((256, 256))
-    at = [np.floor(cells * w).astype(np.int64) % 256 for cells in (12, 37) for w in (u, v)]
-    pattern = 0.5 + 0.5 * speckles[at[0], at[1]] + 0.4 * speckles[at[2], at[3]]
+    mottle = np.zeros_like(u)
+    for cells in (5, 11, 23):  # a metre
+        mottle += speckles[np.floor(cells * u).astype(np.int64) % 256, np.floor(cells * v).astype(np.int64) % 256] / 3
+    pattern = 0.3 + 1.4 * mottle
     textured = np.array([False, *(t[3] for t in THINGS)])[thing]
     floor = (thing == 0) & (side == 4)
-    boards = 0.5 + 0.12 * np.sin(7 * np.floor(points[..., 1] / 0.2)) * (0.7 + 0.6 * speckles[at[0], at[1]])
+    boards = (0.45 + 0.1 * np.sin(7 * np.floor(points[..., 1] / 0.2))) * (0.5 + mottle)
     albedo = np.where(floor[..., None], np.array((1.0, 0.8, 0.55)) * boards[..., None], albedo)
     albedo = np.where(textured[..., None], albedo * pattern[..., None], albedo)
     lamp = np.array((0.3, 0.2, 2.2)) - points

@@ -14,7 +14,7 @@ from gs2d.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.losses import FUSED_LOSSES, LOSSES, compute_losses, target_maps
 from gs2d.losses_multiview import Neighbour, prepare
-from gs2d.losses_priors import KnownDepths, Prior
+from gs2d.losses_priors import KnownDepths, KnownNormals, Prior
 from gs2d.recipe import LossTerm
 from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView
 from gs2d.recipe_priors import PRIOR_KINDS
@@ -58,8 +58,8 @@ def one_loss(
 
 def one_prior(target: Tensor) -> Prior:
     """Depths and normals made of the colours of a target."""
-    known = torch.ones_like(target[..., 0])
-    return Prior(KnownDepths(0.5 + target[..., 1], known), torch.nn.functional.normalize(target, dim=2), opacity=0.2)
+    known, directions = torch.ones_like(target[..., 0]), torch.nn.functional.normalize(target, dim=2)
+    return Prior(KnownDepths(0.5 + target[..., 1], known > 0), KnownNormals(directions, known), opacity=0.2)
 
 
 def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:

@@ -12,6 +12,7 @@ from gs2d.losses_priors import (
     LEAST_POINTS,
     Depths,
     KnownDepths,
+    KnownNormals,
     PointDepths,
     Prior,
     RelativeDepths,
@@ -28,8 +29,12 @@ HIT = torch.ones(4, 5, dtype=torch.float64)
 
 def known(depth: Tensor) -> KnownDepths:
     """A map that knows the depths above 0."""
-    there = (depth > 0).to(depth)
-    return KnownDepths(there / torch.where(depth > 0, depth, 1), there)
+    return KnownDepths(1 / torch.where(depth > 0, depth, 1), depth > 0)
+
+
+def directed(normals: Tensor) -> KnownNormals:
+    """Normals that are known where they are not 0."""
+    return KnownNormals(normals, (normals != 0).any(dim=2).to(normals))
 
 
 def points(pixels: list[list[int]], weights: list[list[float]], depth: list[float]) -> PointDepths:
@@ -82,7 +87,7 @@ def test_normals_cost_one_minus_their_cosine_by_blending_weight() -> None:
     normal[0, 1], truth[0, 1] = torch.tensor([0.8, 0, 0]), torch.tensor([0, 1.0, 0])  # 0.8 (1 - 0)
     normal[1, 0], truth[1, 0] = torch.tensor([0, 0, -0.5]), torch.tensor([0, 0, 1.0])  # 0.5 (1 + 1)
     normal[1, 1] = torch.tensor([1.0, 0, 0])  # unknown
-    assert normal_prior(Prior(normal=truth), normal, alpha).item() == pytest.approx((0.8 + 1.0) / 4)
+    assert normal_prior(Prior(normal=directed(truth)), normal, alpha).item() == pytest.approx((0.8 + 1.0) / 4)
 
 
 # -- gradients ------------------------------------------------------------------------------------------------------
@@ -110,13 +115,13 @@ def test_gradients_of_normals_are_those_of_finite_differences() -> None:
     output = make_output(6, 7, seed=2)
     truth = torch.nn.functional.normalize(make_output(6, 7, seed=3).normal.detach(), dim=2)
     truth[2, 3] = 0
-    prior = Prior(normal=truth)
+    prior = Prior(normal=directed(truth))
     assert torch.autograd.gradcheck(lambda n: normal_prior(prior, n, output.alpha), (output.normal,), atol=1e-7)
 
 
 def test_no_gradient_goes_into_alpha_or_into_the_fit_of_a_relative_map() -> None:
     output, truth = make_output(6, 7), torch.rand(6, 7).double()
-    relative = RelativeDepths(truth, torch.ones_like(truth), "disparity")
+    relative = RelativeDepths(truth, truth >= 0, "disparity")
     (with_fit,) = torch.autograd.grad(
         depth_prior(Prior(relative), output.depth_mean, output.alpha), [output.depth_mean], retain_graph=True
     )
@@ -133,7 +138,7 @@ def test_no_gradient_goes_into_alpha_or_into_the_fit_of_a_relative_map() -> None
 def test_a_relative_map_of_the_very_surface_costs_nothing(space: str) -> None:
     depth = 1 + torch.rand(12, 13, generator=torch.Generator().manual_seed(0)).double()
     values = 0.3 * (1 / depth if space == "disparity" else depth) + 0.2
-    relative = RelativeDepths(values, torch.ones_like(values), space)
+    relative = RelativeDepths(values, values >= 0, space)
     assert depth_prior(Prior(relative), depth, torch.ones_like(depth)).item() == pytest.approx(0, abs=1e-12)
 
 
@@ -151,14 +156,14 @@ def test_a_fifth_of_wrong_pixels_hardly_moves_the_fit() -> None:
 
 def test_a_map_that_runs_the_other_way_says_nothing() -> None:
     depth = 1 + torch.rand(12, 13).double()
-    relative = RelativeDepths(depth, torch.ones_like(depth), "disparity")  # larger where farther: no disparity
+    relative = RelativeDepths(depth, depth > 0, "disparity")  # larger where farther: no disparity
     assert aligned(relative, depth, depth > 0).known.sum() == 0
     assert depth_prior(Prior(relative), depth, torch.ones_like(depth)).item() == 0
 
 
 def test_where_nothing_was_hit_nothing_breaks() -> None:
     nothing, relative = torch.zeros(4, 5).double().requires_grad_(), torch.rand(4, 5).double()
-    for prior in (known(HIT), RelativeDepths(relative, HIT, "depth"), points([[0, 1, 5, 6]], [[0.25] * 4], [1.0])):
+    for prior in (known(HIT), RelativeDepths(relative, HIT > 0, "depth"), points([[0, 1, 5, 6]], [[0.25] * 4], [1.0])):
         loss = depth_prior(Prior(prior), nothing, torch.zeros(4, 5))
         assert loss.item() == 0
         (gradient,) = torch.autograd.grad(loss, [nothing])

@@ -41,6 +41,8 @@ class DepthPrior:
     space : str
         What relative maps are linear in: "disparity" (1 / depth, larger is nearer) or "depth"; "auto": what fits the
         sparse points better.
+    start : bool
+        Training starts from places on the maps too: as many as the recipe's ``init_points``.
     align : str
         What scale and shift of a relative map are fitted to: the sparse "points" in it (where they are too few, and in
         captures without any, what is rendered), or always what is "rendered", anew in each iteration.
@@ -55,6 +57,7 @@ class DepthPrior:
     unit: float | None = None
     space: str = "auto"
     align: str = "points"
+    start: bool = True
 
     def share_at(self, iteration: int) -> float:
         """Share of the weight at an iteration of the run (1-based)."""

@@ -222,3 +222,17 @@ def test_names_of_the_model_and_of_the_views_agree(shared: Shared) -> None:
     images: list[ColmapImage] = read_images(root / "sparse/0", "bin")
     assert sorted(view.name for view in scene.views) == sorted(image.name for image in images)
     assert {(v.camera.width, v.camera.height) for v in scene.views} == {(1920, 1440), (1440, 1920)}
+
+
+@pytest.mark.parametrize("name", ["dtu_scan24", "strecha_fountain_P11"])
+def test_points_are_known_by_the_photographs_that_show_them(shared: Shared, name: str) -> None:
+    scene = load_scene(shared(name), downscale=4)
+    assert scene.observe is not None
+    observed = scene.observe()
+    assert set(observed.seen) == {view.name for view in scene.views}
+    assert observed.track.min() >= 1
+    for view in scene.train[::5]:
+        pixels, depth = view.camera.project(observed.points[observed.seen[view.name]])
+        size = (view.camera.width, view.camera.height)
+        inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels <= size).all(axis=1)
+        assert inside.mean() > 0.99

@@ -12,7 +12,7 @@ from test_train_resume import reload, saved
 from train_toys import SIZE, random_splats, same, short
 
 from gs2d.data.prior_maps import DepthMap, MapFiles, ObservedPoints
-from gs2d.data.scene import Scene
+from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
 from gs2d.losses_priors import KnownDepths, PointDepths, RelativeDepths
 from gs2d.protocols import GENERIC
@@ -22,7 +22,15 @@ from gs2d.recipes import with_depth_prior, with_normal_prior
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.train.loop import Trainer
-from gs2d.train.priors import known_depths, line_of, plan_depths, plan_normals, points_in, world_normals
+from gs2d.train.priors import (
+    known_depths,
+    line_of,
+    plan_depths,
+    plan_normals,
+    points_in,
+    with_known_points,
+    world_normals,
+)
 
 
 @dataclass(frozen=True)
@@ -171,7 +179,7 @@ def test_relative_maps_are_brought_to_the_points_and_tell_what_they_are_linear_i
         known = known_depths(view, plan, settings, torch.float64)
         assert isinstance(known, KnownDepths)
         depth = torch.from_numpy(true.maps.values).double()  # type: ignore[union-attr]
-        there = known.known > 0
+        there = known.known
         assert (depth[there] * known.disparity[there] - 1).abs().median() < 1e-4
     rendered = replace(settings, align="rendered")
     assert plan_depths(made, rendered).observed is None
@@ -202,9 +210,57 @@ def test_the_axes_of_normal_maps_are_those_in_which_surfaces_face_the_camera(sce
         made = facing(scene, flip)
         assert plan_normals(made, NormalPrior()) == axes
         normals = world_normals(made.train[1], axes, torch.float64)
-        assert np.allclose(normals[3, 4], -made.train[1].camera.forward)
+        assert np.allclose(normals.directions[3, 4], -made.train[1].camera.forward)
     with pytest.raises(DataError, match="must face the camera; in the axes opengl, 0% of those of ball do"):
         plan_normals(facing(scene, (1, 1, 1)), NormalPrior(axes="opengl"))
+
+
+# -- the start ------------------------------------------------------------------------------------------------------
+def test_training_starts_from_places_on_the_maps_too(scene: Scene) -> None:
+    made = mapped(scene, lambda _, depth: np.where(depth > 0, 3.0, 0))  # planes in front of the cameras
+    recipe = replace(with_depth_prior(short(), "sensor"), init_points=120)
+    cloud, own = with_known_points(made, recipe).points, scene.points
+    assert cloud is not None
+    assert own is not None
+    added = len(cloud) - len(own)
+    assert 100 <= added <= 126
+    assert (cloud.points[added:] == own.points).all()
+    share = added // 6
+    for k, view in enumerate(made.train):
+        points, colors = cloud.points[k * share : (k + 1) * share], cloud.colors[k * share : (k + 1) * share]  # type: ignore[index]
+        pixels, depth = view.camera.project(points)
+        assert np.allclose(depth, 3.0)
+        assert np.allclose(pixels % 1, 0.5)  # at pixel centres, in their colours
+        columns, rows = np.floor(pixels).astype(int).T
+        assert (colors == view.image()[rows, columns]).all()
+    again = with_known_points(made, recipe).points
+    assert again is not None
+    assert (again.points == cloud.points).all()
+    other = with_known_points(made, replace(recipe, seed=1)).points
+    assert other is not None
+    assert (other.points[:9] != cloud.points[:9]).any()
+
+
+def test_places_that_are_masked_or_transparent_are_not_started_from(scene: Scene) -> None:
+    made = mapped(scene, lambda _, depth: np.full_like(depth, 3.0))
+    mask = np.zeros((SIZE, SIZE), dtype=bool)
+    mask[4, 5] = True
+    first = made.train[0]
+    masked = replace(View.from_arrays(first.name, first.camera, first.image(), mask), maps=first.maps)
+    cloud = with_known_points(replace(made, train=(masked,), points=None), with_depth_prior(short(), "sensor")).points
+    assert cloud is not None
+    assert np.allclose(first.camera.project(cloud.points)[0], [[5.5, 4.5]])
+
+
+def test_without_a_scale_or_where_the_recipe_says_so_the_capture_s_points_are_the_start(scene: Scene) -> None:
+    made, recipe = cases(scene)["sensor"]
+    assert recipe.depth_prior is not None
+    off = replace(recipe, depth_prior=replace(recipe.depth_prior, start=False))
+    assert with_known_points(made, off) is made
+    assert with_known_points(made, short()) is made
+    for source in ("sparse", "relative"):
+        made, recipe = cases(scene)[source]
+        assert with_known_points(made, recipe) is made
 
 
 # -- training -------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ from scipy.linalg import rq
 
 from gs2d.camera import Camera
 from gs2d.data.capture import Capture, Frame
-from gs2d.data.colmap import model_points
+from gs2d.data.colmap import model_points, observed_points
 from gs2d.data.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images
 from gs2d.data.lens import Intrinsics, colmap_intrinsics
+from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError
 from gs2d.images import image_size, natural_key
@@ -79,7 +81,16 @@ def read_dtu(root: Path) -> Capture:
         default_test_every=0,
         skipped=tuple(skipped),
         notes=notes,
+        observe=None if model is None or points is None else partial(_observed, model, frames),
     )
+
+
+def _observed(model: _Model, frames: Sequence[Frame]) -> ObservedPoints:
+    """The model's points by the photographs of the scan, which may have another suffix there."""
+    found = observed_points(model.folder, model.kind)
+    by_stem = {Path(frame.name).stem: frame.name for frame in frames}
+    seen = {by_stem[Path(name).stem]: rows for name, rows in found.seen.items() if Path(name).stem in by_stem}
+    return replace(found, seen=seen)
 
 
 def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float, float, np.ndarray]:

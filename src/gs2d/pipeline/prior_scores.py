@@ -12,7 +12,7 @@ from torch import Tensor
 from gs2d.data import View
 from gs2d.images import write_image
 from gs2d.io.run import PRIORS, RENDERS, RunFolder, make_folder
-from gs2d.losses_priors import Depths, PointDepths, RelativeDepths, aligned
+from gs2d.losses_priors import Depths, KnownNormals, PointDepths, RelativeDepths, aligned
 from gs2d.pipeline.pictures import file_names
 from gs2d.pipeline.prepare import Job
 from gs2d.render.api import rasterize
@@ -84,13 +84,12 @@ def _of_depth(depth: Depths, output: RenderOutput) -> tuple[float | None, dict[s
     return (float(error.median()) if len(error) else None), pictures
 
 
-def _of_normal(normal: Tensor, output: RenderOutput) -> tuple[float | None, dict[str, np.ndarray]]:
+def _of_normal(normal: KnownNormals, output: RenderOutput) -> tuple[float | None, dict[str, np.ndarray]]:
     """The median angle of a view, degrees, and pictures of known and rendered normals."""
-    known = (normal != 0).any(dim=2)
-    cosine = (torch.nn.functional.normalize(output.normal, dim=2) * normal).sum(dim=2).clamp(-1, 1)
-    angles = torch.rad2deg(torch.acos(cosine))[known & (output.alpha > 0.5)]
+    cosine = (torch.nn.functional.normalize(output.normal, dim=2) * normal.directions).sum(dim=2).clamp(-1, 1)
+    angles = torch.rad2deg(torch.acos(cosine))[(normal.known > 0) & (output.alpha > 0.5)]
     pictures = {
-        "known-normal": normal_picture(normal.cpu().numpy(), known.to(normal.dtype).cpu().numpy()),
+        "known-normal": normal_picture(normal.directions.cpu().numpy(), normal.known.cpu().numpy()),
         "normal": normal_picture(output.normal.cpu().numpy(), output.alpha.cpu().numpy()),
     }
     return (float(angles.median()) if len(angles) else None), pictures
@@ -107,9 +106,8 @@ def against(depths: Depths, rendered: Tensor, hit: Tensor) -> tuple[np.ndarray, 
         z = 1 / (depths.weights[seen] / at_points).sum(dim=1)
         return picture.reshape(rendered.shape).cpu().numpy(), (z / depths.depth[seen] - 1).abs()
     known = aligned(depths, rendered, hit) if isinstance(depths, RelativeDepths) else depths
-    there = known.known > 0
-    picture = torch.where(there, 1 / torch.where(there, known.disparity, 1), 0)
-    return picture.cpu().numpy(), (rendered * known.disparity - 1).abs()[there & hit]
+    picture = torch.where(known.known, 1 / torch.where(known.known, known.disparity, 1), 0)
+    return picture.cpu().numpy(), (rendered * known.disparity - 1).abs()[known.known & hit]
 
 
 def grown(points: np.ndarray) -> np.ndarray:

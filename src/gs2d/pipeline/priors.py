@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
-from gs2d.losses_priors import Depths, KnownDepths, PointDepths
+from gs2d.losses_priors import Depths, KnownDepths, KnownNormals, PointDepths
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.recipe import Recipe
 from gs2d.train.priors import DepthPlan, Priors, has_priors
@@ -51,9 +50,9 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
     return whole.hexdigest()
 
 
-def _arrays(view: View, plan: DepthPlan | None, normal: Tensor | None) -> Sequence[np.ndarray]:
+def _arrays(view: View, plan: DepthPlan | None, normal: KnownNormals | None) -> Sequence[np.ndarray]:
     """What decides the known depths and normals of a view."""
-    arrays = [] if normal is None else [normal.numpy()]
+    arrays = [] if normal is None else [normal.directions.numpy()]
     if plan is not None and plan.source != "sparse" and view.maps is not None and view.maps.files.depth is not None:
         arrays.append(view.maps.depth().values)
     if plan is not None and plan.observed is not None:
@@ -68,7 +67,7 @@ def depth_text(plan: DepthPlan, depths: Sequence[Depths], views: int) -> str:
     points = [len(depth.depth) for depth in depths if isinstance(depth, PointDepths)]
     if points:
         return f"known depths: {int(np.median(points)):,} sparse points in the middle one of {of_views}"
-    shares = [float(depth.known.mean()) for depth in depths if not isinstance(depth, PointDepths)]
+    shares = [float(depth.known.float().mean()) for depth in depths if not isinstance(depth, PointDepths)]
     pixels = f"{of_views}, {np.mean(shares):.0%} of their pixels"
     if plan.source == "sensor":
         unit = "" if plan.unit is None else f"; a value of 1 is {plan.unit:.4g} units of the capture"

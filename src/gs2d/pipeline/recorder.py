@@ -295,7 +295,12 @@ def _due(iteration: int, iterations: int, count: int, step: int) -> bool:
 
 def start_text(event: train_events.Initialised) -> str:
     """What training starts from, in words."""
-    source = "points of the capture" if event.source == "points" else "random points in the box the cameras look at"
+    sources = {
+        "points": "points of the capture",
+        "depths": "points of the capture and of its known depths",
+        "random": "random points in the box the cameras look at",
+    }
+    source = sources[event.source]
     dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
     return f"starting from {event.splats:,} {source}{dropped}"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Initialised:
-    """The start: ``source`` is "points" (the scene's) or "random"; ``dropped`` points were not usable."""
+    """The start: ``source`` is "points" (the scene's), "depths" (known ones too) or "random"; ``dropped``: unusable."""
 
     splats: int
     source: str

@@ -31,6 +31,7 @@ from gs2d.train.exposure import as_photographed
 from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
 from gs2d.train.optimizer_fused import fused_adam_step, native_adam_step
+from gs2d.train.priors import with_known_points
 from gs2d.train.rows import keep_rows
 from gs2d.train.state import Statistics, TrainState
 from gs2d.train.targets import DeviceTargets, Targets, TargetSource
@@ -255,15 +256,17 @@ class Trainer:
 
     def _new_state(self, dtype: torch.dtype) -> TrainState:
         generator = torch.Generator().manual_seed(self.recipe.seed)
+        start = with_known_points(self.scene, self.recipe)
         initial = initial_splats(
-            self.scene,
+            start,
             sh_degree=self.recipe.sh_degree,
             random_points=self.recipe.init_points,
             near=self.protocol.near_for(self.scene.extent),
             generator=generator,
             dtype=dtype,
         )
-        self._pending.append(events.Initialised(len(initial.splats), initial.source, initial.dropped))
+        source = initial.source if start is self.scene else "depths"
+        self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped))
         return per_view.start(TrainState(initial.splats, generator), self.recipe, self.scene)
 
     def _checked(self, state: TrainState) -> TrainState:

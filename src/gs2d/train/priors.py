@@ -5,15 +5,15 @@ Nothing here is part of the state: all of it follows from the capture and the re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from gs2d.data.prior_maps import DepthMap, ObservedPoints
-from gs2d.data.scene import Scene, View
+from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
-from gs2d.losses_priors import Depths, KnownDepths, PointDepths, Prior, RelativeDepths, fit_line
+from gs2d.losses_priors import Depths, KnownDepths, KnownNormals, PointDepths, Prior, RelativeDepths, fit_line
 from gs2d.recipe import Recipe
 from gs2d.recipe_priors import DepthPrior, NormalPrior
 
@@ -178,6 +178,8 @@ def points_in(view: View, observed: ObservedPoints, settings: DepthPrior) -> Poi
 class Priors:
     """What is known of each training view, where the splats are; the first that fit in ``limit_bytes`` are kept.
 
+    By default that is 1 GiB in the host's memory, 4 GiB on a device: the others are decoded anew each time.
+
     Raises
     ------
     DataError
@@ -190,11 +192,12 @@ class Priors:
         recipe: Recipe,
         *,
         device: torch.device | str = "cpu",
-        limit_bytes: int = 1 << 30,
+        limit_bytes: int | None = None,
     ) -> None:
         self._views, self._recipe, self._device = scene.train, recipe, device
-        self._room = limit_bytes
-        self._kept: dict[int, tuple[Depths | None, torch.Tensor | None]] = {}
+        by_place = 1 << 30 if torch.device(device).type == "cpu" else 1 << 32
+        self._room = by_place if limit_bytes is None else limit_bytes
+        self._kept: dict[int, tuple[Depths | None, KnownNormals | None]] = {}
         self.plan = None if recipe.depth_prior is None else plan_depths(scene, recipe.depth_prior)
         self.axes = None if recipe.normal_prior is None else plan_normals(scene, recipe.normal_prior)
 
@@ -211,8 +214,8 @@ class Priors:
             normal_share=0.0 if recipe.normal_prior is None else recipe.normal_prior.share_at(of_run),
         )
 
-    def known(self, index: int, dtype: torch.dtype) -> tuple[Depths | None, torch.Tensor | None]:
-        """Depths and normals [H, W, 3] (world) that are known of view ``index``, kept where there is room."""
+    def known(self, index: int, dtype: torch.dtype) -> tuple[Depths | None, KnownNormals | None]:
+        """Depths and normals that are known of view ``index``, kept where there is room."""
         kept = self._kept.get(index)
         if kept is not None:
             return kept
@@ -222,12 +225,50 @@ class Priors:
             assert self._recipe.depth_prior is not None
             depth = known_depths(view, self.plan, self._recipe.depth_prior, dtype, self._device)
         if self.axes is not None and view.maps is not None and view.maps.files.normal is not None:
-            normal = world_normals(view, self.axes, dtype).to(self._device)
+            normal = world_normals(view, self.axes, dtype, self._device)
         nbytes = (0 if depth is None else depth.nbytes) + (0 if normal is None else normal.nbytes)
         if nbytes <= self._room:
             self._room -= nbytes
             self._kept[index] = depth, normal
         return depth, normal
+
+
+def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
+    """The scene with places on its known depth maps among its points; itself where the recipe asks for none.
+
+    As many as the recipe's ``init_points``, of random pixels of all training views alike: the rates of means let a
+    splat wander by a few per cent of the extent, not to a wall that no sparse point is near.
+
+    Raises
+    ------
+    DataError
+    """
+    settings = recipe.depth_prior
+    if settings is None or not settings.start:
+        return scene
+    priors = Priors(scene, replace(recipe, normal_prior=None), limit_bytes=0)
+    rng = np.random.Generator(np.random.Philox(key=recipe.seed))
+    points, colors = [], []
+    for index, view in enumerate(scene.train):
+        depths = priors.known(index, torch.float64)[0]
+        if not isinstance(depths, KnownDepths):
+            continue
+        mask, alpha = view.mask(), view.alpha()
+        usable = depths.known.numpy() & (True if mask is None else mask) & (True if alpha is None else alpha >= 0.5)
+        pixels = np.flatnonzero(usable)
+        share = recipe.init_points // len(scene.train) + 1
+        pixels = np.sort(rng.choice(pixels, min(share, len(pixels)), replace=False))
+        rows, columns = np.unravel_index(pixels, usable.shape)
+        local = rays(view)[rows, columns] / depths.disparity.numpy()[rows, columns, None]
+        points.append((local - view.camera.T_cam_world[:3, 3]) @ view.camera.rotation)
+        colors.append(view.image()[rows, columns, :3])
+    if not any(len(found) for found in points):
+        return scene
+    if scene.points is not None:
+        grey = np.full((len(scene.points), 3), 128, dtype=np.uint8)
+        points.append(scene.points.points)
+        colors.append(grey if scene.points.colors is None else scene.points.colors)
+    return replace(scene, points=PointCloud(np.concatenate(points), np.concatenate(colors)))
 
 
 def known_depths(
@@ -242,11 +283,14 @@ def known_depths(
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(array).to(device, dtype)
 
+    def there(array: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(array).to(device)
+
     if plan.source == "sparse":
         assert plan.observed is not None
         points = points_in(view, plan.observed, settings)
         pixels, weights, depth = _around(points, view.camera.width)
-        return PointDepths(torch.as_tensor(pixels).to(device), tensor(weights), tensor(depth)) if len(depth) else None
+        return PointDepths(there(pixels), tensor(weights), tensor(depth)) if len(depth) else None
     if view.maps is None or view.maps.files.depth is None:
         return None
     map_ = view.maps.depth()
@@ -257,19 +301,19 @@ def known_depths(
     safe = np.where(known, values, 1)
     if plan.source == "sensor":
         unit = plan.unit or view.maps.files.unit or (1e-3 if map_.whole else 1.0)
-        return KnownDepths(tensor(known / (safe * unit)), tensor(known))
+        return KnownDepths(tensor(known / (safe * unit)), there(known))
     line = None
     if plan.observed is not None:
-        depth, there = _values_at(points_in(view, plan.observed, settings), map_)
-        line = line_of(there, depth, plan.space)
+        depth, at_points = _values_at(points_in(view, plan.observed, settings), map_)
+        line = line_of(at_points, depth, plan.space)
     if line is None:
         middle, spread = values[known].mean(), values[known].std()
         centred = np.where(known, (values - middle) / (spread if spread > 1e-9 * middle else 1), 0)
-        return RelativeDepths(tensor(centred), tensor(known), plan.space)
+        return RelativeDepths(tensor(centred), there(known), plan.space)
     on_line = line[0] * safe + line[1]
     good = known & (on_line > 1e-3 * np.median(on_line[known]))  # what is not has no depth in front of the camera
     safe = np.where(good, on_line, 1)
-    return KnownDepths(tensor(good * (safe if plan.space == "disparity" else 1 / safe)), tensor(good))
+    return KnownDepths(tensor(good * (safe if plan.space == "disparity" else 1 / safe)), there(good))
 
 
 def _around(points: PointsInView, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -327,8 +371,12 @@ def _in_opencv(normals: np.ndarray, axes: str) -> np.ndarray:
     return normals * np.array((1, -1, -1) if axes == "opengl" else (1, 1, 1), dtype=np.float32)
 
 
-def world_normals(view: View, axes: str, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-    """Known normals of a view in the world [H, W, 3]; 0 where unknown."""
+def world_normals(
+    view: View, axes: str, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> KnownNormals:
+    """Known normals of a view."""
     assert view.maps is not None
-    normals = _in_opencv(view.maps.normal(), axes) @ view.camera.rotation
-    return torch.as_tensor(normals).to(dtype)
+    normals = view.maps.normal()
+    known = (normals != 0).any(axis=2)
+    directions = torch.as_tensor(_in_opencv(normals, axes) @ view.camera.rotation)
+    return KnownNormals(directions.to(device, dtype), torch.as_tensor(known).to(device, dtype))
