@@ -45,15 +45,17 @@ def points(pixels: list[list[int]], weights: list[list[float]], depth: list[floa
 def test_a_map_counts_relative_errors_over_all_pixels_and_unknown_ones_as_none() -> None:
     depth, truth = torch.full((4, 5), 2.0).double(), torch.zeros(4, 5).double()
     truth[0, 0], truth[1, 2], truth[3, 4] = 1.0, 2.0, 4.0  # errors 1, 0, 1/2; 17 pixels unknown
-    loss = depth_prior(Prior(known(truth)), depth, HIT)
+    loss = depth_prior(Prior(known(truth), noise=1e-9), depth, HIT)
     assert loss.item() == pytest.approx(1.5 / 20)
-    assert depth_prior(Prior(known(truth), depth_share=0.25), depth, HIT).item() == pytest.approx(0.25 * 1.5 / 20)
+    assert depth_prior(Prior(known(truth), depth_share=0.25, noise=1e-9), depth, HIT).item() == pytest.approx(
+        0.25 * 1.5 / 20
+    )
 
 
 def test_pixels_that_are_hardly_covered_are_not_asked() -> None:
     depth, alpha = torch.full((4, 5), 2.0).double(), HIT.clone()
     alpha[0, 0], depth[1, 1] = 0.4, 0.0  # too thin, nothing hit
-    loss = depth_prior(Prior(known(torch.ones(4, 5).double()), opacity=0.5), depth, alpha)
+    loss = depth_prior(Prior(known(torch.ones(4, 5).double()), opacity=0.5, noise=1e-9), depth, alpha)
     assert loss.item() == pytest.approx(18 / 20)
 
 
@@ -62,22 +64,32 @@ def test_a_point_between_pixels_is_compared_with_the_plane_through_them() -> Non
     depth = torch.full((2, 2), 2.0).double()
     depth[:, 1] = 4.0
     middle = points([[0, 1, 2, 3]], [[0.25] * 4], [2.0])
-    assert depth_prior(Prior(middle), depth, HIT[:2, :2]).item() == pytest.approx((8 / 3 / 2 - 1) / LEAST_POINTS)
+    assert depth_prior(Prior(middle, noise=1e-9), depth, HIT[:2, :2]).item() == pytest.approx(
+        (8 / 3 / 2 - 1) / LEAST_POINTS
+    )
 
 
 def test_many_points_weigh_as_much_as_a_whole_picture_and_few_less() -> None:
     depth = torch.full((2, 2), 2.0).double()
     for count, expected in ((LEAST_POINTS // 2, 0.5), (LEAST_POINTS, 1.0), (3 * LEAST_POINTS, 1.0)):
         many = points([[0, 1, 2, 3]] * count, [[1.0, 0, 0, 0]] * count, [1.0] * count)
-        assert depth_prior(Prior(many), depth, HIT[:2, :2]).item() == pytest.approx(expected)
+        assert depth_prior(Prior(many, noise=1e-9), depth, HIT[:2, :2]).item() == pytest.approx(expected)
 
 
 def test_a_point_at_the_edge_of_what_was_hit_is_not_asked() -> None:
     depth, alpha = torch.full((2, 2), 2.0).double(), HIT[:2, :2].clone()
     alpha[1, 1] = 0.0
     asked = points([[0, 1, 2, 3], [0, 1, 2, 2]], [[0.25] * 4] * 2, [1.0, 1.0])
-    assert depth_prior(Prior(asked), depth, alpha).item() == pytest.approx(1 / LEAST_POINTS)
+    assert depth_prior(Prior(asked, noise=1e-9), depth, alpha).item() == pytest.approx(1 / LEAST_POINTS)
     assert depth_prior(Prior(points([], [], [])), depth, alpha).item() == 0
+
+
+def test_errors_that_are_to_be_expected_cost_their_square() -> None:
+    truth = torch.ones(4, 5).double()
+    for depth, expected in ((1.05, 0.05**2 / 0.2), (0.9, 0.05), (1.5, 0.45)):  # noise 0.1: e^2 / 0.2, then e - 0.05
+        rendered = torch.full((4, 5), depth, dtype=torch.float64)
+        loss = depth_prior(Prior(known(truth), noise=0.1), rendered, HIT)
+        assert loss.item() == pytest.approx(expected)
 
 
 def test_normals_cost_one_minus_their_cosine_by_blending_weight() -> None:

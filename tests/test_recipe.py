@@ -182,6 +182,7 @@ def test_comparisons_of_views_are_checked_like_the_stages(field: str, value: flo
         ("final", 0.0, "depth_prior.final must be in (0, 1], got 0.0"),
         ("horizon", 0, "depth_prior.horizon must be an integer >= 1"),
         ("opacity", 1.0, "depth_prior.opacity must be below 1"),
+        ("noise", 0.0, "depth_prior.noise must be positive"),
         ("min_track", 1, "depth_prior.min_track must be an integer >= 2"),
         ("max_error", 0.0, "depth_prior.max_error must be positive"),
         ("unit", -1.0, "depth_prior.unit must be a finite number >= 0"),

@@ -117,6 +117,8 @@ class Prior:
     normal : KnownNormals or None
     opacity : float
         Least rendered alpha of a pixel whose depth is asked.
+    noise : float
+        Relative error of a known depth that is to be expected.
     depth_share, normal_share : float
         What is left of the weights of the losses.
     """
@@ -124,6 +126,7 @@ class Prior:
     depth: Depths | None = None
     normal: KnownNormals | None = None
     opacity: float = 0.5
+    noise: float = 0.05
     depth_share: float = 1.0
     normal_share: float = 1.0
 
@@ -139,22 +142,27 @@ def depth_prior(prior: Prior, depth: Tensor, alpha: Tensor, mask: Tensor | None 
     hit = (alpha.detach() > prior.opacity) & (depth.detach() > 0)
     hit = hit if mask is None else hit & mask
     if isinstance(known, PointDepths):
-        error = _of_points(known, depth, hit)
+        error = _of_points(known, depth, hit, prior.noise)
     else:
         if isinstance(known, RelativeDepths):
             known = aligned(known, depth.detach(), hit)
-        error = masked_mean(torch.where(hit & known.known, depth * known.disparity - 1, 0).abs(), mask)
+        error = masked_mean(_robust(torch.where(hit & known.known, depth * known.disparity - 1, 0), prior.noise), mask)
     return prior.depth_share * error
 
 
-def _of_points(points: PointDepths, depth: Tensor, hit: Tensor) -> Tensor:
+def _robust(error: Tensor, noise: float) -> Tensor:
+    """Huber's loss over ``noise``: e^2 / (2 noise) below it, |e| - noise / 2 beyond."""
+    return torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=noise) / noise
+
+
+def _of_points(points: PointDepths, depth: Tensor, hit: Tensor, noise: float) -> Tensor:
     if len(points.depth) == 0:
         return depth.sum() * 0
     at_points = depth.reshape(-1)[points.pixels]  # [M, 4]
     seen = hit.reshape(-1)[points.pixels].all(dim=1)
     # Disparity is linear in the picture of a plane, depth is not.
     z = 1 / (points.weights / torch.where(seen[:, None], at_points, 1)).sum(dim=1)
-    return torch.where(seen, z / points.depth - 1, 0).abs().sum() / max(len(points.depth), LEAST_POINTS)
+    return _robust(torch.where(seen, z / points.depth - 1, 0), noise).sum() / max(len(points.depth), LEAST_POINTS)
 
 
 @torch.no_grad()

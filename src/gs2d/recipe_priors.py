@@ -31,13 +31,15 @@ class DepthPrior:
         stages counted: photographs know better in the end.
     opacity : float
         Least rendered alpha of a pixel whose depth is asked.
+    noise : float
+        Relative error of known depths that is to be expected: below it the loss is quadratic, beyond it linear.
     min_track : int
         Least photographs that a sparse point was found in.
     max_error : float
         px. Largest mean reprojection error of a sparse point.
     unit : float or None
-        wu of a value 1 in a sensor's map. None: what the capture says, else a thousandth for whole numbers and 1 for
-        others, and, where cameras come from photographs, whose scale is arbitrary, what fits the sparse points.
+        wu of a value 1 in a sensor's map. None: what fits the sparse points where the capture says which photographs
+        show them (COLMAP's scale is arbitrary), else what the capture says, a thousandth for whole numbers, or 1.
     space : str
         What relative maps are linear in: "disparity" (1 / depth, larger is nearer) or "depth"; "auto": what fits the
         sparse points better.
@@ -52,6 +54,7 @@ class DepthPrior:
     final: float = 0.01
     horizon: int = 30_000
     opacity: float = 0.5
+    noise: float = 0.05
     min_track: int = 3
     max_error: float = 2.0
     unit: float | None = None
@@ -113,6 +116,7 @@ def check_priors(where: str, depth: DepthPrior | None, normal: NormalPrior | Non
     one_of(f"{at}.align", depth.align, ALIGNMENTS)
     opacity = number(f"{at}.opacity", depth.opacity, low=0.0)
     require(opacity < 1, f"{at}.opacity must be below 1, which no rendering reaches, got {opacity}")
+    require(number(f"{at}.noise", depth.noise, low=0.0) > 0, f"{at}.noise must be positive, got 0")
     integer(f"{at}.min_track", depth.min_track, low=2)
     require(number(f"{at}.max_error", depth.max_error, low=0.0) > 0, f"{at}.max_error must be positive, got 0")
     if depth.unit is not None:

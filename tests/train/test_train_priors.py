@@ -122,10 +122,8 @@ def test_points_are_where_the_camera_sees_them_with_the_pixels_around(scene: Sce
 
 # -- units, scales and shifts ---------------------------------------------------------------------------------------
 def test_whole_numbers_are_thousandths_unless_the_capture_or_the_recipe_says_otherwise(scene: Scene) -> None:
-    plain = replace(scene, format="nerfstudio")
-
     def disparity(whole: bool, unit: float | None, of_file: float | None) -> float:
-        made = mapped(plain, lambda _, depth: np.full_like(depth, 4.0), whole=whole, unit=of_file)
+        made = mapped(scene, lambda _, depth: np.full_like(depth, 4.0), whole=whole, unit=of_file)
         settings = DepthPrior("sensor", unit=unit)
         known = known_depths(made.train[0], plan_depths(made, settings), settings)
         assert isinstance(known, KnownDepths)
@@ -141,7 +139,7 @@ def test_a_sensor_s_unit_is_fitted_to_the_points_where_cameras_come_from_photogr
     made = mapped(observed(scene), lambda _, depth: 700 * depth, whole=True, metric=True)
     assert plan_depths(made, DepthPrior()).unit == pytest.approx(1 / 700, rel=0.1)  # the points are noisy
     assert plan_depths(made, DepthPrior(unit=0.3)).unit == 0.3
-    assert plan_depths(replace(made, format="blender"), DepthPrior()).unit is None
+    assert plan_depths(replace(made, observe=None), DepthPrior()).unit is None
     few = replace(made, train=made.train[:1])
     assert few.observe is not None
     nothing = replace(few.observe(), seen={})

@@ -79,8 +79,7 @@ def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
             f"no training view of {scene.name} has a depth map; put them in {scene.root}/depths under the names of the "
             "photographs (16-bit PNG or .npy), or name them as depth_file_path in transforms.json"
         )
-    from_photographs = scene.format in ("colmap", "dtu")
-    asks = settings.unit is None and from_photographs if source == "sensor" else settings.align == "points"
+    asks = settings.unit is None if source == "sensor" else settings.align == "points"
     observed = scene.observe() if asks and scene.observe is not None else None
     if source == "sensor":
         return DepthPlan(source, observed, settings.unit or _fitted_unit(mapped, observed, settings))
@@ -210,6 +209,7 @@ class Priors:
             depth,
             normal,
             opacity=0.0 if recipe.depth_prior is None else recipe.depth_prior.opacity,
+            noise=1.0 if recipe.depth_prior is None else recipe.depth_prior.noise,
             depth_share=0.0 if recipe.depth_prior is None else recipe.depth_prior.share_at(of_run),
             normal_share=0.0 if recipe.normal_prior is None else recipe.normal_prior.share_at(of_run),
         )
