@@ -14,6 +14,7 @@ from train_toys import SIZE, random_splats, same, short
 from gs2d.data.prior_maps import DepthMap, MapFiles, ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
+from gs2d.geometry import quats_to_matrices
 from gs2d.losses_priors import KnownDepths, PointDepths, RelativeDepths
 from gs2d.protocols import GENERIC
 from gs2d.recipe import Rates, Recipe
@@ -21,12 +22,14 @@ from gs2d.recipe_priors import DepthPrior, NormalPrior
 from gs2d.recipes import with_depth_prior, with_normal_prior
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
+from gs2d.train.initialise import initial_splats, turned_to
 from gs2d.train.loop import Trainer
 from gs2d.train.priors import (
     known_depths,
     line_of,
     plan_depths,
     plan_normals,
+    plane_normals,
     points_in,
     with_known_points,
     world_normals,
@@ -237,6 +240,21 @@ def test_training_starts_from_places_on_the_maps_too(scene: Scene) -> None:
     other = with_known_points(made, replace(recipe, seed=1)).points
     assert other is not None
     assert (other.points[:9] != cloud.points[:9]).any()
+
+
+def test_splats_on_known_depths_lie_in_their_surface(scene: Scene) -> None:
+    made = mapped(replace(scene, train=scene.train[:1]), lambda _, depth: np.full_like(depth, 3.0))
+    start = with_known_points(replace(made, points=None), replace(with_depth_prior(short(), "sensor"), init_points=200))
+    generator = torch.Generator().manual_seed(0)
+    splats = initial_splats(start, sh_degree=0, random_points=5, near=0.1, generator=generator).splats
+    normals = quats_to_matrices(splats.quats.double())[:, :, 2].numpy()
+    assert np.allclose(np.abs(normals @ made.train[0].camera.forward), 1, atol=1e-5)
+    assert (plane_normals(np.zeros((3, 3))) == 0).all()
+    up = torch.tensor([[0.0, 0, -1], [0, 0, 0], [1, 0, 0]], dtype=torch.float64)
+    others = torch.tensor([[0.0, 1, 0, 0]] * 3, dtype=torch.float64)
+    turned = quats_to_matrices(turned_to(up, others))[:, :, 2].abs()
+    assert torch.allclose(turned, torch.tensor([[0.0, 0, 1], [0, 0, 1], [1, 0, 0]], dtype=torch.float64))
+    assert turned_to(up, others)[1].tolist() == [0, 1, 0, 0]
 
 
 def test_places_that_are_masked_or_transparent_are_not_started_from(scene: Scene) -> None:

@@ -120,15 +120,20 @@ class PointCloud:
     ----------
     points : ndarray [P, 3] float64 wu
     colors : ndarray [P, 3] uint8 sRGB, or None
+    normals : ndarray [P, 3] or None
+        Of the surface, unit, either way round; 0 where unknown.
     """
 
     points: np.ndarray
     colors: np.ndarray | None = None
+    normals: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shapes = {"points": (self.points, "P 3")}
         if self.colors is not None:
             shapes["colors"] = (self.colors, "P 3")
+        if self.normals is not None:
+            shapes["normals"] = (self.normals, "P 3")
         check_shapes(shapes)
 
     def __len__(self) -> int:

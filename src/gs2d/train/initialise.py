@@ -72,9 +72,12 @@ def initial_splats(
         raise _no_points(points, scene, near)
     floor = min(SCALE_FLOOR, RELATIVE_SCALE_FLOOR * scene.extent)
     scales = np.maximum(nearest_distances(kept, k=3), floor)
+    quats = random_rotations(len(kept), generator)
+    if cloud is not None and cloud.normals is not None:
+        quats = turned_to(torch.as_tensor(cloud.normals[usable], dtype=torch.float64), quats)
     splats = Splats(
         means=torch.as_tensor(kept).to(dtype),
-        quats=random_rotations(len(kept), generator).to(dtype),
+        quats=quats.to(dtype),
         log_scales=torch.as_tensor(np.log(scales)).to(dtype)[:, None].repeat(1, 2),
         opacity_logits=torch.full((len(kept),), math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), dtype=dtype),
         sh0=rgb_to_sh0(torch.as_tensor(colors[usable]).to(dtype)),
@@ -110,6 +113,14 @@ def random_rotations(count: int, generator: torch.Generator) -> Tensor:
     """Unit quaternions [count, 4] float64, uniform over rotations (normalised Gaussian 4-vectors)."""
     quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
     return quats / quats.norm(dim=1, keepdim=True)
+
+
+def turned_to(normals: Tensor, others: Tensor) -> Tensor:
+    """Unit quaternions [P, 4] that turn the z axis, a splat's own normal, to normals; ``others`` where those are 0."""
+    known = (normals != 0).any(dim=1)
+    n = torch.where(normals[:, 2:] < 0, -normals, normals)  # either way round: the nearer one
+    quats = torch.stack([1 + n[:, 2], -n[:, 1], n[:, 0], torch.zeros_like(n[:, 0])], dim=1)
+    return torch.where(known[:, None], quats / quats.norm(dim=1, keepdim=True), others)
 
 
 def _no_points(points: np.ndarray, scene: Scene, near: float) -> Exception:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from gs2d.data.prior_maps import DepthMap, ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
@@ -237,7 +238,8 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
     """The scene with places on its known depth maps among its points; itself where the recipe asks for none.
 
     As many as the recipe's ``init_points``, of random pixels of all training views alike: the rates of means let a
-    splat wander by a few per cent of the extent, not to a wall that no sparse point is near.
+    splat wander by a few per cent of the extent, not to a wall that no sparse point is near. They lie in the planes of
+    their neighbours: discs that are turned at random are as thick as they are wide.
 
     Raises
     ------
@@ -264,11 +266,22 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
         colors.append(view.image()[rows, columns, :3])
     if not any(len(found) for found in points):
         return scene
+    normals = [plane_normals(np.concatenate(points))]
     if scene.points is not None:
         grey = np.full((len(scene.points), 3), 128, dtype=np.uint8)
         points.append(scene.points.points)
         colors.append(grey if scene.points.colors is None else scene.points.colors)
-    return replace(scene, points=PointCloud(np.concatenate(points), np.concatenate(colors)))
+        normals.append(np.zeros_like(scene.points.points))
+    return replace(scene, points=PointCloud(*map(np.concatenate, (points, colors, normals))))
+
+
+def plane_normals(points: np.ndarray, neighbours: int = 16) -> np.ndarray:
+    """Unit normals [P, 3] of the planes through the nearest points of each point [P, 3]; 0 where there are too few."""
+    if len(points) < neighbours:
+        return np.zeros_like(points)
+    near = points[cKDTree(points).query(points, k=neighbours)[1]]  # [P, k, 3]
+    near = near - near.mean(axis=1, keepdims=True)
+    return np.asarray(np.linalg.eigh(near.swapaxes(1, 2) @ near)[1][:, :, 0])
 
 
 def known_depths(
