@@ -101,19 +101,38 @@ def test_packed_rows_become_vectors_and_rows_again(any_native: Library, k: int) 
     assert np.array_equal(back, rows)
 
 
-def test_interleaving_takes_a_bit_of_each_mask_in_turn(any_native: Library) -> None:
+def test_rows_of_eight_become_columns(any_native: Library) -> None:
     n = any_native.lanes
-    masks = np.random.default_rng(0).integers(0, 1 << n, size=(50, 4), dtype=np.uint32)
-    function = any_native.function("gs2d_selftest_interleave", ctypes.c_uint64, [ctypes.c_void_p])
-    for row in masks:
-        bits = [int(row[i % 4]) >> (i // 4) & 1 for i in range(4 * n)]
-        assert function(np.ascontiguousarray(row).ctypes.data) == sum(bit << i for i, bit in enumerate(bits))
+    rows = np.arange(n * 8, dtype=real(any_native)).reshape(n, 8)
+    out = np.empty((8, n), rows.dtype)
+    any_native.function("gs2d_selftest_columns", None, [ctypes.c_void_p] * 2)(rows.ctypes.data, out.ctypes.data)
+    assert np.array_equal(out, rows.T)
 
 
-def test_spreading_repeats_each_row_for_the_rows_of_blocks_of_a_tile(any_native: Library) -> None:
+def test_bits_are_added_in_the_lanes_of_a_mask_and_move_to_the_left(any_native: Library) -> None:
     n = any_native.lanes
-    block_rows = {16: 4, 8: 8}[n]  # of 4 and of 2 pixels, in a tile of 16
-    rows = np.arange(16, dtype=real(any_native)).reshape(4, 4)
-    out = np.empty((4, n), rows.dtype)
-    any_native.function("gs2d_selftest_spread", None, [ctypes.c_void_p] * 2)(rows.ctypes.data, out.ctypes.data)
-    assert np.array_equal(out, np.repeat(rows[: n // block_rows], block_rows, axis=0).T)
+    function = any_native.function("gs2d_selftest_with_bits", None, [ctypes.c_void_p] * 3)
+    random = np.random.default_rng(0)
+    for masks, bits in zip(random.integers(0, 1 << n, (50, 2)), random.integers(0, 1 << 28, (50, 2)), strict=True):
+        in_lane = masks[:, None] >> np.arange(n) & 1
+        out = np.empty(n, np.uint32)
+        arguments = masks.astype(np.uint32), bits.astype(np.uint32)
+        function(arguments[0].ctypes.data, arguments[1].ctypes.data, out.ctypes.data)
+        assert np.array_equal(out, in_lane[0] * bits[0] << 4 | in_lane[1] * bits[1])
+
+
+def test_numbers_that_are_not_zero_are_found_for_every_block_of_a_tile(any_native: Library) -> None:
+    n = any_native.lanes
+    function = any_native.function("gs2d_selftest_nonzero", ctypes.c_uint32, [ctypes.c_void_p])
+    random = np.random.default_rng(0)
+    for share in (0.0, 0.1, 0.9, 1.0):
+        numbers = np.where(random.random(256 // n) < share, random.integers(1, 1 << n, 256 // n), 0).astype(np.uint32)
+        assert function(numbers.ctypes.data) == sum(1 << b for b, number in enumerate(numbers) if number)
+
+
+def test_planes_are_unzipped_and_repeated(any_native: Library) -> None:
+    n = any_native.lanes
+    fields = np.arange(1, 9, dtype=real(any_native))
+    out = np.empty((3, n), fields.dtype)
+    any_native.function("gs2d_selftest_unzip", None, [ctypes.c_void_p] * 2)(fields.ctypes.data, out.ctypes.data)
+    assert np.array_equal(out, np.tile([[1, 3, 5, 0], [2, 4, 6, 0], [0, 0, 7, 8]], n // 4))

@@ -68,19 +68,23 @@ template <class V> GS2D_HD mask_t<V> is_plain(V dx, V dy, V ai, V bi, V iz, V pl
     return (middle - range >= plain_from) & ((middle + range) * near < V(0.9999f));
 }
 
-// The alpha of a hit (not yet limited to alpha_max), 0 where it is skipped. Of a plain splat all depths are beyond `near`.
-template <class V> GS2D_HD V plain_alpha_of(V log2_opacity, V rho, const BlendLimits<V>& k) {
-    const V log2_alpha = fma(V(-0.5 * LOG2E), rho, log2_opacity);
+// The alpha of a hit (not yet limited to alpha_max), 0 where it is skipped, by its logarithm. Of a plain splat all depths are
+// beyond `near`.
+template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, V rho) { return fma(V(-0.5 * LOG2E), rho, log2_opacity); }
+template <class V> GS2D_HD V alpha_of(V log2_alpha, const BlendLimits<V>& k) {
     return keep(log2_alpha >= k.log2_alpha_min, exp2_small(log2_alpha));
 }
-template <class V> GS2D_HD V alpha_of(V log2_opacity, V rho, V depth, const BlendLimits<V>& k) {
-    return keep(depth >= k.near, plain_alpha_of(log2_opacity, rho, k));
+template <class V> GS2D_HD V plain_alpha_of(V log2_opacity, V rho, const BlendLimits<V>& k) {
+    return alpha_of(log2_alpha_of(log2_opacity, rho), k);
+}
+template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, const Hit<V>& h, const BlendLimits<V>& k) {
+    return select(h.depth >= k.near, log2_alpha_of(log2_opacity, h.rho), V(-1e30));
 }
 
 // Both.
 template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, const PlaneAt<V>& p, V zc, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h = meet(p, s.iz, zc, dx, dy, k);
-    h.alpha = alpha_of(s.log2_opacity, h.rho, h.depth, k);
+    h.alpha = alpha_of(log2_alpha_of(s.log2_opacity, h, k), k);
     return h;
 }
 template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, V zc, V dx, V dy, const BlendLimits<V>& k) {
@@ -94,15 +98,16 @@ template <class V> struct Pixel {
     V alpha, red, green, blue, nx, ny, nz;
     V depth;  // sum w z
     V median;
-    V inverse_depth0, minus_2M1, M2, distortion;  // M1 = sum w q, M2 = sum w q^2
+    V inverse_depth0, M1_twice, M2, distortion;  // M1 = sum w q, M2 = sum w q^2
     mask_t<V> live;
 };
 
 // One splat at the pixel, given what `intersect` found: its weight, and all of the state that it changes but the images
-// of `accumulate`. Early: a live pixel may have T > 1/2 or nothing in front; otherwise its first and median pairs are past.
+// of `accumulate`. What a stopped pixel does to alpha and `after` is masked later, so that T does not wait for it.
+// Early: a live pixel may have T > 1/2 or nothing in front; otherwise its first and median pairs are past.
 template <bool Early, class V>
 GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
-    const V alpha = keep(p.live, min(raw_alpha, k.alpha_max));
+    const V alpha = min(raw_alpha, k.alpha_max);
     const V after = fnma(alpha, p.T, p.T);
     p.live = p.live & (after >= k.transmittance_min);  // T of a live pixel never is below: only a seen splat can stop it
     const V w = keep(p.live, alpha * p.T);
@@ -110,9 +115,9 @@ GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLim
         p.inverse_depth0 = select(p.alpha <= V(0), inverse_depth, p.inverse_depth0);
         p.median = select((w > V(0)) & (p.T > V(0.5)), depth, p.median);
     }
-    const V q = inverse_depth - p.inverse_depth0, wq = w * q;
-    p.distortion = fma(wq, fma(q, p.alpha, p.minus_2M1), fma(w, p.M2, p.distortion));
-    p.minus_2M1 = p.minus_2M1 - (wq + wq);  // exact: additions instead of a product
+    const V q = p.inverse_depth0 - inverse_depth, wq = w * q;  // -q, so that the one in memory is subtracted
+    p.distortion = fma(wq, fma(q, p.alpha, p.M1_twice), fma(w, p.M2, p.distortion));
+    p.M1_twice = p.M1_twice - (wq + wq);  // exact: additions instead of a product
     p.M2 = fma(wq, q, p.M2);
     p.T = select(p.live, after, p.T);
     p.alpha = p.alpha + w;

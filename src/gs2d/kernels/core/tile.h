@@ -42,14 +42,13 @@ template <class V> struct Chords {
 // What a footprint holds of the rows y0 to y1, from left to right; nothing where left > right. Both shapes hold (cx, cy), so
 // that this is one piece but where a far end of the ellipse comes back beside the disc.
 template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V& left, V& right) {
-    const V zero = V(0), far = V(1e30), a = y0 - s.ey, b = y1 - s.ey;
+    const V far = V(1e30), a = y0 - s.ey, b = y1 - s.ey;
     const V yr = min(max(s.y_right, a), b), yl = min(max(-s.y_right, a), b);
     const V r2 = fnma(yr * s.inv_y2, yr, V(1)), l2 = fnma(yl * s.inv_y2, yl, V(1));
-    const auto in = r2 >= zero;
-    right = select(in, fma(s.half, sqrt(max(r2, zero)), fma(s.slope, yr, s.ex)), -far);
-    left = select(in, fnma(s.half, sqrt(max(l2, zero)), fma(s.slope, yl, s.ex)), far);
-    const V dy = min(max(s.cy, y0), y1) - s.cy, d2 = fnma(dy, dy, s.disc2), d = sqrt(max(d2, zero));
-    const auto near = d2 >= zero;
+    const V dy = min(max(s.cy, y0), y1) - s.cy, d2 = fnma(dy, dy, s.disc2), d = sqrt(d2);
+    const auto near = d2 >= V(0);
+    right = fma(s.half, sqrt(r2), fma(s.slope, yr, s.ex)), left = fnma(s.half, sqrt(l2), fma(s.slope, yl, s.ex));
+    // NaN where the ellipse does not reach: max and min then take the other one
     right = max(right, select(near, s.cx + d, -far)), left = min(left, select(near, s.cx - d, far));
 }
 

@@ -51,7 +51,6 @@ bool list_entries(Frame& f) {
 
 bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
     if (!load_target(f, image, mask)) return false;
-    const BlockRows rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), lx = lane_x(0), ly = lane_y(0);
     parallel_ranges(f.count, 256, [&](int64_t begin, int64_t end) {
@@ -61,18 +60,28 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
             if (r.x1 <= r.x0) continue;
             const Record<V> s = broadcast(&f.records[i * RECORD]);
             const V zc = reciprocal(s.iz);
+            uint32_t same[LANES], touched[LANES];
+            for (uint32_t& splat : same) splat = static_cast<uint32_t>(i);
+            const Footprints footprint(f, same);
+            const int columns = r.x1 - r.x0, tiles = columns * (r.y1 - r.y0);
+            const auto tile_x = [&](int t) { return real((r.x0 + t % columns) * TILE); };
+            const auto tile_y = [&](int t) { return real((r.y0 + t / columns) * TILE); };
             V total = V(0);
-            for (int ty = r.y0; ty < r.y1; ++ty)
-                for (int tx = r.x0; tx < r.x1; ++tx) {
-                    const real x0 = real(tx * TILE), y0 = real(ty * TILE);
-                    const real* target = &f.target[(size_t(ty) * f.tiles_x + tx) * PLANES * PIXELS];
-                    for (uint32_t left = blocks_touched(f, static_cast<uint32_t>(i), rows, x0, y0); left; left &= left - 1) {
-                        const int b = __builtin_ctz(left);
-                        const V x = lx + V(x0 + real(block_x(b))), y = ly + V(y0 + real(block_y(b)));
-                        const Hit<V> h = intersect(s, zc, x - s.cx, y - s.cy, limits);
-                        total = total + keep(counts(h, limits, cutoff2, target, b), difference(s, target, b));
-                    }
+            for (int t = 0; t < tiles; ++t) {
+                if (t % LANES == 0) {
+                    alignas(64) real x[LANES], y[LANES];
+                    for (int k = 0; k < LANES; ++k) x[k] = tile_x(t + k), y[k] = tile_y(t + k);
+                    blocks_touched(footprint, load(x), load(y), touched);
                 }
+                const real x0 = tile_x(t), y0 = tile_y(t);
+                const real* target = &f.target[(size_t(y0) / TILE * f.tiles_x + size_t(x0) / TILE) * PLANES * PIXELS];
+                for (uint32_t left = touched[t % LANES]; left; left &= left - 1) {
+                    const int b = __builtin_ctz(left);
+                    const V x = lx + V(x0 + real(block_x(b))), y = ly + V(y0 + real(block_y(b)));
+                    const Hit<V> h = intersect(s, zc, x - s.cx, y - s.cy, limits);
+                    total = total + keep(counts(h, limits, cutoff2, target, b), difference(s, target, b));
+                }
+            }
             errors[i] = sum(total);
         }
     });
@@ -81,7 +90,6 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
 
 bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
     if (!bin_splats(f) || !list_entries(f) || !load_target(f, image, mask) || !f.saved.reserve(f.tile_begin[f.tiles])) return false;
-    const BlockRows rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff));
     parallel_for(f.tiles, [&](int64_t tile) {
@@ -90,12 +98,18 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
         const V lx = lane_x(a.x0), ly = lane_y(a.y0);
         alignas(64) real T[PIXELS];
         for (real& t : T) t = 1;
-        for (int64_t e = f.tile_begin[tile]; e < f.tile_begin[tile + 1]; ++e) {
+        uint32_t touched[LANES];
+        for (int64_t begin = f.tile_begin[tile], end = f.tile_begin[tile + 1], e = begin; e < end; ++e) {
+            if ((e - begin) % LANES == 0) {
+                uint32_t splats[LANES];
+                for (int k = 0; k < LANES; ++k) splats[k] = f.entries[e + k < end ? e + k : end - 1].splat();
+                blocks_touched(Footprints(f, splats), V(real(a.x0)), V(real(a.y0)), touched);
+            }
             const uint32_t splat = f.entries[e].splat();
             const Record<V> s = broadcast(&f.records[size_t(splat) * RECORD]);
             const V zc = reciprocal(s.iz);
             V total = V(0);
-            for (uint32_t left = blocks_touched(f, splat, rows, real(a.x0), real(a.y0)); left; left &= left - 1) {
+            for (uint32_t left = touched[(e - begin) % LANES]; left; left &= left - 1) {
                 const int b = __builtin_ctz(left);
                 const V x = lx + V(real(block_x(b))), y = ly + V(real(block_y(b)));
                 const Hit<V> h = intersect(s, zc, x - s.cx, y - s.cy, limits);

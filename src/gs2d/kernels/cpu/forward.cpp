@@ -9,7 +9,7 @@ namespace {
 constexpr int CHUNK = 256;  // entries looked at together: what is kept of them stays in the first cache
 
 // What Pixel<V> holds, in memory between chunks.
-enum Plane { RED, GREEN, BLUE, NX, NY, NZ, ALPHA, DEPTH, MEDIAN, DISTORTION, T, MINUS_2M1, M2, DEPTH0, PLANES };
+enum Plane { RED, GREEN, BLUE, NX, NY, NZ, ALPHA, DEPTH, MEDIAN, DISTORTION, T, M1_TWICE, M2, DEPTH0, PLANES };
 
 struct TileState {
     alignas(64) real planes[PLANES][PIXELS];
@@ -17,25 +17,36 @@ struct TileState {
     bool finished[BLOCKS];
 };
 
+// A splat that reaches the tile.
+struct Candidate {
+    PlanesByBlock planes;
+    real record[RECORD];
+    LaneBits seen[BLOCKS];  // live pixels of the block that saw it
+    uint8_t filtered;       // not plain
+};
+
 struct TileWork {
-    alignas(64) real records[CHUNK][RECORD];
-    SplatPlanes planes[CHUNK];
-    uint32_t splats[CHUNK], seen[CHUNK];
+    alignas(64) Candidate candidates[CHUNK];
+    uint32_t splats[CHUNK];
     uint8_t plain[CHUNK];
     uint32_t touched[CHUNK + LANES], list[CHUNK + LANES];  // read and written a vector at a time
     TileState state;
+
+    // The lists of blocks hold bytes from the first one, so that nothing is left to work out.
+    Candidate& at(uint32_t offset) { return *reinterpret_cast<Candidate*>(reinterpret_cast<char*>(candidates) + offset); }
+    const Candidate& at(uint32_t offset) const { return const_cast<TileWork*>(this)->at(offset); }
 };
 
 inline Pixel<V> load_pixel(const TileState& s, int b) {
     const auto at = [&](Plane p) { return load(&s.planes[p][b * LANES]); };
     return {at(T), at(ALPHA), at(RED), at(GREEN), at(BLUE), at(NX), at(NY), at(NZ), at(DEPTH), at(MEDIAN),
-            at(DEPTH0), at(MINUS_2M1), at(M2), at(DISTORTION), s.live[b]};
+            at(DEPTH0), at(M1_TWICE), at(M2), at(DISTORTION), s.live[b]};
 }
 
 inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
     const auto at = [&](Plane k, V v) { store(&s.planes[k][b * LANES], v); };
     at(T, p.T), at(ALPHA, p.alpha), at(RED, p.red), at(GREEN, p.green), at(BLUE, p.blue), at(NX, p.nx), at(NY, p.ny);
-    at(NZ, p.nz), at(DEPTH, p.depth), at(MEDIAN, p.median), at(DEPTH0, p.inverse_depth0), at(MINUS_2M1, p.minus_2M1), at(M2, p.M2);
+    at(NZ, p.nz), at(DEPTH, p.depth), at(MEDIAN, p.median), at(DEPTH0, p.inverse_depth0), at(M1_TWICE, p.M1_twice), at(M2, p.M2);
     at(DISTORTION, p.distortion);
     s.live[b] = p.live;
     s.finished[b] = !any(p.live);
@@ -48,25 +59,25 @@ constexpr int UNROLL = REGISTERS >= 32 ? 2 : 1;  // gcc would unroll all 8 round
 
 // What the intersections leave: one row per splat.
 struct Batch {
-    alignas(64) real alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
+    alignas(64) real log2_alpha[BATCH][LANES], depth[BATCH][LANES], inverse_depth[BATCH][LANES];
 };
 
 template <bool Early>
 inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b, Batch& batch, const BlendLimits<V>& limits, Pixel<V>& p) {
     const auto weigh = [&](int i) {
-        const V alpha = load(batch.alpha[i]);
-        w.seen[list[i]] |= uint32_t(any_positive(alpha, p.live)) << b;
-        return composite_weight<Early>(alpha, load(batch.depth[i]), load(batch.inverse_depth[i]), limits, p);
+        const V log2_alpha = load(batch.log2_alpha[i]);
+        w.at(list[i]).seen[b] = LaneBits(bits(p.live & (log2_alpha >= limits.log2_alpha_min)));
+        return composite_weight<Early>(alpha_of(log2_alpha, limits), load(batch.depth[i]), load(batch.inverse_depth[i]), limits, p);
     };
-    const auto add = [&](int i, V weight) { accumulate(broadcast(w.records[list[i]]), weight, load(batch.depth[i]), p); };
+    const auto add = [&](int i, V weight) { accumulate(broadcast(w.at(list[i]).record), weight, load(batch.depth[i]), p); };
     if constexpr (REGISTERS >= 32) {
 #pragma GCC unroll UNROLL
         for (int i = 0; i < count; ++i) add(i, weigh(i));
     } else {  // the state of a pixel does not fit: first one half of it, then the other
 #pragma GCC unroll UNROLL
-        for (int i = 0; i < count; ++i) store(batch.alpha[i], weigh(i));
+        for (int i = 0; i < count; ++i) store(batch.log2_alpha[i], weigh(i));
 #pragma GCC unroll UNROLL
-        for (int i = 0; i < count; ++i) add(i, load(batch.alpha[i]));
+        for (int i = 0; i < count; ++i) add(i, load(batch.log2_alpha[i]));
     }
 }
 
@@ -76,21 +87,24 @@ inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, 
     uint32_t others = 0;
 #pragma GCC unroll UNROLL
     for (int i = 0; i < count; ++i) {
-        const Hit<V> h = meet_plane(w.planes[list[i]].at(b));
-        store(batch.alpha[i], plain_alpha_of(V(w.records[list[i]][9]), h.rho, limits));
+        const Candidate& c = w.at(list[i]);
+        const Hit<V> h = meet_plane(c.planes.at(b));
         store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
-        others |= uint32_t(!w.plain[list[i]]) << i;
+        store(batch.log2_alpha[i], log2_alpha_of(c.planes.log2_opacity(b), h.rho));
+        others |= uint32_t(c.filtered) << i;
     }
     for (; others; others &= others - 1) {
         const int i = __builtin_ctz(others);
-        const Record<V> s = broadcast(w.records[list[i]]);
-        const Hit<V> h = hit_at(s, reciprocal(s.iz), w.planes[list[i]].at(b), false, centres, b, limits);
-        store(batch.alpha[i], h.alpha), store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
+        const Candidate& c = w.at(list[i]);
+        const V iz = V(c.record[8]), dx = centres.at_x(b) - V(c.record[0]), dy = centres.at_y(b) - V(c.record[1]);
+        const Hit<V> h = meet(c.planes.at(b), iz, reciprocal(iz), dx, dy, limits);
+        store(batch.depth[i], h.depth), store(batch.inverse_depth[i], h.inverse_depth);
+        store(batch.log2_alpha[i], log2_alpha_of(c.planes.log2_opacity(b), h, limits));
     }
 }
 
 void blend_block(TileWork& w, int b, int n, const Centres& centres, const BlendLimits<V>& limits) {
-    const int count = indices_with_bit(w.touched, n, b, w.list);
+    const int count = multiples_with_bit<sizeof(Candidate)>(w.touched, n, b, w.list);
     if (count == 0) return;
     Pixel<V> p = load_pixel(w.state, b);
     for (int j = 0; j < count; j += BATCH) {
@@ -107,37 +121,39 @@ void blend_block(TileWork& w, int b, int n, const Centres& centres, const BlendL
 }
 
 // Entries of the chunk that reach a live block, with their records side by side.
-int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const BlockRows& block_rows, const TileArea& area,
-           const Centres& centres) {
+int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const TileArea& area, const Centres& centres) {
     uint32_t wanted = 0;
     for (int b = 0; b < BLOCKS; ++b) wanted |= uint32_t(!w.state.finished[b]) << b;
     int m = 0;
     constexpr int AHEAD = 16;  // what a splat needs lies far apart: ask for it early
-    constexpr int TOGETHER = BlockRows::SPLATS;
-    for (int i = 0; i < n; i += TOGETHER) {
-        uint32_t splats[TOGETHER], touched[TOGETHER];
-        for (int j = 0; j < TOGETHER; ++j) {
+    const V x0 = V(real(area.x0)), y0 = V(real(area.y0));
+    for (int i = 0; i < n; i += LANES) {
+        uint32_t splats[LANES], touched[LANES];
+        for (int j = 0; j < LANES; ++j) {
             splats[j] = entries[i + j < n ? i + j : n - 1].splat();
             if (i + j + AHEAD < n) {
                 __builtin_prefetch(&f.cull[entries[i + j + AHEAD].splat()]);
                 __builtin_prefetch(&f.records[size_t(entries[i + j + AHEAD].splat()) * RECORD]);
             }
         }
-        blocks_touched(f, splats, block_rows, real(area.x0), real(area.y0), touched);
-        const uint32_t plain = bits(plain_over_tile(f, splats, real(area.x0), real(area.y0)));
-        for (int j = 0; j < TOGETHER && i + j < n; ++j) {
+        const Footprints footprints(f, splats);
+        blocks_touched(footprints, x0, y0, touched);
+        const uint32_t plain = bits(plain_over_tile(f, footprints, x0, y0));
+        for (int j = 0; j < LANES && i + j < n; ++j) {
             const uint32_t blocks = (f.view.exact_masks ? touched[j] : ALL_BLOCKS) & wanted;
             w.splats[m] = splats[j];
-            w.plain[m] = plain >> (j * BlockRows::ROWS) & 1;
+            w.plain[m] = plain >> j & 1;
             w.touched[m] = blocks;
             m += blocks != 0;
         }
     }
     for (int i = 0; i < m; ++i) {
         const real* const record = &f.records[size_t(w.splats[i]) * RECORD];
-        for (int k = 0; k < RECORD; k += LANES) store(w.records[i] + k, load(record + k));
-        w.planes[i].set(record, centres);
-        w.seen[i] = 0;
+        Candidate& c = w.candidates[i];
+        for (int k = 0; k < RECORD; k += LANES) store(c.record + k, load(record + k));
+        c.planes.set(record, centres);
+        memset(c.seen, 0, sizeof c.seen);
+        c.filtered = !w.plain[i];
     }
     return m;
 }
@@ -161,7 +177,7 @@ void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
         const V depth = load(&s.planes[DEPTH][i]) / select(alpha > V(0), alpha, V(1));
         store(&s.planes[DEPTH][i], depth);
         store(&s.planes[DISTORTION][i], load(&s.planes[DISTORTION][i]) * V(real(lever * lever)));
-        store(&s.planes[MINUS_2M1][i], load(&s.planes[MINUS_2M1][i]) * V(real(-0.5)));  // M1
+        store(&s.planes[M1_TWICE][i], load(&s.planes[M1_TWICE][i]) * V(real(0.5)));  // M1
     }
     const int64_t pixels = int64_t(v.width) * v.height;
     write_planes<3>(s.planes[RED], out.color, v.width, a);
@@ -170,7 +186,7 @@ void write(const Frame& f, TileState& s, const TileArea& a, const Images& out) {
     write_planes<1>(s.planes[DEPTH], out.depth_mean, v.width, a);
     write_planes<1>(s.planes[MEDIAN], out.depth_median, v.width, a);
     write_planes<1>(s.planes[DISTORTION], out.distortion, v.width, a);
-    const Plane saved[4] = {T, MINUS_2M1, M2, DEPTH0};
+    const Plane saved[4] = {T, M1_TWICE, M2, DEPTH0};
     for (int k = 0; k < 4; ++k) write_planes<1>(s.planes[saved[k]], &f.saved[k * pixels], v.width, a);
 }
 
@@ -183,8 +199,7 @@ RowLines images_written(const Frame& f, const Images& out) {
     return lines;
 }
 
-void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlockRows& block_rows,
-                const BlendLimits<V>& limits) {
+void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& written, const BlendLimits<V>& limits) {
     TileWork w;
     const TileArea area = tile_area(f, tile);
     const Centres centres(area);
@@ -194,7 +209,7 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
     Entry* const end = &f.entries[f.tile_begin[tile + 1]];
     Entry* kept = begin;
     for (Entry* e = begin; e < end; e += CHUNK) {
-        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, block_rows, area, centres);
+        const int n = gather(f, w, e, end - e < CHUNK ? static_cast<int>(end - e) : CHUNK, area, centres);
         bool live = false;
         for (int b = 0; b < BLOCKS; ++b) {
             rows.ask();
@@ -202,8 +217,9 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
             live |= !w.state.finished[b];
         }
         for (int i = 0; i < n; ++i) {
-            *kept = {w.splats[i] | uint32_t(w.plain[i]) << 31, w.seen[i]};
-            kept += w.seen[i] != 0;
+            const uint32_t seen = nonzero(w.candidates[i].seen);
+            *kept = {w.splats[i] | uint32_t(w.plain[i]) << 31, seen};
+            kept += seen != 0;
         }
         if (!live) break;
     }
@@ -216,14 +232,13 @@ void blend_tile(Frame& f, int64_t tile, const Images& out, const RowLines& writt
 bool blend_tiles(Frame& f, const Images& out) {
     if (!f.tile_count.reserve(f.tiles) || !f.taken.reserve(f.groups())) return false;
     if (!f.saved.reserve(4 * size_t(f.view.width) * f.view.height)) return false;
-    const BlockRows block_rows;
     const BlendLimits<V> limits = limits_of(f.view);
     const RowLines written = images_written(f, out);
     memset(static_cast<void*>(f.taken.data), 0, f.groups());
     parallel_for(get_threads(), [&](int64_t) {
         share_out(0, f.groups(), f.taken.data, [&](int64_t group) {
             for (int64_t tile = group * GROUP; tile < (group + 1) * GROUP && tile < f.tiles; ++tile)
-                blend_tile(f, tile, out, written, block_rows, limits);
+                blend_tile(f, tile, out, written, limits);
         });
     });
     return true;

@@ -7,27 +7,38 @@
 
 namespace gs2d {
 
-// Pixel centres of a tile's blocks: of the lanes, in columns and rows of blocks; and first pixels of blocks.
+constexpr int BLOCKS_Y = BLOCKS / BLOCKS_X;
+
+// Pixel centres of a tile's blocks: of the lanes, in columns and rows of blocks. First pixels of blocks; of those of a row,
+// each four times; of rows, in all lanes.
 struct Centres {
-    alignas(64) real x[BLOCKS_X][LANES], y[BLOCKS / BLOCKS_X][LANES], first_x[BLOCKS], first_y[BLOCKS];
+    alignas(64) real x[BLOCKS_X][LANES], y[BLOCKS_Y][LANES], first_x[BLOCKS], first_y[BLOCKS];
+    alignas(64) real column_x[BLOCKS_X * 4], row_y[BLOCKS_Y][LANES];
     explicit Centres(const TileArea& a) {
         for (int i = 0; i < BLOCKS_X; ++i) store(x[i], lane_x(a.x0) + V(real(i * BLOCK_W)));
-        for (int i = 0; i < BLOCKS / BLOCKS_X; ++i) store(y[i], lane_y(a.y0) + V(real(i * BLOCK_H)));
+        for (int i = 0; i < BLOCKS_Y; ++i) store(y[i], lane_y(a.y0) + V(real(i * BLOCK_H)));
         for (int b = 0; b < BLOCKS; ++b) first_x[b] = real(a.x0 + block_x(b)), first_y[b] = real(a.y0 + block_y(b));
+        for (int i = 0; i < BLOCKS_X * 4; ++i) column_x[i] = first_x[i / 4];
+        for (int i = 0; i < BLOCKS_Y; ++i) store(row_y[i], V(first_y[i * BLOCKS_X]));
     }
     V at_x(int b) const { return load(x[b % BLOCKS_X]); }
     V at_y(int b) const { return load(y[b / BLOCKS_X]); }
 };
 
+// The lanes' parts of X, Y, I.
+inline __attribute__((always_inline)) void set_lanes(const real* record, real (&lane)[3][LANES]) {
+    for (int k = 0; k < 3; ++k) store(lane[k], fma(V(record[2 + 2 * k]), lane_x(0), V(record[3 + 2 * k]) * lane_y(0)));
+}
+
 struct SplatPlanes {
-    // Of X, Y, I. Aligned to a vector, not more: many of them a power of two apart would share few sets of the first cache.
+    // Aligned to a vector, not more: many of them a power of two apart would share few sets of the first cache.
     alignas(LANES * sizeof(real)) real lane[3][LANES], block[3][BLOCKS];
 
     inline __attribute__((always_inline)) void set(const real* record, const Centres& centres) {
         const V cx = V(record[0]), cy = V(record[1]), zero = V(0), constant[3] = {zero, zero, V(record[8])};
+        set_lanes(record, lane);
         for (int k = 0; k < 3; ++k) {
             const V a = V(record[2 + 2 * k]), b = V(record[3 + 2 * k]);
-            store(lane[k], fma(a, lane_x(0), b * lane_y(0)));
             for (int i = 0; i < BLOCKS; i += LANES) {
                 const V dx = load(centres.first_x + i) - cx, dy = load(centres.first_y + i) - cy;
                 store(block[k] + i, fma(a, dx, fma(b, dy, constant[k])));
@@ -39,18 +50,33 @@ struct SplatPlanes {
     }
 };
 
-// Whether each of some splats is plain all over a tile: lane j * ROWS is for splats[j].
-inline M plain_over_tile(const Frame& f, const uint32_t* splats, real tile_x, real tile_y) {
-    constexpr int N = BlockRows::SPLATS;
-    const real *centre[N], *slopes[N], *more[N];
-    for (int j = 0; j < N; ++j) {
-        centre[j] = &f.records[size_t(splats[j]) * RECORD], slopes[j] = centre[j] + 6;
-        more[j] = &f.cull[splats[j]].inv_y2;
+// The same numbers for a walk from block to block, with many splats at each: what a block takes is side by side, and the
+// log2 opacity behind it, so that a splat at a block is in few cache lines.
+struct PlanesByBlock {
+    alignas(LANES * sizeof(real)) real lane[3][LANES], block[BLOCKS][4];
+
+    inline __attribute__((always_inline)) void set(const real* record, const Centres& centres) {
+        constexpr int PARTS = BLOCKS_X * 4 / LANES;  // vectors for a row of blocks
+        set_lanes(record, lane);
+        V a, b, constant, dx[PARTS];
+        unzip_planes(record + 2, a, b, constant);
+        for (int i = 0; i < PARTS; ++i) dx[i] = load(centres.column_x + i * LANES) - V(record[0]);
+        for (int y = 0; y < BLOCKS_Y; ++y) {
+            const V row = fma(b, load(centres.row_y[y]) - V(record[1]), constant);
+            for (int i = 0; i < PARTS; ++i) store(block[y * BLOCKS_X] + i * LANES, fma(a, dx[i], row));
+        }
     }
-    V a[4], b[4], c[4];
-    spread(centre, a), spread(slopes, b), spread(more, c);
-    const V dx = V(tile_x + real(TILE / 2)) - a[0], dy = V(tile_y + real(TILE / 2)) - a[1];
-    return is_plain(dx, dy, b[0], b[1], b[2], c[3], V(real(f.view.near)), V(real(TILE / 2)));  // half a pixel to spare
+    PlaneAt<V> at(int b) const {
+        const real* const p = block[b];
+        return {load(lane[0]) + V(p[0]), load(lane[1]) + V(p[1]), load(lane[2]) + V(p[2])};
+    }
+    V log2_opacity(int b) const { return V(block[b][3]); }
+};
+
+// Whether each splat is plain all over a tile.
+inline M plain_over_tile(const Frame& f, const Footprints& s, V tile_x, V tile_y) {
+    const V half = V(real(TILE / 2));  // half a pixel to spare
+    return is_plain(tile_x + half - s.cx, tile_y + half - s.cy, s.ai, s.bi, s.iz, s.plain_from, V(real(f.view.near)), half);
 }
 
 // A splat at block b, where its plane is `plane`. Plain: as `Entry` says.

@@ -38,7 +38,10 @@ GS2D_EXPORT void gs2d_selftest_transpose_reduce(const real* in, real* out) {
 
 // The indices i < n whose masks[i] has the bit; `masks` and `out` padded by LANES. Returns how many.
 GS2D_EXPORT int gs2d_selftest_indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
-    return indices_with_bit(masks, n, bit, out);
+    constexpr int STRIDE = 736;
+    const int count = multiples_with_bit<STRIDE>(masks, n, bit, out);
+    for (int i = 0; i < count; ++i) out[i] = out[i] % STRIDE ? ~0u : out[i] / STRIDE;
+    return count;
 }
 
 namespace {
@@ -57,16 +60,30 @@ GS2D_EXPORT void gs2d_selftest_packed(int k, const real* in, real* out, real* ba
     if (k == 4) repack_there_and_back<4>(in, out, back);
 }
 
-// Four masks of LANES bits.
-GS2D_EXPORT uint64_t gs2d_selftest_interleave(const uint32_t* masks) {
-    const M m[4] = {mask_of(masks[0]), mask_of(masks[1]), mask_of(masks[2]), mask_of(masks[3])};
-    return interleave(m);
+// in: [LANES, 8]; out: [8, LANES].
+GS2D_EXPORT void gs2d_selftest_columns(const real* in, real* out) {
+    const real* rows[LANES];
+    for (int i = 0; i < LANES; ++i) rows[i] = in + i * 8;
+    V v[8];
+    columns_of_8(rows, v);
+    for (int k = 0; k < 8; ++k) store(out + k * LANES, v[k]);
 }
 
-// in: [LANES / rows, 4], rows = 4 with 16 lanes and 8 with 8; out: [4, LANES].
-GS2D_EXPORT void gs2d_selftest_spread(const real* in, real* out) {
-    const real* rows[4] = {in, in + 4, in + 8, in + 12};
-    V v[4];
-    spread(rows, v);
-    for (int k = 0; k < 4; ++k) store(out + k * LANES, v[k]);
+// Bits of one mask of LANES bits, moved 4 to the left, and of another.
+GS2D_EXPORT void gs2d_selftest_with_bits(const uint32_t* masks, const uint32_t* bits, uint32_t* out) {
+    store(out, with_bits(shifted<4>(with_bits(LaneInts{}, mask_of(masks[0]), bits[0])), mask_of(masks[1]), bits[1]));
+}
+
+// in: 8 reals; out: [3, LANES].
+GS2D_EXPORT void gs2d_selftest_unzip(const real* in, real* out) {
+    V v[3];
+    unzip_planes(in, v[0], v[1], v[2]);
+    for (int k = 0; k < 3; ++k) store(out + k * LANES, v[k]);
+}
+
+// Bit b: in[b] is not 0, of as many as a tile has blocks.
+GS2D_EXPORT uint32_t gs2d_selftest_nonzero(const uint32_t* in) {
+    LaneBits of[BLOCKS];
+    for (int b = 0; b < BLOCKS; ++b) of[b] = LaneBits(in[b]);
+    return nonzero(of);
 }

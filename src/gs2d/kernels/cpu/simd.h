@@ -14,18 +14,19 @@
 //   fma(a,b,c), fnma(a,b,c)   a*b+c, c-a*b            min, max, abs, sqrt, round  min(a,b) is b where a is NaN
 //   exp2, exp, log2           a few ulp               select(m, a, b)             m ? a : b
 //   keep(m, a)                m ? a : 0               any(m), all(m), bits(m), mask_of(bits), first(n)
-//   any_positive(a, m)        any(m & (a > 0)), where no lane of a is below 0, -0 or NaN
 //   iota()                    0, 1, 2, ...            sum(v)                      fixed order
 //   REGISTERS                 how many vectors the processor holds
 //   transpose(v)              in place, LANES vectors
 //   transpose_reduce<K>(v, p) p[k] = sum(v[k]), K = 16 or 4, fixed order
-//   spread(rows, v)           a few rows of 4 reals to 4 vectors, each row's reals repeated
-//   interleave(m)             four masks to one number, a bit of each in turn
+//   columns_of_8(rows, v)     LANES rows of 8 reals to 8 vectors
+//   unzip_planes(p, a, b, c)  the slopes in x and in y and the constants of a splat's planes, repeated
+//   with_bits(i, m, bits)     the LaneInts i, with more bits where m; shifted<N>(i) to the left; store(p, i): LANES of them
 //   load_packed<K>(p, v)      LANES rows of K reals to K vectors, and store_packed<K> back
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
+#include <type_traits>
 #include <utility>
 
 #include "core/base.h"
@@ -42,6 +43,17 @@ struct BitNumbers {
     }
 };
 constexpr BitNumbers BIT_NUMBERS;
+
+// The same times STRIDE.
+template <int STRIDE> struct BitMultiples {
+    static_assert(7 * STRIDE < 1 << 16);
+    alignas(16) uint16_t of[256][8] = {};
+    constexpr BitMultiples() {
+        for (int mask = 0; mask < 256; ++mask)
+            for (int i = 0; i < 8; ++i) of[mask][i] = static_cast<uint16_t>(BIT_NUMBERS.of[mask][i] * STRIDE);
+    }
+};
+template <int STRIDE> constexpr BitMultiples<STRIDE> BIT_MULTIPLES;
 
 // For 2^x = 2^(n + k / N) 2^f: the bits of 2^(k / N), less those that shifting the whole number N n + k to the exponent
 // leaves in the mantissa. Adding `ROUND` to x leaves that number in the lowest bits.
@@ -80,6 +92,7 @@ constexpr int BLOCK_H = LANES / BLOCK_W;
 constexpr int TILE = 16;
 constexpr int BLOCKS = TILE * TILE / LANES;
 constexpr int BLOCKS_X = TILE / BLOCK_W;
+using LaneBits = std::conditional_t<LANES == 16, uint16_t, uint8_t>;  // what bits(m) fits
 
 GS2D_HD M invert(M a) { return ~a; }
 GS2D_HD V operator-(V a) { return V(real(0)) - a; }
@@ -88,14 +101,22 @@ GS2D_HD V& operator-=(V& a, V b) { return a = a - b; }
 GS2D_HD V& operator*=(V& a, V b) { return a = a * b; }
 
 #if !defined(GS2D_OWN_INDICES)
-// Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
-GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
+// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     int count = 0;
     for (int i = 0; i < n; ++i) {
-        out[count] = static_cast<uint32_t>(i);
+        out[count] = static_cast<uint32_t>(i * STRIDE);
         count += static_cast<int>(masks[i] >> bit & 1u);
     }
     return count;
+}
+#endif
+#if !defined(GS2D_OWN_NONZERO)
+// Bit b: p[b] is not 0, of BLOCKS numbers.
+GS2D_HD uint32_t nonzero(const LaneBits* p) {
+    uint32_t all = 0;
+    for (int b = 0; b < BLOCKS; ++b) all |= uint32_t(p[b] != 0) << b;
+    return all;
 }
 #endif
 
@@ -136,20 +157,32 @@ template <int K> GS2D_HD void store_packed(real* p, const V* v) {
     for (int k = 0; k < K; ++k) store(p + k * LANES, rows[k]);
 }
 
-#if !defined(GS2D_OWN_SPREAD)
-// v[k] lane i = rows[i / 8][k], k < 4.
-GS2D_HD void spread(const real* const* rows, V* v) {
-    static_assert(LANES == 8);
-    for (int k = 0; k < 4; ++k) v[k] = V(rows[0][k]);
+#if !defined(GS2D_OWN_UNZIP)
+// Of p = a0 b0 a1 b1 a2 b2 c2 c3: a = a0 a1 a2 0, b = b0 b1 b2 0, c = 0 0 c2 c3, again and again.
+GS2D_HD void unzip_planes(const real* p, V& a, V& b, V& c) {
+    typedef real Four __attribute__((vector_size(4 * sizeof(real))));
+    struct Row {
+        Four of[LANES / 4];
+    };
+    Four first, second;
+    __builtin_memcpy(&first, p, sizeof first), __builtin_memcpy(&second, p + 4, sizeof second);
+    const auto repeated = [](Four v) {
+        Row row;
+        for (Four& part : row.of) part = v;
+        return load(reinterpret_cast<const real*>(&row));
+    };
+    const Four zero = {};
+    a = repeated(__builtin_shufflevector(__builtin_shufflevector(first, second, 0, 2, 4, 4), zero, 0, 1, 2, 4));
+    b = repeated(__builtin_shufflevector(__builtin_shufflevector(first, second, 1, 3, 5, 5), zero, 0, 1, 2, 4));
+    c = repeated(__builtin_shufflevector(zero, second, 0, 1, 6, 7));
 }
 #endif
-#if !defined(GS2D_OWN_INTERLEAVE)
-// Bit 4 i + k is lane i of m[k], k < 4.
-GS2D_HD uint64_t interleave(const M* m) {
-    uint64_t all = 0;
-    for (int k = 0; k < 4; ++k)
-        for (uint64_t left = bits(m[k]); left; left &= left - 1) all |= uint64_t(1) << (4 * __builtin_ctzll(left) + k);
-    return all;
+#if !defined(GS2D_OWN_COLUMNS)
+// v[k] lane i = rows[i][k], k < 8.
+GS2D_HD void columns_of_8(const real* const* rows, V* v) {
+    static_assert(LANES == 8);
+    for (int i = 0; i < 8; ++i) v[i] = load(rows[i]);
+    transpose(v);
 }
 #endif
 

@@ -62,7 +62,11 @@ GS2D_HD M and_not(M a, M b) { return {_mm256_andnot_ps(b.m, a.m)}; }  // a & ~b
 GS2D_HD M operator~(M a) { return {_mm256_xor_ps(a.m, _mm256_castsi256_ps(_mm256_set1_epi32(-1)))}; }
 GS2D_HD uint32_t bits(M m) { return static_cast<uint32_t>(_mm256_movemask_ps(m.m)); }
 GS2D_HD bool any(M m) { return bits(m) != 0; }
-GS2D_HD bool any_positive(V a, M m) { return !_mm256_testz_si256(_mm256_castps_si256(a.v), _mm256_castps_si256(m.m)); }
+#define GS2D_OWN_NONZERO
+GS2D_HD uint32_t nonzero(const uint8_t* p) {  // of 32
+    const __m256i v = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
+    return ~static_cast<uint32_t>(_mm256_movemask_epi8(_mm256_cmpeq_epi8(v, _mm256_setzero_si256())));
+}
 GS2D_HD bool all(M m) { return bits(m) == 0xffu; }
 GS2D_HD M mask_of(uint32_t b) {
     const __m256i bit = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
@@ -107,30 +111,37 @@ GS2D_HD void transpose(V* v) {
     }
 }
 
-#define GS2D_OWN_INTERLEAVE
-// Bit 4 i + k is lane i of m[k], k < 4: byte k of that lane comes from m[k].
-GS2D_HD uint64_t interleave(const M* m) {
-    const __m256i even = _mm256_blend_epi16(_mm256_castps_si256(m[0].m), _mm256_castps_si256(m[2].m), 0xaa);
-    const __m256i odd = _mm256_blend_epi16(_mm256_castps_si256(m[1].m), _mm256_castps_si256(m[3].m), 0xaa);
-    const __m256i low = _mm256_set1_epi16(0xff);
-    return static_cast<uint32_t>(_mm256_movemask_epi8(_mm256_or_si256(_mm256_and_si256(low, even), _mm256_andnot_si256(low, odd))));
+using LaneInts = __m256i;
+GS2D_HD LaneInts with_bits(LaneInts i, M m, uint32_t bits) {
+    return _mm256_or_si256(i, _mm256_and_si256(_mm256_castps_si256(m.m), _mm256_set1_epi32(static_cast<int>(bits))));
 }
+template <int N> GS2D_HD LaneInts shifted(LaneInts i) { return _mm256_slli_epi32(i, N); }
+GS2D_HD void store(uint32_t* p, LaneInts i) { _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), i); }
 
 #define GS2D_OWN_INDICES
-// Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
-GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
+// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m128i shift = _mm_cvtsi32_si128(31 - bit);
     __m256i index = _mm256_setzero_si256();
     int count = 0;
-    for (int i = 0; i < n; i += 8, index = _mm256_add_epi32(index, _mm256_set1_epi32(8))) {
+    for (int i = 0; i < n; i += 8, index = _mm256_add_epi32(index, _mm256_set1_epi32(8 * STRIDE))) {
         const __m256i m = _mm256_sll_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(masks + i)), shift);
         uint32_t k = static_cast<uint32_t>(_mm256_movemask_ps(_mm256_castsi256_ps(m)));
         if (n - i < 8) k &= (1u << (n - i)) - 1u;
-        const __m256i bits = _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(BIT_NUMBERS.of[k])));
+        const __m256i bits = _mm256_cvtepu16_epi32(_mm_load_si128(reinterpret_cast<const __m128i*>(BIT_MULTIPLES<STRIDE>.of[k])));
         _mm256_storeu_si256(reinterpret_cast<__m256i*>(out + count), _mm256_add_epi32(index, bits));
         count += __builtin_popcount(k);
     }
     return count;
+}
+
+#define GS2D_OWN_UNZIP
+GS2D_HD void unzip_planes(const float* p, V& a, V& b, V& c) {
+    const __m256 first = _mm256_broadcast_ps(reinterpret_cast<const __m128*>(p)), zero = _mm256_setzero_ps();
+    const __m256 second = _mm256_broadcast_ps(reinterpret_cast<const __m128*>(p + 4));
+    a = _mm256_blend_ps(_mm256_shuffle_ps(first, second, 0x08), zero, 0x88);
+    b = _mm256_blend_ps(_mm256_shuffle_ps(first, second, 0x1d), zero, 0x88);
+    c = _mm256_blend_ps(second, zero, 0x33);
 }
 
 template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {

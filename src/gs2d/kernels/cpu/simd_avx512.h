@@ -57,9 +57,10 @@ GS2D_HD M operator|(M a, M b) { return {_kor_mask16(a.k, b.k)}; }
 GS2D_HD M operator~(M a) { return {_knot_mask16(a.k)}; }
 GS2D_HD M and_not(M a, M b) { return {_kandn_mask16(b.k, a.k)}; }  // a & ~b
 GS2D_HD bool any(M m) { return !_kortestz_mask16_u8(m.k, m.k); }
-GS2D_HD bool any_positive(V a, M m) {
-    const __m512i i = _mm512_castps_si512(a.v);
-    return any({_mm512_mask_test_epi32_mask(m.k, i, i)});
+#define GS2D_OWN_NONZERO
+GS2D_HD uint32_t nonzero(const uint16_t* p) {  // of 16
+    const __m256i v = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(p));
+    return _mm256_test_epi16_mask(v, v);
 }
 GS2D_HD bool all(M m) { return _kortestc_mask16_u8(m.k, m.k); }
 GS2D_HD uint32_t bits(M m) { return _cvtmask16_u32(m.k); }
@@ -102,30 +103,39 @@ GS2D_HD void transpose(V* v) {
     }
 }
 
-#define GS2D_OWN_SPREAD
-// v[k] lane i = rows[i / 4][k], k < 4.
-GS2D_HD void spread(const float* const* rows, V* v) {
-    __m512 r = _mm512_castps128_ps512(_mm_loadu_ps(rows[0]));
-    r = _mm512_insertf32x4(r, _mm_loadu_ps(rows[1]), 1);
-    r = _mm512_insertf32x4(r, _mm_loadu_ps(rows[2]), 2);
-    r = _mm512_insertf32x4(r, _mm_loadu_ps(rows[3]), 3);
-    v[0] = _mm512_permute_ps(r, 0x00), v[1] = _mm512_permute_ps(r, 0x55);
-    v[2] = _mm512_permute_ps(r, 0xaa), v[3] = _mm512_permute_ps(r, 0xff);
+#define GS2D_OWN_COLUMNS
+// v[k] lane i = rows[i][k], k < 8.
+GS2D_HD void columns_of_8(const float* const* rows, V* v) {
+    __m512 r[8];
+    for (int i = 0; i < 8; ++i) {  // 4 rows and the 4 that follow, two times
+        const int first = i % 4 + i / 4 * 8;
+        r[i] = _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(rows[first])), _mm256_loadu_ps(rows[first + 4]), 1);
+    }
+    __m512 q[8];
+    for (int i = 0; i < 8; i += 4) {  // q[i + j]: columns j and 4 + j of 4 rows, of the 4 that follow
+        const __m512 a = _mm512_unpacklo_ps(r[i], r[i + 1]), b = _mm512_unpackhi_ps(r[i], r[i + 1]);
+        const __m512 c = _mm512_unpacklo_ps(r[i + 2], r[i + 3]), d = _mm512_unpackhi_ps(r[i + 2], r[i + 3]);
+        q[i] = _mm512_shuffle_ps(a, c, 0x44), q[i + 1] = _mm512_shuffle_ps(a, c, 0xee);
+        q[i + 2] = _mm512_shuffle_ps(b, d, 0x44), q[i + 3] = _mm512_shuffle_ps(b, d, 0xee);
+    }
+    for (int j = 0; j < 4; ++j) {
+        v[j] = _mm512_shuffle_f32x4(q[j], q[4 + j], 0x88);
+        v[4 + j] = _mm512_shuffle_f32x4(q[j], q[4 + j], 0xdd);
+    }
 }
 
-#define GS2D_OWN_INTERLEAVE
-// Bit 4 i + k is lane i of m[k], k < 4.
-GS2D_HD uint64_t interleave(const M* m) {
-    constexpr uint64_t every = 0x1111111111111111u;
-    return _pdep_u64(bits(m[0]), every) | _pdep_u64(bits(m[1]), every << 1) | _pdep_u64(bits(m[2]), every << 2) |
-           _pdep_u64(bits(m[3]), every << 3);
+using LaneInts = __m512i;
+GS2D_HD LaneInts with_bits(LaneInts i, M m, uint32_t bits) {
+    return _mm512_mask_or_epi32(i, m.k, i, _mm512_set1_epi32(static_cast<int>(bits)));
 }
+template <int N> GS2D_HD LaneInts shifted(LaneInts i) { return _mm512_slli_epi32(i, N); }
+GS2D_HD void store(uint32_t* p, LaneInts i) { _mm512_storeu_si512(p, i); }
 
 #define GS2D_OWN_INDICES
-// Writes the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
-GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
-    const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16);
-    __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+// Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
+template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
+    const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16 * STRIDE);
+    __m512i index = _mm512_mullo_epi32(_mm512_set1_epi32(STRIDE), _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
     int count = 0;
     for (int i = 0; i < n; i += 16, index = _mm512_add_epi32(index, step)) {
         const __mmask16 inside = static_cast<__mmask16>(n - i >= 16 ? 0xffffu : (1u << (n - i)) - 1u);
@@ -134,6 +144,13 @@ GS2D_HD int indices_with_bit(const uint32_t* masks, int n, int bit, uint32_t* ou
         count += __builtin_popcount(k);
     }
     return count;
+}
+
+#define GS2D_OWN_UNZIP
+GS2D_HD void unzip_planes(const float* p, V& a, V& b, V& c) {
+    const __m512 first = _mm512_broadcast_f32x4(_mm_loadu_ps(p)), second = _mm512_broadcast_f32x4(_mm_loadu_ps(p + 4));
+    a = _mm512_maskz_shuffle_ps(0x7777, first, second, 0x08), b = _mm512_maskz_shuffle_ps(0x7777, first, second, 0x1d);
+    c = _mm512_maskz_mov_ps(0xcccc, second);
 }
 
 // Each step halves the number of vectors and of partial sums per vector.

@@ -160,13 +160,23 @@ GS2D_HD bool any(M m) {
     const Two two = (Two)or_of_parts(m);
     return (two[0] | two[1]) != 0;
 }
-GS2D_HD bool any_positive(V a, M m) { return any((a > V(real(0))) & m); }
 GS2D_HD bool all(M m) { return !any(~m); }
 GS2D_HD M mask_of(uint32_t b) {
     const M own = own_bits();
     return per_part<M>([&](int k) { return (own.of[k] & (lane_int(b) - PartMask{})) == own.of[k]; });
 }
 GS2D_HD M first(int n) { return mask_of((1u << n) - 1u); }
+
+using LaneInts = M;
+GS2D_HD LaneInts with_bits(LaneInts i, M m, uint32_t bits) {
+    return per_part<M>([&](int k) { return i.of[k] | (m.of[k] & (lane_int(bits) - PartMask{})); });
+}
+template <int N> GS2D_HD LaneInts shifted(LaneInts i) {
+    return per_part<M>([&](int k) { return i.of[k] << N; });
+}
+GS2D_HD void store(uint32_t* p, LaneInts n) {
+    for (int i = 0; i < LANES; ++i) p[i] = static_cast<uint32_t>(n.of[i / WIDE][i % WIDE]);
+}
 
 GS2D_HD V load(const real* p) {
     V r;

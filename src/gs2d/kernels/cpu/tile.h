@@ -134,45 +134,44 @@ class RowsAhead {
     int left_ = 0, at_ = 0, each_ = 0;
 };
 
-// The rows of a tile's blocks: lane i is for row i % ROWS, of one of SPLATS splats that are tested at once.
-struct BlockRows {
-    static constexpr int ROWS = BLOCKS / BLOCKS_X, SPLATS = LANES / ROWS;
-    V first;  // pixel centres, relative to the tile
-    BlockRows() {
-        static_assert(LANES % ROWS == 0);
-        alignas(64) real y[LANES];
-        for (int i = 0; i < LANES; ++i) y[i] = real(i % ROWS * BLOCK_H) + real(0.5);
-        first = load(y);
+// What decides where splats reach a tile, one splat a lane; and whether each is unbounded.
+struct Footprints {
+    V ex, ey, slope, half, inv_y2, y_right, disc2, plain_from;  // of the cull record
+    V cx, cy, ai, bi, iz;                                       // of the record
+
+    // Of splats[0 .. LANES).
+    Footprints(const Frame& f, const uint32_t* splats) {
+        const real *rows[LANES], *records[LANES];
+        for (int i = 0; i < LANES; ++i) rows[i] = &f.cull[splats[i]].ex, records[i] = &f.records[size_t(splats[i]) * RECORD];
+        V c[8], r[RECORD];
+        columns_of_8(rows, c);
+        for (int k = 0; k < RECORD; k += LANES) {
+            for (int i = 0; i < LANES; ++i) r[k + i] = load(records[i] + k);
+            transpose(r + k);
+        }
+        ex = c[0], ey = c[1], slope = c[2], half = c[3], inv_y2 = c[4], y_right = c[5], disc2 = c[6], plain_from = c[7];
+        cx = r[0], cy = r[1], ai = r[6], bi = r[7], iz = r[8];
     }
 };
 
-// For SPLATS splats. Bit b: the splat's ellipse or low-pass disc reaches a pixel centre of block b, or nearly so.
-inline void blocks_touched(const Frame& f, const uint32_t* splats, const BlockRows& rows, real tile_x, real tile_y, uint32_t* masks) {
-    constexpr int N = BlockRows::SPLATS;
-    const real *shape[N], *more[N], *record[N];
-    for (int j = 0; j < N; ++j) {
-        shape[j] = &f.cull[splats[j]].ex, more[j] = shape[j] + 4;
-        record[j] = &f.records[size_t(splats[j]) * RECORD];
+// Bit b of masks[i]: the ellipse or the low-pass disc of splat i reaches a pixel centre of block b, or nearly so. A footprint
+// reaches each row of blocks in one interval. tile_x, tile_y: the tile's first pixel.
+inline void blocks_touched(const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
+    const Chords<V> chords = {s.ex - tile_x, s.ey - tile_y, s.slope,       s.half, s.inv_y2, s.y_right,
+                              s.cx - tile_x, s.cy - tile_y, s.disc2};
+    LaneInts touched = {};
+    V last = V(real(TILE) - real(0.5));  // pixel centres of a row of blocks
+#pragma GCC unroll 1
+    for (int y = BLOCKS / BLOCKS_X; y > 0; --y, last = last - V(real(BLOCK_H))) {
+        V left, right;
+        reach_in_rows(chords, last - V(real(BLOCK_H - 1)), last, left, right);
+        touched = shifted<BLOCKS_X>(touched);
+        for (int x = 0; x < BLOCKS_X; ++x) {
+            const V x0 = V(real(x * BLOCK_W) + real(0.5)), x1 = V(real(x * BLOCK_W + BLOCK_W - 1) + real(0.5));
+            touched = with_bits(touched, (right >= x0) & (left <= x1), 1u << x);
+        }
     }
-    V a[4], b[4], c[4];
-    spread(shape, a), spread(more, b), spread(record, c);
-    const V x = V(tile_x), y = V(tile_y);
-    const Chords<V> chords = {a[0] - x, a[1] - y, a[2], a[3], b[0], b[1], c[0] - x, c[1] - y, b[2]};
-    V left, right;
-    reach_in_rows(chords, rows.first, rows.first + V(real(BLOCK_H - 1)), left, right);
-    M columns[BLOCKS_X];
-    for (int i = 0; i < BLOCKS_X; ++i)
-        columns[i] = (right >= V(real(i * BLOCK_W) + real(0.5))) & (left <= V(real(i * BLOCK_W + BLOCK_W - 1) + real(0.5)));
-    const uint64_t all = interleave(columns);
-    for (int j = 0; j < N; ++j) masks[j] = shape[j][6] < 0 ? ALL_BLOCKS : uint32_t(all >> (j * BLOCKS % 64)) & ALL_BLOCKS;
-}
-
-// For one splat.
-inline uint32_t blocks_touched(const Frame& f, uint32_t splat, const BlockRows& rows, real tile_x, real tile_y) {
-    uint32_t splats[BlockRows::SPLATS], masks[BlockRows::SPLATS];
-    for (uint32_t& s : splats) s = splat;
-    blocks_touched(f, splats, rows, tile_x, tile_y, masks);
-    return masks[0];
+    store(masks, with_bits(touched, s.disc2 < V(0), ALL_BLOCKS));
 }
 
 }  // namespace gs2d

@@ -32,7 +32,7 @@ __device__ __forceinline__ void write_pixel(const BlendArguments& a, int x, int 
     a.depth_median[at] = p.median;
     if constexpr (DIST) {
         a.distortion[at] = p.distortion * v.distortion_scale;
-        a.moments[3 * at] = -0.5f * p.minus_2M1, a.moments[3 * at + 1] = p.M2, a.moments[3 * at + 2] = p.inverse_depth0;
+        a.moments[3 * at] = 0.5f * p.M1_twice, a.moments[3 * at + 1] = p.M2, a.moments[3 * at + 2] = p.inverse_depth0;
     }
 }
 
