@@ -206,6 +206,8 @@ def test_known_depths_are_asked_by_the_recipes_that_say_so_while_all_splats_move
     both = with_normal_prior(knowing)
     assert (both.name, both.normal_prior) == (f"{base}-depth-normals", NormalPrior())
     assert validate(both) == with_normal_prior(both)
+    starts = [t.start for s in both.stages for t in s.losses if t.kind == "normal_prior"]
+    assert starts == [7_000, 0][: len(starts)]
     assert [name for name in RECIPES if get_recipe(name).depth_prior] == [
         f"{x}-depth" for x in ("2dgs", "2dgs-60k", "2dgs-r")
     ]

@@ -188,17 +188,24 @@ def with_depth_prior(
 
 
 def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: str | None = None) -> Recipe:
-    """The recipe with a loss on known normals in the stages that train the means of all splats (``NAME-normals``)."""
+    """The recipe with a loss on known normals in the stages that train the means of all splats (``NAME-normals``).
+
+    From where normal consistency begins: before, splats are where colours put them, and turning them does harm.
+    """
     if recipe.normal_prior is not None:
         return recipe
-    term = LossTerm("normal_prior", weight)
+    term = LossTerm("normal_prior", weight, NC_START)
     return replace(_in_stages(recipe, term), name=name or f"{recipe.name}-normals", normal_prior=NormalPrior())
 
 
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
-    """The recipe with a loss in the stages that train the means of all splats."""
-    stages = (replace(stage, losses=(*stage.losses, term)) if stage.moves_all else stage for stage in recipe.stages)
-    return replace(recipe, stages=tuple(stages))
+    """The recipe with a loss in the stages that train the means of all splats; a start is that of the first stage."""
+
+    def extended(index: int, stage: Stage) -> Stage:
+        added = term if index == 0 else replace(term, start=0)
+        return replace(stage, losses=(*stage.losses, added)) if stage.moves_all else stage
+
+    return replace(recipe, stages=tuple(extended(index, stage) for index, stage in enumerate(recipe.stages)))
 
 
 def _normal_consistency(weight: float, start: int) -> tuple[LossTerm, ...]:

@@ -379,5 +379,5 @@ def test_normals_are_trained_by_maps(scene: Scene, backend: str) -> None:
     trainer = Trainer(made, with_normal_prior(short()), GENERIC, backend=backend)
     trainer.enter(0)
     stage = trainer.recipe.stages[0]
-    found = trainer._whole.evaluate(trainer.state, stage, 1, 0)
+    found = trainer._whole.evaluate(trainer.state, stage, 7_001, 0)
     assert found.losses["normal_prior"] > 0

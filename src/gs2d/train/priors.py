@@ -239,7 +239,7 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
 
     As many as the recipe's ``init_points``, of random pixels of all training views alike: the rates of means let a
     splat wander by a few per cent of the extent, not to a wall that no sparse point is near. They lie in the planes of
-    their neighbours: discs that are turned at random are as thick as they are wide.
+    their neighbours in a map: discs that are turned at random are as thick as they are wide.
 
     Raises
     ------
@@ -250,7 +250,7 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
         return scene
     priors = Priors(scene, replace(recipe, normal_prior=None), limit_bytes=0)
     rng = np.random.Generator(np.random.Philox(key=recipe.seed))
-    points, colors = [], []
+    points, colors, normals = [], [], []
     for index, view in enumerate(scene.train):
         depths = priors.known(index, torch.float64)[0]
         if not isinstance(depths, KnownDepths):
@@ -264,9 +264,9 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
         local = rays(view)[rows, columns] / depths.disparity.numpy()[rows, columns, None]
         points.append((local - view.camera.T_cam_world[:3, 3]) @ view.camera.rotation)
         colors.append(view.image()[rows, columns, :3])
+        normals.append(plane_normals(points[-1]))  # of one map: maps may contradict each other
     if not any(len(found) for found in points):
         return scene
-    normals = [plane_normals(np.concatenate(points))]
     if scene.points is not None:
         grey = np.full((len(scene.points), 3), 128, dtype=np.uint8)
         points.append(scene.points.points)

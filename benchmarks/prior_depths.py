@@ -1,0 +1,61 @@
+"""How far rendered depths are from the true surface, view by view: where a mesh would hide what a wall lacks.
+
+::
+
+    python -m benchmarks.prior_depths RUN [RUN ...]
+
+The capture of each run holds ``mesh_gt.ply``. An error is |z / truth - 1| at a pixel where the mesh is seen, z the mean
+depth; where less than half of a pixel is covered it is 1, and no error is more.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gs2d.data.scene import View
+from gs2d.data.toy_rays import cast_camera
+from gs2d.io.ply import read_mesh, read_splats
+from gs2d.io.run import SPLATS, open_run
+from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.render.api import rasterize
+from gs2d.splats import Splats
+from gs2d.triangles import Mesh
+
+WITHIN = (0.01, 0.03)
+
+
+def errors(splats: Splats, views: Sequence[View], mesh: Mesh, job: Job) -> np.ndarray:
+    """Errors [P] of all pixels of some views in which the mesh is seen."""
+    found = []
+    for view in views:
+        truth = torch.from_numpy(cast_camera(mesh.vertices, mesh.faces, view.camera).depth)
+        with torch.no_grad():
+            output = rasterize(splats, view.camera, job.settings, backend=job.backend)
+        error = (output.depth_mean / truth.clamp(min=1e-6) - 1).abs().clamp(max=1)
+        error[output.alpha < 0.5] = 1
+        found.append(error[truth > 0].numpy())
+    return np.concatenate(found)
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    print("| run | views | median | mean | " + " | ".join(f"within {100 * w:g} %" for w in WITHIN) + " |")
+    print("|---" * (4 + len(WITHIN)) + "|")
+    for run in parser.parse_args().runs:
+        job = reload_job(open_run(run), lambda event: None)
+        mesh, splats = read_mesh((job.scene.root or run) / "mesh_gt.ply"), read_splats(run / SPLATS)
+        for split, views in (("test", job.scene.test), ("train", job.scene.train)):
+            error = errors(splats, views, mesh, job)
+            shares = " | ".join(f"{100 * (error < w).mean():.1f} %" for w in WITHIN)
+            print(f"| {run} | {split} | {100 * np.median(error):.2f} % | {100 * error.mean():.2f} % | {shares} |")
+
+
+if __name__ == "__main__":
+    main()
