@@ -13,7 +13,7 @@ from gs2d.camera import Camera, look_at
 from gs2d.data import load_scene, toy
 from gs2d.data import toy_shapes as shapes
 from gs2d.data.toy import demo_cameras, demo_mesh, write_demo_capture
-from gs2d.data.toy_rays import cast_camera, occluded
+from gs2d.data.toy_rays import _sample_boxes, cast_camera, occluded
 from gs2d.data.toy_scene import FLOOR, RADIUS, ToyScene, build_scene
 from gs2d.errors import DataError, DiskError
 from gs2d.io.ply import read_mesh
@@ -104,6 +104,25 @@ def test_random_triangles_give_the_hits_of_a_brute_force_search() -> None:
     np.testing.assert_array_equal(found, np.isfinite(expected))
     np.testing.assert_allclose(hits.depth.ravel()[found], expected[found], rtol=1e-5)
     assert np.ptp(vertices[faces][:, :, 2], axis=1)[vertices[faces][:, :, 2].min(axis=1) < 0].max() > 1
+
+
+def test_from_within_a_room_few_faces_are_compared_with_the_whole_picture() -> None:
+    """The plane of a camera in a room cuts hundreds of its faces; all but a few lie beside the picture."""
+    room = shapes.ball(1.0, rows=90, around=180)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        eye, target = rng.uniform(-0.4, 0.4, 3), rng.uniform(-0.4, 0.4, 3)
+        camera = look_at(eye, target, np.array([0, 0, 1.0]), width=40, height=30, fx=25.0)
+        local = room.vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]
+        behind = (local[room.faces][:, :, 2] < 0).sum(axis=1)
+        assert ((behind == 1) | (behind == 2)).sum() > 200
+        _, low, high = _sample_boxes(local, room.faces, camera, 1, 40, 30)
+        assert (high - low).prod(axis=1).sum() < 10 * 40 * 30
+        hits = cast_camera(room.vertices, room.faces, camera)
+        rays = pixel_rays(camera)
+        expected = brute_force(local, room.faces, np.zeros_like(rays), rays)
+        assert (hits.face >= 0).all()
+        np.testing.assert_allclose(hits.depth.ravel(), expected, rtol=1e-4)
 
 
 def test_a_ray_along_a_shared_edge_hits_and_ties_go_to_the_lower_index() -> None:

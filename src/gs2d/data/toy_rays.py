@@ -110,6 +110,7 @@ def _sample_boxes(
         corners = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
         met, crossing = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
     bounds: list[np.ndarray] = []
+    parts: list[np.ndarray] = []  # the same of the faces that cross the camera plane
     for axis in range(2):
         pixels = (local[:, axis] / safe * focal[axis] + center[axis]) * samples - 0.5  # [P]
         first = np.clip(np.ceil(pixels - _MARGIN), 0, size[axis]).astype(np.int32)
@@ -119,13 +120,35 @@ def _sample_boxes(
         high = np.maximum(np.maximum(end[a], end[b]), end[c])
         some = high > low
         met, bounds = met[some], [*(bound[some] for bound in bounds), low[some], high[some]]
-    whole = np.concatenate([met, crossing])  # faces that cross the camera plane: the whole image
-    order = np.argsort(whole, kind="stable")
-    x0, x1, y0, y1 = (
-        np.concatenate([bound, np.full(len(crossing), all_of_it)])[order]
-        for bound, all_of_it in zip(bounds, (0, width, 0, height), strict=True)
-    )
-    return whole[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
+    for axis in range(2):
+        low, high = _reach(local[faces[crossing]], axis, focal[axis], center[axis])
+        first = np.clip(np.ceil(low * samples - 0.5 - _MARGIN), 0, size[axis]).astype(np.int32)
+        end = np.clip(np.floor(high * samples - 0.5 + _MARGIN) + 1, 0, size[axis]).astype(np.int32)
+        some = end > first
+        crossing = crossing[some]
+        parts = [bound[some] for bound in parts] + [first[some], end[some]]
+    every = np.concatenate([met, crossing])
+    order = np.argsort(every, kind="stable")
+    x0, x1, y0, y1 = (np.concatenate([bound, part])[order] for bound, part in zip(bounds, parts, strict=True))
+    return every[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
+
+
+def _reach(corners: np.ndarray, axis: int, focal: float, center: float) -> tuple[np.ndarray, np.ndarray]:
+    """Between which pixels [n], [n] of an axis the part of triangles [n, 3, 3] lies that is ahead of the camera.
+
+    A triangle that crosses the plane where hits begin is cut there; what is left is as wide as its corners. Of a room,
+    which is all around, thousands cross it, and nearly all of them beside the picture.
+    """
+    z = corners[:, :, 2]
+    ahead = z > _CLOSEST
+    pixels = [np.where(ahead, corners[:, :, axis] / np.where(ahead, z, 1.0), np.nan)]  # [n, 3]
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        cut = ahead[:, i] != ahead[:, j]
+        share = (_CLOSEST - z[:, i]) / np.where(cut, z[:, j] - z[:, i], 1.0)
+        at = corners[:, i, axis] + share * (corners[:, j, axis] - corners[:, i, axis])
+        pixels.append(np.where(cut, at / _CLOSEST, np.nan)[:, None])
+    places = np.concatenate(pixels, axis=1) * focal + center  # [n, 6], three or four of them numbers
+    return np.fmin.reduce(places, axis=1), np.fmax.reduce(places, axis=1)
 
 
 def _pairs(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
