@@ -230,7 +230,7 @@ def test_a_browser_draws_what_the_rasterizer_draws(tmp_path: Path, crossing: str
     with torch.no_grad():
         output = rasterize(splats, CAMERA, settings, backend="reference")
     ours = output.color.clamp(0, 1).numpy()
-    assert psnr(screenshot(tmp_path, "view=0&bare"), ours) > 48
+    assert likeness(tmp_path, "view=0&bare", ours) > 48
     if crossing == "draw":
         text = (
             (tmp_path / "scene.html")
@@ -239,9 +239,17 @@ def test_a_browser_draws_what_the_rasterizer_draws(tmp_path: Path, crossing: str
         )
         (tmp_path / "scene.html").write_text(text)
         normals = normal_picture(output.normal.numpy(), output.alpha.numpy())
-        assert (
-            psnr(screenshot(tmp_path, "bare"), normals) > 35
-        )  # the reference's normals where two faces cancel are noise
+        assert likeness(tmp_path, "bare", normals) > 35  # where two faces cancel, normals are noise
+
+
+def likeness(folder: Path, fragment: str, ours: np.ndarray) -> float:
+    """PSNR of the page's picture. On a busy machine Chromium may take it before anything is drawn: then once more."""
+    found = 0.0
+    for _ in range(5):
+        found = max(found, psnr(screenshot(folder, fragment), ours))
+        if found > 35:
+            break
+    return found
 
 
 def screenshot(folder: Path, fragment: str) -> np.ndarray:
