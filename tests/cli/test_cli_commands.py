@@ -209,7 +209,7 @@ def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
     assert run(["export", str(trained), "--out", str(tmp_path / "a.spz"), "--layout", "3dgs"]) == 2
     assert "--out must name a .ply file, which is what layout 3dgs is, got" in capsys.readouterr().err
     assert run(["export", str(trained), "--out", str(tmp_path / "a.usd")]) == 2
-    assert "--out must name a .ply file" in capsys.readouterr().err
+    assert "--out must end in .compressed.ply, .ply, .spz, .splat, which say" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

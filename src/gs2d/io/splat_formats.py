@@ -36,6 +36,7 @@ LAYOUTS: Mapping[str, Layout] = {
     "splat": Layout(".splat", lambda path, splats: write_splat(path, Gaussians.of(splats))),
 }
 _BY_ENDING = ((".compressed.ply", "compressed"), (".ply", "3dgs"), (".spz", "spz"), (".splat", "splat"))
+ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from gs2d.io.run import (
     open_run,
     remove_made,
 )
-from gs2d.io.splat_formats import LAYOUTS, layout_of, read_disks, write_layout
+from gs2d.io.splat_formats import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
@@ -324,7 +324,9 @@ def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, An
     ------
     RunError, DataError, DiskError
     """
-    layout = layout or layout_of(Path(out)) or "3dgs"
+    layout = layout or layout_of(Path(out))
+    if layout is None:
+        raise RunError(f"--out must end in {', '.join(ENDINGS)}, which say what is written, got {out}")
     if layout not in LAYOUTS:
         raise RunError(f"--layout must be one of {', '.join(LAYOUTS)}, got {layout}")
     path, out = Path(path), checked_output(path, out, LAYOUTS[layout].ending, f"layout {layout} is")
