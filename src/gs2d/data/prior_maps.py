@@ -47,6 +47,14 @@ class DepthMap:
 
 
 @dataclass(frozen=True, eq=False)
+class PointsInView:
+    """Sparse points in a picture: ``pixels`` [M, 2] px and ``depth`` [M] wu along the optical axis."""
+
+    pixels: np.ndarray
+    depth: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class ObservedPoints:
     """The sparse points of a reconstruction, and which photographs they were found in.
 
@@ -65,6 +73,27 @@ class ObservedPoints:
     error: np.ndarray
     track: np.ndarray
     seen: Mapping[str, np.ndarray]
+
+    def in_view(self, name: str, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
+        """Return the points found in one view, inside its outer pixel centres and in front of it.
+
+        Parameters
+        ----------
+        name : str
+            Of the view.
+        camera : Camera
+            Of the view, at the size that its pictures have.
+        min_track : int
+            Points found in fewer photographs are left out.
+        max_error : float, px
+            Points with a larger mean reprojection error are left out.
+        """
+        rows = self.seen.get(name, np.zeros(0, dtype=np.int64))
+        xyz = self.points[rows[(self.track[rows] >= min_track) & (self.error[rows] <= max_error)]]
+        pixels, depth = camera.project(xyz[np.isfinite(xyz).all(axis=1)])
+        inside = (pixels >= 0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
+        inside &= depth > 0
+        return PointsInView(pixels[inside], depth[inside])
 
 
 @dataclass(frozen=True)

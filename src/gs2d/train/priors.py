@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gs2d.data.prior_maps import DepthMap, ObservedPoints
+from gs2d.data.prior_maps import DepthMap, ObservedPoints, PointsInView
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
 from gs2d.losses_priors import Depths, KnownDepths, KnownNormals, PointDepths, Prior, RelativeDepths, fit_line
@@ -155,24 +155,9 @@ def line_of(values: np.ndarray, depth: np.ndarray, space: str) -> tuple[float, f
     return (scale / spread, shift - scale * middle / spread) if scale > 0 else None
 
 
-@dataclass(frozen=True, eq=False)
-class PointsInView:
-    """Sparse points in a picture: ``pixels`` [M, 2] px and ``depth`` [M] wu."""
-
-    pixels: np.ndarray
-    depth: np.ndarray
-
-
 def points_in(view: View, observed: ObservedPoints, settings: DepthPrior) -> PointsInView:
-    """The points that a view was found to show, as far as the settings trust them, inside the outer pixel centres."""
-    rows = observed.seen.get(view.name, np.zeros(0, dtype=np.int64))
-    trusted = (observed.track[rows] >= settings.min_track) & (observed.error[rows] <= settings.max_error)
-    xyz = observed.points[rows[trusted]]
-    pixels, depth = view.camera.project(xyz[np.isfinite(xyz).all(axis=1)])
-    camera = view.camera
-    inside = (pixels >= 0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
-    inside &= depth > 0
-    return PointsInView(pixels[inside], depth[inside])
+    """Return the points that a view was found to show, as far as the settings trust them."""
+    return observed.in_view(view.name, view.camera, min_track=settings.min_track, max_error=settings.max_error)
 
 
 class Priors:

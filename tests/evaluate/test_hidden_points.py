@@ -1,0 +1,44 @@
+"""Fog is counted by the sparse points that it hides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gs2d.camera import Camera
+from gs2d.data.prior_maps import ObservedPoints, PointsInView
+from gs2d.evaluate.hidden_points import HiddenPoints, hidden_points, total
+
+POINTS = PointsInView(np.array([[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5]]), np.full(4, 10.0))
+
+
+def test_a_point_is_hidden_by_a_surface_clearly_nearer_and_by_no_other() -> None:
+    depth = np.array([[9.4, 9.6, 0.0, 20.0]])  # nearer than 9.5; about there; nothing hit; behind the point
+    assert hidden_points(depth, POINTS) == HiddenPoints(shown=4, hidden=1)
+
+
+def test_the_fraction_of_depth_is_a_parameter() -> None:
+    assert hidden_points(np.full((1, 4), 9.4), POINTS, nearer=0.9).hidden == 0
+
+
+def test_the_share_of_no_points_is_unknown_and_not_zero() -> None:
+    nothing = PointsInView(np.zeros((0, 2)), np.zeros(0))
+    assert hidden_points(np.ones((1, 4)), nothing).share is None
+    assert HiddenPoints(shown=4, hidden=1).share == 0.25
+
+
+def test_views_are_pooled_by_points() -> None:
+    assert total([HiddenPoints(10, 1), HiddenPoints(0, 0), HiddenPoints(30, 3)]) == HiddenPoints(40, 4)
+
+
+@pytest.mark.parametrize(
+    ("row", "reason"), [(0, "shown"), (1, "too few photographs"), (2, "error"), (3, "outside"), (4, "behind")]
+)
+def test_points_of_a_view_are_the_trusted_ones_inside_the_picture(row: int, reason: str) -> None:
+    camera = Camera(10, 10, fx=10.0, fy=10.0, cx=5.0, cy=5.0, T_cam_world=np.eye(4))
+    xyz = np.array([[0.0, 0, 2], [0, 0, 2], [0, 0, 2], [2.0, 0, 2], [0, 0, -2]])
+    error, track = np.array([1.0, 1, 3, 1, 1]), np.array([3, 2, 3, 3, 3])
+    observed = ObservedPoints(xyz, error, track, {"a": np.array([row])})
+    found = observed.in_view("a", camera)
+    assert len(found.depth) == (1 if reason == "shown" else 0)
+    assert len(observed.in_view("b", camera).depth) == 0
