@@ -11,11 +11,38 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of work of ``total`` steps (0 = nobody knows) begins; the phase before it is over."""
+    """A stretch of work of ``total`` steps (0 = nobody knows) begins; the phase before it is over.
+
+    Attributes
+    ----------
+    name : str
+    total : int
+    done : int
+        Steps done before (a resumed run).
+    growth : float
+        Steps that grow dearer: the first share s of the steps takes the share s ** growth of the time. 1: all cost
+        the same; 2: each costs in proportion to those before it, as cameras do that are adjusted with all others.
+    """
 
     name: str
     total: int
-    done: int = 0  # steps done before (a resumed run)
+    done: int = 0
+    growth: float = 1.0
+
+    def seconds_left(self, done: int, elapsed: float) -> float | None:
+        """Return the seconds until the phase ends, after ``elapsed`` seconds of it; None where nobody can tell.
+
+        Parameters
+        ----------
+        done : int
+            Steps done, with those of before.
+        elapsed : float
+            Seconds since the phase began.
+        """
+        if not self.total or done <= self.done:
+            return None
+        before, now = ((steps / self.total) ** self.growth for steps in (self.done, min(done, self.total)))
+        return elapsed * (1.0 - now) / (now - before)
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ SHARED_ENOUGH = 8  # photographs of one camera that tell more than its focal len
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
     "cameras", "camera_model", "matching", "overlap", "neighbours", "max_size", "feature_size", "frames", "seed"
 )  # fmt: skip
+_GROWTH = {"placing cameras": 1.5}  # each is adjusted with those that have a place, but not with all of them every time
 FRAMES = "frames"  # of a video, in the workplace, until they are in the capture
 SMALLEST_SIDE, MOST_THREADS = 64, 1024
 _DOUBTFUL_SHARE, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
@@ -260,7 +261,7 @@ def _progress(on_event: OnEvent) -> Any:
 
     def tell(name: str, done: int, total: int) -> None:
         nonlocal current
-        on_event(Step(done) if name == current else Phase(name, total))
+        on_event(Step(done) if name == current else Phase(name, total, growth=_GROWTH.get(name, 1.0)))
         current = name
 
     return tell
