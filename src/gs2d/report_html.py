@@ -127,7 +127,8 @@ def _jpeg(image: np.ndarray, width: int) -> str:
         size = (width, max(round(shrunk.height * width / shrunk.width), 1))
         shrunk = shrunk.resize(size, Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
-    shrunk.save(buffer, format="JPEG", quality=88, subsampling=0, optimize=True)
+    # Not `optimize`: then the whole file must fit a buffer of one byte a pixel, and noise at this quality takes 1.7.
+    shrunk.save(buffer, format="JPEG", quality=88, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 

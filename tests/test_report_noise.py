@@ -1,0 +1,70 @@
+"""Pictures of noise, which compress worst: error maps of a draft look like it."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from gs2d.errors import BackendError
+from gs2d.images import read_image, write_image
+from gs2d.io.video import write_video
+from gs2d.report_html import picture
+from gs2d.sfm.photos import find_photos, read_photos
+from gs2d.sfm.stage import stage_photos
+
+SIDES = (1, 7, 64, 256, 257, 300, 360, 361, 520, 700)
+
+
+def noise(height: int, width: int, channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(height * width).integers(0, 256, (height, width, channels), dtype=np.uint8)
+
+
+def decoded(html: str) -> np.ndarray:
+    data = html.partition("base64,")[2].partition('"')[0]
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))))
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("width", [360, 960])
+def test_noise_of_any_size_becomes_a_picture_of_the_report(side: int, width: int) -> None:
+    image = noise(max(side * 3 // 4, 1), side)
+    shown = decoded(picture(image, alt="noise", width=width))
+    assert shown.shape[1] == min(side, width)
+    if side <= width:  # not shrunk: the noise itself, but for the loss of the compression
+        assert np.abs(shown.astype(float) - image).mean() < 12
+
+
+@pytest.mark.parametrize("side", [16, 300, 700])
+def test_noise_behind_an_alpha_channel_too(side: int) -> None:
+    assert decoded(picture(noise(side, side, 4), alt="noise", width=960)).shape == (side, side, 3)
+
+
+@pytest.mark.parametrize("side", [33, 300])
+def test_noisy_photographs_are_turned_and_shrunk(side: int, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    (tmp_path / "photos").mkdir()
+    for i in range(3):
+        image = Image.fromarray(noise(side, side + i))
+        image.save(tmp_path / "photos" / f"{i}.jpg", quality=95, exif=exif)
+    photos = list(read_photos(find_photos(tmp_path / "photos")[0], tmp_path / "photos", threads=1))
+    done = list(stage_photos(photos, tmp_path / "out", max_size=side, link=False, threads=1))
+    assert done == ["turned", "resized", "resized"]
+    assert read_image(tmp_path / "out" / "0.jpg").shape == (side, side, 3)
+
+
+@pytest.mark.parametrize("ending", [".webp", ".mp4"])
+def test_noise_makes_a_film(ending: str, tmp_path: Path) -> None:
+    frames = [tmp_path / f"{i}.png" for i in range(3)]
+    for i, frame in enumerate(frames):
+        write_image(frame, np.roll(noise(120, 180), i, axis=0))
+    try:
+        write_video(tmp_path / f"film{ending}", frames, fps=10, quality=100)
+    except BackendError as error:
+        pytest.skip(str(error))
+    assert (tmp_path / f"film{ending}").stat().st_size > 0
