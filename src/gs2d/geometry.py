@@ -24,7 +24,10 @@ __all__ = [
     "quats_to_matrices",
     "rigid_motion",
     "similarity_motions",
+    "up_direction",
 ]
+
+_SPREAD = 0.02  # of the cameras' horizontal axes, mean square, from which they tell what is up
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:
@@ -176,6 +179,23 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     right = np.einsum("vij,vj->i", projectors, centers - origin)
     offset = np.linalg.lstsq(projectors.sum(axis=0), right, rcond=1e-9)[0]
     return np.asarray(origin + offset)
+
+
+def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
+    """What is up [3], unit, for people who hold cameras level: across the cameras' horizontal axes.
+
+    The direction with the least sum of squares of its products with the cameras' x axes; where these are all but
+    parallel (everybody looks the same way), the mean of the cameras' own up vectors. Unlike that mean it is not tilted
+    where all look down from one side.
+    """
+    rotations = np.stack([camera.rotation for camera in cameras])  # [V, 3, 3]
+    mean_up = -rotations[:, 1].mean(axis=0)
+    squares, directions = np.linalg.eigh(rotations[:, 0].T @ rotations[:, 0] / len(cameras))  # ascending
+    up = directions[:, 0] if squares[1] > max(_SPREAD, 4 * squares[0]) else mean_up
+    if not np.linalg.norm(up) > 1e-9:
+        up = -rotations[0, 1]
+    up = up / np.linalg.norm(up)
+    return np.asarray(up if up @ mean_up >= 0 else -up)
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

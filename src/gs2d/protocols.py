@@ -32,6 +32,9 @@ class FusionLimits:
         How many of the largest connected components are kept; 0 keeps all.
     depth : str or None
         "mean" or "median": the depth that is fused; None is the one that the losses use.
+    subject : bool
+        Mesh what most cameras look at (``data.subject``), cleaned and simplified by evidence; False: all that is
+        inside the limits, as the scripts of the data sets do.
     """
 
     voxel: float | None = None
@@ -39,6 +42,7 @@ class FusionLimits:
     depth_limit: float | None = None
     clusters: int = 50
     depth: str | None = None
+    subject: bool = False
 
 
 @dataclass(frozen=True)
@@ -188,6 +192,7 @@ GENERIC = Protocol(
     distortion_weight=100.0,  # [2dgs] unbounded scenes
     near=None,  # [d] 0.2 is meaningless in a frame of unknown size
     test_every=8,  # [c] --eval
+    fusion=FusionLimits(subject=True),  # [d] people photograph things, and want them without the forest behind
 )
 
 PROTOCOLS: Mapping[str, Protocol] = MappingProxyType(

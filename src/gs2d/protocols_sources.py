@@ -35,6 +35,7 @@ _COMMON = {
     "fusion.depth_limit": f"{_OURS}: from the depth maps",
     "fusion.clusters": f"{_CODE}: render.py keeps 50",
     "fusion.depth": f"{_CODE}: render.py fuses the depth that was trained",
+    "fusion.subject": f"{_CODE}: render.py meshes all that is inside the limits",
     "metrics.from_8bit": f"{_CODE}: metrics.py reads PNG files",
     "metrics.lpips_unit_range": f"{_CODE}: LPIPS of images in [0, 1]",
     "metrics.surface": f"{_PAPER}: F-score",
@@ -84,6 +85,7 @@ _OWN: dict[str, dict[str, str]] = {
         "near": f"{_OURS}: 1 % of the extent, for 0.2 means nothing in a frame of unknown size",
         "crossing": f"{_OURS}: floors and walls pass by the camera",
         "use_mask_in_training": f"{_OURS}: a mask that a capture comes with says which pixels to leave out",
+        "fusion.subject": f"{_OURS}: what most cameras look at",
     },
 }
 _PARTS: dict[str, dict[str, str]] = {

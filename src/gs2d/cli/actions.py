@@ -113,6 +113,8 @@ def mesh(command: c.Mesh, console: Console) -> None:
         max_gib=command.max_gib,
         depth=command.depth,
         keep_components=command.keep_components,
+        subject_box=command.subject_box,
+        whole_scene=command.whole_scene,
     )
     if command.texture:
         _textured_mesh(command, options, console)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
-from gs2d.cli.options import Backend, Common, Finding, Overrides, Training, TrainingCommon
+from gs2d.cli.options import Backend, Box, Common, Finding, Overrides, Training, TrainingCommon
 
 RunPath = Annotated[Positional[Path], arg(metavar="RUN")]
 
@@ -105,8 +105,12 @@ class Mesh(Common):
     """Truncation distance in world units (default: from the voxel size)."""
     depth_limit: float | None = None
     """Ignore depth beyond this, in world units (default: from the scene)."""
-    bbox: tuple[float, float, float, float, float, float] | None = None
-    """Keep only this box: x0 y0 z0 x1 y1 z1. With --unbounded: where the voxels are finest."""
+    bbox: Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")] = None
+    """Keep only this box, not the subject's. With --unbounded: where the voxels are finest."""
+    subject_box: Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")] = None
+    """What the photographs are of, from now on (default: what the run says, or what most cameras look at)."""
+    whole_scene: Annotated[bool, arg(name="scene")] = False
+    """Mesh everything, not only the subject."""
     unbounded: bool = False
     """Mesh what lies far away too, in voxels that grow with the distance."""
     max_gib: float = 4.0

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
 LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+Box = tuple[float, float, float, float, float, float]
 Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), tyro.conf.UseAppendAction]
 
 
@@ -74,6 +75,10 @@ class Training:
     """Show the training in the browser while it runs; the address is printed, and nothing of the result changes."""
     viewer_port: int | None = None
     """With --viewer: port of the page (default: the first free one from 8080 on)."""
+    subject_box: Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")] = None
+    """What the photographs are of, as a box (default: what most cameras look at). The mesh is of it."""
+    whole_scene: Annotated[bool, arg(name="scene")] = False
+    """Mesh everything, not only the subject."""
     stage2_cache_mb: int = 1024
     """MiB for cached views in stage 2, about 5 MiB a view of 400x400 (0 = none; results differ by rounding)."""
 

@@ -9,6 +9,7 @@
       metrics.json  splats.ply  mesh.ply  mesh.glb (textured, if asked for)  renders/  report.html
       scene.html     the splats as a page for any browser, if asked for
       exposure.json  poses.json  what was learned of each photograph, where the recipe learns it
+      subject.json   what the cameras look at (data.subject.read_subject)
       .lock          held by the process that trains; the kernel frees it when that process dies
 
 Every file is written to a temporary name and renamed, except the log, which only grows: each checkpoint holds the
@@ -41,7 +42,7 @@ RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
 PRIORS = "priors"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
-EXPOSURE, POSES = "exposure.json", "poses.json"
+EXPOSURE, POSES, SUBJECT = "exposure.json", "poses.json", "subject.json"
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
 _UNREADABLE = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
@@ -186,7 +187,7 @@ class RunFolder:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
         for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
-        for name in (EVENTS, METRICS, SPLATS, EXPOSURE, POSES, MESH, TEXTURED, REPORT, PAGE, RUN_JSON):
+        for name in (EVENTS, METRICS, SPLATS, EXPOSURE, POSES, SUBJECT, MESH, TEXTURED, REPORT, PAGE, RUN_JSON):
             self.file(name).unlink(missing_ok=True)
 
     def discard(self) -> None:

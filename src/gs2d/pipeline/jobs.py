@@ -39,6 +39,7 @@ from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.refined import aligned
 from gs2d.pipeline.scoring import score_views, split_metrics
+from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
 
@@ -123,9 +124,11 @@ def mesh_run(
     path, out = Path(path), None if out is None else checked_output(path, out)
     run, job, splats = open_job(path, threads, on_event)
     if out is not None and out.resolve() != run.file(MESH).resolve():
-        return extract_mesh(job, splats, options, out, on_event)
+        subject = meshed_subject(run, job, splats, options, on_event)
+        return extract_mesh(job, splats, options, out, on_event, subject=subject)
     with run.locked():
-        result = extract_mesh(job, splats, options, run.file(MESH), on_event)
+        subject = meshed_subject(run, job, splats, options, on_event)
+        result = extract_mesh(job, splats, options, run.file(MESH), on_event, subject=subject)
         metrics = run.metrics()
         if metrics.get("surface"):  # was of the mesh before
             run.write_metrics({**metrics, "surface": None})

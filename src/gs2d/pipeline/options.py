@@ -8,6 +8,8 @@ from pathlib import Path
 from gs2d.protocols import Protocol
 from gs2d.recipe import Recipe
 
+Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, wu
+
 
 def paths_of(options: object, *names: str) -> None:
     """Turn the fields of these names that are strings into paths: in Python people write both."""
@@ -73,6 +75,10 @@ class TrainOptions:
         Port of that page; None = the first free one from 8080 on.
     estimate : bool
         Tell before training how long it will take and what is held out.
+    subject_box : six floats or None
+        The box of the subject, wu (``MeshOptions``); None: it is found.
+    whole_scene : bool
+        Mesh everything, not the subject.
     """
 
     scene: Path
@@ -104,6 +110,8 @@ class TrainOptions:
     viewer: bool = False
     viewer_port: int | None = None
     estimate: bool = False
+    subject_box: Box | None = None
+    whole_scene: bool = False
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "start_from", "cache")
@@ -127,16 +135,22 @@ class MeshOptions:
         "mean" or "median".
     keep_components : int or None
         The so many largest connected pieces; 0 = all; None = the protocol's.
+    subject_box : six floats or None
+        The box of the subject from now on, wu; None: what the run says, or what is found.
+    whole_scene : bool
+        Everything, not the subject, also where the protocol meshes the subject.
     """
 
     voxel: float | None = None
     truncation: float | None = None
     depth_limit: float | None = None
-    bbox: tuple[float, float, float, float, float, float] | None = None
+    bbox: Box | None = None
     unbounded: bool = False
     max_gib: float = 4.0
     depth: str | None = None
     keep_components: int | None = None
+    subject_box: Box | None = None
+    whole_scene: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

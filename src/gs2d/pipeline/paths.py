@@ -9,9 +9,8 @@ import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
 from gs2d.camera import Camera, look_at
-from gs2d.geometry import focus_point
+from gs2d.geometry import focus_point, up_direction
 
-_SPREAD = 0.02  # of the cameras' horizontal axes, mean square, from which they tell what is up
 _MOST_IN_TOUR = 300  # cameras; more are passed by without being looked at
 _DETOUR = 1.6  # a way in the order of names may be so many times longer than a short one
 _FRAMES_A_STOP = 15  # of a flight: half a second from one photograph to the next
@@ -19,23 +18,6 @@ _LEAST_STOPS = 4
 _AIMED = 0.5  # cosine between the axis of each camera and the way to what they look at
 _LEVEL = 0.1  # a level camera's x axis rises no more than this
 _STEEP = 0.98  # how far down a camera may look and still be kept level
-
-
-def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """What is up [3], unit, for people who hold cameras level: across the cameras' horizontal axes.
-
-    The direction with the least sum of squares of its products with the cameras' x axes; where these are all but
-    parallel (everybody looks the same way), the mean of the cameras' own up vectors. Unlike that mean it is not tilted
-    where all look down from one side.
-    """
-    rotations = np.stack([camera.rotation for camera in cameras])  # [V, 3, 3]
-    mean_up = -rotations[:, 1].mean(axis=0)
-    squares, directions = np.linalg.eigh(rotations[:, 0].T @ rotations[:, 0] / len(cameras))  # ascending
-    up = directions[:, 0] if squares[1] > max(_SPREAD, 4 * squares[0]) else mean_up
-    if not np.linalg.norm(up) > 1e-9:
-        up = -rotations[0, 1]
-    up = up / np.linalg.norm(up)
-    return np.asarray(up if up @ mean_up >= 0 else -up)
 
 
 def orbit_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:

@@ -21,7 +21,7 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined import with_found_poses
-from gs2d.protocols import FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
+from gs2d.protocols import GENERIC, FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
 from gs2d.recipe import Recipe, validate
 from gs2d.recipe_json import apply_overrides, from_json, to_json
 from gs2d.recipes import get_recipe, with_depth_prior, with_exposure, with_normal_prior, with_poses
@@ -343,7 +343,8 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
 
 def protocol_from_json(data: dict[str, Any]) -> Protocol:
     """The protocol that ``asdict`` and JSON made of one."""
-    fusion, metrics = FusionLimits(**data["fusion"]), MetricConventions(**data["metrics"])
+    old = {"subject": data["name"] == GENERIC.name}  # for runs of before there was such a field
+    fusion, metrics = FusionLimits(**{**old, **data["fusion"]}), MetricConventions(**data["metrics"])
     return Protocol(**{**data, "background": tuple(data["background"]), "fusion": fusion, "metrics": metrics})
 
 
@@ -376,8 +377,8 @@ def check_same_run(run: RunFolder, job: Job) -> None:
 
 
 def _training_facts(protocol: dict[str, Any]) -> dict[str, Any]:
-    """A protocol without the kind of depth that is fused, which decides no byte of training."""
-    fusion = {name: value for name, value in protocol.get("fusion", {}).items() if name != "depth"}
+    """A protocol without the kind of depth that is fused and what part, which decide no byte of training."""
+    fusion = {name: value for name, value in protocol.get("fusion", {}).items() if name not in ("depth", "subject")}
     return {**protocol, "fusion": fusion}
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.data.subject import Subject
 from gs2d.disk import disk_error
 from gs2d.errors import ProtocolError
 from gs2d.io.ply import write_mesh
@@ -28,8 +29,10 @@ LARGEST = 1e12  # wu; depth and voxels are 32-bit numbers, of which squares and 
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
 
-def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_event: OnEvent) -> dict[str, Any]:
-    """Render depth of all training views, fuse it, write the mesh.
+def extract_mesh(
+    job: Job, splats: Splats, options: MeshOptions, out: Path, on_event: OnEvent, *, subject: Subject | None = None
+) -> dict[str, Any]:
+    """Render depth of all training views, fuse it, write the mesh: of the subject, or of everything.
 
     Returns
     -------
@@ -46,9 +49,9 @@ def extract_mesh(job: Job, splats: Splats, options: MeshOptions, out: Path, on_e
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     check_mesh_options(options)
     depth = options.depth or job.protocol.fused_depth
-    result = _extract(job, splats, options, depth, on_event)
+    result = _extract(job, splats, options, depth, on_event, subject)
     write_mesh(out, result.mesh)
-    if result.limits.cut_fraction > MOSTLY_CUT:
+    if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         on_event(Notice(_cut_text(result, options)))
     limits = asdict(result.limits)
     return {
@@ -102,15 +105,19 @@ def check_mesh_options(options: MeshOptions) -> None:
         raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
 
 
-def _extract(job: Job, splats: Splats, options: MeshOptions, depth: str, on_event: OnEvent) -> Extraction:
+def _extract(
+    job: Job, splats: Splats, options: MeshOptions, depth: str, on_event: OnEvent, subject: Subject | None
+) -> Extraction:
     fusion = job.protocol.fusion
     keep = fusion.clusters if options.keep_components is None else options.keep_components
     # A box or a voxel of the user's own makes the protocol's other limits meaningless.
-    own = options.bbox is not None or options.unbounded
+    bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
+    bbox = bbox if subject is None else subject.box
+    own = bbox is not None or options.unbounded
     fuse_frames = extract_unbounded if options.unbounded else extract
     result = fuse_frames(
         _frames(job, splats, depth, on_event),
-        bbox=None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3),
+        bbox=bbox,
         voxel=options.voxel if own else options.voxel or fusion.voxel,
         truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
         depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,

@@ -27,6 +27,7 @@ from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.pictures import render_view
 from gs2d.pipeline.prepare import Job, read_scene
+from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.surface import OPAQUE, extract_mesh
 from gs2d.splats import Splats
 from gs2d.triangles import Mesh
@@ -135,7 +136,8 @@ def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder
     if options == MeshOptions() and run.file(MESH).exists():
         return read_mesh(run.file(MESH))
     with tempfile.TemporaryDirectory(prefix=".gs2d-", dir=folder) as temporary:
-        extract_mesh(job, splats, options, Path(temporary) / MESH, on_event)
+        subject = meshed_subject(run, job, splats, options, on_event)
+        extract_mesh(job, splats, options, Path(temporary) / MESH, on_event, subject=subject)
         return read_mesh(Path(temporary) / MESH)
 
 

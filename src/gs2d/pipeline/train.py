@@ -20,6 +20,7 @@ from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
 from gs2d.pipeline.refined import FoundPoses, found_poses, write_poses
 from gs2d.pipeline.restart import Start, check_sources, choose_start
+from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
 from gs2d.train import events
@@ -80,7 +81,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         write_exposures(run, exposures, on_event)
         write_poses(run, job.scene, poses, on_event)
         job = replace(job, scene=job.scene.with_poses(poses)) if poses else job
-        finish(run, job, splats, on_event)
+        mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
+        finish(run, job, splats, mesh, on_event)
     return run
 
 
@@ -224,14 +226,15 @@ def foretold(job: Job) -> list[str]:
     return lines
 
 
-def finish(run: RunFolder, job: Job, splats: Splats, on_event: OnEvent) -> None:
+def finish(run: RunFolder, job: Job, splats: Splats, mesh: MeshOptions, on_event: OnEvent) -> None:
     """Write what the user came for. Splats that give no mesh still give a report, before the error."""
     from gs2d.pipeline.jobs import report_run
 
     write_splats(run.file(SPLATS), splats)
     try:
+        subject = meshed_subject(run, job, splats, mesh, on_event)
         if not run.file(MESH).exists():
-            extract_mesh(job, splats, MeshOptions(), run.file(MESH), on_event)
+            extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject)
     except ProtocolError as error:
         report_run(run.path)
         raise ProtocolError(f"no mesh of {run.path}: {error}; splats and report are written") from error

@@ -1,0 +1,135 @@
+"""What most cameras look at, on surfaces and cameras whose subject is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs2d.camera import Camera, look_at
+from gs2d.data.subject import Sight, Subject, find_subject, given_subject, middle_weights, read_subject
+from gs2d.errors import DataError
+from gs2d.io.files import write_json
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def camera(eye: np.ndarray, target: np.ndarray) -> Camera:
+    return look_at(np.asarray(eye, float), np.asarray(target, float), UP, width=40, height=30, fx=36.0)
+
+
+def around(count: int, radius: float, *, arc: float = 360.0, height: float = 1.0) -> list[Camera]:
+    """Cameras on an arc around the origin, that look at it."""
+    turns = np.radians(np.linspace(0, arc, count, endpoint=arc < 360))
+    return [camera(np.array([radius * np.cos(a), radius * np.sin(a), height]), np.zeros(3)) for a in turns]
+
+
+def sight(seen_from: Camera, *balls: tuple[np.ndarray, float], room: float = 50.0) -> Sight:
+    """What a camera sees of balls (centre, radius) inside a large sphere around the origin: the nearest hit."""
+    columns, rows = np.meshgrid(np.arange(seen_from.width) + 0.5, np.arange(seen_from.height) + 0.5)
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    rays = np.concatenate([(pixels - [seen_from.cx, seen_from.cy]) / seen_from.fx, np.ones((len(pixels), 1))], axis=1)
+    rays = rays @ seen_from.rotation
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    distance = np.full(len(rays), np.inf)
+    for center, radius in (*balls, (np.zeros(3), room)):
+        arm = seen_from.center - center
+        b, c = rays @ arm, arm @ arm - radius**2
+        root = np.sqrt(np.maximum(b**2 - c, 0))
+        hit = np.where(-b - root > 0, -b - root, -b + root)
+        distance = np.where((b**2 >= c) & (hit > 0), np.minimum(distance, hit), distance)
+    weights = middle_weights(seen_from, pixels)
+    return Sight(seen_from, seen_from.center + distance[:, None] * rays, weights / weights.sum())
+
+
+@pytest.mark.parametrize("arc", [360.0, 50.0])
+def test_the_subject_is_the_ball_that_the_cameras_stand_around_not_the_room(arc: float) -> None:
+    place = np.array([0.3, -0.2, 0.1])
+    subject = find_subject([sight(c, (place, 1.0)) for c in around(12, 5.0, arc=arc)])
+    assert subject.kind == "object"
+    assert subject.why == "12 of 12 cameras look at it"
+    np.testing.assert_allclose(subject.up, UP, atol=1e-6 if arc == 360 else 0.05)
+    if arc == 360:  # all of the ball was seen
+        assert (subject.low < place - 0.9).all()
+        assert (subject.high > place + 0.9).all()
+    assert np.linalg.norm(subject.center - place) < 1.0
+    assert subject.radius < 6.0  # the room's is 87
+
+
+def test_a_few_cameras_that_look_elsewhere_do_not_change_the_subject() -> None:
+    cameras = around(10, 5.0)
+    astray = [
+        camera(np.array([5.0, 0, 1]), np.array([20.0, 5, 1])),
+        camera(np.array([0, 5.0, 1]), np.array([0, 20.0, 9])),
+    ]
+    ball = (np.zeros(3), 1.0)
+    alone, both = (find_subject([sight(c, ball) for c in chosen]) for chosen in (cameras, cameras + astray))
+    assert both.kind == "object"
+    assert both.why == "10 of 12 cameras look at it"
+    np.testing.assert_allclose(both.box, alone.box, atol=0.1)
+
+
+def test_cameras_inside_a_room_have_a_scene_and_say_so() -> None:
+    turns = np.radians(np.arange(0, 360, 24))
+    inside = [
+        camera(0.4 * np.array([np.cos(a), np.sin(a), 0]), np.array([9 * np.cos(a), 9 * np.sin(a), 0])) for a in turns
+    ]
+    subject = find_subject([sight(c, room=4.0) for c in inside])
+    assert subject.kind == "scene"
+    assert "no place is looked at by most cameras" in subject.why
+    assert (subject.low < -2).any()
+    assert (subject.high > 2).any()
+
+
+def test_a_walk_along_a_wall_has_a_scene() -> None:
+    walk = [camera(np.array([x, 0.0, 0.0]), np.array([x, 5.0, 0.0])) for x in np.linspace(0, 40, 15)]
+    wall = (np.array([20.0, 1e4 + 5.0, 0.0]), 1e4)
+    assert find_subject([sight(c, wall, room=1e6) for c in walk]).kind == "scene"
+
+
+def test_the_unit_of_the_capture_does_not_matter() -> None:
+    cameras, scale, shift = around(9, 5.0), 1e-3, np.array([40.0, -7.0, 3.0])
+    ball = (np.zeros(3), 1.0)
+    plain = find_subject([sight(c, ball) for c in cameras])
+    moved = []
+    for seen in (sight(c, ball) for c in cameras):
+        eye = seen.camera.center * scale + shift
+        moved.append(Sight(camera(eye, shift), seen.points * scale + shift, seen.weights))
+    np.testing.assert_allclose(find_subject(moved).box, plain.box * scale + shift, atol=1e-5)
+
+
+def test_a_subject_reads_back_from_the_run_folder(tmp_path: Path) -> None:
+    subject = find_subject([sight(c, (np.zeros(3), 1.0)) for c in around(6, 5.0)])
+    assert read_subject(tmp_path) is None
+    write_json(tmp_path / "subject.json", subject.to_json())
+    assert set(subject.to_json()) == {"kind", "min", "max", "center", "radius", "up", "why"}
+    back = read_subject(tmp_path)
+    assert back is not None
+    assert back.to_json() == subject.to_json()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("min", [1, 2]), ("max", [-9.0, -9.0, -9.0]), ("kind", "thing"), ("up", ["a", "b", "c"]), ("center", None)],
+)
+def test_a_damaged_subject_is_named_with_what_to_do(tmp_path: Path, name: str, value: object) -> None:
+    good = Subject("object", np.zeros(3), np.ones(3), np.ones(3) / 2, UP, "so").to_json()
+    write_json(tmp_path / "subject.json", {**good, name: value})
+    with pytest.raises(DataError, match=r"subject\.json was damaged.*delete it"):
+        read_subject(tmp_path)
+
+
+def test_a_given_box_is_taken_as_it_is_or_refused() -> None:
+    cameras = around(4, 5.0)
+    subject = given_subject((-1, -2, -3, 1, 2, 3), cameras)
+    assert (subject.kind, subject.low.tolist(), subject.high.tolist()) == ("object", [-1, -2, -3], [1, 2, 3])
+    for box in ((1, 0, 0, 0, 1, 1), (0, 0, 0, 1, 1, np.nan), (0, 0, 1, 1)):
+        with pytest.raises(DataError, match="lower corner and a higher one"):
+            given_subject(box, cameras)
+
+
+def test_cameras_that_see_nothing_have_no_subject() -> None:
+    empty = [Sight(c, np.zeros((0, 3)), np.zeros(0)) for c in around(3, 5.0)]
+    with pytest.raises(DataError, match="some camera sees"):
+        find_subject(empty)
