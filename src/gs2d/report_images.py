@@ -8,6 +8,7 @@ from gs2d.check import check_shapes
 
 ERROR_TOP = 0.2  # mean absolute error over channels, on colours in [0, 1], that gets the last colour of its scale
 HIGHLIGHT = (0.93, 0.11, 0.62)  # of the high-error splats
+HATCH, HATCHED = 6, (0.9, 0.9, 0.92)  # px, and the lighter stripes of what is unknown; the darker ones are IGNORED
 IGNORED = (0.82, 0.82, 0.84)  # of pixels that the view's mask leaves out
 
 _ERROR_SCALE = np.array(
@@ -114,6 +115,26 @@ def error_picture(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None 
         check_shapes({"photo": (photo, "H W 3"), "mask": (mask, "H W")})
         picture[~mask] = IGNORED
     return picture
+
+
+def known_picture(photo: np.ndarray, known: np.ndarray | None) -> np.ndarray:
+    """Return a photograph hatched where it says nothing (``known`` is False), which undistortion left black.
+
+    Parameters
+    ----------
+    photo : ndarray [H, W, 3 or 4]
+        uint8, or floats in [0, 1]; as it is returned.
+    known : ndarray bool [H, W] or None
+        None: all of it.
+    """
+    if known is None:
+        return photo
+    check_shapes({"photo": (photo, "H W C"), "known": (known, "H W")})
+    rows, columns = np.indices(known.shape)
+    stripes = ((rows + columns) // HATCH % 2 == 0)[..., None]
+    opaque = np.where(stripes, (*IGNORED, 1.0), (*HATCHED, 1.0))[..., : photo.shape[2]]
+    tones = np.rint(255 * opaque) if photo.dtype == np.uint8 else opaque
+    return np.where(known[..., None], photo, tones.astype(photo.dtype))
 
 
 def highlight_picture(color: np.ndarray, weight: np.ndarray) -> np.ndarray:

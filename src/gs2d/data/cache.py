@@ -22,14 +22,17 @@ class Picture:
         False = ignore this pixel.
     object_mask : ndarray bool [H, W] or None
         True = the object.
+    known : ndarray bool [H, W] or None
+        False = the photograph does not reach so far: undistortion left the pixel black. None: all are known.
     """
 
     image: np.ndarray
     mask: np.ndarray | None = None
     object_mask: np.ndarray | None = None
+    known: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for field in ("image", "mask", "object_mask"):
+        for field in ("image", "mask", "object_mask", "known"):
             array = getattr(self, field)
             if array is not None:
                 frozen = array.view()
@@ -39,7 +42,8 @@ class Picture:
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        return sum(array.nbytes for array in (self.image, self.mask, self.object_mask) if array is not None)
+        arrays = [array for array in (self.image, self.mask, self.object_mask, self.known) if array is not None]
+        return sum({array.ctypes.data: array.nbytes for array in arrays}.values())  # often mask is known
 
 
 class ImageCache:

@@ -118,19 +118,22 @@ class Decoder:
         if frame.alpha_is_silhouette and image.shape[2] == 4:
             object_mask = image[:, :, 3] >= 128 if object_mask is None else object_mask
             image = image[:, :, :3]
+        known = None
         if k.lens is not None:
             positions, valid = self.lens_maps(k)
+            known = valid
             image = undistort_image(image, positions, valid)
-            mask = valid if mask is None else valid & undistort_mask(mask, positions, need=1.0)
+            mask = None if mask is None else valid & undistort_mask(mask, positions, need=1.0)
             if object_mask is not None:
                 object_mask = valid & undistort_mask(object_mask, positions, need=0.5)
         if self.downscale > 1:
             image = area_downscale(image, self.downscale)
-            mask = None if mask is None else mask_downscale(mask, self.downscale, need=1.0)
+            mask, known = (
+                None if pixels is None else mask_downscale(pixels, self.downscale, need=1.0) for pixels in (mask, known)
+            )
             object_mask = None if object_mask is None else mask_downscale(object_mask, self.downscale, need=0.5)
-        if mask is not None and mask.all():
-            mask = None
-        return Picture(np.ascontiguousarray(image), mask, object_mask)
+        mask, known = (None if pixels is None or pixels.all() else pixels for pixels in (mask, known))
+        return Picture(np.ascontiguousarray(image), known if mask is None else mask, object_mask, known)
 
     def _read_mask(self, path: Path | None, need: float) -> np.ndarray | None:
         """A mask at the image's size: True where at least ``need`` of the pixel's area is white."""

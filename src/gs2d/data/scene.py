@@ -52,9 +52,12 @@ class View:
         image: np.ndarray,
         mask: np.ndarray | None = None,
         object_mask: np.ndarray | None = None,
+        known: np.ndarray | None = None,
     ) -> View:
         """A view of arrays in memory: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
-        picture = Picture(image, mask, object_mask)
+        if known is not None:
+            mask = known if mask is None else mask & known
+        picture = Picture(image, mask, object_mask, known)
         return cls(name, camera, lambda: picture)
 
     def at(self, T_cam_world: np.ndarray) -> View:
@@ -76,6 +79,25 @@ class View:
         """Which pixels count, bool [H, W] (a fresh copy), or None if all do. False = ignore this pixel."""
         mask = self._picture().mask
         return None if mask is None else mask.copy()
+
+    def known(self) -> np.ndarray | None:
+        """Return where the photograph says anything, bool [H, W] (a fresh copy), or None if everywhere.
+
+        False where undistortion reaches beyond the photograph: there ``image()`` is black, and nobody may learn it,
+        score it or show it, whatever a protocol makes of masks.
+        """
+        known = self._picture().known
+        return None if known is None else known.copy()
+
+    def usable(self, *, masks: bool) -> np.ndarray | None:
+        """Return which pixels count where a protocol uses masks or does not, bool [H, W], or None if all do.
+
+        Parameters
+        ----------
+        masks : bool
+            True: ``mask()``, which leaves out unknown pixels too; False: ``known()``.
+        """
+        return self.mask() if masks else self.known()
 
     def object_mask(self) -> np.ndarray | None:
         """Where the object is, bool [H, W] (a fresh copy): a silhouette file (DTU), else alpha >= 0.5, else None.
@@ -103,7 +125,8 @@ class View:
     def _decode_checked(self) -> Picture:
         picture = self.decode()
         expected = (self.camera.height, self.camera.width)
-        for what, array in (("image", picture.image), ("mask", picture.mask), ("object mask", picture.object_mask)):
+        masks = {"mask": picture.mask, "object mask": picture.object_mask, "mask of known pixels": picture.known}
+        for what, array in {"image": picture.image, **masks}.items():
             if array is not None and array.shape[:2] != expected:
                 raise DataError(
                     f"the {what} of view {self.name} must be {expected[1]}x{expected[0]} like its camera, "

@@ -26,7 +26,7 @@ from gs2d.recipe import RankByError, Recipe
 from gs2d.recipe_json import from_json
 from gs2d.render.api import splat_errors
 from gs2d.report_curves import Panel, compared, read_history
-from gs2d.report_images import ERROR_TOP, error_picture, error_scale, highlight_picture
+from gs2d.report_images import ERROR_TOP, error_picture, error_scale, highlight_picture, known_picture
 from gs2d.splats import Splats
 from gs2d.train.actions import worst
 from gs2d.train.exposure import as_photographed
@@ -184,7 +184,7 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
             transform = transforms[view.name].to(splats.means)
             seen, settings = as_photographed(splats, view.camera, transform, settings)
         image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
-        mask = view.mask() if job.protocol.use_mask_in_training else None
+        mask = view.usable(masks=job.protocol.use_mask_in_training)
         errors = splat_errors(
             seen,
             view.camera,
@@ -270,7 +270,7 @@ def draw_error_maps(
         color, alpha = np.clip(own.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
         photo = view.target(job.settings.background)
         pictures = [
-            photo,
+            known_picture(photo, view.known()),
             color,
             error_picture(color, photo, view.mask()),
             map_picture(ranking.splats, positions, view, job, alpha),

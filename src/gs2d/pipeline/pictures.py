@@ -24,7 +24,14 @@ from gs2d.pipeline.prepare import Job
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.report_images import depth_limits, depth_picture, error_picture, highlight_picture, normal_picture
+from gs2d.report_images import (
+    depth_limits,
+    depth_picture,
+    error_picture,
+    highlight_picture,
+    known_picture,
+    normal_picture,
+)
 from gs2d.report_pictures import read_index
 from gs2d.sh import rgb_to_sh0
 from gs2d.splats import Splats
@@ -112,7 +119,7 @@ def draw_stage(
             pictures["high_error"] = highlight_picture(color, share)
         for what, picture in pictures.items():
             write_image(folder / stage / f"{file}.{what}.png", picture)
-        write_image(folder / "photos" / f"{file}.png", photo)
+        write_image(folder / "photos" / f"{file}.png", known_picture(photo, view.known()))
         shown_as = {"name": view.name, "file": file, "split": split, "depth_limits": near_far}
         views.append({**shown_as, "camera": camera_json(view.camera)})
     stages = [*(name for name in index["stages"] if name != stage), stage]

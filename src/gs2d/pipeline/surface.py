@@ -138,8 +138,9 @@ def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator
             output = rasterize(splats, view.camera, job.settings, backend=job.backend)
         valid = (output.alpha >= OPAQUE).cpu().numpy()
         mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
-        if mask is not None:
-            valid = valid & mask
+        for pixels in (mask, view.known()):  # beyond the photograph nothing has said how far the surface is
+            if pixels is not None:
+                valid = valid & pixels
         yield Frame(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
     on_event(Phase("fusing", 0))
 

@@ -30,7 +30,7 @@ from gs2d.pipeline.train import use_threads
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.report_images import depth_picture, normal_picture
+from gs2d.report_images import depth_picture, known_picture, normal_picture
 from gs2d.splats import Splats
 from gs2d.train.state import TrainState
 from gs2d.view import Shot, Stage, Viewer, middle_of, required_viser, thumbnail
@@ -211,6 +211,6 @@ def shots(views: Sequence[View], settings: RasterSettings, on_event: OnEvent) ->
         on_event(Notice(f"{MOST_CAMERAS} of {len(some)} cameras are shown"))
         some = [some[i] for i in np.linspace(0, len(some) - 1, MOST_CAMERAS).round().astype(int)]
     return [
-        Shot(view.name, view.camera, thumbnail(view.image(), settings.background))
+        Shot(view.name, view.camera, thumbnail(known_picture(view.image(), view.known()), settings.background))
         for view in counted(some, "thumbnails", len(some), on_event)
     ]

@@ -79,7 +79,7 @@ class Targets:
             return kept
         view = self._views[index]
         image = torch.as_tensor(view.target(self._background)).to(self._device, self._dtype)
-        mask = view.mask() if self._use_masks else None
+        mask = view.usable(masks=self._use_masks)
         alpha = view.alpha() if self._with_silhouettes else None
         target = Target(
             image,
@@ -164,7 +164,7 @@ class DeviceTargets:
     def _take_in(self, index: int) -> _Picture:
         """Decode a photograph, and keep it where there is room."""
         view = self._views[index]
-        mask = view.mask() if self._use_masks else None
+        mask = view.usable(masks=self._use_masks)
         picture = _Picture(torch.tensor(view.image()), None if mask is None else torch.tensor(mask))
         for place in ("device", "pinned"):
             if picture.nbytes(place) > self._room[place]:

@@ -1,0 +1,157 @@
+"""Pixels beyond the photograph, which undistortion leaves black: nobody learns, scores, fuses or shows them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from capture_writers import ring, small_colmap
+from PIL import Image
+
+from gs2d.data import View, load_scene
+from gs2d.data.cache import Picture
+from gs2d.data.lens import colmap_intrinsics, source_positions
+from gs2d.pipeline import surface
+from gs2d.pipeline.events import ignore
+from gs2d.render.backend import get_backend
+from gs2d.render.types import RasterSettings
+from gs2d.report_images import HATCHED, IGNORED, known_picture
+from gs2d.splats import Splats
+from gs2d.train.targets import DeviceTargets, Targets
+
+WIDTH, HEIGHT = 160, 120
+PINCUSHION = (110.0, 80.0, 60.0, 0.3)  # the corners of the pinhole picture lie beyond the photograph
+
+
+def distorted(root: Path, params: tuple[float, ...] = PINCUSHION, *, mask: bool = False) -> View:
+    """The first view of a capture with a SIMPLE_RADIAL lens; all photographs are plain grey."""
+    small_colmap(root, count=3, cameras={7: ("SIMPLE_RADIAL", WIDTH, HEIGHT, params)})
+    (root / "masks").mkdir()
+    half = np.zeros((HEIGHT, WIDTH), np.uint8)
+    half[:, :80] = 255
+    for i in range(3):
+        Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(root / f"images/{i}.png")
+        if mask:
+            Image.fromarray(half).save(root / f"masks/{i}.png")
+    return load_scene(root, test_every=0).train[0]
+
+
+def reached() -> np.ndarray:
+    """Where the photograph has pixels."""
+    return source_positions(colmap_intrinsics("camera", "SIMPLE_RADIAL", WIDTH, HEIGHT, PINCUSHION))[1]
+
+
+def test_what_the_photograph_does_not_reach_is_unknown_and_also_outside_the_mask(tmp_path: Path) -> None:
+    plain, masked = distorted(tmp_path / "a"), distorted(tmp_path / "b", mask=True)
+    for view in (plain, masked):
+        np.testing.assert_array_equal(view.known(), reached())
+        assert not view.known()[0, 0]
+        assert (view.image()[~view.known()] == 0).all()
+        np.testing.assert_array_equal(view.usable(masks=False), reached())
+    np.testing.assert_array_equal(plain.mask(), reached())
+    assert masked.mask()[60, 40]
+    assert not masked.mask()[60, 120]
+    assert masked.known()[60, 120]
+    np.testing.assert_array_equal(masked.usable(masks=True), masked.mask())
+
+
+def test_all_of_a_photograph_without_distortion_is_known(tmp_path: Path) -> None:
+    view = distorted(tmp_path / "a", (110.0, 80.0, 60.0, 0.0))
+    assert view.known() is None
+    assert view.mask() is None
+    assert view.usable(masks=False) is None
+    masked = distorted(tmp_path / "b", (110.0, 80.0, 60.0, 0.0), mask=True)
+    assert masked.known() is None
+    assert masked.usable(masks=False) is None
+    assert not masked.usable(masks=True)[60, 120]
+
+
+def test_nerfstudio_captures_say_it_too(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    frames = []
+    for i, camera in enumerate(ring(3)):
+        Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(tmp_path / f"images/{i}.png")
+        pose = np.linalg.inv(camera.T_cam_world) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    f, cx, cy, k1 = PINCUSHION
+    facts = {"fl_x": f, "fl_y": f, "cx": cx, "cy": cy, "w": WIDTH, "h": HEIGHT, "k1": k1, "camera_model": "OPENCV"}
+    (tmp_path / "transforms.json").write_text(json.dumps({**facts, "frames": frames}))
+    np.testing.assert_array_equal(load_scene(tmp_path, test_every=0).train[0].known(), reached())
+
+
+def test_a_smaller_picture_knows_what_all_its_pixels_know(tmp_path: Path) -> None:
+    distorted(tmp_path)
+    view = load_scene(tmp_path, test_every=0, downscale=4).train[0]
+    blocks = reached().reshape(HEIGHT // 4, 4, WIDTH // 4, 4).all(axis=(1, 3))
+    np.testing.assert_array_equal(view.known(), blocks)
+
+
+def test_a_mask_that_is_what_is_known_takes_no_memory_twice() -> None:
+    known = np.eye(4, dtype=bool)
+    picture = Picture(np.zeros((4, 4, 3), np.uint8), known, None, known)
+    assert picture.nbytes == 48 + 16
+
+
+def pictures(unknown: int) -> View:
+    """A view of 8 x 8 pixels, of which the left half is unknown and has this value."""
+    image = np.full((8, 8, 3), 200, np.uint8)
+    image[:, :4] = unknown
+    known = np.ones((8, 8), bool)
+    known[:, :4] = False
+    camera = ring(1, width=8, height=8, f=8.0)[0]
+    return View.from_arrays("a", camera, image, known=known)
+
+
+@pytest.mark.parametrize("use_masks", [True, False])
+def test_unknown_pixels_are_no_target_of_any_protocol(use_masks: bool) -> None:
+    view = pictures(0)
+    black = (0.0, 0.0, 0.0)
+    made: list[Any] = [
+        Targets([view], black, use_masks=use_masks, with_maps=False)[0],
+        DeviceTargets([view], black, use_masks=use_masks, device=torch.device("cpu"))[0],
+    ]
+    for target in made:
+        np.testing.assert_array_equal(target.mask.numpy(), view.known())
+
+
+@pytest.mark.parametrize("use_masks", [True, False])
+def test_the_depth_of_unknown_pixels_is_not_fused(use_masks: bool) -> None:
+    view = pictures(0)
+    splat = Splats(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[0.7, 0.0, 0.7, 0.0]]),
+        log_scales=torch.full((1, 2), 2.0),
+        opacity_logits=torch.tensor([9.0]),
+        sh0=torch.zeros(1, 1, 3),
+        shN=torch.zeros(1, 0, 3),
+    )
+    job: Any = SimpleNamespace(
+        scene=SimpleNamespace(train=(view,)),
+        settings=RasterSettings(sh_degree=0),
+        backend=get_backend("reference"),
+        protocol=SimpleNamespace(use_mask_in_fusion=use_masks),
+    )
+    frame = next(iter(surface._frames(job, splat, "median", ignore)))
+    assert frame.valid is not None
+    assert frame.valid[:, 4:].any()
+    assert not frame.valid[:, :4].any()
+
+
+def test_a_photograph_is_hatched_where_it_ends() -> None:
+    known = np.ones((20, 20), bool)
+    known[:, :10] = False
+    photo = np.where(known[..., None], 0.5, np.zeros(3)).astype(np.float32)
+    shown = known_picture(photo, known)
+    assert shown.dtype == np.float32
+    np.testing.assert_array_equal(shown[known], photo[known])
+    tones = np.unique(shown[~known], axis=0)
+    np.testing.assert_allclose(tones, [IGNORED, HATCHED], atol=1e-6)
+    assert known_picture(photo, None) is photo
+    straight = known_picture(np.zeros((20, 20, 4), np.uint8), known)
+    assert (straight[~known][:, 3] == 255).all()
+    assert straight[~known].min() > 200
