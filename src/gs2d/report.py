@@ -21,10 +21,12 @@ from gs2d.io.run import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, open_run
 from gs2d.report_curves import curves, read_history
 from gs2d.report_exposure import exposure_section
 from gs2d.report_html import drawing, escape, facts, missing, page, table
+from gs2d.report_links import links
 from gs2d.report_pictures import hero, mesh_section, view_sections
 from gs2d.report_poses import poses_section
 from gs2d.report_priors import priors_section
 from gs2d.report_surface import surface_scores
+from gs2d.report_terms import glossary, titles_of
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 
@@ -112,8 +114,11 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
         f'<div class="eyebrow">gs2d report</div><h1>{escape(title)}</h1>',
         f'<p class="lead">{verdict(record)}</p>',
         hero(renders),
+        "<h2>Files</h2>",
+        links(record.path),
         "<h2>Results</h2>",
         stage_table(record),
+        glossary(),
         "<h2>Surface</h2>",
         surface_scores(record.surface, record.surface_reason, record.path),
         mesh_section(record.path / MESH, cameras),
@@ -240,7 +245,7 @@ def stage_table(record: RunRecord) -> str:
     words = "PSNR and SSIM: means over the views, of pictures rounded to 8 bits. Higher is better, the best is green."
     legend = f'<p class="soft">{words}{_other_conventions(record)}</p>' if shown else ""
     notes = [legend, _reasons(record.stages, splits), _clone_note(record)]
-    return table(columns, rows) + "".join(notes)
+    return table(columns, rows, titles=titles_of(columns)) + "".join(notes)
 
 
 def _scaled(value: Any, factor: float) -> float | None:

@@ -1,82 +1,44 @@
-"""The look of the report: style sheet, small HTML builders, pictures and scales as data URLs."""
+"""The look of the report: small HTML builders, pictures and scales as data URLs.
+
+Style sheet and script lie in ``report_files``.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from types import MappingProxyType
+from urllib.parse import quote
 
 import numpy as np
 from PIL import Image
 
 from gs2d.images import composite, to_uint8
 
-STYLE = """
-:root { color-scheme: light dark; --ink: #1d2129; --soft: #5f6773; --line: #dfe2e7; --page: #fbfbfa; --card: #ffffff;
-  --accent: #b3246f; --good: #1e7a46; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e8eaee; --soft: #9aa2ae; --line: #30353d; --page: #14171b;
-  --card: #1b1f25; --accent: #ff6db5; --good: #69d093; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.55 system-ui, -apple-system, "Segoe UI",
-  Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 1180px; margin: 0 auto; padding: 2.8rem 1.6rem 5rem; }
-h1 { font-size: 2.1rem; line-height: 1.15; letter-spacing: -0.02em; margin: 0 0 .35rem; }
-h2 { font-size: 1.25rem; letter-spacing: -0.01em; margin: 3rem 0 .8rem; }
-h3 { font-size: .95rem; font-weight: 600; margin: 1.8rem 0 .5rem; overflow-wrap: anywhere; }
-h3 small { font-weight: 400; color: var(--soft); }
-p { max-width: 76ch; margin: .5rem 0; } ul { max-width: 90ch; padding-left: 1.2rem; margin: .5rem 0; }
-.lead { font-size: 1.12rem; line-height: 1.5; border-left: 3px solid var(--accent); padding: .1rem 0 .1rem 1rem;
-  margin: 1.2rem 0 1.6rem; }
-.lead b { color: var(--good); } .soft, figcaption, .missing { color: var(--soft); font-size: .87rem; }
-.eyebrow { color: var(--accent); font-weight: 600; font-size: .8rem; letter-spacing: .08em; text-transform: uppercase; }
-.missing { border: 1px dashed var(--line); border-radius: 8px; padding: .6rem .8rem; margin: .5rem 0; }
-dl.facts { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: .7rem 1.4rem;
-  margin: .9rem 0 1.2rem; }
-dl.facts dt { color: var(--soft); font-size: .78rem; } dl.facts dd { margin: 0; overflow-wrap: anywhere; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; min-width: 100%; }
-th, td { text-align: right; padding: .42rem .65rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th { font-weight: 600; font-size: .8rem; color: var(--soft); }
-th:first-child, td:first-child, th.text, td.text { text-align: left; }
-td.text { white-space: normal; color: var(--soft); font-size: .87rem; min-width: 9rem; }
-td.best { font-weight: 650; color: var(--good); }
-td .why { display: block; color: var(--soft); font-size: .72rem; white-space: normal;
-  max-width: 16rem; margin-left: auto; }
-figure { margin: 0; } img { display: block; width: 100%; height: auto; border-radius: 6px; background: #fff; }
-.hero, .meshes { display: grid; grid-template-columns: repeat(auto-fit, minmax(13rem, 1fr)); gap: .9rem; }
-.meshes { grid-template-columns: repeat(auto-fit, minmax(18rem, 1fr)); margin-top: 1rem; }
-.pair { display: grid; gap: .9rem; }
-figcaption { padding: .3rem .1rem 0; }
-.views { display: grid; gap: .5rem; align-items: start; min-width: 46rem; }
-.views > .head { font-size: .8rem; font-weight: 600; color: var(--soft); text-align: center; }
-.views > .row, .views > .key { align-self: center; }
-.views > .row { font-size: .8rem; font-weight: 600; color: var(--soft); }
-.views figcaption { text-align: center; padding: .15rem 0 0; font-size: .78rem; }
-.key { color: var(--soft); font-size: .8rem; padding: 0 .6rem; }
-.bar { height: 10px; border-radius: 5px; margin: .3rem 0; }
-.ends { display: flex; justify-content: space-between; }
-.curves { display: grid; grid-template-columns: repeat(auto-fit, minmax(25rem, 1fr)); gap: 1rem; }
-.curves figure { background: var(--card); border: 1px solid var(--line); border-radius: 10px;
-  padding: .7rem .8rem .3rem; }
-.curves img { background: none; border-radius: 0; }
-.curves figcaption { font-weight: 600; color: var(--ink); padding: 0 0 .3rem; }
-details { margin-top: .8rem; } summary { cursor: pointer; color: var(--soft); }
-pre { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: .8rem; overflow: auto;
-  font-size: .8rem; max-height: 30rem; }
-@media (max-width: 40rem) { .curves { grid-template-columns: 1fr; } }
-"""
+LARGE = """<dialog class="large" aria-label="enlarged picture">
+<nav><button class="before" type="button" aria-label="picture before">&lsaquo;</button>
+<button class="next" type="button" aria-label="next picture">&rsaquo;</button><p></p>
+<button class="close" type="button" aria-label="close">&times;</button></nav>
+<div class="stage"></div>
+</dialog>"""
 
 
 def page(title: str, body: Sequence[str]) -> str:
-    """A whole document without scripts and without anything from elsewhere."""
+    """Return a whole document that needs nothing from elsewhere; without its script everything is still to be seen."""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"<title>{escape(title)}</title>\n<style>\n{_text('report.css')}</style>\n</head>\n<body>\n<main>\n"
         + "\n".join(body)
-        + "\n</main>\n</body>\n</html>\n"
+        + f"\n</main>\n{LARGE}\n<script>\n{_text('report.js')}</script>\n</body>\n</html>\n"
     )
+
+
+def _text(name: str) -> str:
+    return (files("gs2d") / "report_files" / name).read_text(encoding="utf-8")
 
 
 def escape(text: object) -> str:
@@ -98,10 +60,28 @@ def facts(pairs: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, texts: Sequence[int] = ()) -> str:
-    """A table of cells that are HTML already: ``<td ...>`` elements, or text; ``texts`` are the columns of words."""
+def table(
+    columns: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    texts: Sequence[int] = (),
+    titles: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Return a table of cells that are HTML already: ``<td ...>`` elements, or text.
+
+    Parameters
+    ----------
+    texts : sequence of int
+        The columns of words.
+    titles : mapping
+        What columns mean, by column: shown where the mouse rests on their names.
+    """
     style = [' class="text"' if i in texts else "" for i in range(len(columns))]
-    head = "".join(f"<th{style[i]}>{escape(column)}</th>" for i, column in enumerate(columns))
+    named = [
+        f'<abbr title="{escape(titles[column])}">{escape(column)}</abbr>' if column in titles else escape(column)
+        for column in columns
+    ]
+    head = "".join(f"<th{style[i]}>{name}</th>" for i, name in enumerate(named))
     body = "".join(
         "<tr>"
         + "".join(cell if cell.startswith("<td") else f"<td{style[i]}>{cell}</td>" for i, cell in enumerate(row))
@@ -111,11 +91,62 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, texts: Seque
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def picture(image: np.ndarray, caption: str = "", *, alt: str, width: int = 360) -> str:
-    """An image [H, W, 3 or 4] inline as JPEG, at most ``width`` px wide, over white."""
-    source = _jpeg(image, width)
+def picture(image: np.ndarray, caption: str = "", *, alt: str, width: int = 360, full: str | None = None) -> str:
+    """Return an image [H, W, 3 or 4] inline as JPEG, at most ``width`` px wide, over white.
+
+    Parameters
+    ----------
+    full : str, optional
+        The same picture in all its pixels, beside the report: what is shown enlarged where it is there.
+    """
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f'<figure><img src="{source}" alt="{escape(alt)}">{below}</figure>'
+    return f"<figure>{_image(image, alt, width, full)}{below}</figure>"
+
+
+def wipe(
+    images: tuple[np.ndarray, np.ndarray],
+    names: tuple[str, str],
+    *,
+    title: str,
+    width: int = 800,
+    full: tuple[str, str] | None = None,
+) -> str:
+    """Return two pictures of one view, one over the other, with a line to be moved by mouse, finger or arrow keys.
+
+    Parameters
+    ----------
+    images : two ndarrays [H, W, 3 or 4]
+        What is shown left of the line, and right of it.
+    names : two str
+        What they are.
+    title : str
+        What of.
+    width : int
+        px at most, of each.
+    full : two str, optional
+        As for :func:`picture`.
+    """
+    alts = [f"{name} of {title}" for name in names]
+    both = [
+        _image(image, alt, width, None if full is None else full[i])
+        for i, (image, alt) in enumerate(zip(images, alts, strict=True))
+    ]
+    before, after = (escape(name) for name in names)
+    ratio = images[0].shape[1] / images[0].shape[0]
+    return (
+        f'<figure class="wipe" data-title="{before} and {after} of {escape(title)}" style="--ratio: {ratio:.4f}">'
+        f'<div class="both">{both[0]}{both[1]}'
+        f'<span class="tag before">{before}</span><span class="tag after">{after}</span></div>'
+        '<input type="range" min="0" max="100" value="50" step="1" '
+        f'aria-label="How much of the {before} is shown over the {after}">'
+        f"<figcaption>{escape(title)}: {before} left, {after} right"
+        '<button class="larger" type="button">enlarge</button></figcaption></figure>'
+    )
+
+
+def _image(image: np.ndarray, alt: str, width: int, full: str | None) -> str:
+    beside = "" if full is None else f' data-full="{escape(quote(full))}"'
+    return f'<img src="{_jpeg(image, width)}" alt="{escape(alt)}"{beside}>'
 
 
 def _jpeg(image: np.ndarray, width: int) -> str:

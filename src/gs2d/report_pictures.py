@@ -14,7 +14,8 @@ from gs2d.errors import DataError
 from gs2d.images import composite, read_image
 from gs2d.io.files import read_json
 from gs2d.io.ply import read_mesh
-from gs2d.report_html import color_bar, escape, missing, picture
+from gs2d.io.run import RENDERS
+from gs2d.report_html import color_bar, escape, missing, picture, wipe
 from gs2d.report_images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
 from gs2d.report_mesh import mesh_pictures, orbit_cameras
 
@@ -55,6 +56,10 @@ class Gallery:
     def rendering(self, stage: str, view: ShownView, kind: str) -> np.ndarray | None:
         """One rendering."""
         return _read(self.folder / stage / f"{view.file}.{kind}.png")
+
+    def beside(self, view: ShownView, stage: str = PHOTOS, kind: str = "") -> str:
+        """Return where a picture lies, seen from the report."""
+        return f"{RENDERS}/{stage}/{view.file}.{kind}.png" if kind else f"{RENDERS}/{stage}/{view.file}.png"
 
 
 def _read(path: Path) -> np.ndarray | None:
@@ -119,19 +124,40 @@ def _is_view(entry: Any) -> bool:
 
 
 def hero(renders: Path) -> str:
-    """The first view large: photograph, the last stage's colour and normal, and its error."""
+    """The first view large: the photograph wiped over the last stage's colour; its normal and its depth."""
     gallery = read_gallery(renders)
     if gallery is None or not gallery.views or not gallery.stages:
         return ""
     view, stage = gallery.views[0], gallery.stages[-1]
-    images = [("Photograph", gallery.photo(view))]
-    images += [
-        (f"{KINDS[kind]}, {stage}", gallery.rendering(stage, view, kind)) for kind in ("color", "normal", "depth")
+    compared = comparison(gallery, view, width=1000)
+    figures = [] if compared else [("Photograph", gallery.photo(view), gallery.beside(view))]
+    figures += [
+        (f"{KINDS[kind]}, {stage}", gallery.rendering(stage, view, kind), gallery.beside(view, stage, kind))
+        for kind in (("normal", "depth") if compared else ("color", "normal", "depth"))
     ]
-    figures = [
-        picture(image, title, alt=f"{title} of {view.name}", width=520) for title, image in images if image is not None
-    ]
-    return f'<div class="hero">{"".join(figures)}</div>' if figures else ""
+    others = "".join(
+        picture(image, title, alt=f"{title} of {view.name}", width=520, full=full)
+        for title, image, full in figures
+        if image is not None
+    )
+    beside = f'<div class="hero">{others}</div>' if others else ""
+    return f'<div class="hero first">{compared}{beside}</div>' if compared else beside
+
+
+def comparison(gallery: Gallery, view: ShownView, *, width: int = 800) -> str:
+    """Return the photograph of a view wiped over the last stage's rendering; "" where there are not both."""
+    stage = gallery.stages[-1]
+    photo, color = gallery.photo(view), gallery.rendering(stage, view, "color")
+    if photo is None or color is None or photo.shape[:2] != color.shape[:2]:
+        return ""
+    split = f" ({view.split} view)" if view.split else ""
+    return wipe(
+        (photo, color),
+        ("photograph", "rendering"),
+        title=f"{view.name}{split}, {_psnr_caption(color, photo)}",
+        width=width,
+        full=(gallery.beside(view), gallery.beside(view, stage, "color")),
+    )
 
 
 def view_sections(renders: Path, *, expected_stages: Sequence[str]) -> str:
@@ -143,7 +169,9 @@ def view_sections(renders: Path, *, expected_stages: Sequence[str]) -> str:
     parts = []
     for view in gallery.views[:MOST_VIEWS]:
         split = f" <small>{escape(view.split)} view</small>" if view.split else ""
-        parts.append(f'<h3>{escape(view.name)}{split}</h3><div class="scroll">{_grid(gallery, view, stages)}</div>')
+        compared = comparison(gallery, view) if view is not gallery.views[0] and gallery.stages else ""  # that: on top
+        grid = f'<div class="scroll">{_grid(gallery, view, stages)}</div>'
+        parts.append(f"<h3>{escape(view.name)}{split}</h3>{compared}{grid}")
     left = len(gallery.views) - MOST_VIEWS
     if left > 0:
         parts.append(missing(f"{left} more views are in the folder renders/."))
@@ -159,7 +187,8 @@ def _grid(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> str:
         cells.append(f'<div class="row">{title}</div>')
         if kind == "color":
             missing_photo = missing("no photograph in renders/photos")
-            cells.append(missing_photo if photo is None else picture(photo, alt=f"photograph {view.name}"))
+            shown = "" if photo is None else picture(photo, alt=f"photograph {view.name}", full=gallery.beside(view))
+            cells.append(shown or missing_photo)
         else:
             cells.append(_key(kind, view))
         for stage, image in zip(stages, images, strict=True):
@@ -167,7 +196,8 @@ def _grid(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> str:
                 cells.append(missing(_why_missing(kind, stage)))
                 continue
             caption = _psnr_caption(image, photo) if kind == "color" else ""
-            cells.append(picture(image, caption, alt=f"{title} of {view.name} after {stage}"))
+            alt, full = f"{title} of {view.name} after {stage}", gallery.beside(view, stage, kind)
+            cells.append(picture(image, caption, alt=alt, full=full))
     columns = f"5.2rem repeat({len(stages) + 1}, minmax(8rem, 1fr))"
     return f'<div class="views" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
 

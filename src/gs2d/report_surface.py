@@ -8,6 +8,7 @@ from typing import Any
 
 from gs2d.images import read_image
 from gs2d.report_html import escape, missing, picture, table
+from gs2d.report_terms import titles_of
 
 SCORES = (
     "Precision: the share of the mesh that is nearer to the true surface than the distance in the first column. "
@@ -65,7 +66,8 @@ def surface_scores(surface: Mapping[str, Any] | None, reason: str | None, folder
         for row in surface.get("thresholds") or []
     ]
     if rows:
-        parts.append(table(["Nearer than", "Precision", "Recall", "F-score"], rows))
+        columns = ["Nearer than", "Precision", "Recall", "F-score"]
+        parts.append(table(columns, rows, titles=titles_of(columns)))
         counts = _COUNTS.get(str(surface.get("evaluator", "visible-surface")), "")
         parts.append(f'<p class="soft">{escape(SCORES + counts)}</p>')
     parts += _doubts(surface.get("self_check"))
