@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +21,28 @@ from gs2d.io.ply import read_mesh
 from gs2d.report_mesh import mesh_pictures
 
 
-def strip(run: Path, view: int, stage: str | None, size: int) -> list[np.ndarray]:
-    """The pictures of one view of a run, uint8 [size, size, 3] each."""
+def views_of(run: Path) -> int:
+    """How many views a run drew."""
+    return len(json.loads((run / "renders" / "index.json").read_text())["views"])
+
+
+def pictures_of(run: Path, view: int, stage: str | None, kinds: Sequence[str]) -> list[np.ndarray]:
+    """Photograph, renderings of some kinds and mesh of one view of a run, uint8 [H, W, 3] each."""
     shown = json.loads((run / "renders" / "index.json").read_text())["views"][view]
     stages = [entry["name"] for entry in json.loads((run / "metrics.json").read_text())["stages"]]
     folder = run / "renders" / (stage or stages[-1])
     files = [run / "renders" / "photos" / f"{shown['file']}.png"]
-    files += [folder / f"{shown['file']}.{kind}.png" for kind in ("color", "normal", "depth")]
+    files += [folder / f"{shown['file']}.{kind}.png" for kind in kinds]
     pictures = [np.asarray(Image.open(file).convert("RGB")) for file in files]
     saved = shown["camera"]
     camera = Camera(**{**saved, "T_cam_world": np.asarray(saved["T_cam_world"])})
     clay = mesh_pictures(read_mesh(run / "mesh.ply"), [camera], width=camera.width)[0].shape
-    pictures.append((clay * 255).round().astype(np.uint8))
+    return [*pictures, (clay * 255).round().astype(np.uint8)]
+
+
+def strip(run: Path, view: int, stage: str | None, size: int) -> list[np.ndarray]:
+    """The pictures of one view of a run, uint8 [size, size, 3] each."""
+    pictures = pictures_of(run, view, stage, ("color", "normal", "depth"))
     return [np.asarray(Image.fromarray(p).resize((size, size), Image.Resampling.LANCZOS)) for p in pictures]
 
 

@@ -1,0 +1,64 @@
+"""Pictures of finished captures: photograph, rendering of a test view, normals and mesh, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from PIL import Image
+
+from benchmarks.figure import pictures_of, views_of
+from gs2d.io.run import MESH, METRICS
+
+HEIGHT, GAP, QUALITY = 240, 4, 85  # px, px, of JPEG
+KINDS = ("color", "normal")
+
+
+class Shown(Protocol):
+    """A capture as the gallery needs it."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    def licence(self) -> str:
+        """Of its photographs."""
+
+    @property
+    def may_be_shown(self) -> bool:
+        """Whether its pictures may be published."""
+
+
+def gallery_row(run: Path, height: int = HEIGHT) -> Image.Image:
+    """The middle one of the views that a run drew, as photograph, rendering, normals and mesh at one height."""
+    view = views_of(run) // 2
+    pictures = [
+        Image.fromarray(p).resize((max(1, round(height * p.shape[1] / p.shape[0])), height), Image.Resampling.LANCZOS)
+        for p in pictures_of(run, view, None, KINDS)
+    ]
+    row = Image.new("RGB", (sum(p.width for p in pictures) + GAP * (len(pictures) - 1), height), "white")
+    left = 0
+    for picture in pictures:
+        row.paste(picture, (left, 0))
+        left += picture.width + GAP
+    return row
+
+
+def write_gallery(folder: Path, captures: Sequence[Shown], runs: Path, quality: str) -> list[Path]:
+    """Write a JPEG of each finished run and a page that says which of them may be published; the pictures' files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files, lines = [], ["| capture | photograph, rendering, normals, mesh | may be published |", "|---|---|---|"]
+    for capture in captures:
+        run = runs / capture.name / "run"
+        if not ((run / MESH).exists() and (run / METRICS).exists()):
+            lines.append(f"| {capture.name} | not finished | |")
+            continue
+        file = folder / f"{capture.name}-{quality}.jpg"
+        gallery_row(run).save(file, quality=QUALITY)
+        may = "yes" if capture.may_be_shown else "no"
+        lines.append(f"| {capture.name} | ![{capture.name}]({file.name}) | {may}: {capture.licence} |")
+        files.append(file)
+    (folder / f"gallery-{quality}.md").write_text("\n".join(lines) + "\n")
+    return files

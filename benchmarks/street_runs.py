@@ -1,0 +1,297 @@
+"""One capture from its photographs alone: the command is run, watched and scored.
+
+A run is ``gs2d reconstruct`` in a process of its own, so that its exit code, processor time and memory are those a
+person would see. What it left is scored here, in the same way for every capture and every version of the program.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.data import View
+from gs2d.evaluate.hidden_points import hidden_points, total
+from gs2d.evaluate.images import ImageMetrics
+from gs2d.io.files import read_json
+from gs2d.io.ply import read_mesh
+from gs2d.io.run import MESH, METRICS, PAGE, REPORT, SPLATS
+from gs2d.pipeline.events import ignore
+from gs2d.pipeline.exposure import read_exposures
+from gs2d.pipeline.jobs import open_job
+from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.reconstruct import CAPTURE, FEW
+from gs2d.pipeline.scoring import score_views
+from gs2d.render.api import rasterize
+from gs2d.sfm.photos import find_photos
+from gs2d.sfm.workplace import POSES_JSON
+from gs2d.splats import Splats
+
+POLL_SECONDS = 0.2
+PROCESS, CONSOLE, PHOTOS, PEER = "process.json", "console.txt", "photographs", "peer"
+TEST_EVERY = 8  # where `reconstruct` itself would hold nothing out
+UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0, "days": 86400.0}
+_DURATION = r"([\d.]+)\s*(s|min|h|days?)\b"
+
+
+# -- a process and what it took ------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Process:
+    """What a finished process took, with all its children.
+
+    Attributes
+    ----------
+    exit_code : int
+        Negative: the signal that ended it.
+    seconds, cpu_seconds : float
+        Of the clock and of the processor.
+    cpu_seconds_before : float or None
+        Of the processor until the file ``when`` was there; None where it never was.
+    peak_rss_bytes : int
+        Of the largest process among them.
+    """
+
+    command: list[str]
+    exit_code: int
+    seconds: float
+    cpu_seconds: float
+    cpu_seconds_before: float | None
+    peak_rss_bytes: int
+
+
+def watch_process(
+    command: Sequence[str], console: Path, *, when: Path | None = None, environment: Mapping[str, str] | None = None
+) -> Process:
+    """Run a command to its end, what it says going to a file.
+
+    Parameters
+    ----------
+    when : Path, optional
+        The processor time is also taken when this file appears.
+
+    Raises
+    ------
+    OSError
+        The command cannot be started.
+    """
+    start, before = time.perf_counter(), None
+    variables = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE", **(environment or {})}  # waiting threads take no time
+    with open(console, "w") as file:
+        child = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=variables)
+    try:
+        while True:
+            pid, status, used = os.wait4(child.pid, os.WNOHANG)
+            if before is None and when is not None and when.exists():
+                before = used.ru_utime + used.ru_stime if pid else _cpu_seconds_so_far(child.pid)
+            if pid:
+                break
+            time.sleep(POLL_SECONDS)
+    except BaseException:
+        child.terminate()
+        child.wait()
+        raise
+    child.returncode = os.waitstatus_to_exitcode(status)
+    unit = 1 if sys.platform == "darwin" else 1024
+    return Process(
+        list(map(str, command)),
+        child.returncode,
+        round(time.perf_counter() - start, 2),
+        round(used.ru_utime + used.ru_stime, 2),
+        None if before is None else round(before, 2),
+        used.ru_maxrss * unit,
+    )
+
+
+def _cpu_seconds_so_far(pid: int) -> float | None:
+    """Of a running process and of its children that have ended; None where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")  # user, system, and both of children
+
+
+# -- a capture -----------------------------------------------------------------------------------------------------
+def copy_photographs(source: Path, target: Path) -> int:
+    """Copy the photographs of a folder to one where nothing else is; how many there are.
+
+    Raises
+    ------
+    DataError
+        There are none.
+    """
+    photos = find_photos(source)[0]
+    target.mkdir(parents=True, exist_ok=True)
+    for photo in photos:
+        copy = target / photo.name
+        if not copy.exists():
+            shutil.copyfile(photo, copy)
+    return len(photos)
+
+
+def reconstruct_command(photos: Path, count: int, run: Path, quality: str, extra: Sequence[str] = ()) -> list[str]:
+    """The command of one run, as a person types it after ``gs2d``."""
+    words = ["reconstruct", str(photos), "--out", str(run), "--quality", quality]
+    if count < FEW and "--test-every" not in extra:
+        words += ["--test-every", str(TEST_EVERY)]
+    return [*words, *extra]
+
+
+def run_reconstruct(source: Path, folder: Path, quality: str, extra: Sequence[str] = ()) -> tuple[Path, Process, int]:
+    """Run the command for a capture unless it was run to its end before; run folder, what it took, photographs."""
+    run, process_file = folder / "run", folder / PROCESS
+    photos = folder / PHOTOS / folder.name  # the report is named after its folder
+    count = copy_photographs(source, photos)
+    words = reconstruct_command(photos, count, run, quality, extra)
+    if process_file.exists():
+        before = Process(**json.loads(process_file.read_text()))
+        if before.command[3:] == words:
+            return run, before, count
+    for left in (run, folder / PEER):  # of a run that was cut off, whose time is not known, or of another command
+        shutil.rmtree(left, ignore_errors=True)
+    print("$ gs2d", " ".join(words), flush=True)
+    process = watch_process([sys.executable, "-m", "gs2d", *words], folder / CONSOLE, when=run / CAPTURE / POSES_JSON)
+    process_file.write_text(json.dumps(asdict(process), indent=1) + "\n")
+    return run, process, count
+
+
+# -- what it told and what it left ---------------------------------------------------------------------------------
+def told_estimate(console: str) -> dict[str, Any] | None:
+    """The first estimate of the training's time in what a run said: the line, and its bounds in seconds."""
+    for line in console.splitlines():
+        found = re.search(rf"will take about {_DURATION}(?:\s*(?:to|-)\s*{_DURATION})?", line)
+        if found:
+            low = float(found[1]) * UNITS[found[2]]
+            high = float(found[3]) * UNITS[found[4]] if found[3] else low
+            return {"line": line.strip(), "least": low, "most": high}
+    return None
+
+
+def estimate_error(estimate: Mapping[str, Any] | None, seconds: float | None) -> float | None:
+    """By what factor the time lay outside the bounds that were told: 1 within them, 2 twice as long or half."""
+    if estimate is None or not seconds:
+        return None
+    return max(1.0, seconds / estimate["most"], estimate["least"] / seconds)
+
+
+def summary_of(scores: Mapping[str, ImageMetrics]) -> dict[str, Any] | None:
+    """Mean PSNR and SSIM of some views and the worst of them; None where there are no views."""
+    psnr = {name: score.psnr.value for name, score in scores.items() if score.psnr.value is not None}
+    ssim = [score.ssim.value for score in scores.values() if score.ssim.value is not None]
+    if not psnr or not ssim:
+        return None
+    worst = min(psnr, key=lambda name: psnr[name])
+    return {
+        "views": len(psnr),
+        "psnr": round(sum(psnr.values()) / len(psnr), 3),
+        "ssim": round(sum(ssim) / len(ssim), 4),
+        "worst_psnr": round(psnr[worst], 3),
+        "worst_view": worst,
+        "psnr_by_view": {name: round(value, 3) for name, value in sorted(psnr.items())},
+    }
+
+
+def score_run(path: Path) -> dict[str, Any]:
+    """Scores of a run's splats: both splits, with colours matched, and the sparse points that test views hide."""
+    run, job, splats = open_job(path, None, ignore)
+    drawing = (job.settings, job.backend)
+    exposures = read_exposures(run, job.recipe)
+
+    def scores(views: Sequence[View], **how: Any) -> dict[str, Any] | None:
+        return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, **how))
+
+    return {
+        "test": scores(job.scene.test),
+        "test_matched": scores(job.scene.test, match=True),
+        "train": scores(job.scene.train, exposures=exposures),
+        "hidden": hidden_share(job, splats),
+        "splats": len(splats),
+        "downscale": job.downscale,
+        "pixels": [job.scene.views[0].camera.width, job.scene.views[0].camera.height],
+    }
+
+
+def hidden_share(job: Job, splats: Splats) -> dict[str, Any] | None:
+    """Sparse points that the rendered median depth of test views hides; None without test views or points."""
+    if job.scene.observe is None or not job.scene.test:
+        return None
+    observed, counts = job.scene.observe(), {}
+    for view in job.scene.test:
+        with torch.no_grad():
+            depth = rasterize(splats, view.camera, job.settings, backend=job.backend).depth_median.cpu().numpy()
+        counts[view.name] = hidden_points(np.asarray(depth), observed.in_view(view.name, view.camera))
+    whole = total(list(counts.values()))
+    if whole.share is None:
+        return None
+    shares = {name: count.share for name, count in counts.items() if count.share is not None}
+    worst = max(shares, key=lambda name: shares[name])
+    return {
+        "points": whole.shown,
+        "share": round(whole.share, 5),
+        "worst_share": round(shares[worst], 5),
+        "worst_view": worst,
+    }
+
+
+def placed(run: Path) -> dict[str, Any] | None:
+    """How many photographs have a place, and with which cameras; None where none were found."""
+    file = run / CAPTURE / POSES_JSON
+    if not file.exists():
+        return None
+    poses = read_json(file)
+    rows = poses["photographs"]
+    return {
+        "photographs": len(rows),
+        "placed": sum(bool(row["placed"]) for row in rows),
+        "cameras": poses.get("cameras"),
+    }
+
+
+def measure_run(source: Path, folder: Path, quality: str, extra: Sequence[str] = ()) -> dict[str, Any]:
+    """Run a capture, if that is not done, and tabulate what it took, told and left."""
+    folder.mkdir(parents=True, exist_ok=True)
+    run, process, count = run_reconstruct(source, folder, quality, extra)
+    row: dict[str, Any] = {
+        "photographs": count,
+        "poses": placed(run),
+        **{name: value for name, value in asdict(process).items() if name != "command"},
+        "command": " ".join(["gs2d", *process.command[3:]]),
+        "files": {name: (run / name).exists() for name in (SPLATS, MESH, REPORT, PAGE)},
+    }
+    if process.exit_code:
+        row["last_lines"] = (folder / CONSOLE).read_text(errors="replace").splitlines()[-3:]
+    row |= _times_of(run, folder)
+    for name, file, measure in (("scores", SPLATS, score_run), ("mesh", MESH, measure_mesh)):
+        row[name] = measure(run) if (run / file).exists() and (run / METRICS).exists() else None
+    return row
+
+
+def _times_of(run: Path, folder: Path) -> dict[str, Any]:
+    """Seconds that training took, and what had been told."""
+    estimate = told_estimate((folder / CONSOLE).read_text(errors="replace"))
+    stages = read_json(run / METRICS)["stages"] if (run / METRICS).exists() else []
+    seconds = round(sum(stage["seconds"] for stage in stages), 1) if stages else None
+    error = estimate_error(estimate, seconds)
+    return {
+        "iterations": sum(stage["iterations"] for stage in stages),
+        "training_seconds": seconds,
+        "estimate": estimate,
+        "estimate_error": None if error is None else round(error, 2),
+    }
+
+
+def measure_mesh(run: Path) -> dict[str, Any]:
+    """The size of a run's mesh."""
+    mesh = read_mesh(run / MESH)
+    return {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
