@@ -175,7 +175,7 @@ def test_rows_are_written_as_they_are_there_and_a_failed_run_shows_in_the_exit_c
 
     monkeypatch.setattr(street, "measure_run", measured)
     words = ["--data", str(tmp_path / "data"), "--out", str(out), "--results", str(results), "--quality", "normal"]
-    words += ["--options", "--exposure"]
+    words += ["--options=--exposure"]
     assert street.main([*words, "--captures", "monstree", "fox"]) == 1
     assert [r["capture"] for r in json.loads(results.read_text())["rows"]] == ["fox", "monstree"]
     assert (out / "normal.md").read_text().count("\n| ") == 2

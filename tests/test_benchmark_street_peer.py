@@ -170,5 +170,6 @@ def test_the_peers_own_pictures_of_test_views_are_scored_once_it_is_trained(
     assert 0 < len(moving) < len(trainings)
     assert all(words[words.index("--densify-until") + 1] == words[words.index("-n") + 1] for words in moving)
     before = len(calls(binary))
+    monkeypatch.setattr(street_peer, "draw_test_views", drawn)  # the pictures are there
     assert street_peer.measure_peer(binary, tmp_path / "run", tmp_path / "peer", 0.6)["scores"] == row["scores"]
     assert len(calls(binary)) == before  # what is finished is not repeated
