@@ -36,7 +36,7 @@ class Extraction:
 
 
 def extract(
-    frames: Iterable[Frame],
+    frames: Iterable[Frame] | Spool,
     *,
     limits: FusionLimits | None = None,
     resolution: int = 512,
@@ -57,8 +57,8 @@ def extract(
 
     Parameters
     ----------
-    frames : iterable of Frame
-        Read once (a generator is fine) and kept in a temporary file.
+    frames : iterable of Frame, or Spool
+        Read once (a generator is fine) and kept in a temporary file; a spool is one, and is closed at the end.
     limits : FusionLimits, optional
         Default: ``derive_limits`` from the frames, with ``resolution``, ``bbox``, ``voxel``, ``truncation``,
         ``depth_limit`` and ``points`` as it takes them (they may not be given together with ``limits``); a truncation
@@ -89,8 +89,7 @@ def extract(
     if limits is not None and any(v is not None for v in (bbox, voxel, truncation, depth_limit, points)):
         raise TypeError("give limits, or the numbers to derive them from, not both")
     backend = fusion_backend(backend)
-    with Spool(folder) as spool:
-        spool.extend(frames)
+    with Spool.of(frames, folder) as spool:
         if limits is None:
             samples = [sample_depths(item) for item in spool]
             limits = derive_limits(
@@ -111,7 +110,7 @@ def extract(
 
 
 def extract_unbounded(
-    frames: Iterable[Frame],
+    frames: Iterable[Frame] | Spool,
     *,
     resolution: int = 512,
     bbox: np.ndarray | None = None,
@@ -154,8 +153,7 @@ def extract_unbounded(
         As ``extract``.
     """
     backend = fusion_backend(backend)
-    with Spool(folder) as spool:
-        spool.extend(frames)
+    with Spool.of(frames, folder) as spool:
         samples = [sample_depths(item) for item in spool]
         nest = derive_nest(
             samples,

@@ -135,6 +135,19 @@ class Spool:
             ) from error
         self._slots.append(_Slot(item.camera, offset, item.color is not None, item.weight is not None))
 
+    @classmethod
+    def of(cls, frames: Iterable[Frame] | Spool, folder: str | os.PathLike[str] | None = None) -> Spool:
+        """The frames in a file of their own, cleaned one by one; a spool as it is."""
+        if isinstance(frames, Spool):
+            return frames
+        spool = cls(folder)
+        try:
+            spool.extend(frames)
+        except BaseException:
+            spool.close()
+            raise
+        return spool
+
     def extend(self, frames: Iterable[Frame]) -> None:
         """Clean and write frames one by one."""
         for frame in frames:

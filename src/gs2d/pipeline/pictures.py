@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from gs2d.io.files import write_json
 from gs2d.io.run import RENDERS, RunFolder, make_folder
 from gs2d.pipeline.exposure import NONE, Transforms, photographed
 from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.scoring import evenly
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -44,8 +46,7 @@ IMAGES = ("color", "normal", "depth", "error", "high_error")
 def choose_views(scene: Scene, count: int) -> list[tuple[str, View]]:
     """(split, view) of the views to show: test views where there are any, spread evenly."""
     split, views = ("test", scene.test) if scene.test else ("train", scene.train)
-    count = min(count, len(views))
-    return [(split, views[(2 * i + 1) * len(views) // (2 * count)]) for i in range(count)]
+    return [(split, view) for view in evenly(views, count)]
 
 
 def file_name(view: View) -> str:
@@ -79,6 +80,7 @@ def draw_stage(
     splats: Splats,
     group: Tensor | None,
     exposures: Transforms = NONE,
+    outputs: Mapping[str, RenderOutput] = MappingProxyType({}),
 ) -> None:
     """Write the pictures of one stage, the photographs, and the index of both.
 
@@ -88,6 +90,8 @@ def draw_stage(
     ----------
     group : Tensor [N] bool or None
         The high-error splats, once they are known.
+    outputs : mapping
+        By the name of the view: what was rendered of these splats already.
 
     Raises
     ------
@@ -102,7 +106,7 @@ def draw_stage(
     views = []
     files = file_names([view for _, view in shown])
     for (split, view), file in zip(shown, files, strict=True):
-        output = render_view(splats, view, job.settings, job.backend)
+        output = outputs.get(view.name) or render_view(splats, view, job.settings, job.backend)
         depth = output.depth(job.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
         near_far = limits.get(view.name) or list(depth_limits(depth, alpha))  # of the first stage: stages compare

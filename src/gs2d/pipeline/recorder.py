@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from types import MappingProxyType
 from typing import Any
 
 from gs2d.data import View
 from gs2d.errors import DivergedError
+from gs2d.evaluate.images import ImageMetrics
 from gs2d.io.run import RunFolder, load_tensors
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
@@ -21,8 +23,19 @@ from gs2d.pipeline.pictures import choose_views, draw_stage
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.prior_scores import score_priors
 from gs2d.pipeline.restart import Start, put_in_cache
-from gs2d.pipeline.scoring import PeakGpuMemory, PeakMemory, mean_psnr, score_views, split_metrics
+from gs2d.pipeline.scoring import (
+    PeakGpuMemory,
+    PeakMemory,
+    SeenView,
+    Visitor,
+    evenly,
+    is_partial,
+    mean_psnr,
+    score_views,
+    split_metrics,
+)
 from gs2d.recipe import CloneInPlace, Stage
+from gs2d.render.types import RenderOutput
 from gs2d.splats import Splats
 from gs2d.train import events as train_events
 from gs2d.train.loop import Trainer
@@ -32,14 +45,27 @@ from gs2d.train.state import TrainState
 LOG_LINES = 300  # step lines a stage
 PROBES = 30  # times a stage at which the probe views are scored for the PSNR curve
 PROBE_VIEWS = 4
+EARLY_VIEWS = 16  # training views that score a stage before the last; of test views all do, they are what is compared
 REPORTS = {"cpu": 10, "cuda": 50}  # iterations between progress events, by device: for each the host waits for a GPU
 
 
 class Recorder:
-    """The memory of a training run. Nothing it does changes what is trained."""
+    """The memory of a training run. Nothing it does changes what is trained.
 
-    def __init__(self, run: RunFolder, job: Job, options: TrainOptions, start: Start, on_event: OnEvent) -> None:
+    ``visitors`` see every view of the finished splats, while they are scored.
+    """
+
+    def __init__(
+        self,
+        run: RunFolder,
+        job: Job,
+        options: TrainOptions,
+        start: Start,
+        on_event: OnEvent,
+        visitors: Sequence[Visitor] = (),
+    ) -> None:
         self._run, self._job, self._options, self._start, self._on_event = run, job, options, start, on_event
+        self._visitors = visitors
         self.progress_every = max(1, min(REPORTS[job.backend.device], options.checkpoint_every))
         self._shown = choose_views(job.scene, options.shown_views)
         self._probes = (job.scene.test or job.scene.train)[
@@ -181,9 +207,9 @@ class Recorder:
         if not any(isinstance(action, CloneInPlace) for action in self._stage(event.index).on_enter):
             return
         self._stop_clock()
-        for split, views in (("train", self._job.scene.train), ("test", self._job.scene.test)):
-            scores = self._score(self._state.splats, views, f"scoring after the clone ({split})", self._on_event)
-            self._at_entry |= split_metrics(scores, split)
+        for split, views in self._scored(last=False):
+            scores = self._score(split, views, f"scoring after the clone ({split})")
+            self._at_entry |= split_metrics(scores, split, of=len(self._views(split)))
         self._run.events.append({"kind": "after_clone", "stage": event.stage, **self._at_entry})
         self._phase()
         self._start_clock()
@@ -196,15 +222,20 @@ class Recorder:
 
     def _finish_reused(self, state: TrainState) -> None:
         """Pictures of the stages taken over, and the scores of one that was killed before it was scored."""
-        done = len(self._run.metrics()["stages"])
-        if state.stage > 0 and done < state.stage:
+        stages = self._run.metrics()["stages"]
+        if state.stage > 0 and len(stages) < state.stage:
             self._score_stage(state.stage - 1)
+        elif state.stage > 0 and self._is_last(state.stage - 1) and is_partial(stages[-1]):
+            self._score_stage(state.stage - 1, taken_over=stages[-1])  # the last stage here was none of the last there
         elif state.stage > 0:
             self._draw(self._stage(state.stage - 1).name)
 
-    def _score_stage(self, index: int) -> None:
-        """Score a finished stage, draw it, write its entry of metrics.json, put it in the cache."""
-        state, stage = self._state, self._stage(index)
+    def _score_stage(self, index: int, taken_over: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Score a finished stage, draw it, write its entry of metrics.json, put it in the cache.
+
+        ``taken_over`` is the entry of the same stage in another run, of which the scores are done again.
+        """
+        state, stage, last = self._state, self._stage(index), self._is_last(index)
         entry: dict[str, Any] = {
             "name": stage.name,
             "iterations": stage.iterations,
@@ -215,30 +246,50 @@ class Recorder:
         }
         if self._gpu_memory.read():
             entry["peak_gpu_memory_bytes"] = self._gpu_memory.read()  # before scoring adds to it
-        for split, views in (("train", self._job.scene.train), ("test", self._job.scene.test)):
-            scores = self._score(state.splats, views, f"scoring {split} views", self._on_event)
-            entry |= split_metrics(scores, split)
         if self._at_entry:
             entry["after_clone"] = self._at_entry
+        entry |= taken_over
+        shown = {view.name for _, view in self._shown}
+        outputs: dict[str, RenderOutput] = {}
+
+        def keep(seen: SeenView, scores: ImageMetrics) -> None:
+            if seen.view.name in shown:
+                outputs[seen.view.name] = seen.output
+
+        for split, views in self._scored(last=last):
+            scores = self._score(split, views, f"scoring {split} views", [keep, *(self._visitors if last else ())])
+            entry |= split_metrics(scores, split, of=len(self._views(split)))
         entry |= score_priors(self._run, self._job, self._now(self._job.scene.train), state.splats)
-        self._draw(stage.name)
-        metrics = self._run.metrics()
-        stages = [*metrics["stages"][:index], entry]
+        self._draw(stage.name, outputs)
+        stages = [*self._run.metrics()["stages"][:index], entry]
         self._run.write_metrics({"stages": stages, "surface": None})
         if self._options.cache is not None:
             saved = next(c for c in self._run.checkpoints() if c.stage_index == index and c.iteration is None)
             put_in_cache(self._options.cache, self._run, load_tensors(saved.path))
         self._on_event(StageDone(entry))
 
-    def _score(self, splats: Splats, views: Any, name: str, on_event: OnEvent) -> Any:
-        backend, exposures = self._job.backend, self._exposures
-        views = self._now(views)
-        return score_views(splats, views, self._settings, backend, name=name, on_event=on_event, exposures=exposures)
+    def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
+        """The views that score a stage: of the training views all after the last stage, some before it."""
+        scene = self._job.scene
+        return [("train", scene.train if last else evenly(scene.train, EARLY_VIEWS)), ("test", scene.test)]
 
-    def _draw(self, stage: str) -> None:
+    def _score(self, split: str, views: Sequence[View], name: str, visitors: Sequence[Visitor] = ()) -> Any:
+        return score_views(
+            self._state.splats,
+            self._now(views),
+            self._settings,
+            self._job.backend,
+            name=name,
+            on_event=self._on_event,
+            exposures=self._exposures,
+            split=split,
+            visitors=visitors,
+        )
+
+    def _draw(self, stage: str, outputs: Mapping[str, RenderOutput] = MappingProxyType({})) -> None:
         state = self._state
         shown = zip((split for split, _ in self._shown), self._now([view for _, view in self._shown]), strict=True)
-        draw_stage(self._run, self._job, list(shown), stage, state.splats, _group(state), self._exposures)
+        draw_stage(self._run, self._job, list(shown), stage, state.splats, _group(state), self._exposures, outputs)
 
     # -- small things --------------------------------------------------------------------------------------------------
     @property
@@ -259,6 +310,12 @@ class Recorder:
     def _state(self) -> TrainState:
         assert self._trainer is not None
         return self._trainer.state
+
+    def _views(self, split: str) -> Sequence[View]:
+        return self._job.scene.train if split == "train" else self._job.scene.test
+
+    def _is_last(self, index: int) -> bool:
+        return index == len(self._job.recipe.stages) - 1
 
     def _stage(self, index: int) -> Stage:
         return self._job.recipe.stages[index]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,39 @@ from gs2d.pipeline.events import OnEvent, Phase, Step
 from gs2d.pipeline.exposure import NONE, Transforms, matched_by_halves, photographed
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend
-from gs2d.render.types import RasterSettings
+from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.splats import Splats
+
+
+@dataclass(frozen=True, eq=False)
+class SeenView:
+    """A view that was rendered, beside its photograph: what whoever looks at it needs, so that it is rendered once.
+
+    Attributes
+    ----------
+    view : View
+    split : str
+        "train", "test", or "" where nobody said.
+    output : RenderOutput
+        As the scene is, without its distortion.
+    image : Tensor [H, W, 3]
+        Its colour in the exposure of the photograph; may exceed 1.
+    target : Tensor [H, W, 3]
+        The photograph over the background, in [0, 1].
+    mask : Tensor [H, W] bool or None
+        False = ignore this pixel.
+    """
+
+    view: View
+    split: str
+    output: RenderOutput
+    image: torch.Tensor
+    target: torch.Tensor
+    mask: torch.Tensor | None
+
+
+Visitor = Callable[[SeenView, ImageMetrics], None]
+"""Is shown each view with its scores while it is in memory, and keeps what it needs of it, not the view."""
 
 
 def score_views(
@@ -34,18 +65,21 @@ def score_views(
     lpips: Lpips | None = None,
     exposures: Transforms = NONE,
     match: bool = False,
+    split: str = "",
+    visitors: Sequence[Visitor] = (),
 ) -> dict[str, ImageMetrics]:
     """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere.
 
     A view with a transform in ``exposures`` is rendered in the exposure of its photograph, any other as the scene is;
-    with ``match`` by :func:`~gs2d.pipeline.exposure.matched_by_halves`.
+    with ``match`` by :func:`~gs2d.pipeline.exposure.matched_by_halves`. ``visitors`` see each view, named ``split``.
     """
     on_event(Phase(name, len(views)))
     scores: dict[str, ImageMetrics] = {}
-    for done, drawn in enumerate(_drawn(splats, views, settings, backend, exposures, match), start=1):
-        scores[drawn.name] = image_metrics(
-            drawn.image, drawn.target, drawn.mask, backend_name=backend.name, lpips=lpips
-        )
+    for done, seen in enumerate(_seen(splats, views, settings, backend, exposures, match, split), start=1):
+        metrics = image_metrics(seen.image, seen.target, seen.mask, backend_name=backend.name, lpips=lpips)
+        scores[seen.view.name] = metrics
+        for visit in visitors:
+            visit(seen, metrics)
         on_event(Step(done))
     return scores
 
@@ -58,48 +92,56 @@ def mean_psnr(
     exposures: Transforms = NONE,
 ) -> float | None:
     """Mean ``psnr_float`` of the views that have one, as by :func:`score_views`, without the other metrics."""
-    values = [psnr_float(d.image, d.target, d.mask) for d in _drawn(splats, views, settings, backend, exposures)]
+    values = [psnr_float(s.image, s.target, s.mask) for s in _seen(splats, views, settings, backend, exposures)]
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else None
 
 
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """A view of the splats and its photograph."""
-
-    name: str
-    image: torch.Tensor  # [H, W, 3]
-    target: torch.Tensor  # [H, W, 3]
-    mask: torch.Tensor | None  # [H, W] bool
-
-
-def _drawn(
+def _seen(
     splats: Splats,
     views: Sequence[View],
     settings: RasterSettings,
     backend: Backend,
     exposures: Transforms,
     match: bool = False,
-) -> Iterator[_Drawn]:
-    settings = replace(settings, sh_degree=splats.sh_degree)
+    split: str = "",
+) -> Iterator[SeenView]:
+    settings = replace(settings, sh_degree=splats.sh_degree, with_distortion=False)
     for view in views:
         with torch.no_grad():
-            image = rasterize(splats, view.camera, settings, backend=backend).color
-        target = torch.from_numpy(view.target(settings.background)).to(image)
+            output = rasterize(splats, view.camera, settings, backend=backend)
+        target = torch.from_numpy(view.target(settings.background)).to(output.color)
         pixels = view.mask()
-        mask = None if pixels is None else torch.from_numpy(pixels).to(image.device)
+        mask = None if pixels is None else torch.from_numpy(pixels).to(target.device)
         if match:
-            image = matched_by_halves(view, image, target, mask, settings.background)
+            image = matched_by_halves(view, output.color, target, mask, settings.background)
         else:
-            image = photographed(view, image, exposures, settings.background)
-        yield _Drawn(view.name, image, target, mask)
+            image = photographed(view, output.color, exposures, settings.background)
+        yield SeenView(view, split, output, image, target, mask)
 
 
-def split_metrics(scores: dict[str, ImageMetrics], name: str, split: str | None = None) -> dict[str, Any]:
-    """``{name: means}``; null with the reason where the scene has no views of the split (by default ``name``)."""
+def split_metrics(
+    scores: dict[str, ImageMetrics], name: str, split: str | None = None, *, of: int | None = None
+) -> dict[str, Any]:
+    """``{name: means}``; null with the reason where the scene has no views of the split (by default ``name``).
+
+    Where fewer views than the split has, ``of``, were scored, ``views`` says how many.
+    """
     if not scores:
         return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
-    return {name: mean_metrics(list(scores.values())).to_json()}
+    some = {} if of is None or len(scores) == of else {"views": len(scores)}
+    return {name: {**mean_metrics(list(scores.values())).to_json(), **some}}
+
+
+def is_partial(entry: Mapping[str, Any]) -> bool:
+    """Whether the scores of a stage in ``metrics.json`` are of some of the views only."""
+    return any("views" in (entry.get(split) or {}) for split in ("train", "test"))
+
+
+def evenly(views: Sequence[View], most: int) -> Sequence[View]:
+    """At most so many of the views, from all along their order."""
+    count = min(most, len(views))
+    return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
 
 
 class PeakGpuMemory:

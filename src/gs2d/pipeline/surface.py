@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 import torch
 
+from gs2d.data import View
 from gs2d.data.subject import Subject
 from gs2d.disk import disk_error
 from gs2d.errors import ProtocolError
+from gs2d.evaluate.images import ImageMetrics
 from gs2d.io.ply import write_mesh
 from gs2d.mesh.extract import Extraction, extract, extract_unbounded
-from gs2d.mesh.frames import Frame
+from gs2d.mesh.frames import Frame, Spool, depth_map
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.scoring import SeenView
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 from gs2d.splats import Splats
@@ -29,10 +33,57 @@ LARGEST = 1e12  # wu; depth and voxels are 32-bit numbers, of which squares and 
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
 
+class MeshFrames:
+    """Depth maps of the training views, kept in a temporary file while others look at the same renderings.
+
+    Its :meth:`visit` is for :func:`~gs2d.pipeline.scoring.score_views`.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self.spool = Spool()
+
+    def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
+        """Keep what is fused of a training view.
+
+        Raises
+        ------
+        DiskError
+        """
+        if seen.split == "train":
+            frame = fusion_frame(self._job, seen.view, seen.output, self._job.protocol.fused_depth)
+            self.spool.append(depth_map(frame))
+
+    @property
+    def complete(self) -> bool:
+        """Whether every training view was seen."""
+        return len(self.spool) == len(self._job.scene.train)
+
+    def __enter__(self) -> MeshFrames:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.spool.close()
+
+
 def extract_mesh(
-    job: Job, splats: Splats, options: MeshOptions, out: Path, on_event: OnEvent, *, subject: Subject | None = None
+    job: Job,
+    splats: Splats,
+    options: MeshOptions,
+    out: Path,
+    on_event: OnEvent,
+    *,
+    subject: Subject | None = None,
+    seen: MeshFrames | None = None,
 ) -> dict[str, Any]:
     """Render depth of all training views, fuse it, write the mesh: of the subject, or of everything.
+
+    Parameters
+    ----------
+    seen : MeshFrames, optional
+        Depth maps of these splats, by the protocol's kind of depth; where they are complete, nothing is rendered.
 
     Returns
     -------
@@ -49,7 +100,9 @@ def extract_mesh(
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     check_mesh_options(options)
     depth = options.depth or job.protocol.fused_depth
-    result = _extract(job, splats, options, depth, on_event, subject)
+    usable = seen is not None and seen.complete and depth == job.protocol.fused_depth
+    frames = seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
+    result = _extract(job, frames, options, on_event, subject)
     write_mesh(out, result.mesh)
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         on_event(Notice(_cut_text(result, options)))
@@ -106,7 +159,7 @@ def check_mesh_options(options: MeshOptions) -> None:
 
 
 def _extract(
-    job: Job, splats: Splats, options: MeshOptions, depth: str, on_event: OnEvent, subject: Subject | None
+    job: Job, frames: Iterable[Frame] | Spool, options: MeshOptions, on_event: OnEvent, subject: Subject | None
 ) -> Extraction:
     fusion = job.protocol.fusion
     keep = fusion.clusters if options.keep_components is None else options.keep_components
@@ -115,8 +168,10 @@ def _extract(
     bbox = bbox if subject is None else subject.box
     own = bbox is not None or options.unbounded
     fuse_frames = extract_unbounded if options.unbounded else extract
+    if isinstance(frames, Spool):
+        on_event(Phase("fusing", 0))
     result = fuse_frames(
-        _frames(job, splats, depth, on_event),
+        frames,
         bbox=bbox,
         voxel=options.voxel if own else options.voxel or fusion.voxel,
         truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
@@ -132,17 +187,22 @@ def _extract(
 
 
 def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[Frame]:
-    views = job.scene.train
+    views, settings = job.scene.train, replace(job.settings, with_distortion=False)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
-            output = rasterize(splats, view.camera, job.settings, backend=job.backend)
-        valid = (output.alpha >= OPAQUE).cpu().numpy()
-        mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
-        for pixels in (mask, view.known()):  # beyond the photograph nothing has said how far the surface is
-            if pixels is not None:
-                valid = valid & pixels
-        yield Frame(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
+            output = rasterize(splats, view.camera, settings, backend=job.backend)
+        yield fusion_frame(job, view, output, depth)
     on_event(Phase("fusing", 0))
+
+
+def fusion_frame(job: Job, view: View, output: RenderOutput, depth: str) -> Frame:
+    """What fusion takes of a rendered view: depth ("mean" or "median") and colour where it is covered well enough."""
+    valid = (output.alpha >= OPAQUE).cpu().numpy()
+    mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
+    for pixels in (mask, view.known()):  # beyond the photograph nothing has said how far the surface is
+        if pixels is not None:
+            valid = valid & pixels
+    return Frame(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
 
 
 def surface_color(output: RenderOutput, job: Job) -> torch.Tensor:

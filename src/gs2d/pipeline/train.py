@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -20,8 +20,9 @@ from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
 from gs2d.pipeline.refined import FoundPoses, found_poses, write_poses
 from gs2d.pipeline.restart import Start, check_sources, choose_start
+from gs2d.pipeline.scoring import Visitor
 from gs2d.pipeline.subject import meshed_subject
-from gs2d.pipeline.surface import extract_mesh
+from gs2d.pipeline.surface import MeshFrames, extract_mesh
 from gs2d.splats import Splats
 from gs2d.train import events
 from gs2d.train.state import TrainState
@@ -77,12 +78,13 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         if options.estimate and start.state is None:
             for text in foretold(job):
                 on_event(Notice(text))
-        splats, exposures, poses = train_stages(run, job, options, start, watch)
-        write_exposures(run, exposures, on_event)
-        write_poses(run, job.scene, poses, on_event)
-        job = replace(job, scene=job.scene.with_poses(poses)) if poses else job
-        mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
-        finish(run, job, splats, mesh, on_event)
+        with MeshFrames(job) as frames:
+            splats, exposures, poses = train_stages(run, job, options, start, watch, [frames.visit])
+            write_exposures(run, exposures, on_event)
+            write_poses(run, job.scene, poses, on_event)
+            job = replace(job, scene=job.scene.with_poses(poses)) if poses else job
+            mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
+            finish(run, job, splats, mesh, on_event, frames)
     return run
 
 
@@ -174,13 +176,16 @@ def undone_if_worthless(run: RunFolder) -> Iterator[None]:
 
 
 def train_stages(
-    run: RunFolder, job: Job, options: TrainOptions, start: Start, watch: Watch
+    run: RunFolder, job: Job, options: TrainOptions, start: Start, watch: Watch, visitors: Sequence[Visitor] = ()
 ) -> tuple[Splats, Transforms, FoundPoses]:
-    """Train from where ``start`` is to the end of the last stage; splats, exposures and poses of the photographs."""
+    """Train from where ``start`` is to the end of the last stage; splats, exposures and poses of the photographs.
+
+    ``visitors`` see every view of the finished splats, unless the last stage was scored before.
+    """
     from gs2d.train.loop import Trainer
     from gs2d.train.per_view import scene_now
 
-    recorder = Recorder(run, job, options, start, watch.on_event)
+    recorder = Recorder(run, job, options, start, watch.on_event, visitors)
 
     def listen(event: events.Event) -> None:
         recorder.on_training_event(event)
@@ -226,7 +231,7 @@ def foretold(job: Job) -> list[str]:
     return lines
 
 
-def finish(run: RunFolder, job: Job, splats: Splats, mesh: MeshOptions, on_event: OnEvent) -> None:
+def finish(run: RunFolder, job: Job, splats: Splats, mesh: MeshOptions, on_event: OnEvent, frames: MeshFrames) -> None:
     """Write what the user came for. Splats that give no mesh still give a report, before the error."""
     from gs2d.pipeline.jobs import report_run
 
@@ -234,7 +239,7 @@ def finish(run: RunFolder, job: Job, splats: Splats, mesh: MeshOptions, on_event
     try:
         subject = meshed_subject(run, job, splats, mesh, on_event)
         if not run.file(MESH).exists():
-            extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject)
+            extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames)
     except ProtocolError as error:
         report_run(run.path)
         raise ProtocolError(f"no mesh of {run.path}: {error}; splats and report are written") from error
