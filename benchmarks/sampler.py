@@ -5,12 +5,14 @@ Native code counts for the Python function that called it. Nothing is instrument
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import FrameType
 
 PERIOD = 0.004  # s
@@ -96,3 +98,57 @@ class Sampler:
         self.seconds.phases[classify(stack, self.phases) or "other"][part or "other"] += elapsed
         if part is None and stack:
             self.seconds.deepest[f"{stack[0][0].rsplit('/', 1)[-1]}:{stack[0][1]}"] += elapsed
+
+
+@dataclass
+class Cost:
+    """What one part of one phase took."""
+
+    wall: float = 0.0  # s
+    cpu: float = 0.0  # s, of all threads of the process
+    rss: int = 0  # bytes, the most that were resident at once
+
+
+class CostSampler:
+    """Samples where the thread that enters it is, what the whole process used meanwhile, and how large it is.
+
+    Parameters
+    ----------
+    phases, parts : sequence of Rule
+        Every sample has one of each, or "other".
+    """
+
+    def __init__(self, phases: Sequence[Rule], parts: Sequence[Rule]) -> None:
+        self.phases, self.parts = phases, parts
+        self.costs: dict[str, dict[str, Cost]] = defaultdict(lambda: defaultdict(Cost))
+        self._watched = threading.get_ident()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> dict[str, dict[str, Cost]]:
+        self._thread.start()
+        return self.costs
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        wall, cpu = time.perf_counter(), time.process_time()
+        while not self._stop.wait(PERIOD):
+            frame = sys._current_frames().get(self._watched)
+            now, used = time.perf_counter(), time.process_time()
+            stack = [(f.f_code.co_filename, f.f_code.co_name) for f in frames(frame)]
+            self.add(stack, now - wall, used - cpu, resident_bytes())
+            wall, cpu = now, used
+
+    def add(self, stack: Sequence[tuple[str, str]], wall: float, cpu: float, rss: int) -> None:
+        """Count one sample."""
+        phase, part = classify(stack, self.phases) or "other", classify(stack, self.parts) or "other"
+        cost = self.costs[phase][part]
+        cost.wall, cost.cpu, cost.rss = cost.wall + wall, cost.cpu + cpu, max(cost.rss, rss)
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process now (Linux)."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

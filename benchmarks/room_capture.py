@@ -1,0 +1,137 @@
+"""A capture as large as those of rooms that people publish: 292 photographs of 1560x1040, drawn from splats.
+
+A room with a table and things on it, all of it splats with colours of several scales, seen by our rasterizer from two
+rings inside; cameras and points are written as COLMAP's text model, pictures as JPEG. So a run on it reads, shrinks by
+two, trains on 780x520, scores and meshes as much as one on bonsai of Mip-NeRF 360, without its photographs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from gs2d.camera import Camera, look_at
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+VIEWS, SIZE = 292, (1560, 1040)  # px; half of it is what bonsai has as images_4
+SPLATS, POINTS = 200_000, 60_000
+HALF = np.array([3.0, 3.0, 1.4])  # wu, of the room
+QUALITY = 92  # of the JPEG files
+
+
+def surfaces(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Places [count, 3] wu on walls, floor, ceiling, a table top and three balls, with normals."""
+    places, normals = [], []
+    shares = [0.09] * 6 + [0.16] + [0.1] * 3
+    numbers = np.floor(np.array(shares) * count).astype(int)
+    numbers[0] += count - numbers.sum()
+    for side in range(6):
+        at = rng.uniform(-1, 1, (numbers[side], 3))
+        at[:, side // 2] = 1 if side % 2 else -1
+        places.append(at * HALF)
+        normals.append(np.repeat(np.eye(3)[side // 2][None], numbers[side], axis=0))
+    places.append(np.concatenate([rng.uniform(-0.8, 0.8, (numbers[6], 2)), np.full((numbers[6], 1), -0.4)], axis=1))
+    normals.append(np.repeat([[0.0, 0.0, 1.0]], numbers[6], axis=0))
+    for number, (x, y, radius) in zip(numbers[7:], ((0.0, 0.0, 0.4), (0.5, 0.4, 0.2), (-0.4, 0.5, 0.15)), strict=True):
+        direction = rng.normal(size=(number, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        places.append(np.array([x, y, radius - 0.4]) + radius * direction)
+        normals.append(direction)
+    return np.concatenate(places), np.concatenate(normals)
+
+
+def colors(places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Colours [P, 3] in [0, 1]: waves from as long as the room down to a hand's breadth."""
+    out = np.full((len(places), 3), 0.5)
+    for wave, weight in ((0.8, 0.16), (3.0, 0.12), (9.0, 0.1), (25.0, 0.1)):
+        for channel in range(3):
+            out[:, channel] += weight * np.sin(places @ rng.normal(size=3) * wave + rng.uniform(0, 2 * math.pi))
+    return np.asarray(np.clip(out, 0, 1))
+
+
+def room_splats(count: int, seed: int) -> tuple[Splats, np.ndarray]:
+    """The splats of the room, and their colours [N, 3] uint8."""
+    rng = np.random.default_rng(seed)
+    places, normals = surfaces(count, rng)
+    painted = colors(places, rng)
+    axis = np.cross([0.0, 0.0, 1.0], normals)
+    quats = np.concatenate([1 + normals[:, 2:], axis], axis=1)  # half way from z to the normal
+    quats[np.linalg.norm(quats, axis=1) < 1e-6] = (0.0, 1.0, 0.0, 0.0)
+    scale = np.where(np.abs(places[:, :2]).max(axis=1) < 0.85, 0.009, 0.035) * np.exp(0.3 * rng.normal(size=count))
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+    splats = Splats(
+        means=tensor(places),
+        quats=tensor(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
+        log_scales=tensor(np.repeat(np.log(scale)[:, None], 2, axis=1)),
+        opacity_logits=tensor(np.full(count, 3.0)),
+        sh0=tensor((painted - 0.5)[:, None] / 0.28209479177387814),
+        shN=torch.zeros(count, 15, 3),
+    )
+    return splats, np.rint(255 * painted).astype(np.uint8)
+
+
+def room_cameras(count: int, size: tuple[int, int]) -> list[Camera]:
+    """Cameras on two rings in the room, which look at the table, a little past its middle."""
+    found = []
+    for number in range(count):
+        angle = 4 * math.pi * number / count
+        radius, height = (2.0, 0.3) if number < count // 2 else (1.6, 0.9)
+        eye = np.array([radius * math.cos(angle), radius * math.sin(angle), height + 0.1 * math.sin(5 * angle)])
+        target = np.array([0.2 * math.sin(3 * angle), 0.2 * math.cos(2 * angle), -0.3])
+        found.append(look_at(eye, target, np.array([0.0, 0.0, 1.0]), width=size[0], height=size[1], fx=0.75 * size[0]))
+    return found
+
+
+def write_room_capture(
+    folder: Path,
+    *,
+    views: int = VIEWS,
+    size: tuple[int, int] = SIZE,
+    splats: int = SPLATS,
+    points: int = POINTS,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Write ``images/*.jpg`` and ``sparse/0/*.txt``; the model last, so that half a capture is not taken for one."""
+    scene, painted = room_splats(splats, seed)
+    cameras = room_cameras(views, size)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(seed + 1)
+    rows = []
+    for number, camera in enumerate(cameras, start=1):
+        with torch.no_grad():
+            seen = rasterize(scene, camera, RasterSettings(sh_degree=0, with_distortion=False)).color.numpy()
+        noisy = 255 * np.clip(seen, 0, 1) + rng.normal(scale=2.0, size=seen.shape)  # as of a sensor
+        name = f"room_{number:04d}.jpg"
+        Image.fromarray(np.rint(np.clip(noisy, 0, 255)).astype(np.uint8)).save(
+            folder / "images" / name, quality=QUALITY
+        )
+        x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
+        pose = " ".join(f"{value:.12g}" for value in (w, x, y, z, *camera.T_cam_world[:3, 3]))
+        rows.append(f"{number} {pose} 1 {name}\n\n")
+        on_progress(number, views)
+    chosen = rng.choice(splats, points, replace=False)
+    places = scene.means.numpy()[chosen] + rng.normal(scale=0.004, size=(points, 3))
+    colours = painted[chosen]
+    lines = [
+        f"{number} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0.5\n"
+        for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, colours, strict=True), start=1)
+    ]
+    (model / "points3D.txt").write_text("".join(lines))
+    first = cameras[0]
+    intrinsics = f"{first.fx} {first.fy} {first.cx} {first.cy}"
+    (model / "cameras.txt").write_text(f"1 PINHOLE {first.width} {first.height} {intrinsics}\n")
+    (model / "images.txt").write_text("".join(rows))

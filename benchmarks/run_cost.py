@@ -1,0 +1,154 @@
+"""What a whole run costs, phase by phase: seconds, processor seconds, and the most memory that was resident in each.
+
+::
+
+    python -m benchmarks.run_cost --out FILE.json --room [--capture FOLDER] [--schedule-scale 0.01]
+    python -m benchmarks.run_cost --out FILE.json --capture FOLDER [--downscale 2] [--schedule-scale 0.05] [--threads 2]
+
+Both are one `gs2d train` in a fresh process. ``--room`` makes a capture of 292 photographs of 1560x1040
+(``room_capture.py``; in ``--capture``, where it stays, or in a temporary folder) and trains on it at 780x520. The file
+holds the digest of ``splats.ply`` and the last scores: versions of the code that train alike have the same. On a shared
+machine processor seconds and shares mean something, seconds do not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
+
+from benchmarks.sampler import CostSampler, Rule
+
+RECORDER, LOOP = "pipeline/recorder.py", "train/loop.py"
+PHASES = (  # names that a version of the code does not have are found nowhere in it
+    Rule("read the capture", (("pipeline/prepare.py", "prepare"), ("pipeline/prepare.py", "reload_job"))),
+    Rule("PSNR curve", ((RECORDER, "_probe_psnr"),)),
+    Rule("log of changes", (("pipeline/changes.py", ""),)),
+    Rule("pictures", (("pipeline/pictures.py", "draw_stage"),)),
+    Rule("score a stage", ((RECORDER, "_score_stage"), (RECORDER, "_score_entry"))),
+    Rule("checkpoints", ((RECORDER, "_save"),)),
+    Rule("initial splats", ((LOOP, "_new_state"),)),
+    Rule("rank by E_i", (("train/actions.py", "rank_by_error"),)),
+    Rule("fill the stage 2 cache", (("train/cached_views.py", "choose_evaluator"),)),
+    Rule("mesh", (("pipeline/surface.py", "extract_mesh"),)),
+    Rule("report", (("pipeline/jobs.py", "report_run"),)),
+    Rule("training iterations", ((LOOP, "step"),)),
+    Rule("enter a stage", ((LOOP, "enter"),)),
+    Rule("imports", (("importlib._bootstrap>", ""),)),
+)
+PARTS = (
+    Rule("render", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
+    Rule("photographs", (("gs2d/images.py", ""), ("data/scene.py", ""), ("data/capture.py", ""), ("data/lens.py", ""))),
+    Rule("metrics", (("evaluate/images.py", ""), ("gs2d/losses.py", ""), ("kernels/ops.py", ""))),
+    Rule("blocks", (("mesh/fuse.py", ""),)),
+    Rule("integrate", (("mesh/integrate.py", ""), ("mesh/sampling.py", ""))),
+    Rule("depth maps", (("mesh/frames.py", ""), ("mesh/limits.py", ""), ("mesh/consistency.py", ""))),
+    Rule("marching cubes", (("mesh/surface.py", ""), ("mesh/cases.py", ""))),
+)
+
+
+def measure(arguments: argparse.Namespace, capture: Path, out: Path) -> dict[str, Any]:
+    """One run, sampled; the process must be fresh."""
+    began = time.perf_counter(), time.process_time()
+    with CostSampler(PHASES, PARTS) as costs:
+        from gs2d.pipeline.options import TrainOptions
+        from gs2d.pipeline.train import train
+
+        run = train(
+            TrainOptions(
+                scene=capture,
+                out=out,
+                backend="cpu",
+                recipe=arguments.recipe,
+                downscale=arguments.downscale,
+                schedule_scale=arguments.schedule_scale,
+                threads=arguments.threads,
+                overwrite=True,
+            )
+        )
+    wall, cpu = time.perf_counter() - began[0], time.process_time() - began[1]
+    stages = run.metrics()["stages"]
+    total = max(sum(cost.cpu for parts in costs.values() for cost in parts.values()), 1e-9)
+    rows = {
+        name: {
+            "cpu_seconds": round(sum(cost.cpu for cost in parts.values()), 2),
+            "cpu_share": round(sum(cost.cpu for cost in parts.values()) / total, 3),
+            "seconds": round(sum(cost.wall for cost in parts.values()), 2),
+            "peak_rss_mb": round(max(cost.rss for cost in parts.values()) / 1e6),
+            "parts_cpu_seconds": {
+                part: round(cost.cpu, 2) for part, cost in sorted(parts.items(), key=lambda p: -p[1].cpu)
+            },
+        }
+        for name, parts in costs.items()
+    }
+    return {
+        "recipe": arguments.recipe,
+        "schedule_scale": arguments.schedule_scale,
+        "downscale": arguments.downscale,
+        "threads": arguments.threads,
+        "splats": stages[-1]["splats"],
+        "wall_seconds": round(wall, 1),
+        "cpu_seconds": round(cpu, 1),
+        "peak_rss_mb": max(row["peak_rss_mb"] for row in rows.values()),
+        "phases": dict(sorted(rows.items(), key=lambda row: -row[1]["cpu_seconds"])),
+        "splats_sha256": hashlib.sha256(run.file("splats.ply").read_bytes()).hexdigest(),
+        "mesh_sha256": hashlib.sha256(run.file("mesh.ply").read_bytes()).hexdigest(),
+        "psnr": {split: (stages[-1].get(split) or {}).get("psnr") for split in ("train", "test")},
+    }
+
+
+def show(result: dict[str, Any]) -> None:
+    """The table on the screen."""
+    print(f"{result['what']}: {result['cpu_seconds']} s of CPU, peak {result['peak_rss_mb']} MB resident")
+    for name, row in result["phases"].items():
+        parts = ", ".join(f"{part} {s}" for part, s in row["parts_cpu_seconds"].items() if s >= 0.1)
+        print(f"{row['cpu_seconds']:8.2f} s {100 * row['cpu_share']:5.1f} % {row['peak_rss_mb']:6} MB  {name}: {parts}")
+    print("splats.ply", result["splats_sha256"][:16], "mesh.ply", result["mesh_sha256"][:16], "PSNR", result["psnr"])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run and write the file."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.run_cost", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--room", action="store_true")
+    parser.add_argument("--capture", type=Path)
+    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--schedule-scale", type=float)
+    parser.add_argument("--recipe", default="2dgs-r")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="the run folder; otherwise a temporary one")
+    args = parser.parse_args(arguments)
+    if not args.room and args.capture is None:
+        parser.error("--capture FOLDER or --room expected")
+    if args.schedule_scale is None:
+        args.schedule_scale = 0.01 if args.room else 0.05
+    with tempfile.TemporaryDirectory() as folder:
+        capture = args.capture or Path(folder) / "room"
+        if args.room and not (capture / "sparse" / "0" / "images.txt").exists():
+            make = f"from benchmarks.room_capture import *; write_room_capture(Path({str(capture)!r}))"
+            subprocess.run([sys.executable, "-c", make], check=True)  # what it takes is no cost of the run
+        result = measure(args, capture, args.keep or Path(folder) / "run")
+    from benchmarks.timing import machine
+
+    what = "room of 292 photographs" if args.room else capture.resolve().name
+    document = {"machine": machine(), "what": what, **result}
+    show(document)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(document, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
