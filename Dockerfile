@@ -5,7 +5,7 @@
 #   docker run --rm --gpus all -u "$(id -u):$(id -g)" -v "$PWD:/work" gs2d train CAPTURE --out runs/x
 #
 # torch's Linux wheels carry CUDA: the image runs on both, at several gigabytes. For a small one that runs on CPUs only,
-# name an index that has torch's CPU builds: --build-arg PIP_EXTRA_INDEX_URL=...  Fewer or other extras: --build-arg EXTRAS=...
+# name an index that has torch's CPU builds: --build-arg PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu  Fewer or other extras: --build-arg EXTRAS=...
 FROM debian:bookworm-slim AS build
 RUN apt-get update \
     && apt-get install -y --no-install-recommends g++ python3-dev python3-venv \

@@ -23,6 +23,7 @@ FLOORS = {
     "errors": 0,
     "check": 0,
     "disk": 0,
+    "extras": 0,
     "recipe": 1,
     "recipes": 1,
     "protocols": 1,

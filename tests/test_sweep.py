@@ -289,7 +289,7 @@ def test_slurm_that_is_not_there_and_parameters_that_are_none_are_errors(
     sweep = make_sweep(tmp_path, {"a": ("1",)})
     options: dict[str, Any] = {"slots": 1, "parameters": {"colour": 1}, "after_job": lambda _job: None}
     monkeypatch.setitem(sys.modules, "submitit", None)
-    with pytest.raises(BackendError, match="needs submitit, which is not installed; pip install '2dgs-r.slurm.'"):
+    with pytest.raises(BackendError, match="needs submitit, which is not installed; pip install 'submitit>="):
         run_on_slurm(sweep, lambda _event: None, **options)
     executor = FakeExecutor()
     monkeypatch.setattr(executor, "update_parameters", lambda: None)

@@ -19,6 +19,7 @@ from PIL import Image
 
 from gs2d.camera import Camera
 from gs2d.errors import BackendError, Gs2dError
+from gs2d.extras import install
 from gs2d.geometry import focus_point
 from gs2d.view_exact import ExactPictures, Frame, Render
 from gs2d.view_splats import Preview
@@ -67,7 +68,7 @@ def required_viser() -> Any:
         return importlib.import_module("viser")
     except ModuleNotFoundError as error:
         raise BackendError(
-            f"the viewer needs {error.name}, which is not installed; pip install '2dgs-r[view]'"
+            f"the viewer needs {error.name}, which is not installed; {install('view')}"
         ) from error
 
 

@@ -5,58 +5,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-import gs2d
 from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.prepare import prepare
 from gs2d.recipes import RECIPES
 from tiny import write_ball_mesh, write_capture
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["train"], "--out RUN"),
-        (["train", "here", "--out", "there", "--downscale", "two"], "--downscale"),
-        (["train", "here", "--out", "there", "--nonsense"], "--nonsense"),
-        (["train", "here", "--out", "there", "--backend", "gpu"], "--backend"),
-        (["paint"], "paint"),
-        (["paint"], "see `gs2d --help`"),
-        (["mesh", "here", "--bbox", "1", "2", "3"], "input length 3 did not match expected argument count 6 of `FLOAT"),
-        (["train", "here", "--out", "there", "--resume", "--overwrite"], "exclude each other"),
-    ],
-)
-def test_arguments_that_do_not_parse_give_one_line_and_exit_code_2(
-    words: list[str], named: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(words) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert named in one_line(err)
-
-
-def test_help_is_instant_because_it_does_not_import_torch() -> None:
-    code = "import sys; from gs2d.cli import run; run(['--help']); run(['train', '--help']); run(['recipes']); "
-    code += "assert 'torch' not in sys.modules; assert 'numpy' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-
-
-@pytest.mark.parametrize("words", [["--help"], [], ["train", "--help"]])
-def test_help_exits_with_0(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(words) == 0
-    assert "usage: gs2d" in capsys.readouterr().out
-
-
-def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["--version"]) == 0
-    assert capsys.readouterr().out == f"gs2d {gs2d.__version__}\n"
 
 
 def test_recipes_lists_every_recipe_and_shows_one(capsys: pytest.CaptureFixture[str]) -> None:
@@ -272,11 +230,3 @@ def test_a_name_that_the_terminal_cannot_show_is_shown_as_its_numbers(trained: P
     done = spawn(["info", str(copy)], env={**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
     assert done.returncode == 0
     assert f"{tmp_path}/r\\xfcn/mesh.ply" in done.stdout
-
-
-def test_a_terminal_without_boxes_gets_the_same_one_line() -> None:
-    done = spawn(["train", "here", "--lol"], env={**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"})
-    assert done.returncode == 2
-    assert "---- " not in done.stderr
-    assert " | " not in done.stderr
-    assert "--lol" in one_line(done.stderr)

@@ -303,7 +303,7 @@ def test_without_viser_one_line_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--viewer"]) == 2
-    assert "the viewer needs viser, which is not installed; pip install '2dgs-r[view]'" in one_line(
+    assert "the viewer needs viser, which is not installed; pip install 'viser>=" in one_line(
         capsys.readouterr().err
     )
     assert list(tmp_path.iterdir()) == []

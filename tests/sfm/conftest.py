@@ -20,7 +20,7 @@ from room_photos import Room, turn_file, write_room
 def colmap() -> None:
     """Skip where pycolmap is not installed."""
     if importlib.util.find_spec("pycolmap") is None:
-        pytest.skip('no pycolmap: pip install "2dgs-r[sfm]"')
+        pytest.skip("no pycolmap: pip install pycolmap")
 
 
 @pytest.fixture(scope="session")

@@ -180,7 +180,7 @@ def test_a_run_does_not_lie_among_the_photographs(
 
 @pytest.mark.parametrize(
     ("package", "words", "message"),
-    [("pycolmap", [], 'pip install "2dgs-r[sfm]"'), ("xatlas", ["--texture"], "pip install '2dgs-r[texture]'")],
+    [("pycolmap", [], "pip install 'pycolmap>="), ("xatlas", ["--texture"], "pip install 'xatlas>=")],
 )
 def test_an_extra_that_is_missing_is_one_line_before_anything_is_made(
     package: str,

@@ -290,30 +290,11 @@ def poses(command: c.Poses, console: Console) -> None:
     find(command, console)
 
 
-def doctor(_command: c.Doctor, console: Console) -> None:
+def doctor(command: c.Doctor, console: Console) -> None:
     """``gs2d doctor``."""
-    from gs2d.cli.extras import EXTRAS
-    from gs2d.io.run import machine, versions
-    from gs2d.render.backend import backend_report
+    from gs2d.cli.doctor import doctor as look
 
-    host, installed, backends = machine(), versions(), backend_report()
-    console.say(f"{host['processor']}, {host['cores']} cores, {host['system']}")
-    console.say(", ".join(f"{name} {version}" for name, version in installed.items()))
-    for status in backends:
-        if status.available:
-            console.say(f"  yes  {status.name}: {status.details}")
-        else:
-            console.say(f"  no   {status.name}: {status.reason}")
-            if status.remedy:
-                console.say(f"         to get it: {status.remedy}")
-    chosen = next((status.name for status in backends if status.available), "none")
-    console.say(f"--backend auto takes: {chosen}")
-    for extra in EXTRAS:
-        console.say(extra.line())
-    fields = ("name", "available", "reason", "remedy", "details")
-    found = [{field: getattr(status, field) for field in fields} for status in backends]
-    extras = {extra.name: not extra.missing() for extra in EXTRAS}
-    console.result({"machine": host, "versions": installed, "backends": found, "auto": chosen, "extras": extras})
+    look(command, console)
 
 
 def info(command: c.Info, console: Console) -> None:

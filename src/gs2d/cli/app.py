@@ -19,9 +19,10 @@ from typing import NoReturn
 
 import gs2d
 from gs2d.cli.commands import COMMANDS, Command, Demo, Doctor, Info, Recipes, Reconstruct, TableCommon, Train
-from gs2d.cli.console import Console
+from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.options import Common, TrainingCommon
+from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
 from gs2d.errors import Gs2dError
 
 OK, OURS, USERS, NOBODY_READS = 0, 1, 2, 141
@@ -41,7 +42,6 @@ _MENDABLE = {
     errno.EIO,
 }
 _HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info))
-_COMMANDS = {command.__name__.lower() for command in COMMANDS}
 _MARKUP = re.compile(r"\[/?bold\]")  # tyro shows its own markup in one of its messages
 _NO_MEMORY = re.compile("can't allocate memory|out of memory")  # how torch says it, on the CPU and on a GPU
 _ASCII_BOX = re.compile(r"(?<!\S)(?:[-+]{3,}|\|)(?!\S)")  # the same frame where the terminal has no other
@@ -50,15 +50,13 @@ _BOX = str.maketrans(dict.fromkeys("╭╮╰╯│─", " "))
 
 def run(argv: Sequence[str]) -> int:
     """Run one command line and return its exit code; prints every error on stderr."""
-    if list(argv) == ["--version"]:
-        print(f"gs2d {gs2d.__version__}")
-        return OK
-    if not argv:
-        argv = ["--help"]
     try:
+        if (asked := _answer(argv)) is not None:
+            show_help(asked)
+            return OK
         command = parse(argv)
     except SystemExit as exit_:
-        return exit_.code if isinstance(exit_.code, int) else USERS
+        return OK if exit_.code is None else exit_.code if isinstance(exit_.code, int) else USERS
     except BrokenPipeError:  # `gs2d train --help | head`
         _drop_stdout()
         return NOBODY_READS
@@ -102,8 +100,26 @@ def _drop_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-class UsageError(Exception):
-    """A command line that does not parse."""
+def _answer(argv: Sequence[str]) -> list[str] | None:
+    """What is printed where nothing is done: help and the version; None where a command is asked for."""
+    from gs2d.cli import help as helps
+
+    words = list(argv)
+    if not words:
+        return helps.first_day()
+    if words[0] == "help":
+        words = [*words[1:], "--help"]
+    if "--version" in words or words[0] in ("version", "-V"):
+        return [f"gs2d {gs2d.__version__}"]
+    asked = [word for word in words if word in HELP_WORDS]
+    if not asked:
+        return None
+    everything = "--help-all" in asked
+    if words[0] in NAMES:
+        return helps.command_help(words[0], everything=everything)
+    if words[0] in HELP_WORDS:
+        return helps.program_help(everything=everything)
+    return None
 
 
 def parse(argv: Sequence[str]) -> Common:
@@ -114,20 +130,18 @@ def parse(argv: Sequence[str]) -> Common:
     UsageError
         In one line.
     SystemExit
-        After ``--help``, with code 0.
+        After tyro's own options (``--tyro-print-completion bash``), with code 0.
     """
     import tyro
 
+    config = (tyro.conf.FlagCreatePairsOff,)
+    if argv[0].startswith("--tyro-"):  # completions of a shell are of all commands
+        return tyro.cli(Command, prog="gs2d", args=list(argv), config=config)
+    check(argv)
     complaint = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint):
-            command = tyro.cli(
-                Command,
-                prog="gs2d",
-                description="Photographs in; a surface mesh and a scene of 2D Gaussian splats out.",
-                args=list(argv),
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )
+        with contextlib.redirect_stderr(complaint):  # one command alone is ready ten times as soon as all of them
+            command: Common = tyro.cli(NAMES[argv[0]], prog=f"gs2d {argv[0]}", args=list(argv[1:]), config=config)
     except SystemExit as exit_:
         if not exit_.code:
             raise
@@ -147,8 +161,7 @@ def _one_line(box: str, argv: Sequence[str]) -> str:
                 body = body[:i]
                 break
     words = " ".join(_ASCII_BOX.sub("", _MARKUP.sub("", " ".join(body))).split()) or "the arguments do not parse"
-    topic = argv[0] if argv[0] in _COMMANDS else ""
-    return f"{words}; see `gs2d {topic + ' ' if topic else ''}--help`".replace(" (required)", "")
+    return f"{words}; see `gs2d {argv[0]} --help`".replace(" (required)", "")
 
 
 def _fail(message: str) -> int:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import IO, Any
 
 from rich import box
 from rich.console import Console as RichConsole
@@ -21,6 +22,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from gs2d.cli.layout import wrapped
 from gs2d.pipeline.events import Event, Notice, Phase, StageDone, Step
 
 
@@ -30,6 +32,20 @@ class _Screen(RichConsole):
         raise BrokenPipeError
 
 
+def show_help(lines: Sequence[str]) -> None:
+    """Print help on stdout, headings in bold where that is wanted."""
+    screen = _screen(sys.stdout)
+    for line in lines:
+        heading = line.endswith(":") and not line.startswith(" ")
+        screen.print(line, style="bold" if heading else None, markup=False, soft_wrap=True)
+
+
+def _screen(file: IO[str], **settings: Any) -> _Screen:
+    """One of the two streams; without a single escape of style where ``NO_COLOR`` says that none is wanted."""
+    color = None if os.environ.get("NO_COLOR") else "auto"
+    return _Screen(file=file, highlight=False, color_system=color, **settings)  # type: ignore[arg-type]
+
+
 class Console:
     """The screen. With ``quiet`` nothing but results asked for as JSON; with ``as_json`` stdout carries only JSON."""
 
@@ -37,8 +53,8 @@ class Console:
         self.quiet = quiet
         self.as_json = as_json
         self._before_each = before_each  # event; may raise
-        self._out = _Screen(file=sys.stdout, highlight=False, soft_wrap=True)
-        self._err = _Screen(file=sys.stderr, highlight=False)
+        self._out = _screen(sys.stdout, soft_wrap=True)
+        self._err = _screen(sys.stderr)
         self._progress: Progress | None = None
         self._task: TaskID | None = None
         self._named: set[str] = set()  # phases that a log file has heard of
@@ -95,10 +111,19 @@ class Console:
         if sys.stdout is not None:
             sys.stdout.flush()
 
-    def say(self, text: str) -> None:
-        """A line for people, on stdout."""
+    def say(self, text: str, *, indent: str = "") -> None:
+        """Print a line for people on stdout; on a terminal it breaks between words, and goes on after ``indent``."""
+        if self.quiet or self.as_json:
+            return
+        lines = wrapped(text, self._out.width, rest=indent, keep_spaces=True) if self._out.is_terminal else [text]
+        for line in lines:
+            self._out.print(line, markup=False)
+
+    def heading(self, text: str) -> None:
+        """Print an empty line and a heading for people, on stdout."""
         if not (self.quiet or self.as_json):
-            self._out.print(escape(text))
+            self._out.print()
+            self._out.print(text, markup=False, style="bold")
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """A table for people, on stdout; the first column is text, the others are figures."""

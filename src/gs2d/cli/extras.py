@@ -1,36 +1,98 @@
-"""What the optional dependencies add, and which of them this environment has."""
+"""What the doctor looks for beside the rasterizers: packages and programs that single commands need."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
+
+from gs2d.extras import install
+
+CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"  # as pytorch.org has it
+_FFMPEG = "apt install ffmpeg, brew install ffmpeg, or ffmpeg.org"
 
 
 @dataclass(frozen=True)
-class Extra:
-    """An extra of the distribution: the packages that must be there for a command."""
+class Found:
+    """Whether something is here; ``details`` is its version or what is missing, ``remedy`` how to get it."""
+
+    available: bool
+    details: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a command needs beside what every installation has."""
 
     name: str
-    packages: tuple[str, ...]
     command: str
-
-    def missing(self) -> list[str]:
-        """Packages that are not installed."""
-        return [name for name in self.packages if _version(name) is None]
-
-    def line(self) -> str:
-        """One line for people."""
-        missing = self.missing()
-        if missing:
-            return f'  no   {self.command}: {", ".join(missing)} missing: pip install "2dgs-r[{self.name}]"'
-        return f"  yes  {self.command}: {', '.join(f'{name} {_version(name)}' for name in self.packages)}"
+    look: Callable[[], Found]
 
 
-EXTRAS = (
-    Extra("sfm", ("pycolmap",), "gs2d poses"),
-    Extra("texture", ("xatlas", "fast-simplification"), "gs2d mesh --texture"),
-    Extra("slurm", ("submitit",), "gs2d paper --slurm"),
+def _packages(extra: str, *names: str) -> Callable[[], Found]:
+    """Look for the packages of an extra."""
+
+    def look() -> Found:
+        versions = {name: _version(name) for name in names}
+        if missing := [name for name, version in versions.items() if version is None]:
+            return Found(False, f"{', '.join(missing)} missing", install(extra))
+        return Found(True, ", ".join(f"{name} {version}" for name, version in versions.items()))
+
+    return look
+
+
+def _programs(remedy: str, *names: str) -> Callable[[], Found]:
+    """Look for programs on the PATH."""
+
+    def look() -> Found:
+        if missing := [name for name in names if shutil.which(name) is None]:
+            return Found(False, f"no {' and no '.join(missing)} on the PATH", remedy)
+        return Found(True, str(shutil.which(names[0])))
+
+    return look
+
+
+def _heic() -> Found:
+    """Look for one of the two packages that decode HEIC."""
+    for name in ("pi-heif", "pillow-heif"):
+        if (version := _version(name)) is not None:
+            return Found(True, f"{name} {version}")
+    return Found(False, "pi-heif missing", "pip install pi-heif (its wheel holds LGPL code), or convert to JPEG")
+
+
+def _films() -> Found:
+    """Look for the AVIF encoder of Pillow, which compresses films."""
+    from PIL import features
+
+    here = f"pillow {_version('pillow')}"
+    if features.check("avif"):
+        return Found(True, f"{here} with AVIF")
+    return Found(False, f"{here} has no AVIF; .webp works", "pip install 'pillow>=11.3'")
+
+
+OPTIONAL = (
+    Wanted("sfm", "cameras of photographs (gs2d reconstruct, poses)", _packages("sfm", "pycolmap")),
+    Wanted("ffmpeg", "videos instead of photographs", _programs(_FFMPEG, "ffmpeg", "ffprobe")),
+    Wanted("heic", "HEIC photographs, as of an iPhone", _heic),
+    Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas", "fast-simplification")),
+    Wanted("view", "viewer in the browser (gs2d view, --viewer)", _packages("view", "viser")),
+    Wanted("films", "films (gs2d render --video x.mp4)", _films),
+    Wanted("slurm", "runs as Slurm jobs (--slurm)", _packages("slurm", "submitit")),
 )
+
+
+def torch_advice() -> str:
+    """Return what to do about a torch that brought CUDA to a machine without a GPU; nothing where all is well."""
+    import torch
+
+    if torch.version.cuda is None or torch.cuda.is_available():
+        return ""
+    return (
+        f"this torch was built for CUDA {torch.version.cuda}, gigabytes of it, and there is no GPU that "
+        f"it can use. Without one torch's CPU build is enough, in a fresh environment: {CPU_TORCH}"
+    )
 
 
 def _version(name: str) -> str | None:

@@ -10,6 +10,7 @@ import numpy as np
 from gs2d.camera import Camera
 from gs2d.data.toy_rays import cast_camera
 from gs2d.errors import BackendError, ProtocolError
+from gs2d.extras import install
 from gs2d.triangles import Mesh
 
 PADDING = 4  # texels between charts: two smaller copies of the texture do not mix them
@@ -85,7 +86,7 @@ def required(module: str) -> Any:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise BackendError(
-            f"--texture needs {module}, which is not installed; pip install '2dgs-r[texture]', or leave --texture out"
+            f"--texture needs {module}, which is not installed; {install('texture')}, or leave --texture out"
         ) from error
 
 

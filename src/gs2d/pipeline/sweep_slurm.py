@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from gs2d.errors import BackendError, RunError
+from gs2d.extras import install
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.sweep import Sweep, SweepJob, work
 from gs2d.pipeline.sweep_slots import watch
@@ -71,7 +72,7 @@ def _slurm_executor(sweep: Sweep) -> Any:
         import submitit
     except ModuleNotFoundError as error:
         raise BackendError(
-            "--slurm needs submitit, which is not installed; pip install '2dgs-r[slurm]', or leave --slurm out"
+            f"--slurm needs submitit, which is not installed; {install('slurm')}, or leave --slurm out"
         ) from error
     if shutil.which("sbatch") is None:
         raise BackendError(

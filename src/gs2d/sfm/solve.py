@@ -19,11 +19,10 @@ from typing import IO, Any
 
 from gs2d.disk import atomic_write
 from gs2d.errors import BackendError, DataError
+from gs2d.extras import install
 
 OnProgress = Callable[[str, int, int], None]  # name of the phase, steps done, steps in all
-MISSING = (
-    'structure from motion needs pycolmap, which is not installed: pip install "2dgs-r[sfm]", or pip install pycolmap'
-)
+MISSING = f"structure from motion needs pycolmap, which is not installed: {install('sfm')}"
 POLL_SECONDS = 0.5
 _LITTLE_SPACE = 64 << 20  # bytes; what SQLite could not write is given back when it gives up
 # Modules are looked for where this process does: `-m` would first take a random.py of the folder one is in.

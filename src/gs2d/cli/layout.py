@@ -1,0 +1,58 @@
+"""Text for a terminal of any width: lines that break between words, and two columns where there is room for them."""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+from collections.abc import Sequence
+
+WIDEST = 100  # columns of running text; longer lines are hard to read
+_LEFT, _NARROW = 30, 70  # columns: most of the left column; below the second less of it
+
+
+def terminal_width() -> int:
+    """Return the columns that running text may fill (``COLUMNS``, else of the terminal, else 80)."""
+    return max(20, min(shutil.get_terminal_size().columns, WIDEST))
+
+
+def wrapped(text: str, width: int, *, first: str = "", rest: str = "", keep_spaces: bool = False) -> list[str]:
+    """Return the lines of a text, broken between words only: what is longer than a line stays whole, to be copied."""
+    if keep_spaces and len(text) <= width:
+        return [text]
+    begin = " " * (len(text) - len(text.lstrip())) if keep_spaces else ""
+    return textwrap.wrap(
+        text.lstrip() if keep_spaces else text,
+        width,
+        initial_indent=first + begin,
+        subsequent_indent=rest,
+        break_long_words=False,
+        break_on_hyphens=False,
+    ) or [first.rstrip()]
+
+
+def entries(pairs: Sequence[tuple[str, str]], width: int) -> list[str]:
+    """Return names and what is said of each, in two columns; a name that is too long has a line of its own."""
+    most = _LEFT if width >= _NARROW else _LEFT - 12
+    column = max((len(left) for left, _ in pairs if len(left) <= most), default=0)
+    lines = []
+    for left, right in pairs:
+        gap = " " * (column + 4)
+        if not right:
+            lines.append(f"  {left}")
+        elif len(left) <= column:
+            lines += wrapped(right, width, first=f"  {left:<{column}}  ", rest=gap)
+        else:
+            lines += [f"  {left}", *wrapped(right, width, first=gap, rest=gap)]
+    return lines
+
+
+def records(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a table that is too wide for its terminal as a block for each row: a line for each cell."""
+    wide = max((len(column) for column in columns[1:]), default=0)
+    lines = []
+    for row in rows:
+        cells = [
+            f"  {column:<{wide}}  {cell}".rstrip() for column, cell in zip(columns[1:], row[1:], strict=True) if cell
+        ]
+        lines += [f"{columns[0]} {row[0]}".strip(), *cells]
+    return lines

@@ -1,0 +1,156 @@
+"""Mistakes on a command line, in one line each with what was probably meant. What is in order goes to tyro."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import shlex
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from gs2d.cli.catalogue import Option, options_of
+from gs2d.cli.commands import COMMANDS
+
+NAMES: dict[str, type] = {command.__name__.lower(): command for command in COMMANDS}
+HELP_WORDS = ("-h", "--help", "--help-all")
+_NUMBER = re.compile(r"-\.?\d")  # a value, not an option
+_ALIKE = 0.6  # of difflib's ratio, from which a word is proposed
+_MOST = 3  # words that are proposed
+
+
+class UsageError(Exception):
+    """A command line that does not parse; one line."""
+
+
+def check(argv: Sequence[str]) -> None:
+    """Raise for a command line with a mistake that can be explained; ``argv`` has at least one word.
+
+    Raises
+    ------
+    UsageError
+    """
+    name, words = argv[0], argv[1:]
+    if name not in NAMES:
+        raise UsageError(_with_help(_no_command(name, words), "gs2d --help"))
+    try:
+        _check_words(name, words)
+    except UsageError as error:
+        raise UsageError(_with_help(str(error), f"gs2d {name} --help")) from None
+
+
+def _with_help(text: str, command: str) -> str:
+    return f"{text} See `{command}`" if text.endswith("?") else f"{text}; see `{command}`"
+
+
+def _no_command(name: str, words: Sequence[str]) -> str:
+    """What is said of a first word that is no command."""
+    if name.startswith("-"):
+        command = next((word for word in words if word in NAMES), None)
+        if command is not None:
+            rest = [word for word in words if word != command]
+            return f"options come after the command: gs2d {shlex.join([command, name, *rest])}"
+        return f"no option {name}{_meant(name, ('--help', '--help-all', '--version'))}"
+    if name.lower() not in NAMES and Path(name).exists():
+        return f"{name} is not a command; did you mean `gs2d reconstruct {shlex.quote(name)} --out RUN`?"
+    return f"no command {name!r}{_meant(name.lower(), NAMES, 'gs2d ')}"
+
+
+def _check_words(name: str, words: Sequence[str]) -> None:
+    """Walk through the words as the parser does."""
+    options = options_of(NAMES[name])
+    flags = {flag: option for option in options for flag in option.flags}
+    seen: set[str] = set()
+    loose: list[str] = []
+    i = 0
+    while i < len(words):
+        word, i = words[i], i + 1
+        if not _is_flag(word):
+            loose.append(word)
+            continue
+        flag, equals, value = word.partition("=")
+        option = flags.get(flag.replace("_", "-"))
+        if option is None:
+            raise UsageError(_no_option(name, flag, flags))
+        values = [value] if equals else []
+        while not equals and i < len(words) and not _is_flag(words[i]) and option.count != len(values):
+            values, i = [*values, words[i]], i + 1
+        _check_values(option, values, given=bool(equals))
+        seen.add(option.field)
+    _check_positional([option for option in options if not option.flags], loose, seen)
+    if lacking := [option.usage for option in options if option.required and option.field not in seen]:
+        raise UsageError(f"gs2d {name} needs {' and '.join(lacking)}")
+
+
+def _is_flag(word: str) -> bool:
+    return word.startswith("-") and len(word) > 1 and not _NUMBER.match(word)
+
+
+def _no_option(name: str, flag: str, flags: Iterable[str]) -> str:
+    """What is said of an option that the command does not have: one much like it, or a command that does."""
+    known = list(flags)
+    wanted = flag.replace("_", "-")
+    others = [
+        other
+        for other, command in NAMES.items()
+        if other != name and any(wanted in option.flags for option in options_of(command))
+    ]
+    if others:
+        have = ("has" if len(others) == 1 else "have") + " one"
+        return f"gs2d {name} has no option {flag}; {_listed([f'gs2d {other}' for other in others], 'and')} {have}"
+    begun = sorted((other for other in known if other.startswith(wanted)), key=len)[:_MOST]
+    meant = f"; did you mean {_listed(begun, 'or')}?" if begun else _meant(wanted, known)
+    return f"gs2d {name} has no option {flag}{meant}"
+
+
+def _check_values(option: Option, values: Sequence[str], *, given: bool) -> None:
+    """Raise for values of an option or a positional argument that it does not take."""
+    if option.count == 0:
+        if given:
+            raise UsageError(f"{option.name} takes no value, got {values[0]!r}")
+        return
+    if option.count is not None and len(values) < option.count:
+        many = f"{option.count} numbers, got {len(values)}" if option.count > 1 else f"a value: {option.usage}"
+        raise UsageError(f"{option.name} needs {many}")
+    for value in values:
+        if option.choices and value not in (*option.choices, "None"):
+            meant = _meant(value, option.choices)
+            raise UsageError(f"{option.name} must be {_listed(option.choices, 'or')}, got {value!r}{meant}")
+        if option.kind in (int, float) and not option.choices and not _converts(option.kind, value):
+            what = "a whole number" if option.kind is int else "a number"
+            raise UsageError(f"{option.name} must be {what}, got {value!r}")
+
+
+def _converts(kind: type, value: str) -> bool:
+    if value == "None":  # tyro's word for the default
+        return True
+    try:
+        kind(value)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_positional(options: Sequence[Option], words: Sequence[str], seen: set[str]) -> None:
+    """Give the words without an option to the arguments in their order."""
+    left = list(words)
+    for option in options:
+        taken, left = (left, []) if option.count is None else (left[:1], left[1:])
+        if taken:
+            _check_values(option, taken, given=False)
+            seen.add(option.field)
+    if left:
+        takes = f"takes {' '.join(option.usage for option in options)} and options" if options else "takes options only"
+        raise UsageError(f"what is {left[0]!r}? The command {takes}")
+
+
+def _meant(word: str, known: Iterable[str], before: str = "") -> str:
+    """Return "; did you mean ...?" with the names most like a word, or nothing."""
+    plain = {name.lstrip("-"): name for name in known}
+    close = [plain[name] for name in difflib.get_close_matches(word.lstrip("-"), list(plain), n=2, cutoff=_ALIKE)]
+    names = [f"`{before}{name}`" if before else name for name in close]
+    return f"; did you mean {_listed(names, 'or')}?" if names else ""
+
+
+def _listed(names: Sequence[str], last: str) -> str:
+    """Return "a, b or c"."""
+    return f" {last} ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

@@ -1,0 +1,25 @@
+"""The packages that some commands need and that gs2d does not bring, and the words that install them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+# extra -> what pyproject.toml says of it (a test compares them)
+EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "sfm": ("pycolmap>=4.2",),
+        "texture": ("xatlas>=0.0.9", "fast-simplification>=0.1.9"),
+        "view": ("viser>=1.1,<2",),
+        "slurm": ("submitit>=1.5",),
+    }
+)
+
+
+def install(extra: str) -> str:
+    """Return the command that installs an extra's packages.
+
+    They are named themselves: that works from a clone, from a wheel and in a container, where ``2dgs-r[...]`` would be
+    looked for on an index that does not have it.
+    """
+    return "pip install " + " ".join(f"'{requirement}'" for requirement in EXTRAS[extra])
