@@ -10,7 +10,8 @@ best it can:
   50 iterations, because ten views are rendered each time.
 - In the second half of a training, where it refines no more, its optimizer moves every 32nd, then every 64th iteration
   only. That is made for long trainings; in a short one it is two dozen steps. So it is trained twice, each time for all
-  the seconds: as it is ("own"), and refining to the end, so that it always moves ("moving"). The better one counts.
+  the seconds: as it is ("own"), and refining after each tenth but the last, so that it always moves ("moving"). The
+  better one counts.
 
 Its pictures of the test views are drawn by itself. It draws a view that it leaves out of training in every tenth
 iteration, and its optimizer moves every 32nd (64th): after a multiple of 64 iterations it can be resumed for ten more,
@@ -53,6 +54,7 @@ ENOUGH, TRIES, CAUTION = 0.8, 4, 0.95  # share of the budget to use, trainings t
 TRAIN, ALL, SPLATS = "train", "all", "splat.ply"
 OWN_SCHEDULE, MOVING = "own", "moving"
 VARIANTS = (OWN_SCHEDULE, MOVING)
+REFINED = 10  # parts of a training, after each of which but the last "moving" refines
 
 
 # -- what it is given ----------------------------------------------------------------------------------------------
@@ -190,13 +192,13 @@ def _points(scene: Scene) -> bytes:
 
 # -- what it does --------------------------------------------------------------------------------------------------
 def schedule(iterations: int, variant: str) -> list[str]:
-    """Its options for so many iterations: its own schedule of 30,000, scaled."""
+    """Its options for so many iterations: its own schedule of 30,000, scaled; "moving" as the module says."""
+    scaled = {name: max(LEAST[name], round(value * iterations / OWN_ITERATIONS)) for name, value in OWN.items()}
     words = ["-n", str(iterations)]
     if variant == MOVING:
+        scaled["refine-every"] = max(LEAST["refine-every"], iterations // REFINED + 1)  # never in the last tenth
         words += ["--densify-until", str(iterations)]
-    for name, value in OWN.items():
-        words += [f"--{name}", str(max(LEAST[name], round(value * iterations / OWN_ITERATIONS)))]
-    return words
+    return words + [word for name, value in scaled.items() for word in (f"--{name}", str(value))]
 
 
 def train_command(binary: Path, capture: Path, out: Path, iterations: int, variant: str) -> list[str]:

@@ -22,6 +22,8 @@ import numpy as np
 import torch
 
 from gs2d.data import View
+from gs2d.data.subject import find_subject
+from gs2d.errors import DataError
 from gs2d.evaluate.hidden_points import hidden_points, total
 from gs2d.evaluate.images import ImageMetrics
 from gs2d.io.files import read_json
@@ -33,10 +35,12 @@ from gs2d.pipeline.jobs import open_job
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.pipeline.scoring import score_views
+from gs2d.pipeline.subject import sights
 from gs2d.render.api import rasterize
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.workplace import POSES_JSON
 from gs2d.splats import Splats
+from gs2d.triangles import Mesh
 
 POLL_SECONDS = 0.2
 PROCESS, CONSOLE, PHOTOS, PEER = "process.json", "console.txt", "photographs", "peer"
@@ -291,7 +295,25 @@ def _times_of(run: Path, folder: Path) -> dict[str, Any]:
     }
 
 
-def measure_mesh(run: Path) -> dict[str, Any]:
-    """The size of a run's mesh."""
-    mesh = read_mesh(run / MESH)
-    return {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
+def measure_mesh(path: Path) -> dict[str, Any]:
+    """The size of a run's mesh, and how much of its area lies in the box of what the cameras look at.
+
+    The box is found from the splats by today's program, whatever the run's own says and whether its mesh was cut to it.
+    """
+    run, job, splats = open_job(path, None, ignore)
+    mesh = read_mesh(run.file(MESH))
+    facts: dict[str, Any] = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
+    try:
+        subject = find_subject(sights(job, splats))
+    except DataError as error:
+        return facts | {"subject": str(error), "share_in_subject": None}
+    return facts | {"subject": subject.kind, "share_in_subject": round(share_in_box(mesh, subject.box), 4)}
+
+
+def share_in_box(mesh: Mesh, box: np.ndarray) -> float:
+    """Part of a mesh's area that is of faces whose middle lies in a box [2, 3]; 0 of a mesh without area."""
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    middles = corners.mean(axis=1)
+    inside = ((middles >= box[0]) & (middles <= box[1])).all(axis=1)
+    return float(areas[inside].sum() / areas.sum()) if areas.sum() > 0 else 0.0

@@ -129,6 +129,14 @@ def test_views_are_summed_up_by_their_mean_and_the_worst() -> None:
     assert street_runs.summary_of({}) is None
 
 
+def test_the_part_of_a_mesh_in_the_subjects_box_is_by_area() -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [9, 0, 0], [5, 2, 0]], dtype=np.float32)
+    mesh = Mesh(corners, np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32))  # areas 0.5 and 4
+    box = np.array([[-1.0, -1, -1], [1, 1, 1]])
+    assert street_runs.share_in_box(mesh, box) == pytest.approx(0.5 / 4.5)
+    assert street_runs.share_in_box(Mesh(corners, np.zeros((0, 3), np.int32)), box) == 0.0
+
+
 # -- the table -----------------------------------------------------------------------------------------------------
 def row(capture: str, **changes: Any) -> dict[str, Any]:
     test = {"views": 2, "psnr": 21.0, "ssim": 0.7, "worst_psnr": 18.0, "worst_view": "b"}

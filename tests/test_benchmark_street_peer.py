@@ -92,6 +92,10 @@ def test_its_schedule_is_scaled_and_nothing_moves_while_it_draws() -> None:
     assert schedule(30_000, "own") == ["-n", "30000", "--refine-every", "500", "--densify-from", "500",
                                 "--sh-degree-interval", "1000"]  # fmt: skip
     assert schedule(1500, "own")[2:] == ["--refine-every", "50", "--densify-from", "25", "--sh-degree-interval", "50"]
+    words = schedule(1500, "moving")
+    refines, until = (int(words[words.index(name) + 1]) for name in ("--refine-every", "--densify-until"))
+    assert until == 1500
+    assert max(range(0, 1500, refines)) < 0.95 * 1500  # what it adds last is still trained
     assert [whole_steps(n) for n in (3, 64, 127.9, 128)] == [64, 64, 64, 128]
     for iterations in range(64, 64 * 60, 64):
         words = draw_command(Path("b"), Path("c"), Path("s"), iterations, "a.png", Path("o"))
