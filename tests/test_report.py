@@ -149,14 +149,19 @@ def test_a_lost_picture_is_named_where_it_should_be(tmp_path: Path) -> None:
     assert "no splats were ranked by error up to this stage" in text  # stage surface, as fabricated
 
 
-def test_a_folder_that_is_no_run_and_broken_files_are_errors_with_names(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_run_is_an_error_and_broken_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(RunError):
         write_report(tmp_path)
     run = fabricate(tmp_path / "run", size=16)
     (run / "renders" / "index.json").write_text("{")
-    with pytest.raises(DataError, match=r"index\.json"):
+    failed: list[tuple[str, Exception]] = []
+    text = text_of(write_report(run, on_failure=lambda part, error: failed.append((part, error))).read_text())
+    assert [part for part, _ in failed] == ["pictures at the top", "pictures of the stages"]
+    assert all(isinstance(error, DataError) and "index.json" in str(error) for _, error in failed)
+    assert "The pictures of the stages could not be made: " in text
+    (run / "run.json").write_text("{")
+    with pytest.raises(DataError, match=r"run\.json"):
         write_report(run)
-    assert not (run / "report.html").exists()
 
 
 # -- sentences and tables ----------------------------------------------------------------------------------------------

@@ -34,7 +34,12 @@ _REMEDIES = {
 def disk_error(path: str | os.PathLike[str], error: OSError) -> DiskError:
     """The one-line DiskError for a failed write of ``path``."""
     remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
-    return DiskError(f"cannot write {os.fspath(path)}: {error.strerror or error}; {remedy}")
+    return DiskError(f"cannot write {os.fspath(path)}: {error.strerror or error}; {remedy}", error.errno)
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether nothing more can be written: a full disk, a quota, a limit of file sizes."""
+    return isinstance(error, DiskError | OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _RecordingFile(io.FileIO):

@@ -47,7 +47,11 @@ class RunError(Gs2dError):
 
 
 class DiskError(Gs2dError):
-    """A file could not be written."""
+    """A file could not be written; ``errno`` is the system's number of the reason, where it gave one."""
+
+    def __init__(self, message: str, errno: int | None = None) -> None:
+        super().__init__(message)
+        self.errno = errno
 
 
 class DivergedError(Gs2dError):

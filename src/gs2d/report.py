@@ -20,6 +20,7 @@ from gs2d.disk import atomic_write
 from gs2d.io.run import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, open_run
 from gs2d.report_curves import curves, read_history
 from gs2d.report_exposure import exposure_section
+from gs2d.report_guard import Guard, OnFailure
 from gs2d.report_html import drawing, escape, facts, missing, page, table
 from gs2d.report_links import links
 from gs2d.report_pictures import hero, mesh_section, view_sections
@@ -83,7 +84,7 @@ def read_record(folder: Path) -> RunRecord:
     )
 
 
-def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
+def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFailure | None = None) -> Path:
     """Write ``report.html`` into a run folder.
 
     Parameters
@@ -92,6 +93,8 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
         A run folder, finished or not.
     cameras : sequence of Camera, optional
         From where the mesh is shown (the first three). Default: around it, taking the third axis as up.
+    on_failure : callable, optional
+        Is told which section failed and why; the report says so in its place, and has all others.
 
     Returns
     -------
@@ -103,33 +106,33 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
     RunError
         Not a run folder.
     DataError
-        A file in it is broken.
+        What the run says about itself is broken.
     DiskError
         The report could not be written.
     """
     record = read_record(run)
-    renders = record.path / RENDERS
-    title = _title(record)
+    renders, part = record.path / RENDERS, Guard(on_failure)
+    title, stages = _title(record), [stage["name"] for stage in record.stages]
     body = [
         f'<div class="eyebrow">gs2d report</div><h1>{escape(title)}</h1>',
-        f'<p class="lead">{verdict(record)}</p>',
-        hero(renders),
+        part("summary", lambda: f'<p class="lead">{verdict(record)}</p>'),
+        part("pictures at the top", lambda: hero(renders)),
         "<h2>Files</h2>",
-        links(record.path),
+        part("list of files", lambda: links(record.path)),
         "<h2>Results</h2>",
-        stage_table(record),
+        part("table of stages", lambda: stage_table(record)),
         glossary(),
         "<h2>Surface</h2>",
-        surface_scores(record.surface, record.surface_reason, record.path),
-        mesh_section(record.path / MESH, cameras),
+        part("scores of the surface", lambda: surface_scores(record.surface, record.surface_reason, record.path)),
+        part("pictures of the mesh", lambda: mesh_section(record.path / MESH, cameras)),
         "<h2>Every stage beside the photographs</h2>",
-        view_sections(renders, expected_stages=[stage["name"] for stage in record.stages]),
+        part("pictures of the stages", lambda: view_sections(renders, expected_stages=stages)),
         "<h2>Training</h2>",
-        curve_section(record),
-        story(record.events),
-        *_of_views(record),
+        part("curves", lambda: curve_section(record)),
+        part("story of the training", lambda: story(record.events)),
+        *_of_views(record, part),
         "<h2>What was run</h2>",
-        facts(definition_facts(record.definition)),
+        part("facts of the run", lambda: facts(definition_facts(record.definition))),
         _raw("The whole definition (run.json)", record.definition),
         _raw("All figures (metrics.json)", {"stages": record.stages, "surface": record.surface}),
     ]
@@ -139,18 +142,21 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = ()) -> Path:
     return target
 
 
-def _of_views(record: RunRecord) -> list[str]:
+def _of_views(record: RunRecord, part: Guard) -> list[str]:
     """The sections about exposures, poses and priors, where the recipe has them."""
     recipe, last = record.definition.get("recipe"), record.stages[-1] if record.stages else {}
     learned: Mapping[str, Any] = recipe if isinstance(recipe, Mapping) else {}
     parts = []
     if learned.get("exposure"):
-        parts += ["<h2>Exposure of the photographs</h2>", exposure_section(record.path / EXPOSURE, last)]
+        section = part("exposures", lambda: exposure_section(record.path / EXPOSURE, last))
+        parts += ["<h2>Exposure of the photographs</h2>", section]
     if learned.get("poses"):
-        parts += ["<h2>Where the photographs were taken</h2>", poses_section(record.path / POSES, last)]
+        section = part("cameras", lambda: poses_section(record.path / POSES, last))
+        parts += ["<h2>Where the photographs were taken</h2>", section]
     if learned.get("depth_prior") or learned.get("normal_prior"):
         folder = record.path / RENDERS / PRIORS
-        parts += ["<h2>What was known of the photographs</h2>", priors_section(folder, record.stages)]
+        section = part("known depths", lambda: priors_section(folder, record.stages))
+        parts += ["<h2>What was known of the photographs</h2>", section]
     return parts
 
 

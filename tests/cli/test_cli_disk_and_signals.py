@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import resource
 import shutil
@@ -18,6 +19,8 @@ import pytest
 from cli_runs import TINY, one_line, spawn
 from gs2d.cli import app as app_module
 from gs2d.cli import run
+
+NOTHING = "interrupted; nothing was kept, because training had not begun\n"
 
 
 def test_a_file_size_limit_stops_training_with_one_line_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:
@@ -54,7 +57,7 @@ def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
 ) -> None:
     from gs2d.pipeline import jobs
 
-    def broken(_path: Path) -> Path:
+    def broken(_path: Path, _on_event: object) -> Path:
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr(jobs, "report_run", broken)
@@ -151,7 +154,7 @@ def test_a_second_ctrl_c_right_after_the_first_does_not_stop_the_cleaning_up(
     monkeypatch.setattr(Trainer, "step", lambda _self: os.kill(os.getpid(), signal.SIGINT))
     monkeypatch.setattr(RunFolder, "discard", impatient)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
-    assert capsys.readouterr().err == "interrupted\n"
+    assert capsys.readouterr().err == NOTHING
     assert list(tmp_path.iterdir()) == []
 
 
@@ -184,7 +187,7 @@ def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(
     assert len(done.stderr.splitlines()) == bool(message)
 
 
-def test_ctrl_c_before_the_first_checkpoint_leaves_nothing(
+def test_ctrl_c_before_the_first_iteration_leaves_nothing_and_says_so(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from gs2d.train.loop import Trainer
@@ -194,7 +197,7 @@ def test_ctrl_c_before_the_first_checkpoint_leaves_nothing(
 
     monkeypatch.setattr(Trainer, "step", interrupted)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY]) == 130
-    assert capsys.readouterr().err == "interrupted\n"
+    assert capsys.readouterr().err == NOTHING
     assert list(tmp_path.iterdir()) == []
 
 
@@ -211,7 +214,7 @@ def test_out_of_memory_names_the_remedy(
 ) -> None:
     from gs2d.pipeline import jobs
 
-    def hungry(_path: Path) -> Path:
+    def hungry(_path: Path, _on_event: object) -> Path:
         raise error
 
     monkeypatch.setattr(jobs, "report_run", hungry)
@@ -224,10 +227,28 @@ def test_an_os_error_that_the_user_can_mend_is_one_line(
 ) -> None:
     from gs2d.pipeline import jobs
 
-    def denied(path: Path) -> Path:
+    def denied(path: Path, _on_event: object) -> Path:
         raise PermissionError(13, "Permission denied", str(path / "report.html"))
 
     monkeypatch.setattr(jobs, "report_run", denied)
     assert run(["report", str(trained)]) == 2
     assert "Permission denied" in one_line(capsys.readouterr().err)
     assert app_module.OURS == 1
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_what_could_not_be_made_is_exit_code_3_and_names_the_command_that_makes_it(
+    quiet: bool, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_args: object) -> str:
+        raise ValueError("broken data stream")
+
+    copy = Path(shutil.copytree(trained, tmp_path / "run"))
+    monkeypatch.setattr("gs2d.report.curve_section", broken)
+    assert run(["report", str(copy), "--json", *["--quiet"] * quiet]) == app_module.INCOMPLETE == 3
+    out, err = capsys.readouterr()
+    said = "fault in gs2d: ValueError: broken data stream"
+    assert json.loads(out)["missing"] == [{"what": "curves in report.html", "reason": said}]
+    last = err.splitlines()[-1]
+    assert last == f"not made: curves in report.html{f' ({said})' * quiet}; again: gs2d report {copy}"
+    assert err.count(said) == 1

@@ -59,23 +59,6 @@ def test_meshing_with_senseless_limits_is_refused_before_anything_is_rendered(
     assert not any(isinstance(event, Step) for event in heard)
 
 
-def test_splats_that_give_no_mesh_still_give_a_report(
-    capture: Path, undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from gs2d.pipeline import train as train_module
-
-    def nothing(*_args: Any, **_kwargs: Any) -> None:
-        raise ProtocolError("depth was expected, got none")
-
-    monkeypatch.setattr(train_module, "extract_mesh", nothing)
-    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
-    for name in ("mesh.ply", "report.html"):
-        (copy / name).unlink()
-    with pytest.raises(ProtocolError, match="no mesh of .*: depth was expected, got none; splats and report"):
-        train(options(capture, copy, resume=True))
-    assert "There is no mesh.ply" in (copy / "report.html").read_text()
-
-
 def test_an_empty_mesh_is_said_to_be_empty_in_the_report(undisturbed: RunFolder, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
     write_mesh(copy / "mesh.ply", Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))

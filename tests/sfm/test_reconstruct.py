@@ -240,7 +240,8 @@ def interrupt(words: list[str], until: str) -> str:
 def test_ctrl_c_among_the_cameras_leaves_nothing_and_names_the_command(room: Room, tmp_path: Path) -> None:
     out = tmp_path / "run"
     said = interrupt(words_for(room.photos, out), "finding features")
-    assert said.splitlines()[-1].startswith("interrupted; resume with: gs2d reconstruct ")
+    line = said.splitlines()[-1]
+    assert line.startswith("interrupted; nothing was kept, as no camera was found; resume with: gs2d reconstruct ")
     assert said.splitlines()[-1].endswith(" --resume")
     assert list(tmp_path.iterdir()) == []
 

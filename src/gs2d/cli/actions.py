@@ -93,6 +93,7 @@ def demo(command: c.Demo, console: Console) -> None:
         viewer_port=command.viewer_port,
         vary_poses=command.vary_poses,
         refine_poses=command.refine_poses,
+        page=command.page,
     )
     run = run_demo(options, console.on_event)
     console.close()
@@ -171,7 +172,7 @@ def render(command: c.Render, console: Console) -> None:
     )
     console.close()
     console.say(f"{result['images']} images in {result['folder']}")
-    if command.video is not None:
+    if "video" in result:
         console.say(f"{result['video']}: {result['seconds']:.1f} s, {result['video_bytes'] / 1e6:.1f} MB")
     console.result(result)
 
@@ -247,7 +248,7 @@ def report(command: c.Report, console: Console) -> None:
     """``gs2d report``."""
     from gs2d.pipeline.jobs import report_run
 
-    path = report_run(command.run)
+    path = report_run(command.run, console.on_event)
     console.say(str(path))
     console.result({"file": str(path)})
 

@@ -1,6 +1,7 @@
 """From arguments to an exit code: 0 done, 2 the user can mend it (one line), 1 a fault of ours, 130 interrupted.
 
-141 (as of a process that SIGPIPE ended) where the reader of a pipe went away: ``gs2d recipes | head -1``.
+3 where the work is done and something that belongs to it could not be made, such as the report or a picture; 141 (as of
+a process that SIGPIPE ended) where the reader of a pipe went away: ``gs2d recipes | head -1``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from gs2d.cli.options import Common, TrainingCommon
 from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
 from gs2d.errors import Gs2dError
 
-OK, OURS, USERS, NOBODY_READS = 0, 1, 2, 141
+OK, OURS, USERS, INCOMPLETE, NOBODY_READS = 0, 1, 2, 3, 141
 _MENDABLE = {
     errno.ENOSPC,
     errno.EDQUOT,
@@ -71,7 +72,7 @@ def run(argv: Sequence[str]) -> int:
         with interruptible:
             actions.execute(command, console)
             console.flush()
-        return OK
+        return _what_is_missing(console, argv, command)
     except KeyboardInterrupt:
         console.close()
         return _interrupted(argv, command)
@@ -185,12 +186,35 @@ def _report(error: Exception, debug: bool) -> int:
     return OURS
 
 
+def _what_is_missing(console: Console, argv: Sequence[str], command: Common) -> int:
+    """Print what a finished command could not make and how to make it; 0 where that is nothing."""
+    for event in console.missing:
+        if command.debug and event.error is not None:
+            traceback.print_exception(event.error)
+        line = f"not made: {event.what}"
+        if console.quiet:  # nobody has read why
+            line += f" ({event.reason})"
+        again = _resumed(argv) if event.command is None else event.command
+        print(f"{line}; again: {again}" if again else line, file=sys.stderr)
+    return INCOMPLETE if console.missing else OK
+
+
+def _resumed(argv: Sequence[str]) -> str:
+    """The same command, that goes on."""
+    words = [word for word in argv if word not in ("--resume", "--overwrite")]
+    return f"gs2d {shlex.join([*words, '--resume'])}"
+
+
 def _interrupted(argv: Sequence[str], command: Common) -> int:
     line = "interrupted"
-    kept = isinstance(command, Train | Demo) and any((command.out / "checkpoints").glob("*.pt"))
-    if kept or isinstance(command, Reconstruct):  # which starts where there is nothing yet
-        words = [word for word in argv if word not in ("--resume", "--overwrite")]
-        line += f"; resume with: gs2d {shlex.join([*words, '--resume'])}"
+    if isinstance(command, Train | Demo | Reconstruct):
+        trained = any((command.out / "checkpoints").glob("*.pt"))
+        found = isinstance(command, Reconstruct) and (command.out / "capture").exists()
+        if trained or isinstance(command, Reconstruct):  # which starts where there is nothing yet
+            kept = "the cameras are kept; " if found else "nothing was kept, as no camera was found; "
+            line += f"; {'' if trained else kept}resume with: {_resumed(argv)}"
+        else:
+            line += "; nothing was kept, because training had not begun"
     if isinstance(command, TableCommon) and not command.no_train:
         line += f"; go on with: gs2d {shlex.join(argv)}"
     print(line, file=sys.stderr)

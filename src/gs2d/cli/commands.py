@@ -29,6 +29,8 @@ class Demo(TrainingCommon):
     """Say wrong places for the cameras: those of training pictures are off by half a degree and half a percent."""
     refine_poses: bool = False
     """Learn where each photograph was taken from, as in `gs2d train`."""
+    page: bool = True
+    """Do not write scene.html at the end, as in `gs2d train`."""
     viewer: bool = False
     """Show the training in the browser while it runs, as in `gs2d train`."""
     viewer_port: int | None = None

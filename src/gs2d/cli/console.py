@@ -23,7 +23,7 @@ from rich.progress import (
 from rich.table import Table
 
 from gs2d.cli.layout import wrapped
-from gs2d.pipeline.events import Event, Notice, Phase, StageDone, Step
+from gs2d.pipeline.events import Event, Missing, Notice, Phase, StageDone, Step
 
 
 class _Screen(RichConsole):
@@ -58,10 +58,13 @@ class Console:
         self._progress: Progress | None = None
         self._task: TaskID | None = None
         self._named: set[str] = set()  # phases that a log file has heard of
+        self.missing: list[Missing] = []  # what could not be made, for the end of the command
 
     def on_event(self, event: Event) -> None:
         """Draw an event of the pipeline."""
         self._before_each()
+        if isinstance(event, Missing):
+            self.missing.append(event)
         if self.quiet:
             return
         if isinstance(event, Phase):
@@ -71,6 +74,8 @@ class Console:
                 self._progress.update(self._task, completed=event.done, detail=escape(event.detail))
         elif isinstance(event, Notice):
             self._err.print(f"[yellow]note[/yellow] {escape(event.text)}", soft_wrap=True)
+        elif isinstance(event, Missing):
+            self._err.print(f"[red]not made[/red] {escape(event.what)}: {escape(event.reason)}", soft_wrap=True)
         elif isinstance(event, StageDone):
             self._err.print(escape(stage_line(event.metrics)), soft_wrap=True)
 
@@ -139,6 +144,8 @@ class Console:
     def result(self, value: Any) -> None:
         """The result of the command, for programs: JSON on stdout, if it was asked for."""
         if self.as_json:
+            if self.missing and isinstance(value, dict):
+                value = {**value, "missing": [{"what": m.what, "reason": m.reason} for m in self.missing]}
             print(json.dumps(value, indent=2, allow_nan=False))
 
 

@@ -71,6 +71,8 @@ class Training:
     """Iterations between checkpoints."""
     checkpoint_seconds: float = 120.0
     """Seconds between checkpoints, whichever comes first."""
+    page: bool = True
+    """Do not write scene.html, the splats as a page for any browser, at the end."""
     viewer: bool = False
     """Show the training in the browser while it runs; the address is printed, and nothing of the result changes."""
     viewer_port: int | None = None

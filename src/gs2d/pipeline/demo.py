@@ -10,10 +10,10 @@ from gs2d.data.toy_exposure import GAINS
 from gs2d.data.toy_poses import TRUTH as TRUE_POSES
 from gs2d.errors import RunError
 from gs2d.io.run import RunFolder, is_run, open_run
+from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
 from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
-from gs2d.pipeline.page import page_run
 from gs2d.pipeline.train import check_viewer, train, use_threads
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
@@ -43,6 +43,7 @@ class DemoOptions:
     viewer_port: int | None = None
     vary_poses: bool = False
     refine_poses: bool = False
+    page: bool = True
     train_views: int = TRAIN_VIEWS
     test_views: int = TEST_VIEWS
     size: int = SIZE
@@ -104,10 +105,12 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
             overwrite=overwrite,
             schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
             title=TITLE,
+            page=options.page,
             allowed=(CAPTURE,),
         ),
         on_event,
     )
-    evaluate_run(run.path, EvaluateOptions(ground_truth=capture / TRUTH, match_poses=options.refine_poses), on_event)
-    page_run(run.path, on_event=on_event)
+    truth = capture / TRUTH
+    with attempted("scores of the surface", again("evaluate", run.path, "--ground-truth", truth), on_event):
+        evaluate_run(run.path, EvaluateOptions(ground_truth=truth, match_poses=options.refine_poses), on_event)
     return run

@@ -67,7 +67,28 @@ class StageDone:
     metrics: dict[str, Any] = field(default_factory=dict)
 
 
-Event = Phase | Step | Notice | StageDone
+@dataclass(frozen=True)
+class Missing:
+    """Something that belongs to the result could not be made; all else is there.
+
+    Attributes
+    ----------
+    what : str
+        File or section.
+    reason : str
+        One line.
+    command : str or None
+        Makes it again; None: the same command with ``--resume``; "": nothing does, and nothing needs it.
+    error : Exception or None
+    """
+
+    what: str
+    reason: str
+    command: str | None = None
+    error: Exception | None = None
+
+
+Event = Phase | Step | Notice | StageDone | Missing
 OnEvent = Callable[[Event], None]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.camera import Camera
 from gs2d.data import View
 from gs2d.disk import check_writable
 from gs2d.errors import DataError, RunError
@@ -31,7 +32,8 @@ from gs2d.io.run import (
     remove_made,
 )
 from gs2d.io.splat_formats import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
+from gs2d.pipeline.attempts import again, attempted, reason_of
+from gs2d.pipeline.events import Missing, Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras
@@ -136,7 +138,7 @@ def mesh_run(
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
             on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
-    report_run(path)
+    _report_again(run, on_event)
     return result
 
 
@@ -205,12 +207,13 @@ def render_run(
             remove_made(made)
             raise
         result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
-        if video is not None:
-            on_event(Phase("compressing the film", len(views)))
-            frames = [folder / f"{name}.png" for name, _ in views]
-            write_video(
-                video, frames, fps=fps, threads=torch.get_num_threads(), on_frame=lambda done: on_event(Step(done))
-            )
+        if video is None:
+            return result
+        on_event(Phase("compressing the film", len(views)))
+        frames = [folder / f"{name}.png" for name, _ in views]
+        with attempted(str(video), again("render", path, f"--{moving}", len(views), "--video", video), on_event):
+            threads = torch.get_num_threads()
+            write_video(video, frames, fps=fps, threads=threads, on_frame=lambda done: on_event(Step(done)))
             result |= {"video": str(video), "seconds": len(views) / fps, "video_bytes": video.stat().st_size}
         return result
 
@@ -311,7 +314,7 @@ def evaluate_run(
         last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
-    report_run(path)
+    _report_again(run, on_event)
     return result
 
 
@@ -343,18 +346,32 @@ def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, An
     return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes)}
 
 
-def report_run(path: Path) -> Path:
-    """Write the report of a run.
+def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
+    """Write the report of a run; a section that fails is said in it, and told as ``Missing``.
 
     Raises
     ------
-    RunError, DiskError
+    RunError, DataError, DiskError
     """
     from gs2d.report import write_report
 
     run = open_run(Path(path))
-    write_report(run.path, cameras=shown_cameras(run))
+    command = again("report", run.path)
+
+    def failed(section: str, error: Exception) -> None:
+        on_event(Missing(f"{section} in {REPORT}", reason_of(error), command, error))
+
+    cameras: list[Camera] = []
+    with attempted(f"cameras of the pictures in {REPORT}", command, on_event):
+        cameras = shown_cameras(run)
+    write_report(run.path, cameras=cameras, on_failure=failed)
     return run.file(REPORT)
+
+
+def _report_again(run: RunFolder, on_event: OnEvent) -> None:
+    """Write the report of a run that has changed."""
+    with attempted(REPORT, again("report", run.path), on_event):
+        report_run(run.path, on_event)
 
 
 __all__ = ["evaluate_run", "export_run", "mesh_run", "render_run", "report_run"]

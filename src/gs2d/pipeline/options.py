@@ -79,6 +79,8 @@ class TrainOptions:
         The box of the subject, wu (``MeshOptions``); None: it is found.
     whole_scene : bool
         Mesh everything, not the subject.
+    page : bool
+        Write ``scene.html`` at the end.
     """
 
     scene: Path
@@ -112,6 +114,7 @@ class TrainOptions:
     estimate: bool = False
     subject_box: Box | None = None
     whole_scene: bool = False
+    page: bool = True
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "start_from", "cache")

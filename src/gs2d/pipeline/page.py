@@ -23,7 +23,14 @@ SUFFIXES = (".html", ".htm")
 LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
 
 
-def page_run(path: Path, out: Path | None = None, *, sh_degree: int = 3, on_event: OnEvent = ignore) -> dict[str, Any]:
+def page_run(
+    path: Path,
+    out: Path | None = None,
+    *,
+    sh_degree: int = 3,
+    on_event: OnEvent = ignore,
+    job: Job | None = None,
+) -> dict[str, Any]:
     """Write the page of a run or of a file of splats.
 
     Parameters
@@ -33,6 +40,9 @@ def page_run(path: Path, out: Path | None = None, *, sh_degree: int = 3, on_even
         None: ``scene.html`` in the run, or beside the file.
     sh_degree : int
         0 to 3: how much of the colours' dependence on the direction is stored.
+    on_event : callable
+    job : Job or None
+        What defines the run, where it is at hand; None: it is read.
 
     Returns
     -------
@@ -50,14 +60,13 @@ def page_run(path: Path, out: Path | None = None, *, sh_degree: int = 3, on_even
         raise RunError(f"--out must name an .html file, which is what is written, got {out}")
     if not 0 <= sh_degree <= 3:
         raise RunError(f"--sh-degree must be 0, 1, 2 or 3, got {sh_degree}")
-    job: Job | None = None
     if of_run:
         run = open_run(path)
         splats = finished_splats(run)
         definition = run.definition()
         title = definition.get("title") or definition["scene"]["name"]
         try:
-            job = reload_job(run, on_event)
+            job = job or reload_job(run, on_event)
         except (RunError, DataError) as error:
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:

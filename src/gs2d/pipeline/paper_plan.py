@@ -176,6 +176,7 @@ def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe
         resume=True,
         cache=cache,
         threads=options.threads,
+        page=False,  # of dozens of runs nobody looks at each, and it is as large as the splats
     )
     evaluate = None
     if scene.scored or options.lpips_weights is not None:

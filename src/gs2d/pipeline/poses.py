@@ -18,6 +18,7 @@ from gs2d.data import load_scene
 from gs2d.errors import DataError, RunError
 from gs2d.io.files import write_json
 from gs2d.io.run import make_folder, now, remove_made
+from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.options import paths_of
 from gs2d.sfm.frames import MOST_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
@@ -127,7 +128,8 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             result = _result(options, request, photos, staged, pieces, facts)
             result["seconds"] = round(time.monotonic() - started, 1)
             on_event(Phase("checking the capture", 0))
-            write_picture(capture / POSES_PNG, pieces[0], _title(result))
+            with attempted(POSES_PNG, "", on_event):
+                write_picture(capture / POSES_PNG, pieces[0], _title(result))
             write_json(capture / POSES_JSON, result)
             load_scene(capture, format="colmap")
             check_out(options.out, options.photos, overwrite=options.overwrite)  # hours later it may hold something

@@ -12,13 +12,13 @@ from types import MappingProxyType
 from typing import Any
 
 from gs2d.data import detect_format, load_scene
-from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.files import read_json
-from gs2d.io.run import LOCK, PAGE, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
+from gs2d.io.run import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
 from gs2d.mesh.atlas import required
+from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.options import TrainOptions, paths_of
-from gs2d.pipeline.page import page_run
 from gs2d.pipeline.poses import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.prepare import check_train_options
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
@@ -147,9 +147,10 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
     training = replace(options.train_options, overwrite=False)
     run = train(_by_the_photographs(training, options, quality, on_event), on_event)
     if options.texture and not run.file(TEXTURED).exists():
-        texture_run(run.path, on_event=on_event, threads=options.threads)
-    if not run.file(PAGE).exists():
-        page_run(run.path, on_event=on_event)
+        with attempted(TEXTURED, again("mesh", run.path, "--texture"), on_event):
+            if not run.file(MESH).exists():
+                raise ProtocolError(f"there is no {MESH} to be given a texture")
+            texture_run(run.path, on_event=on_event, threads=options.threads)
     return run
 
 

@@ -12,12 +12,14 @@ from types import MappingProxyType
 from typing import Any
 
 from gs2d.data import View
-from gs2d.errors import DivergedError
+from gs2d.errors import DivergedError, Gs2dError
 from gs2d.evaluate.images import ImageMetrics
 from gs2d.io.run import RunFolder, load_tensors
+from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
 from gs2d.pipeline.exposure import Transforms, named
+from gs2d.pipeline.interruption import HeldSignals
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
 from gs2d.pipeline.prepare import Job
@@ -80,6 +82,7 @@ class Recorder:
         self._trainer: Trainer | None = None
         self.psnr: float | None = None  # of the probe views, the last time that they were scored
         self._before: Snapshot | None = None  # of the last step line, until it is compared with the next progress
+        self._signals = HeldSignals()
 
     # -- called by the pipeline ----------------------------------------------------------------------------------------
     def begin(self, trainer: Trainer) -> None:
@@ -94,22 +97,54 @@ class Recorder:
         self._saved_iteration = state.step
         self._phase()
         self._start_clock()
+        if state.entered:
+            self._signals.hold()
+
+    def stop_if_asked(self) -> None:
+        """Save a checkpoint and stop, where a signal asks for it and this iteration can be gone on from."""
+        state = self._state
+        if not self._signals.asked or not state.entered:
+            return
+        if self._before is not None and self._before.iteration != state.step:
+            return  # the line of changes that is due would be lost: at most until the next progress
+        if state.step == self._stage(state.stage).iterations:
+            return  # the checkpoint at the end of the stage is due
+        self._keep_what_is_trained()
+        self._signals.release()
+
+    def _keep_what_is_trained(self) -> None:
+        """Save a checkpoint between two iterations; one that cannot be saved stops nothing."""
+        state = self._state
+        if state.entered and state.step > 0:
+            self._stop_clock()
+            try:
+                self._save(state.stage, state.step)
+            except Gs2dError as error:
+                self._on_event(Notice(f"no checkpoint at iteration {state.step}: {error}"))
 
     @contextmanager
-    def naming_the_last_checkpoint(self) -> Iterator[None]:
-        """Say in a DivergedError from where training can go on."""
+    def ending_well(self) -> Iterator[None]:
+        """Say in a DivergedError from where training can go on; signals act as before in the end."""
         try:
             yield
         except DivergedError as error:
             saved = self._run.checkpoints()
             last = f"the last good checkpoint is {saved[-1].path}" if saved else "there is no checkpoint yet"
             raise DivergedError(f"{error}; {last}") from error
+        finally:
+            self._signals.forget()
 
     @contextmanager
     def off_the_clock(self) -> Iterator[None]:
-        """What is done meanwhile is no training time."""
+        """What is done meanwhile is no training time, and may take long: signals act at once, after a checkpoint."""
         self._stop_clock()
-        yield
+        try:
+            self._signals.release()
+            yield
+        except KeyboardInterrupt:
+            self._keep_what_is_trained()
+            raise
+        self._signals.hold()
         self._start_clock()
 
     def on_training_event(self, event: train_events.Event) -> None:
@@ -125,6 +160,7 @@ class Recorder:
         elif isinstance(event, train_events.StageStarted):
             self._log("stage_start", event)
             self._score_entry(event)
+            self._signals.hold()
         elif isinstance(event, train_events.StageFinished):
             self._stop_clock()
             self._log("stage_end", event)
@@ -216,6 +252,7 @@ class Recorder:
 
     def _finish_stage(self, index: int) -> None:
         self._save(index, None)
+        self._signals.release()
         self._score_stage(index)
         if index + 1 < len(self._job.recipe.stages):
             self._phase()
@@ -289,7 +326,8 @@ class Recorder:
     def _draw(self, stage: str, outputs: Mapping[str, RenderOutput] = MappingProxyType({})) -> None:
         state = self._state
         shown = zip((split for split, _ in self._shown), self._now([view for _, view in self._shown]), strict=True)
-        draw_stage(self._run, self._job, list(shown), stage, state.splats, _group(state), self._exposures, outputs)
+        with attempted(f"pictures of stage {stage}", None, self._on_event):
+            draw_stage(self._run, self._job, list(shown), stage, state.splats, _group(state), self._exposures, outputs)
 
     # -- small things --------------------------------------------------------------------------------------------------
     @property

@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gs2d.errors import Gs2dError, ProtocolError
+from gs2d.errors import Gs2dError
 from gs2d.io.files import read_json, write_json
-from gs2d.io.run import SPLATS, RunFolder, make_folder, now
-from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, StageDone, ignore
+from gs2d.io.run import MESH, SPLATS, RunFolder, make_folder, now
+from gs2d.pipeline.events import Event, Missing, Notice, OnEvent, Phase, StageDone, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.sweep_claims import FOREIGN_SECONDS, Claim, holder, take_claim
 
@@ -281,15 +281,19 @@ def train_and_evaluate(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
     from gs2d.pipeline.train import train
 
     run = RunFolder(job.train.out)
-    try:
-        train(job.train, on_event)
-    except ProtocolError as error:
-        if not is_trained(job):
-            raise
+    missing: list[Missing] = []
+
+    def listen(event: Event) -> None:
+        missing.extend([event] if isinstance(event, Missing) else [])
+        on_event(event)
+
+    train(job.train, listen)
+    no_mesh = [event.reason for event in missing if event.what == MESH]
+    if no_mesh:
         if job.evaluate is not None and job.evaluate.lpips_weights is not None:
             images = EvaluateOptions(lpips_weights=job.evaluate.lpips_weights)
             evaluate_run(run.path, images, on_event, threads=job.train.threads)
-        return {"surface": str(error)}  # trained, but its splats give no mesh
+        return {"surface": f"no mesh: {no_mesh[0]}"}
     if job.evaluate is not None:
         evaluate_run(run.path, job.evaluate, on_event, threads=job.train.threads)
     return {}

@@ -9,10 +9,11 @@ from dataclasses import replace
 import torch
 
 from gs2d.data.archive import is_archive
-from gs2d.errors import ProtocolError, RecipeError, RunError
+from gs2d.errors import RecipeError, RunError
 from gs2d.io.ply import write_splats
-from gs2d.io.run import MESH, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
+from gs2d.io.run import MESH, PAGE, REPORT, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
 from gs2d.pipeline.archive import train_archive
+from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.options import MeshOptions, TrainOptions
@@ -84,7 +85,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             write_poses(run, job.scene, poses, on_event)
             job = replace(job, scene=job.scene.with_poses(poses)) if poses else job
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
-            finish(run, job, splats, mesh, on_event, frames)
+            finish(run, job, splats, mesh, on_event, frames, with_page=options.page)
     return run
 
 
@@ -195,6 +196,7 @@ def train_stages(
             between()
 
     def between() -> None:
+        recorder.stop_if_asked()
         if watch.waiting:
             with recorder.off_the_clock():
                 watch.turn()
@@ -211,7 +213,7 @@ def train_stages(
         stage2_cache_bytes=job.stage2_cache_bytes,
     )
     recorder.begin(trainer)
-    with recorder.naming_the_last_checkpoint():
+    with recorder.ending_well():
         trainer.run()
     state = trainer.state
     poses = found_poses(job.scene, scene_now(state, job.scene))
@@ -231,17 +233,28 @@ def foretold(job: Job) -> list[str]:
     return lines
 
 
-def finish(run: RunFolder, job: Job, splats: Splats, mesh: MeshOptions, on_event: OnEvent, frames: MeshFrames) -> None:
-    """Write what the user came for. Splats that give no mesh still give a report, before the error."""
+def finish(
+    run: RunFolder,
+    job: Job,
+    splats: Splats,
+    mesh: MeshOptions,
+    on_event: OnEvent,
+    frames: MeshFrames,
+    *,
+    with_page: bool,
+) -> None:
+    """Write what the user came for: the splats, and then each thing that is made of them, whatever the others do."""
     from gs2d.pipeline.jobs import report_run
+    from gs2d.pipeline.page import page_run
 
     write_splats(run.file(SPLATS), splats)
-    try:
+    with attempted(MESH, again("mesh", run.path), on_event):
         subject = meshed_subject(run, job, splats, mesh, on_event)
         if not run.file(MESH).exists():
             extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames)
-    except ProtocolError as error:
-        report_run(run.path)
-        raise ProtocolError(f"no mesh of {run.path}: {error}; splats and report are written") from error
-    on_event(Phase("writing the report", 0))
-    report_run(run.path)
+    if with_page and not run.file(PAGE).exists():
+        with attempted(PAGE, again("page", run.path), on_event):
+            page_run(run.path, on_event=on_event, job=job)
+    on_event(Phase("writing the report", 0))  # last: it links to the others
+    with attempted(REPORT, again("report", run.path), on_event):
+        report_run(run.path, on_event)

@@ -1,0 +1,137 @@
+"""A picture, a mesh, a report or a page that cannot be made is said, and leaves all else as it is."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ball_runs import options
+from gs2d.disk import disk_error
+from gs2d.errors import DiskError, ProtocolError
+from gs2d.io.run import RunFolder
+from gs2d.pipeline import train as train_module
+from gs2d.pipeline.attempts import attempted
+from gs2d.pipeline.events import Event, Missing
+from gs2d.pipeline.jobs import report_run
+from gs2d.pipeline.train import train
+
+MADE = ("mesh.ply", "report.html", "scene.html")
+
+
+def failing(error: Exception) -> Any:
+    def fail(*_args: Any, **_kwargs: Any) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.fixture
+def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
+    """A finished run whose last files are to be made again."""
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    for name in MADE:
+        (copy / name).unlink()
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("place", "error", "what", "reason", "command"),
+    [
+        ("train.extract_mesh", ProtocolError("no depth"), "mesh.ply", "no depth", "gs2d mesh {run}"),
+        ("train.extract_mesh", MemoryError("much"), "mesh.ply", "fault in gs2d: MemoryError: much", "gs2d mesh {run}"),
+        (
+            "jobs.report_run",
+            OSError("broken data stream"),
+            "report.html",
+            "fault in gs2d: OSError: broken data stream",
+            "gs2d report {run}",
+        ),
+        (
+            "page.page_run",
+            ZeroDivisionError(),
+            "scene.html",
+            "fault in gs2d: ZeroDivisionError: no message",
+            "gs2d page {run}",
+        ),
+        ("recorder.draw_stage", ValueError("x"), "pictures of stage refine", "fault in gs2d: ValueError: x", None),
+    ],
+)
+def test_what_cannot_be_made_is_said_and_leaves_the_others(
+    place: str,
+    error: Exception,
+    what: str,
+    reason: str,
+    command: str | None,
+    capture: Path,
+    finished: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(f"gs2d.pipeline.{place}", failing(error))
+    heard: list[Event] = []
+    train(options(capture, finished, resume=True), heard.append)
+    missing = [event for event in heard if isinstance(event, Missing)]
+    assert [(event.what, event.reason) for event in missing] == [(what, reason)]
+    assert missing[0].command == (command and command.format(run=finished))
+    assert missing[0].error is error
+    assert {name for name in MADE if (finished / name).exists()} == set(MADE) - {what}
+
+
+def test_a_report_without_its_mesh_says_so(
+    capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_module, "extract_mesh", failing(ProtocolError("depth was expected, got none")))
+    train(options(capture, finished, resume=True))
+    assert "There is no mesh.ply" in (finished / "report.html").read_text()
+
+
+def test_a_full_disk_ends_the_run_all_the_same(
+    capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = disk_error(finished / "report.html", OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr("gs2d.pipeline.jobs.report_run", failing(full))
+    with pytest.raises(DiskError, match="No space left"):
+        train(options(capture, finished, resume=True))
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), BrokenPipeError(), OSError(errno.EDQUOT, "quota")])
+def test_interrupts_closed_pipes_and_quotas_pass(error: BaseException) -> None:
+    heard: list[Event] = []
+    with pytest.raises(type(error)), attempted("x", None, heard.append):
+        raise error
+    assert heard == []
+
+
+def test_a_page_is_written_unless_it_is_not_wanted(capture: Path, finished: Path) -> None:
+    train(options(capture, finished, resume=True, page=False))
+    assert not (finished / "scene.html").exists()
+    train(options(capture, finished, resume=True))
+    page = (finished / "scene.html").read_bytes()
+    assert b"<canvas" in page
+    train(options(capture, finished, resume=True))
+    assert (finished / "scene.html").read_bytes() == page
+
+
+def test_a_section_that_fails_loses_no_other_section(
+    undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
+    monkeypatch.setattr("gs2d.report.curve_section", failing(RuntimeError("no curve today")))
+    (copy / "renders" / "index.json").write_text("{")
+    heard: list[Event] = []
+    report_run(copy, heard.append)
+    whats = [event.what for event in heard if isinstance(event, Missing)]
+    assert whats == [
+        "cameras of the pictures in report.html",
+        "pictures at the top in report.html",
+        "pictures of the stages in report.html",
+        "curves in report.html",
+    ]
+    assert {event.command for event in heard if isinstance(event, Missing)} == {f"gs2d report {copy}"}
+    text = (copy / "report.html").read_text()
+    assert "The curves could not be made: no curve today" in text
+    assert "What was run" in text
+    assert "The mesh, " in text
