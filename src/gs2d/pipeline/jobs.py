@@ -138,7 +138,7 @@ def mesh_run(
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
             on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
-    _report_again(run, on_event)
+    report_again(run, on_event)
     return result
 
 
@@ -314,7 +314,7 @@ def evaluate_run(
         last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
-    _report_again(run, on_event)
+    report_again(run, on_event)
     return result
 
 
@@ -368,7 +368,7 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
     return run.file(REPORT)
 
 
-def _report_again(run: RunFolder, on_event: OnEvent) -> None:
+def report_again(run: RunFolder, on_event: OnEvent) -> None:
     """Write the report of a run that has changed."""
     with attempted(REPORT, again("report", run.path), on_event):
         report_run(run.path, on_event)

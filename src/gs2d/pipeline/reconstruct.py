@@ -18,6 +18,7 @@ from gs2d.io.run import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, ma
 from gs2d.mesh.atlas import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.jobs import report_again
 from gs2d.pipeline.options import TrainOptions, paths_of
 from gs2d.pipeline.poses import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.prepare import check_train_options
@@ -151,6 +152,7 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
             if not run.file(MESH).exists():
                 raise ProtocolError(f"there is no {MESH} to be given a texture")
             texture_run(run.path, on_event=on_event, threads=options.threads)
+        report_again(run, on_event)  # it links to it
     return run
 
 
