@@ -1,4 +1,4 @@
-"""How long a training will take, from a few iterations of it that are thrown away."""
+"""What a training starts from, and how long it will take, from a few iterations of it that are thrown away."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.prepare import Job
+from gs2d.train.events import Initialised
 from gs2d.train.loop import Trainer
 
 WARM_UP, FEWEST, MOST = 2, 3, 30  # iterations
@@ -72,3 +73,15 @@ def estimate_text(found: Estimate, iterations: int) -> str:
         f"training will take about {duration(found.least)} to {duration(found.most)}: {iterations:,} iterations, "
         f"{found.iteration * 1000:.0f} ms each at the start and more as splats are added"
     )
+
+
+def start_text(event: Initialised) -> str:
+    """What training starts from, in words."""
+    sources = {
+        "points": "points of the capture",
+        "depths": "points of the capture and of its known depths",
+        "random": "random points in the box the cameras look at",
+    }
+    source = sources[event.source]
+    dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
+    return f"starting from {event.splats:,} {source}{dropped}"

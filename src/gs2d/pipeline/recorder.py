@@ -17,6 +17,7 @@ from gs2d.evaluate.images import ImageMetrics
 from gs2d.io.run import RunFolder, load_tensors
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
+from gs2d.pipeline.estimate import start_text
 from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
 from gs2d.pipeline.exposure import Transforms, named
 from gs2d.pipeline.interruption import HeldSignals
@@ -386,18 +387,6 @@ def _due(iteration: int, iterations: int, count: int, step: int) -> bool:
     """Whether an iteration that is a multiple of ``step`` is one of about ``count`` of a stage."""
     every = max(1, math.ceil(iterations / count / step)) * step
     return iteration % every == 0
-
-
-def start_text(event: train_events.Initialised) -> str:
-    """What training starts from, in words."""
-    sources = {
-        "points": "points of the capture",
-        "depths": "points of the capture and of its known depths",
-        "random": "random points in the box the cameras look at",
-    }
-    source = sources[event.source]
-    dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
-    return f"starting from {event.splats:,} {source}{dropped}"
 
 
 def _storable(value: Any) -> bool:
