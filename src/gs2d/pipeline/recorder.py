@@ -396,6 +396,3 @@ def _storable(value: Any) -> bool:
 def _group(state: TrainState) -> Any:
     """The rows to highlight, once they are known."""
     return state.groups.get("high_error")
-
-
-__all__ = ["Recorder"]
