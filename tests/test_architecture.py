@@ -15,7 +15,7 @@ import gs2d
 
 PACKAGE = Path(gs2d.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
-MAX_LINES = 400
+MAX_LINES = 700  # soft: a file is one thing that a reader looks for
 
 # Floors: a module imports from its own unit or from a lower floor. A package without an entry of its own for a module
 # has the floor of the package. Two units of one floor do not import each other, except where PEERS says so.

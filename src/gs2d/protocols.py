@@ -87,6 +87,8 @@ class Protocol:
         Every so many views (by name) are test views where the format has no split; 0 = all train.
     test_on : str
         "test" or "train": the views on which the headline image metrics are measured.
+    robust : bool
+        Whether recipes are made robust where the capture allows it (``recipes.with_robustness``, ``--robust auto``).
     use_mask_in_training, use_mask_in_fusion : bool
         Whether masked-out pixels are ignored by losses and ranking, and by fusion.
     fusion : FusionLimits
@@ -102,6 +104,7 @@ class Protocol:
     downscale: int = 1
     test_every: int = 8
     test_on: str = "test"
+    robust: bool = False
     use_mask_in_training: bool = True
     use_mask_in_fusion: bool = True
     fusion: FusionLimits = FusionLimits()
@@ -193,6 +196,7 @@ GENERIC = Protocol(
     near=None,  # [d] 0.2 is meaningless in a frame of unknown size
     test_every=8,  # [c] --eval
     fusion=FusionLimits(subject=True),  # [d] people photograph things, and want them without the forest behind
+    robust=True,  # [d] photographs of the street: few, unevenly spread, on automatic
 )
 
 PROTOCOLS: Mapping[str, Protocol] = MappingProxyType(

@@ -16,6 +16,7 @@ from types import MappingProxyType
 from gs2d.recipe_checks import group, integer, number, one_of, require
 from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView, check_multiview
 from gs2d.recipe_priors import PRIOR_KINDS, DepthPrior, NormalPrior, check_priors
+from gs2d.recipe_robust import DenseStart, FreeSpace, OpacityDecay, check_robust
 from gs2d.recipe_views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
 from gs2d.recipe_views import PoseRefinement as PoseRefinement
 from gs2d.recipe_views import check_exposure, check_poses
@@ -243,6 +244,7 @@ class Recipe:
     ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
     photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says. ``multiview``,
     ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses that do.
+    ``dense_start``, ``free_space``, ``opacity_decay``: what keeps fog out where photographs are few.
     """
 
     name: str
@@ -255,6 +257,9 @@ class Recipe:
     multiview: MultiView | None = None
     depth_prior: DepthPrior | None = None
     normal_prior: NormalPrior | None = None
+    dense_start: DenseStart | None = None
+    free_space: FreeSpace | None = None
+    opacity_decay: OpacityDecay | None = None
 
     @property
     def iterations(self) -> int:
@@ -287,6 +292,7 @@ def validate(recipe: Recipe) -> Recipe:
     kinds = [term.kind for stage in recipe.stages for term in stage.losses]
     check_multiview(f"{where}: multiview", recipe.multiview, kinds)
     check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
+    check_robust(where, recipe.dense_start, recipe.free_space, recipe.opacity_decay)
     names = [stage.name for stage in recipe.stages]
     for name in names:
         require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gs2d.recipe_checks import integer, number, require
+from gs2d.recipe_checks import integer, number, one_of, require
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,9 @@ class Exposure:
         Weight of the summed squares of what a transform differs from the identity by.
     beta1, beta2, eps : float
         Adam's.
+    initial : "identity" or "points"
+        What transforms begin as: all the same, or the gains by which the colours of sparse points differ between
+        photographs (``train/point_gains.py``), so that no splat ever explains an exposure.
     """
 
     rate: float = 0.05
@@ -33,6 +36,7 @@ class Exposure:
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
+    initial: str = "identity"
 
     def rate_at(self, iteration: int) -> float:
         """Rate at an iteration of the run (1-based): log-linear, then constant."""
@@ -86,6 +90,7 @@ def check_exposure(where: str, exposure: Exposure) -> None:
     require(max(exposure.beta1, exposure.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
     integer(f"{where}.horizon", exposure.horizon, low=1)
     integer(f"{where}.start", exposure.start, low=0)
+    one_of(f"{where}.initial", exposure.initial, ("identity", "points"))
 
 
 def check_poses(where: str, poses: PoseRefinement) -> None:

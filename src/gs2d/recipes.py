@@ -29,6 +29,7 @@ from gs2d.recipe import (
 )
 from gs2d.recipe_multiview import MultiView
 from gs2d.recipe_priors import DepthPrior, NormalPrior
+from gs2d.recipe_robust import DenseStart, FreeSpace, OpacityDecay
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
 SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned
@@ -196,6 +197,21 @@ def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: st
         return recipe
     term = LossTerm("normal_prior", weight, NC_START)
     return replace(_in_stages(recipe, term), name=name or f"{recipe.name}-normals", normal_prior=NormalPrior())
+
+
+def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
+    """Return the recipe with what photographs of the street need; what it has of that already stays.
+
+    Not in the paper: a dense start, free space that is kept free, opacity that decays (docs/decisions.md, "Fog"). The
+    capture must say which sparse points its photographs show.
+    """
+    return replace(
+        recipe,
+        name=name or recipe.name,
+        dense_start=recipe.dense_start or DenseStart(),
+        free_space=recipe.free_space or FreeSpace(),
+        opacity_decay=recipe.opacity_decay or OpacityDecay(),
+    )
 
 
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:

@@ -57,7 +57,25 @@ def training_options(command: TrainingCommon, training: Training, **own: Any) ->
     from gs2d.pipeline.options import TrainOptions
 
     common = ("backend", "seed", "threads", "resume", "overwrite")
-    return TrainOptions(**values(Training, training), **{name: getattr(command, name) for name in common}, **own)
+    return TrainOptions(**training_values(training), **{name: getattr(command, name) for name in common}, **own)
+
+
+def training_values(training: Training) -> dict[str, Any]:
+    """Values of the pipeline's options of training: two flags of the command line are one of its fields.
+
+    Raises
+    ------
+    RecipeError
+        Both flags are given.
+    """
+    from gs2d.errors import RecipeError
+
+    given = values(Training, training)
+    if given.pop("no_exposure"):
+        if training.exposure:
+            raise RecipeError("--exposure and --no-exposure contradict each other, got both; leave one out")
+        return {**given, "exposure": False}
+    return {**given, "exposure": True if training.exposure else None}
 
 
 def train(command: c.Train, console: Console) -> None:

@@ -51,8 +51,12 @@ class Training:
     """What is trained; `gs2d recipes` lists them."""
     protocol: str = "auto"
     """What depends on the data set: background, depth, near plane, fusion limits."""
+    robust: Literal["auto", "on", "off"] = "auto"
+    """Keep fog out: a dense start, free space kept free, opacity that decays; auto: for photographs of no data set."""
     exposure: bool = False
-    """Learn an exposure and a white balance for each photograph: for cameras on automatic."""
+    """Learn an exposure and a white balance for each photograph (robust training does where photographs differ)."""
+    no_exposure: bool = False
+    """Take all photographs to have one exposure."""
     test_every: int | None = None
     """Every so many-th view, by name, is a test view; 0: all train (default: what the protocol says, mostly 8)."""
     refine_poses: bool = False

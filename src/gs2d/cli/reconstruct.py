@@ -6,9 +6,9 @@ import shlex
 from typing import Any
 
 from gs2d.cli import commands as c
-from gs2d.cli.actions import show_run, values
+from gs2d.cli.actions import show_run, training_values, values
 from gs2d.cli.console import Console
-from gs2d.cli.options import Finding, Training
+from gs2d.cli.options import Finding
 from gs2d.io.files import read_json
 from gs2d.io.run import PAGE
 from gs2d.pipeline.reconstruct import CAPTURE, ReconstructOptions
@@ -31,6 +31,6 @@ def reconstruct_options(command: c.Reconstruct) -> ReconstructOptions:
     fields: dict[str, Any] = {name: getattr(command, name) for name in (*own, *both)}
     return ReconstructOptions(
         **fields,
-        training={**values(Training, command.training), "backend": command.backend},
+        training={**training_values(command.training), "backend": command.backend},
         finding=values(Finding, command.cameras),
     )

@@ -38,6 +38,7 @@ from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
+from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.refined import aligned
 from gs2d.pipeline.scoring import score_views, split_metrics
@@ -289,7 +290,7 @@ def evaluate_run(
     if truth is not None and not has_mesh and given is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     drawing = (job.settings, job.backend)
-    exposures = read_exposures(run, job.recipe)
+    exposures = with_predicted(read_exposures(run, job.recipe), job.scene)
     if options.match_exposure:
         name = "scoring test views, colours matched"
         scores = score_views(splats, job.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)

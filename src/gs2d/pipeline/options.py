@@ -40,8 +40,12 @@ class TrainOptions:
     overrides : tuple of str
         ``stage.field=value``; applied after the schedule is scaled, so that a number means what it says.
     seed : int
-    exposure : bool
-        Learn an exposure and a white balance for each photograph (``recipes.with_exposure``).
+    robust : str
+        "on", "off", or "auto": a dense start, free space and opacity decay (``recipes.with_robustness``) where the
+        protocol says so and the capture tells which sparse points its photographs show.
+    exposure : bool or None
+        Learn an exposure and a white balance for each photograph (``recipes.with_exposure``); None: in robust training
+        where its photographs differ.
     refine_poses : bool
         Learn where each photograph was taken from, beginning where the capture says (``recipes.with_poses``).
     depth_prior : str or None
@@ -93,7 +97,8 @@ class TrainOptions:
     schedule_scale: float = 1.0
     overrides: tuple[str, ...] = ()
     seed: int = 0
-    exposure: bool = False
+    robust: str = "auto"
+    exposure: bool | None = None
     refine_poses: bool = False
     depth_prior: str | None = None
     normal_prior: bool = False

@@ -24,16 +24,23 @@ from gs2d.pipeline.refined import with_found_poses
 from gs2d.protocols import GENERIC, FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
 from gs2d.recipe import Recipe, validate
 from gs2d.recipe_json import apply_overrides, from_json, to_json
-from gs2d.recipes import get_recipe, with_depth_prior, with_exposure, with_normal_prior, with_poses
+from gs2d.recipes import get_recipe, with_depth_prior, with_exposure, with_normal_prior, with_poses, with_robustness
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.schedule import scale_schedule
 from gs2d.train.cached_views import is_cacheable
 from gs2d.train.loop import raster_settings
+from gs2d.train.point_gains import point_gains
 
 DECODE_THREADS = 2
 SHOWN_SKIPS = 3
 MOST_VIEWS = 1_000_000
+ROBUST = ("auto", "on", "off")
+DIFFERS = 0.05  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
+LATER_FIELDS = (  # of recipes, that run folders of before there were such lack
+    *("exposure", "poses", "multiview", "depth_prior", "normal_prior"),
+    *("dense_start", "free_space", "opacity_decay"),
+)
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ class Job:
             "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
-            **{name: recipe[name] for name in ("multiview", "depth_prior", "normal_prior") if recipe[name] is not None},
+            **{name: recipe[name] for name in LATER_FIELDS[2:] if recipe[name] is not None},
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
@@ -117,6 +124,8 @@ def build_recipe(
     poses: bool = False,
     depth_prior: str | None = None,
     normal_prior: bool = False,
+    robust: bool = False,
+    by_points: bool = False,
 ) -> Recipe:
     """The recipe as it will be trained: found, scaled, seeded, overridden, validated.
 
@@ -131,6 +140,9 @@ def build_recipe(
     value = with_poses(value) if poses else value
     value = with_depth_prior(value, depth_prior) if depth_prior is not None else value
     value = with_normal_prior(value) if normal_prior else value
+    value = with_robustness(value) if robust else value
+    if by_points and value.exposure is not None:
+        value = replace(value, exposure=replace(value.exposure, initial="points"))
     value = apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides)
     for option, wanted, field in (
         ("--exposure", exposure, "exposure"),
@@ -150,16 +162,9 @@ def check_train_options(options: TrainOptions) -> Recipe:
     ------
     RecipeError, ProtocolError
     """
-    recipe = build_recipe(
-        options.recipe,
-        schedule_scale=options.schedule_scale,
-        seed=options.seed,
-        overrides=options.overrides,
-        exposure=options.exposure,
-        poses=options.refine_poses,
-        depth_prior=options.depth_prior,
-        normal_prior=options.normal_prior,
-    )
+    if options.robust not in ROBUST:
+        raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
+    recipe = _recipe_of(options, robust=options.robust != "off", exposure=bool(options.exposure))
     if options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     if options.checkpoint_every < 1:
@@ -178,6 +183,45 @@ def check_train_options(options: TrainOptions) -> Recipe:
     return recipe
 
 
+def _recipe_of(options: TrainOptions, *, robust: bool, exposure: bool) -> Recipe:
+    """The recipe of the options, made robust or not, with exposures or not."""
+    return build_recipe(
+        options.recipe,
+        schedule_scale=options.schedule_scale,
+        seed=options.seed,
+        overrides=options.overrides,
+        exposure=exposure,
+        poses=options.refine_poses,
+        depth_prior=options.depth_prior,
+        normal_prior=options.normal_prior,
+        robust=robust,
+        by_points=robust,
+    )
+
+
+def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: OnEvent) -> Recipe:
+    """Return the recipe as this capture needs it, and say what was decided.
+
+    Where ``options.robust`` is "auto" it is made robust under a protocol that says so, if the capture tells which
+    sparse points its photographs show; where ``options.exposure`` is None, exposures are learned if those points say
+    that the photographs differ.
+
+    Raises
+    ------
+    RecipeError, DataError
+    """
+    robust = options.robust == "on" or (options.robust == "auto" and protocol.robust and scene.observe is not None)
+    if options.robust == "auto" and protocol.robust and scene.observe is None:
+        on_event(Notice("no dense start and no known free space: the capture does not say which points are seen where"))
+    exposure = bool(options.exposure)
+    if robust and options.exposure is None and (found := point_gains(scene)) is not None:
+        exposure = found.spread >= DIFFERS
+        least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
+        what = "learned for each" if exposure else "taken to be one (--exposure learns them)"
+        on_event(Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}"))
+    return _recipe_of(options, robust=robust, exposure=exposure)
+
+
 def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     """Check the options, cheapest first, then read the capture.
 
@@ -185,13 +229,14 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     ------
     RecipeError, ProtocolError, BackendError, DataError
     """
-    recipe = check_train_options(options)
+    check_train_options(options)
     backend = choose_backend(options.backend, on_event)
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
     protocol = choose_protocol(options, scene_format, on_event)
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
+    recipe = fit_recipe(options, scene, protocol, on_event)
     digest = with_priors(digest, scene, recipe, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
@@ -362,8 +407,9 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         if name == "protocol" and isinstance(old, dict):
             old, value = _training_facts(old), _training_facts(value)
         if name == "recipe" and isinstance(old, dict):
-            later = ("exposure", "poses", "multiview", "depth_prior", "normal_prior")
-            old = {**dict.fromkeys(later), **old}  # runs of before there were such
+            old = {**dict.fromkeys(LATER_FIELDS), **old}  # runs of before there were such
+            if old["exposure"] is not None:
+                old["exposure"] = {"initial": "identity", **old["exposure"]}
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]
@@ -377,9 +423,9 @@ def check_same_run(run: RunFolder, job: Job) -> None:
 
 
 def _training_facts(protocol: dict[str, Any]) -> dict[str, Any]:
-    """A protocol without the kind of depth that is fused and what part, which decide no byte of training."""
+    """A protocol without what decides no byte of training: what is fused, and what the recipe says."""
     fusion = {name: value for name, value in protocol.get("fusion", {}).items() if name not in ("depth", "subject")}
-    return {**protocol, "fusion": fusion}
+    return {**{name: value for name, value in protocol.items() if name != "robust"}, "fusion": fusion}
 
 
 def _difference(old: Any, new: Any, where: str = "") -> str:

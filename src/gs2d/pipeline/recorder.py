@@ -23,6 +23,7 @@ from gs2d.pipeline.exposure import Transforms, named
 from gs2d.pipeline.interruption import HeldSignals
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.pictures import choose_views, draw_stage
+from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.prior_scores import score_priors
 from gs2d.pipeline.restart import Start, put_in_cache
@@ -167,7 +168,7 @@ class Recorder:
             self._log("stage_end", event)
             self._finish_stage(event.index)
         else:
-            if isinstance(event, train_events.Densified | train_events.OpacityLimited):
+            if isinstance(event, train_events.Densified | train_events.OpacityLimited | train_events.FreeSpacePruned):
                 self._before = None  # other rows, or a jump that no gradient made
             if isinstance(event, train_events.Initialised):
                 self._on_event(Notice(start_text(event)))
@@ -337,7 +338,7 @@ class Recorder:
 
     @property
     def _exposures(self) -> Transforms:
-        return named(self._job.scene.train, self._state.exposures)
+        return with_predicted(named(self._job.scene.train, self._state.exposures), self._job.scene)
 
     def _now(self, views: Sequence[View]) -> list[View]:
         """Views of the capture from where their cameras are now."""
@@ -380,6 +381,7 @@ _KINDS = {
     train_events.Cloned: "cloned",
     train_events.Densified: "densify",
     train_events.OpacityLimited: "opacity_limited",
+    train_events.FreeSpacePruned: "free_space_pruned",
 }
 
 

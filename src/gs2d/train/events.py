@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Initialised:
-    """The start: ``source`` is "points" (the scene's), "depths" (known ones too) or "random"; ``dropped``: unusable."""
+    """The start: ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths"
+    (known ones too) or "random"; ``dropped``: unusable."""
 
     splats: int
     source: str
@@ -107,6 +108,16 @@ class OpacityLimited:
 
 
 @dataclass(frozen=True)
+class FreeSpacePruned:
+    """Splats in space that photographs show to be empty were pruned."""
+
+    stage: str
+    iteration: int
+    pruned: int
+    splats: int
+
+
+@dataclass(frozen=True)
 class StageFinished:
     """A stage is done; the state already points at the next one. ``unseen`` splats, in no training view, are gone."""
 
@@ -118,5 +129,14 @@ class StageFinished:
 
 
 Event = (
-    Initialised | StageEntering | Ranked | Cloned | StageStarted | Progress | Densified | OpacityLimited | StageFinished
+    Initialised
+    | StageEntering
+    | Ranked
+    | Cloned
+    | StageStarted
+    | Progress
+    | Densified
+    | OpacityLimited
+    | FreeSpacePruned
+    | StageFinished
 )

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,6 +49,11 @@ class Exposures:
         """Identities."""
         zeros = like.new_zeros(views, 3, 4, requires_grad=False)
         return cls(zeros, zeros.clone(), zeros.clone(), [0] * views)
+
+    def begin_with(self, gains: np.ndarray) -> None:
+        """Take gains [V, 3] of the channels as what is known of the transforms."""
+        for channel in range(3):
+            self.offsets[:, channel, channel] = torch.as_tensor(gains[:, channel] - 1).to(self.offsets)
 
     def __len__(self) -> int:
         return len(self.steps)

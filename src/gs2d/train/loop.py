@@ -32,6 +32,7 @@ from gs2d.train.initialise import initial_splats
 from gs2d.train.optimizer import adam_step, begin_stage, rates_at
 from gs2d.train.optimizer_fused import fused_adam_step, native_adam_step
 from gs2d.train.priors import with_known_points
+from gs2d.train.robust import Robustness
 from gs2d.train.rows import keep_rows
 from gs2d.train.state import Statistics, TrainState
 from gs2d.train.targets import DeviceTargets, Targets, TargetSource
@@ -106,8 +107,10 @@ class Trainer:
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
         self._on_event, self._between, self._progress_every = on_event, between, progress_every
         self._pending: list[events.Event] = []
+        self._robust = Robustness(scene, self.recipe)
         self.state = self._new_state(dtype) if state is None else self._checked(state)
         self.state.move_to(self.backend.device)
+        self._robust.move_to(self.backend.device)
         self._targets = self._make_targets(target_bytes)
         self._adam_step = {"cpu": native_adam_step, "cuda": fused_adam_step}.get(self.backend.name, adam_step)
         self._budget = PairBudget()  # used by the cuda backend alone
@@ -180,8 +183,10 @@ class Trainer:
         if self._evaluator is None:
             self._evaluator = choose_evaluator(self._whole, state, stage, self._stage2_cache_bytes)
         reports = iteration % self._progress_every == 0 or iteration == stage.iterations
-        self._budget.exact = reports or self._densifies_or_limits(stage, iteration)  # those wait for the device anyway
+        changes_rows = self._densifies_or_limits(stage, iteration) or self._robust.prunes(stage, iteration)
+        self._budget.exact = reports or changes_rows  # those wait for the device anyway
         result, happened = self._learn(stage, iteration, index)
+        happened += self._robust.prune(self.state, stage, iteration)
         self._last = (iteration, index)
         state.step = iteration
         for event in happened:
@@ -205,6 +210,7 @@ class Trainer:
                 options["cancel"] = cancel
             rates = rates_at(stage.rates, iteration, self.scene.extent)
             self._adam_step(self.state, stage, result.gradients, rates, **options)  # type: ignore[arg-type]
+        self._robust.decay(self.state, stage, iteration, cancel)
         per_view.learn(self.state, self.recipe, iteration, index, result.gradients, cancel)
         return result, happened
 
@@ -256,7 +262,7 @@ class Trainer:
 
     def _new_state(self, dtype: torch.dtype) -> TrainState:
         generator = torch.Generator().manual_seed(self.recipe.seed)
-        start = with_known_points(self.scene, self.recipe)
+        start = with_known_points(self._robust.scene, self.recipe)
         initial = initial_splats(
             start,
             sh_degree=self.recipe.sh_degree,
@@ -265,7 +271,8 @@ class Trainer:
             generator=generator,
             dtype=dtype,
         )
-        source = initial.source if start is self.scene else "depths"
+        source = initial.source if start is self._robust.scene else "depths"
+        source = "sweep" if source == "points" and self.recipe.dense_start is not None else source
         self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped))
         return per_view.start(TrainState(initial.splats, generator), self.recipe, self.scene)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from gs2d.data.scene import Scene
 from gs2d.recipe import Recipe
 from gs2d.train.exposure import Exposures, check_views, exposure_step, uncount
+from gs2d.train.point_gains import point_gains
 from gs2d.train.poses import Poses, check_poses, pose_rate, pose_step
 from gs2d.train.state import TrainState
 from gs2d.train.views import finite
@@ -18,6 +19,9 @@ def start(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:
     """The state with what the recipe learns of views, at its beginning."""
     if recipe.exposure is not None:
         state.exposures = Exposures.start(len(scene.train), state.splats.means)
+        known = point_gains(scene) if recipe.exposure.initial == "points" else None
+        if known is not None:
+            state.exposures.begin_with(known.gains)
     if recipe.poses is not None:
         state.poses = Poses.start([view.camera for view in scene.train], scene.extent)
     return state

@@ -1,0 +1,133 @@
+"""What photographs of the street need beside losses: a dense start, free space kept free, opacity that decays.
+
+Why each is there, and what was tried instead: docs/decisions.md, "Fog". Pure Python; never imports torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gs2d.recipe_checks import integer, number, require
+
+
+@dataclass(frozen=True)
+class DenseStart:
+    """Splats to start from where a plane sweep over neighbouring photographs agrees (``train/plane_sweep.py``).
+
+    Attributes
+    ----------
+    side : int, px
+        Photographs are shrunk by a whole factor until their longer side is about this.
+    planes : int
+        Depths that are tried for each pixel, evenly spaced in 1/z over the depths of the view's sparse points.
+    neighbours : int
+        Photographs that each is compared with; the best two count, so that one may be hidden from a place.
+    min_angle, max_angle : float, degrees
+        Between the lines of sight of neighbours at the scene.
+    radius : int, px
+        Patches of 2 radius + 1 pixels a side are compared by normalised cross-correlation (NCC).
+    min_ncc : float
+        Places with a lower NCC are unknown.
+    agree : float
+        Depths of two views agree when they differ by at most this fraction.
+    votes : int
+        Neighbours that must agree for a splat to start there.
+    cell : float, px
+        One splat starts in each cell of so many pixels of the shrunk photographs.
+    far_cell : float, px
+        Where nothing is known, splats start on a sphere around everything, one in each cell of so many pixels: sky and
+        bare walls are explained from behind, or they will be by sheets before the cameras. 0 = none.
+    max_views : int
+        Photographs that are swept, evenly chosen.
+    """
+
+    side: int = 200
+    planes: int = 64
+    neighbours: int = 4
+    min_angle: float = 2.0
+    max_angle: float = 35.0
+    radius: int = 3
+    min_ncc: float = 0.5
+    agree: float = 0.02
+    votes: int = 2
+    cell: float = 3.0
+    far_cell: float = 6.0
+    max_views: int = 120
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Prune splats from space that photographs show to be empty (``train/free_space.py``).
+
+    What a photograph shows at a depth, it sees through all that lies before it. Depths are those of sparse points and
+    of the plane sweep, as far as a neighbour agrees.
+
+    Attributes
+    ----------
+    every : int
+        Iterations between prunings, and from the start to the first.
+    views : int
+        Photographs in whose free space a splat must lie to be pruned.
+    nearer : float
+        Free is what is nearer than this fraction of the depth: depths are good to a few percent.
+    window : int, px
+        The nearest depth in a window of so many pixels of the shrunk photographs counts, because a splat has a size and
+        edges are not sharp.
+    spread : float
+        Standard deviations from its centre at which a splat is looked at too, along both axes.
+    floor : float
+        Where a photograph's depth is unknown, what is nearer than this fraction of the nearest depth it shows is free.
+    ball : float
+        Around a camera, within this fraction of that nearest depth, is free: the photographer stood there.
+    agree : float
+        Depths of the plane sweep count where a neighbour's differs by at most this fraction.
+    """
+
+    every: int = 100
+    views: int = 1
+    nearer: float = 0.9
+    window: int = 5
+    spread: float = 1.0
+    floor: float = 0.8
+    ball: float = 0.5
+    agree: float = 0.03
+
+
+@dataclass(frozen=True)
+class OpacityDecay:
+    """Opacity is multiplied by ``1 - rate`` every ``every`` iterations, in stages that train it for all splats.
+
+    What many photographs need grows back at once; what one or two need for a veil does not. Unlike resets it works at
+    any schedule. Splats never decay below ``least``, where they would be pruned or not drawn.
+    """
+
+    rate: float = 0.01
+    every: int = 10
+    least: float = 0.005
+
+
+def check_robust(where: str, start: DenseStart | None, free: FreeSpace | None, decay: OpacityDecay | None) -> None:
+    """Raise RecipeError for a value that cannot be trained with."""
+    if start is not None:
+        at = f"{where}: dense_start"
+        least = {"side": 16, "planes": 4, "neighbours": 1, "radius": 1, "votes": 1, "max_views": 2}
+        for name, low in least.items():
+            integer(f"{at}.{name}", getattr(start, name), low=low)
+        for name in ("min_angle", "max_angle", "min_ncc", "agree", "cell", "far_cell"):
+            number(f"{at}.{name}", getattr(start, name), low=0.0)
+        require(start.cell >= 1, f"{at}.cell must be at least 1 px, got {start.cell}")
+        require(start.min_angle < start.max_angle, f"{at}.min_angle must be below max_angle, got {start.min_angle}")
+    if free is not None:
+        at = f"{where}: free_space"
+        for name in ("every", "views", "window"):
+            integer(f"{at}.{name}", getattr(free, name), low=1)
+        require(free.window % 2 == 1, f"{at}.window must be odd, got {free.window}")
+        for name in ("nearer", "spread", "floor", "ball", "agree"):
+            number(f"{at}.{name}", getattr(free, name), low=0.0)
+        require(free.nearer < 1, f"{at}.nearer must be below 1, got {free.nearer}: surfaces would be pruned")
+    if decay is not None:
+        at = f"{where}: opacity_decay"
+        integer(f"{at}.every", decay.every, low=1)
+        for name in ("rate", "least"):
+            value = number(f"{at}.{name}", getattr(decay, name), low=0.0)
+            require(value < 1, f"{at}.{name} must be below 1, got {value}")

@@ -1,0 +1,105 @@
+"""Space that photographs show to be empty, and the splats in it.
+
+A photograph sees through everything before the surface that it shows. Splats there are fog: sheets and streaks before a
+camera that explain its picture and hide what others see. Nothing here is part of the state: it follows from the capture
+and the recipe, so a resume knows the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gs2d.geometry import quats_to_matrices
+from gs2d.recipe_robust import FreeSpace
+from gs2d.splats import Splats
+from gs2d.train.plane_sweep import Sweep
+
+MIN_KNOWN = 20  # pixels of known depth, below which a photograph says nothing where it knows none
+NEAREST = 2  # percentile of a photograph's known depths that stands for the nearest
+_UNKNOWN = float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class FreeView:
+    """One photograph: everything before ``limit`` [H, W] wu is free, and a ball of ``radius`` wu around the camera."""
+
+    limit: Tensor
+    radius: float
+    K: Tensor  # [3, 3]
+    T: Tensor  # [4, 4] T_cam_world
+
+    def to(self, device: torch.device | str) -> FreeView:
+        """Return the same on a device."""
+        return FreeView(self.limit.to(device), self.radius, self.K.to(device), self.T.to(device))
+
+
+class FreeSpaceMaps:
+    """The free space of all training views of a scene."""
+
+    def __init__(self, sweep: Sweep, settings: FreeSpace) -> None:
+        self._settings = settings
+        self._views = [_free_view(sweep, index, settings) for index in range(len(sweep.views))]
+
+    def move_to(self, device: torch.device | str) -> None:
+        """Move all tensors to a device."""
+        self._views = [view.to(device) for view in self._views]
+
+    @torch.no_grad()
+    def inside(self, splats: Splats) -> Tensor:
+        """Return the splats [N] bool that lie in the free space of enough photographs."""
+        ends = self._ends(splats)
+        counts = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
+        for view in self._views:
+            free = (ends[0] - _center(view)).norm(dim=1) < view.radius
+            for places in ends:
+                free |= _is_free(view, places)
+            counts += free
+        return counts >= self._settings.views
+
+    def _ends(self, splats: Splats) -> list[Tensor]:
+        """Places [N, 3] at which a splat is looked at: its centre, and its ends along both axes."""
+        reach = self._settings.spread * splats.scales
+        axes = quats_to_matrices(splats.quats)
+        ends = [splats.means]
+        if self._settings.spread > 0:
+            for axis in (0, 1):
+                offset = axes[:, :, axis] * reach[:, axis : axis + 1]
+                ends += [splats.means + offset, splats.means - offset]
+        return ends
+
+
+def _free_view(sweep: Sweep, index: int, settings: FreeSpace) -> FreeView:
+    view = sweep.views[index]
+    known = np.where(sweep.agreeing(index, settings.agree) >= 1, sweep.depths[index], _UNKNOWN)
+    column, row = np.floor(view.pixels).astype(np.int64).T
+    np.minimum.at(known, (row, column), view.depth)
+    depths = known[np.isfinite(known)]
+    nearest = float(np.percentile(depths, NEAREST)) if len(depths) >= MIN_KNOWN else 0.0
+    half = settings.window // 2
+    grown = -F.max_pool2d(-torch.from_numpy(known)[None, None], settings.window, 1, half)[0, 0]
+    floor = torch.full_like(grown, settings.floor * nearest)
+    limit = settings.nearer * torch.where(torch.isfinite(grown), grown, floor)
+    tensors = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in (view.K, view.T))
+    return FreeView(limit.float(), settings.ball * settings.floor * nearest, *tensors)
+
+
+def _center(view: FreeView) -> Tensor:
+    return -view.T[:3, :3].T @ view.T[:3, 3]
+
+
+def _is_free(view: FreeView, places: Tensor) -> Tensor:
+    """Which places [N, 3] a photograph shows, and sees through."""
+    seen = places @ (view.K @ view.T[:3, :3]).T + view.K @ view.T[:3, 3]  # (x z, y z, z)
+    z = seen[:, 2]
+    front = z.clamp_min(1e-12)
+    x, y = seen[:, 0] / front, seen[:, 1] / front
+    height, width = view.limit.shape
+    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    column = torch.nan_to_num(x, nan=0.0).clamp(0, width - 1).long()
+    row = torch.nan_to_num(y, nan=0.0).clamp(0, height - 1).long()
+    return inside & (z < view.limit[row, column])

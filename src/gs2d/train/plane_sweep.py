@@ -1,0 +1,332 @@
+"""Depths of photographs by comparing each with its neighbours over a sweep of planes, and splats to start from.
+
+A pixel is tried at depths evenly spaced in 1/z; its patch is fetched from the neighbours at each, and the depth with
+the best normalised cross-correlation wins (Collins 1996; the two best neighbours count). Depths on which neighbours
+agree become points. On the host's processor, and without any random choice: a resume finds the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.recipe_robust import DenseStart
+
+MIN_POINTS = 20  # sparse points of a view, below which its depths are unknown
+MIN_SHARED = 8  # sparse points that neighbours must both show
+NEAR_MARGIN, FAR_MARGIN = 0.8, 1.5  # of the 1st and 99th percentile of depth: where the sweep begins and ends
+NOISE = 1e-4  # variance of grey values, [0, 1]^2, that is no texture: added to both sides of the NCC
+MIN_TEXTURE = 2e-5  # variance of a patch below which every depth fits
+GREY = (0.3, 0.6, 0.1)
+BEST_ANGLE, NARROW, WIDE = 10.0, 4.0, 12.0  # degrees: neighbours' baselines, and how fast narrower and wider ones lose
+REPEATED = 3.0  # cells: sparse points within that of a swept one start no splat of their own
+
+
+@dataclass(frozen=True, eq=False)
+class SmallView:
+    """A training view, shrunk.
+
+    Attributes
+    ----------
+    color : Tensor [3, H, W]
+    grey : Tensor [1, 1, H, W]
+    usable : ndarray [H, W] bool
+        Pixels that the photograph's mask and alpha leave in.
+    K, T : ndarray [3, 3], [4, 4] float64
+        Intrinsics at this size; T_cam_world.
+    near, far : float, wu
+        Where the sweep begins and ends; 0 where the view shows too few points.
+    pixels, depth : ndarray [M, 2] px, [M] wu
+        The sparse points that it shows.
+    """
+
+    color: Tensor
+    grey: Tensor
+    usable: np.ndarray
+    K: np.ndarray
+    T: np.ndarray
+    near: float
+    far: float
+    pixels: np.ndarray
+    depth: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """H, W."""
+        return int(self.grey.shape[2]), int(self.grey.shape[3])
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What a sweep found.
+
+    Attributes
+    ----------
+    views : tuple of SmallView
+        Of the training views, in their order.
+    neighbours : tuple of tuple of int
+        Of each view, best first; empty for views that were not swept.
+    depths : tuple of ndarray [H, W] float64 wu
+        Along the optical axis; 0 where unknown.
+    scores : tuple of ndarray [H, W] float32
+        NCC of those depths.
+    """
+
+    views: tuple[SmallView, ...]
+    neighbours: tuple[tuple[int, ...], ...]
+    depths: tuple[np.ndarray, ...]
+    scores: tuple[np.ndarray, ...]
+
+    def agreeing(self, index: int, fraction: float) -> np.ndarray:
+        """Return how many neighbours have, where a pixel's place appears in them, the same depth: int [H, W]."""
+        view, depth = self.views[index], self.depths[index]
+        places = unproject(view, depth)
+        votes = np.zeros(depth.shape, dtype=np.int64)
+        for other in self.neighbours[index]:
+            z, column, row, inside = _into(self.views[other], places)
+            there = self.depths[other][row, column]
+            votes += inside & (depth > 0) & (there > 0) & (np.abs(there - z) <= fraction * z)
+        return votes
+
+
+def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
+    """Find depths of the training views of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        With ``observe``: which sparse points each photograph shows.
+    settings : DenseStart
+    """
+    assert scene.observe is not None
+    observed = scene.observe()
+    longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
+    factor = max(1, round(longest / settings.side))
+    views = tuple(_shrunk(view, observed, factor) for view in scene.train)
+    neighbours = _neighbours(scene, views, observed, settings)
+    found = [_depths(views, index, neighbours[index], settings) for index in range(len(views))]
+    return Sweep(views, neighbours, tuple(depth for depth, _ in found), tuple(score for _, score in found))
+
+
+def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
+    """Return the places [H, W, 3] wu of the pixels of a shrunk view at depths [H, W]."""
+    height, width = depth.shape
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(view.K).T
+    T = np.linalg.inv(view.T)
+    return np.asarray((rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3])
+
+
+def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud:
+    """Points to start from: swept ones, sparse ones where none is near, and far ones where nothing is known."""
+    found = [_swept(sweep, index, settings) for index in range(len(sweep.views))]
+    swept = _thin(_joined(found), settings.cell)
+    parts = [(swept.places, swept.colors, swept.normals)]
+    if scene.points is not None and len(scene.points):
+        parts.append(_apart(scene.points, swept, settings.cell))
+    if settings.far_cell > 0:
+        shell = _shell(sweep)
+        shells = [_far(sweep, index, settings, *shell) for index in range(len(sweep.views))]
+        far = _thin(_joined(shells), settings.far_cell)
+        parts.append((far.places, far.colors, far.normals))
+    places, colors, normals = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return PointCloud(places, np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8), normals)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    places: np.ndarray  # [M, 3] wu
+    colors: np.ndarray  # [M, 3] in [0, 1]
+    normals: np.ndarray  # [M, 3]
+    pixel: np.ndarray  # [M] wu: the size of a pixel there
+    score: np.ndarray  # [M]
+
+
+def _joined(found: Sequence[_Found]) -> _Found:
+    return _Found(*(np.concatenate([getattr(f, name) for f in found]) for name in _Found.__dataclass_fields__))
+
+
+def _thin(found: _Found, cell: float) -> _Found:
+    """One of each cell of so many pixels, that with the best score; cells are of sizes that are powers of two."""
+    level = np.rint(np.log2(found.pixel * cell))
+    keys = np.concatenate([np.floor(found.places / np.exp2(level)[:, None]), level[:, None]], axis=1)
+    order = np.argsort(-found.score, kind="stable")
+    _, first = np.unique(keys[order], axis=0, return_index=True)
+    rows = order[first]
+    return _Found(*(getattr(found, name)[rows] for name in _Found.__dataclass_fields__))
+
+
+def _swept(sweep: Sweep, index: int, settings: DenseStart) -> _Found:
+    """The places on which enough neighbours of a view agree."""
+    view, depth = sweep.views[index], sweep.depths[index]
+    places = unproject(view, depth)
+    kept = sweep.agreeing(index, settings.agree) >= min(settings.votes, max(1, len(sweep.neighbours[index]) - 1))
+    normals = np.cross(np.gradient(places, axis=1), np.gradient(places, axis=0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    colors = view.color.permute(1, 2, 0).numpy()
+    return _Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], sweep.scores[index][kept])
+
+
+def _shell(sweep: Sweep) -> tuple[np.ndarray, float]:
+    """Centre [3] and radius, wu, of a sphere around all cameras and all that they are known to show.
+
+    What is put there hides nothing from any camera. At the end of a view's own depths it would stand before others.
+    """
+    centers = np.stack([-view.T[:3, :3].T @ view.T[:3, 3] for view in sweep.views])
+    middle = centers.mean(axis=0)
+    reach = np.linalg.norm(centers - middle, axis=1).max()
+    return middle, float(reach + max(view.far for view in sweep.views))
+
+
+def _far(sweep: Sweep, index: int, settings: DenseStart, middle: np.ndarray, radius: float) -> _Found:
+    """Places on the shell, facing its middle, where nothing nearer is known."""
+    view = sweep.views[index]
+    stride = max(1, round(settings.far_cell))
+    unknown = np.logical_and(view.usable, sweep.depths[index] == 0)
+    for column, row in np.floor(view.pixels).astype(np.int64):
+        unknown[max(0, row - stride) : row + stride + 1, max(0, column - stride) : column + stride + 1] = False
+    grid = np.zeros_like(unknown)
+    grid[stride // 2 :: stride, stride // 2 :: stride] = view.far > 0
+    kept = unknown & grid
+    center = -view.T[:3, :3].T @ view.T[:3, 3]
+    rays = unproject(view, np.ones(kept.shape))[kept] - center
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    along = rays @ (center - middle)  # |center + t ray - middle| = radius
+    distance = -along + np.sqrt(along**2 + radius**2 - ((center - middle) ** 2).sum())
+    places = center + distance[:, None] * rays
+    colors = F.avg_pool2d(view.color[None], stride, 1, stride // 2, count_include_pad=False)[0].permute(1, 2, 0).numpy()
+    colors = colors[: kept.shape[0], : kept.shape[1]]
+    return _Found(places, colors[kept], (middle - places) / radius, distance / view.K[0, 0], np.zeros(len(places)))
+
+
+def _apart(points: PointCloud, swept: _Found, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sparse points that lie apart from the swept ones: places, colours in [0, 1], unknown normals."""
+    from scipy.spatial import cKDTree
+
+    places = np.asarray(points.points, dtype=np.float64)
+    apart = np.logical_and.reduce(np.isfinite(places), axis=1)
+    if len(swept.places):
+        distance = cKDTree(swept.places).query(np.where(apart[:, None], places, 0.0))[0]
+        apart &= distance > REPEATED * cell * float(np.median(swept.pixel))
+    colors = np.full((len(places), 3), 0.5) if points.colors is None else points.colors / 255.0
+    return places[apart], colors[apart], np.zeros((int(apart.sum()), 3))
+
+
+def _shrunk(view: View, observed: ObservedPoints, factor: int) -> SmallView:
+    camera = view.camera
+    image = torch.from_numpy(np.ascontiguousarray(view.target((0.0, 0.0, 0.0)))).permute(2, 0, 1)[None]
+    height, width = camera.height // factor * factor, camera.width // factor * factor
+    small = F.avg_pool2d(image[:, :, :height, :width], factor)
+    usable: np.ndarray = np.ones((camera.height, camera.width), dtype=bool)
+    for left_in in (view.mask(), None if (alpha := view.alpha()) is None else alpha >= 0.5):
+        if left_in is not None:
+            usable[~left_in] = False
+    blocks = usable[:height, :width].reshape(height // factor, factor, width // factor, factor)
+    left = np.logical_and.reduce(blocks, axis=(1, 3))
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    K[:2] /= factor
+    shown = observed.in_view(view.name, camera)
+    enough = len(shown.depth) >= MIN_POINTS
+    near, far = np.percentile(shown.depth, (1, 99)) if enough else (0.0, 0.0)
+    pixels = np.minimum(shown.pixels / factor, np.array((width // factor, height // factor)) - 0.5)
+    grey = (small * torch.tensor(GREY)[:, None, None]).sum(dim=1, keepdim=True)
+    T = np.asarray(camera.T_cam_world, dtype=np.float64)
+    return SmallView(small[0], grey, left, K, T, NEAR_MARGIN * near, FAR_MARGIN * far, pixels, shown.depth)
+
+
+def _neighbours(
+    scene: Scene, views: Sequence[SmallView], observed: ObservedPoints, settings: DenseStart
+) -> tuple[tuple[int, ...], ...]:
+    """The views that each is compared with: many shared points, and lines of sight some ten degrees apart."""
+    count = len(views)
+    centers = np.stack([view.camera.center for view in scene.train])
+    rows = [observed.seen.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train]
+    swept = set(np.unique(np.linspace(0, count - 1, min(count, settings.max_views)).round().astype(int)).tolist())
+    found: list[tuple[int, ...]] = []
+    for index, view in enumerate(scene.train):
+        if views[index].far == 0 or index not in swept:
+            found.append(())
+            continue
+        target = view.camera.center + view.camera.forward * float(np.median(views[index].depth))
+        mine, theirs = view.camera.center - target, centers - target
+        lengths = np.maximum(np.linalg.norm(theirs, axis=1) * np.linalg.norm(mine), 1e-12)
+        angle = np.degrees(np.arccos(np.clip(theirs @ mine / lengths, -1, 1)))
+        shared = np.array([np.isin(rows[index], other, assume_unique=True).sum() for other in rows])
+        fits = (angle >= settings.min_angle) & (angle <= settings.max_angle) & (shared >= MIN_SHARED)
+        fits[index] = False
+        width = np.where(angle < BEST_ANGLE, NARROW, WIDE)
+        worth = np.where(fits, shared * np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * width**2)), 0.0)
+        order = np.argsort(-worth, kind="stable")[: settings.neighbours]
+        found.append(tuple(int(i) for i in order if worth[i] > 0))
+    return tuple(found)
+
+
+@torch.no_grad()
+def _depths(
+    views: Sequence[SmallView], index: int, neighbours: Sequence[int], settings: DenseStart
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [H, W] wu of a view, 0 where unknown, and its NCC."""
+    view = views[index]
+    height, width = view.size
+    if not neighbours:
+        return np.zeros((height, width)), np.zeros((height, width), dtype=np.float32)
+    step = (1 / view.near - 1 / view.far) / (settings.planes - 1)
+    z = (1 / (1 / view.far + step * torch.arange(settings.planes, dtype=torch.float64))).float()  # far to near
+    variance = _blurred(view.grey * view.grey, settings.radius) - _blurred(view.grey, settings.radius) ** 2
+    each = [_ncc(view, views[other], z, variance.clamp_min(0), settings.radius) for other in neighbours]
+    score = torch.stack(each).topk(min(2, len(each)), dim=0).values.mean(dim=0)  # [D, H, W]
+    best, plane = score.max(dim=0)
+    inner = plane.clamp(1, settings.planes - 2)
+    left, middle, right = (score.gather(0, (inner + offset)[None])[0] for offset in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    shift = torch.where(bend < -1e-6, 0.5 * (left - right) / bend, torch.zeros_like(bend)).clamp(-0.5, 0.5)
+    depth = 1 / (1 / view.far + step * (inner + shift).double())
+    known = (best >= settings.min_ncc) & (plane > 0) & (plane < settings.planes - 1)
+    known &= (variance[0, 0] >= MIN_TEXTURE) & torch.from_numpy(view.usable)
+    return torch.where(known, depth, torch.zeros_like(depth)).numpy(), best.numpy()
+
+
+def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, radius: int) -> Tensor:
+    """NCC [D, H, W] of the patches of a view with those of another at depths z [D]; -1 outside the other."""
+    (height, width), (rows, columns) = view.size, other.size
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1).double()
+    motion = other.T @ np.linalg.inv(view.T)
+    turned = (torch.from_numpy(other.K @ motion[:3, :3] @ np.linalg.inv(view.K)) @ pixels).float()  # [3, HW]
+    moved = torch.from_numpy(other.K @ motion[:3, 3]).float()
+    seen = turned[:, None, :] * z[None, :, None] + moved[:, None, None]  # [3, D, HW]
+    depth = seen[2].clamp_min(1e-9)
+    at = torch.stack([seen[0] / depth * (2 / columns) - 1, seen[1] / depth * (2 / rows) - 1], dim=-1)
+    inside = (at.abs() < 1).all(dim=-1) & (seen[2] > 0)
+    fetched = F.grid_sample(other.grey, at[None], align_corners=False, padding_mode="border")
+    fetched = fetched.reshape(len(z), 1, height, width)
+    mean, mine = _blurred(fetched, radius), _blurred(view.grey, radius)
+    spread = (_blurred(fetched * fetched, radius) - mean * mean).clamp_min(0)
+    common = _blurred(fetched * view.grey, radius) - mean * mine
+    ncc = common / ((spread + NOISE) * (variance + NOISE)).sqrt()
+    return torch.where(inside.reshape(len(z), height, width), ncc[:, 0], torch.full((), -1.0))
+
+
+def _blurred(image: Tensor, radius: int) -> Tensor:
+    """Mean over patches of 2 radius + 1 pixels a side; images are mirrored at their edges."""
+    return F.avg_pool2d(F.pad(image, (radius,) * 4, mode="reflect"), 2 * radius + 1, 1)
+
+
+def _into(view: SmallView, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Depth, column and row (clipped to the picture) of places [..., 3] in a view, and whether they are inside."""
+    seen = places @ view.T[:3, :3].T + view.T[:3, 3]
+    z = seen[..., 2]
+    front = np.maximum(z, 1e-12)
+    x = view.K[0, 0] * seen[..., 0] / front + view.K[0, 2]
+    y = view.K[1, 1] * seen[..., 1] / front + view.K[1, 2]
+    height, width = view.size
+    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    column = np.clip(np.nan_to_num(x), 0, width - 1).astype(np.int64)
+    return z, column, np.clip(np.nan_to_num(y), 0, height - 1).astype(np.int64), inside

@@ -1,0 +1,98 @@
+"""How exposures of photographs differ, by the colours that sparse points have in them: known before training.
+
+A point that photographs k and l show has colours g_k c and g_l c, g the gains of the channels. The logarithms are
+fitted by turns, with weights that leave out points whose colours change for other reasons (highlights, wrong matches).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.scene import Scene, View
+
+HALF = 2  # px: colours are means of patches of 5x5
+DARKEST, BRIGHTEST = 0.03, 0.97  # of a patch: beyond, its logarithm is noise, or it is clipped
+OUTLIER = 0.1  # of the logarithm: residuals of this size weigh half
+ROUNDS = 30
+MIN_COLORS = 30  # in a photograph: with fewer its gains are taken to be 1
+MIN_TRACK = 3
+
+
+@dataclass(frozen=True, eq=False)
+class PointGains:
+    """Gains of the training photographs of a scene.
+
+    Attributes
+    ----------
+    gains : ndarray [V, 3]
+        Of each photograph and channel; their geometric mean over photographs is 1.
+    spread : float
+        Standard deviation over photographs of the logarithm of the mean gain of the channels.
+    residual : float
+        Median of what is left of the logarithms.
+    """
+
+    gains: np.ndarray
+    spread: float
+    residual: float
+
+
+def point_gains(scene: Scene) -> PointGains | None:
+    """Return the gains of the training photographs; None where the capture does not say which points they show."""
+    if scene.observe is None:
+        return None
+    observed = scene.observe()
+    views, points, values = [], [], []
+    for index, view in enumerate(scene.train):
+        rows, colors = _colors(view, observed)
+        views.append(np.full(len(rows), index))
+        points.append(rows)
+        values.append(np.log(colors))
+    return _fitted(np.concatenate(views), np.concatenate(points), np.concatenate(values), len(scene.train))
+
+
+def _colors(view: View, observed: ObservedPoints) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [M] of the points that a view shows well, and their colours [M, 3] in (0, 1)."""
+    camera = view.camera
+    rows = observed.seen.get(view.name, np.zeros(0, dtype=np.int64))
+    rows = rows[(observed.track[rows] >= MIN_TRACK) & np.isfinite(observed.points[rows]).all(axis=1)]
+    pixels, depth = camera.project(observed.points[rows])
+    column, row = np.floor(pixels).astype(np.int64).T
+    inside = (depth > 0) & (column >= HALF) & (row >= HALF)
+    inside &= (column < camera.width - HALF) & (row < camera.height - HALF)
+    image, mask = view.target((0.0, 0.0, 0.0)), view.mask()
+    column, row, rows = column[inside], row[inside], rows[inside]
+    offsets = range(-HALF, HALF + 1)
+    patches = np.stack([image[row + i, column + j] for i in offsets for j in offsets])  # [25, M, 3]
+    colors = patches.mean(axis=0)
+    good = ((colors > DARKEST) & (colors < BRIGHTEST)).all(axis=1)
+    if mask is not None:
+        good &= mask[row, column]
+    return rows[good], colors[good].astype(np.float64)
+
+
+def _fitted(views: np.ndarray, points: np.ndarray, values: np.ndarray, count: int) -> PointGains:
+    """Gains of ``count`` views from logarithms [M, 3] of colours of points in views."""
+    if len(values) == 0:
+        return PointGains(np.ones((count, 3)), 0.0, 0.0)
+    _, points = np.unique(points, return_inverse=True)
+    logs, weights = np.zeros((count, 3)), np.ones(len(values))
+    error = np.zeros(len(values))
+    for _ in range(ROUNDS):
+        colors = _means(points, values - logs[views], weights, int(points.max()) + 1)
+        left = values - colors[points]
+        logs = _means(views, left, weights, count)
+        logs[np.bincount(views, minlength=count) < MIN_COLORS] = 0.0
+        logs -= logs.mean(axis=0)
+        error = np.abs(left - logs[views]).mean(axis=1)
+        weights = 1 / (1 + (error / OUTLIER) ** 2)
+    return PointGains(np.exp(logs), float(logs.mean(axis=1).std()), float(np.median(error)))
+
+
+def _means(groups: np.ndarray, values: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
+    """Weighted means [count, 3] of values [M, 3] by group; 0 for empty ones."""
+    total = np.maximum(np.bincount(groups, weights, minlength=count), 1e-12)
+    return np.stack([np.bincount(groups, weights * v, minlength=count) / total for v in values.T], axis=1)

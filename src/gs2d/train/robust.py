@@ -1,0 +1,83 @@
+"""What keeps fog out of a scene, as the training loop meets it: where to start, what to prune, how opacity decays."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gs2d.data.scene import Scene
+from gs2d.errors import DataError
+from gs2d.recipe import Recipe, Stage
+from gs2d.recipe_robust import DenseStart
+from gs2d.train import events
+from gs2d.train.free_space import FreeSpaceMaps
+from gs2d.train.plane_sweep import start_points, sweep_views
+from gs2d.train.rows import keep_rows
+from gs2d.train.state import TrainState
+
+
+class Robustness:
+    """The dense start, free space and opacity decay of a recipe on a scene; nothing where it has none of them.
+
+    Attributes
+    ----------
+    scene : Scene
+        With the points that training starts from.
+
+    Raises
+    ------
+    DataError
+        From the constructor: the capture does not say which sparse points its photographs show.
+    """
+
+    def __init__(self, scene: Scene, recipe: Recipe) -> None:
+        self.scene, self._recipe = scene, recipe
+        self._free: FreeSpaceMaps | None = None
+        if recipe.dense_start is None and recipe.free_space is None:
+            return
+        if scene.observe is None:
+            raise DataError(
+                f"{scene.name} must say which sparse points its photographs show (COLMAP does) for a dense start and "
+                "for free space; train with --robust off"
+            )
+        sweep = sweep_views(scene, recipe.dense_start or DenseStart())
+        if recipe.dense_start is not None:
+            self.scene = replace(scene, points=start_points(scene, sweep, recipe.dense_start))
+        if recipe.free_space is not None:
+            self._free = FreeSpaceMaps(sweep, recipe.free_space)
+
+    def move_to(self, device: torch.device | str) -> None:
+        """Move all tensors to a device."""
+        if self._free is not None:
+            self._free.move_to(device)
+
+    def prunes(self, stage: Stage, iteration: int) -> bool:
+        """Whether splats in free space are pruned at the end of an iteration (1-based) of a stage."""
+        settings = self._recipe.free_space
+        return settings is not None and stage.moves_all and iteration % settings.every == 0
+
+    def prune(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
+        """Prune the splats in free space, where that is due."""
+        if self._free is None or not self.prunes(stage, iteration):
+            return []
+        keep = ~self._free.inside(state.splats)
+        pruned = int((~keep).sum())
+        if pruned == 0 or pruned == len(keep):  # nothing would be left: the photographs contradict each other
+            return []
+        keep_rows(state, keep)
+        return [events.FreeSpacePruned(stage.name, iteration, pruned, len(state.splats))]
+
+    @torch.no_grad()
+    def decay(self, state: TrainState, stage: Stage, iteration: int, cancel: Tensor | None = None) -> None:
+        """Let opacity decay, where that is due; ``cancel`` on a device: where it is not 0 nothing changes."""
+        settings = self._recipe.opacity_decay
+        if settings is None or stage.train.get("opacity_logits") != "all" or iteration % settings.every:
+            return
+        logits = state.splats.opacity_logits
+        least = math.log(settings.least / (1 - settings.least))
+        faded = torch.logit(torch.sigmoid(logits) * (1 - settings.rate)).clamp_min(least)
+        changed = logits > least
+        logits.copy_(torch.where(changed if cancel is None else changed & (cancel == 0), faded, logits))

@@ -1,0 +1,294 @@
+"""What keeps fog out: depths by a plane sweep, space that photographs show to be empty, opacity that decays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from train_toys import full_state, make_scene, random_splats
+
+from gs2d.camera import Camera, look_at
+from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.errors import DataError, RecipeError
+from gs2d.protocols import GENERIC
+from gs2d.recipe import Recipe, validate
+from gs2d.recipe_robust import DenseStart, FreeSpace, OpacityDecay
+from gs2d.recipes import refine, surface, two_dgs, with_exposure, with_robustness
+from gs2d.schedule import scale_schedule
+from gs2d.splats import Splats
+from gs2d.train import events
+from gs2d.train.free_space import FreeSpaceMaps
+from gs2d.train.loop import Trainer
+from gs2d.train.plane_sweep import start_points, sweep_views
+from gs2d.train.point_gains import point_gains
+from gs2d.train.robust import Robustness
+
+WALL = 4.0  # the wall is the plane z = 4; cameras stand at z = 0 and look along z
+WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
+SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0, far_cell=4.0)
+
+
+def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Colours [..., 3] in [0.1, 0.9] of a wall without a repeating pattern."""
+    rng = np.random.default_rng(5)
+    waves = rng.normal(size=(24, 2)) * 6
+    phases = rng.uniform(0, 2 * np.pi, size=(24, 3))
+    value = sum(np.sin(x[..., None] * w[0] + y[..., None] * w[1] + p) for w, p in zip(waves, phases, strict=True))
+    return np.asarray(0.5 + 0.4 * np.tanh(0.3 * value))
+
+
+def photograph(camera: Camera, gain: float = 1.0) -> np.ndarray:
+    """The wall as a camera at z = 0 sees it, uint8; its left third is bare."""
+    x = (np.arange(WIDTH) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(HEIGHT) + 0.5 - camera.cy) / camera.fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((HEIGHT, WIDTH))], axis=-1) @ camera.rotation
+    places = camera.center + rays * ((WALL - camera.center[2]) / rays[..., 2])[..., None]
+    color = texture(places[..., 0], places[..., 1])
+    color[places[..., 0] < -1.2] = 0.5
+    return np.rint(np.clip(color * gain, 0, 1) * 255).astype(np.uint8)
+
+
+@cache
+def wall(gains: tuple[float, ...] = (1.0,) * 5) -> Scene:
+    """Five photographs of a wall, with sparse points on its textured part."""
+    cameras = [
+        look_at(np.array([x, 0.1 * i, 0.0]), np.array([x * 0.5, 0, WALL]), np.array([0.0, -1.0, 0.0]),
+                width=WIDTH, height=HEIGHT, fx=FOCAL)
+        for i, x in enumerate(np.linspace(-0.8, 0.8, 5))
+    ]  # fmt: skip
+    views = tuple(
+        View.from_arrays(f"{i}.png", c, photograph(c, g)) for i, (c, g) in enumerate(zip(cameras, gains, strict=True))
+    )
+    rng = np.random.default_rng(1)
+    points = np.stack([rng.uniform(-1.1, 1.8, 300), rng.uniform(-1.4, 1.4, 300), np.full(300, WALL)], axis=1)
+    seen = {view.name: np.arange(300) for view in views}
+    observed = ObservedPoints(points, np.full(300, 0.5), np.full(300, 5), seen)
+    bounds = np.array([[-2.0, -2, 0], [2, 2, 5]])
+    return Scene("wall", "colmap", views, (), PointCloud(points), 1.0, bounds, observe=lambda: observed)
+
+
+@cache
+def swept_wall() -> object:
+    return sweep_views(wall(), SMALL)
+
+
+def splat_at(*places: tuple[float, float, float], scale: float = 0.02) -> Splats:
+    """Splats at places, facing the cameras."""
+    splats = random_splats(len(places))
+    splats.means[:] = torch.tensor(places)
+    splats.quats[:] = torch.tensor([1.0, 0, 0, 0])  # t_u = x, t_v = y
+    splats.log_scales[:] = float(np.log(scale))
+    return splats
+
+
+# -- the plane sweep ------------------------------------------------------------------------------------------------
+def test_a_sweep_finds_the_depth_of_a_textured_wall_and_says_nothing_of_a_bare_one() -> None:
+    sweep = swept_wall()
+    depth = sweep.depths[2][:, 20:]  # type: ignore[attr-defined]
+    known = depth > 0
+    assert known.mean() > 0.8
+    assert np.median(np.abs(depth[known] / WALL - 1)) < 0.02  # a quarter of a pixel
+    bare = sweep.depths[2][4:-4, 2:6]  # type: ignore[attr-defined]
+    assert (bare > 0).mean() < 0.1
+
+
+def test_training_starts_on_the_wall_and_far_behind_what_is_not_known() -> None:
+    cloud = start_points(wall(), swept_wall(), SMALL)  # type: ignore[arg-type]
+    z = cloud.points[:, 2]
+    on_wall = np.abs(z / WALL - 1) < 0.03
+    far = ~on_wall & (z > 1.3 * WALL)
+    assert on_wall.sum() > 200
+    assert far.sum() > 10
+    assert (on_wall | far).mean() > 0.97
+    assert cloud.normals is not None
+    assert np.median(np.abs(cloud.normals[on_wall & (np.abs(cloud.normals).sum(axis=1) > 0)][:, 2])) > 0.9
+    assert cloud.colors is not None
+    assert np.median(np.abs(cloud.colors[far].astype(int) - 128)) < 10  # mostly the grey of the bare part
+    without = start_points(wall(), swept_wall(), replace(SMALL, far_cell=0.0))  # type: ignore[arg-type]
+    assert (without.points[:, 2] < 1.3 * WALL).mean() > 0.99
+
+
+def test_the_far_places_enclose_every_camera() -> None:
+    cloud = start_points(wall(), swept_wall(), SMALL)  # type: ignore[arg-type]
+    centers = np.stack([view.camera.center for view in wall().train])
+    far = cloud.points[cloud.points[:, 2] > 1.3 * WALL]
+    middle = centers.mean(axis=0)
+    assert np.linalg.norm(far - middle, axis=1).min() > np.linalg.norm(centers - middle, axis=1).max() + WALL
+
+
+def test_pixels_that_a_mask_leaves_out_have_no_depth() -> None:
+    views = list(wall().train)
+    mask = np.ones((HEIGHT, WIDTH), dtype=bool)
+    mask[:, 28:34] = False
+    views[2] = View.from_arrays(views[2].name, views[2].camera, views[2].image(), mask)
+    sweep = sweep_views(replace(wall(), train=tuple(views)), SMALL)
+    assert (sweep.depths[2][:, 28:34] == 0).all()
+    assert (sweep.depths[2][:, 36:] > 0).any()
+
+
+def test_at_most_so_many_photographs_are_swept() -> None:
+    sweep = sweep_views(wall(), replace(SMALL, max_views=2))
+    assert [bool(neighbours) for neighbours in sweep.neighbours] == [True, False, False, False, True]
+
+
+# -- free space -----------------------------------------------------------------------------------------------------
+@pytest.fixture
+def maps() -> FreeSpaceMaps:
+    return FreeSpaceMaps(swept_wall(), FreeSpace())  # type: ignore[arg-type]
+
+
+def test_splats_before_the_wall_are_in_free_space_and_those_on_it_or_behind_are_not(maps: FreeSpaceMaps) -> None:
+    splats = splat_at((0.5, 0, 2.0), (0.5, 0, 0.97 * WALL), (0.5, 0, WALL), (0.5, 0, 6.0), (0.5, 0, -2.0))
+    assert maps.inside(splats).tolist() == [True, False, False, False, False]
+
+
+def test_before_what_is_not_known_only_what_is_nearer_than_anything_known_is_free(maps: FreeSpaceMaps) -> None:
+    # Nearest known depth 4, floor 0.8 of it, free below 0.9 of that: 2.88; the bare part is at x < -1.2.
+    splats = splat_at((-1.6, 0, 3.3), (-1.6, 0, 2.0))
+    assert maps.inside(splats).tolist() == [False, True]
+
+
+def test_a_ball_around_each_camera_is_free_also_behind_it(maps: FreeSpaceMaps) -> None:
+    # Radius 0.5 x 0.8 x 4 = 1.6.
+    assert maps.inside(splat_at((0.0, 0, -1.0), (0.0, 0, -1.9))).tolist() == [True, False]
+    without = FreeSpaceMaps(swept_wall(), FreeSpace(ball=0.0))  # type: ignore[arg-type]
+    assert without.inside(splat_at((0.0, 0, -1.0))).tolist() == [False]
+
+
+def test_a_large_splat_is_looked_at_by_its_ends_too() -> None:
+    beside = (4.5, 0.0, 3.2)  # out of every picture; its left end, 3 wu away, is before the wall
+    large, small = splat_at(beside, scale=3.0), splat_at(beside)
+    maps = FreeSpaceMaps(swept_wall(), FreeSpace(ball=0.0))  # type: ignore[arg-type]
+    assert maps.inside(small).tolist() == [False]
+    assert maps.inside(large).tolist() == [True]
+    by_centre = FreeSpaceMaps(swept_wall(), FreeSpace(ball=0.0, spread=0.0))  # type: ignore[arg-type]
+    assert by_centre.inside(large).tolist() == [False]
+
+
+def test_so_many_photographs_must_say_so() -> None:
+    seen_by_all, seen_by_few = (0.2, 0.0, 2.0), (2.1, 0.0, 3.0)
+    settings = FreeSpace(ball=0.0, views=5)
+    maps = FreeSpaceMaps(swept_wall(), settings)  # type: ignore[arg-type]
+    assert maps.inside(splat_at(seen_by_all, seen_by_few)).tolist() == [True, False]
+    one = FreeSpaceMaps(swept_wall(), replace(settings, views=1))  # type: ignore[arg-type]
+    assert one.inside(splat_at(seen_by_all, seen_by_few)).tolist() == [True, True]
+
+
+# -- in training ----------------------------------------------------------------------------------------------------
+def short(**changes: object) -> Recipe:
+    made = scale_schedule(with_robustness(two_dgs()), 0.0005)  # 15 iterations
+    stage = replace(made.stages[0], densify=None)
+    made = replace(made, stages=(stage,), sh_degree=1, free_space=FreeSpace(every=10), dense_start=SMALL)
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def test_fog_is_pruned_at_every_turn_and_said() -> None:
+    happened: list[object] = []
+    trainer = Trainer(wall(), short(), GENERIC, backend="auto", on_event=happened.append)
+    trainer.enter(0)
+    assert isinstance(happened[0], events.Initialised)
+    assert happened[0].source == "sweep"
+    trainer.state.splats.means[:7] = torch.tensor([0.5, 0.0, 1.8])
+    before = len(trainer.splats)
+    for _ in range(9):
+        trainer.step()
+    assert len(trainer.splats) == before
+    trainer.step()
+    pruned = [event for event in happened if isinstance(event, events.FreeSpacePruned)]
+    assert [(event.iteration, event.pruned >= 7) for event in pruned] == [(10, True)]
+    assert len(trainer.splats) == pruned[0].splats == before - pruned[0].pruned
+
+
+def test_a_resumed_run_starts_from_the_same_places_and_ends_with_the_same_bits() -> None:
+    whole = Trainer(wall(), short(), GENERIC, backend="auto").run()
+    first = Trainer(wall(), short(), GENERIC, backend="auto")
+    first.enter(0)
+    for _ in range(12):
+        first.step()
+    state = type(first.state).from_state_dict(first.state.state_dict())
+    again = Trainer(wall(), short(), GENERIC, backend="auto", state=state).run()
+    assert all(torch.equal(a, b) for (_, a), (_, b) in zip(whole.items(), again.items(), strict=True))
+
+
+def test_a_capture_without_observations_is_refused_in_one_line() -> None:
+    with pytest.raises(DataError, match="ball must say which sparse points .* train with --robust off"):
+        Trainer(make_scene(), short(), GENERIC, backend="auto")
+
+
+def test_a_scene_of_fog_alone_is_left_as_it_is() -> None:
+    robust, state = Robustness(wall(), short()), full_state(4)
+    state.splats.means[:] = torch.tensor([0.5, 0.0, 1.8])
+    assert robust.prune(state, short().stages[0], 10) == []
+    assert len(state.splats) == 4
+
+
+# -- opacity decay --------------------------------------------------------------------------------------------------
+def test_opacity_decays_by_its_rate_every_so_many_iterations_and_not_below_the_least() -> None:
+    recipe = short(dense_start=None, free_space=None, opacity_decay=OpacityDecay(rate=0.1, every=5, least=0.02))
+    robust, state = Robustness(make_scene(), recipe), full_state(4)
+    state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.9, 0.5, 0.021, 0.01]))
+    robust.decay(state, recipe.stages[0], 4)
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.021, 0.01]), abs=1e-6)
+    robust.decay(state, recipe.stages[0], 5, cancel=torch.tensor(1))
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.021, 0.01]), abs=1e-6)
+    robust.decay(state, recipe.stages[0], 5)
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.81, 0.45, 0.02, 0.01]), abs=1e-6)
+
+
+def test_frozen_opacity_does_not_decay() -> None:
+    recipe = short(dense_start=None, free_space=None)
+    robust, state = Robustness(make_scene(), recipe), full_state(4)
+    before = state.splats.opacity_logits.clone()
+    robust.decay(state, refine(), 10)
+    assert torch.equal(state.splats.opacity_logits, before)
+    robust.decay(state, surface(), 10)
+    assert not torch.equal(state.splats.opacity_logits, before)
+
+
+# -- exposures by points --------------------------------------------------------------------------------------------
+def test_gains_come_out_of_the_colours_of_points() -> None:
+    gains = (0.7, 0.85, 1.0, 0.9, 0.8)
+    found = point_gains(wall(gains))
+    assert found is not None
+    expected = np.array(gains) / np.exp(np.mean(np.log(gains)))
+    assert found.gains == pytest.approx(np.repeat(expected[:, None], 3, axis=1), rel=0.03)
+    assert found.spread == pytest.approx(np.log(gains).std(), rel=0.1)
+    same = point_gains(wall())
+    assert same is not None
+    assert same.spread < 0.01
+
+
+def test_a_capture_without_observations_says_nothing_of_gains() -> None:
+    assert point_gains(make_scene()) is None
+
+
+def test_exposures_begin_with_the_gains_of_points_where_the_recipe_says_so() -> None:
+    scene = wall((0.7, 0.85, 1.0, 0.9, 0.8))
+    for initial, spread in (("points", 0.11), ("identity", 0.0)):
+        recipe = with_exposure(short(dense_start=None, free_space=None))
+        assert recipe.exposure is not None
+        recipe = replace(recipe, exposure=replace(recipe.exposure, initial=initial))
+        trainer = Trainer(scene, recipe, GENERIC, backend="auto")
+        assert trainer.state.exposures is not None
+        assert float(trainer.state.exposures.transforms()[:, 0, 0].std(correction=0)) == pytest.approx(spread, abs=0.03)
+
+
+# -- what cannot be trained with ------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dense_start": DenseStart(planes=1)}, "dense_start.planes"),
+        ({"dense_start": DenseStart(cell=0.5)}, "dense_start.cell must be at least 1 px"),
+        ({"dense_start": DenseStart(min_angle=50.0)}, "min_angle must be below max_angle"),
+        ({"free_space": FreeSpace(nearer=1.0)}, "nearer must be below 1"),
+        ({"free_space": FreeSpace(window=4)}, "window must be odd"),
+        ({"opacity_decay": OpacityDecay(rate=1.0)}, "opacity_decay.rate must be below 1"),
+    ],
+)
+def test_values_that_mean_nothing_are_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(RecipeError, match=message):
+        validate(short(**changes))
