@@ -28,6 +28,7 @@ _COMMON = {
     "background": f"{_CODE}: black unless asked for white",
     "near": f"{_CODE}: its rasterizer's 0.2",
     "crossing": f"{_CODE}: the box of an ellipse, also for a splat that reaches the camera plane",
+    "robust": f"{_CODE}: it starts from sparse points, and nothing keeps space free",
     "use_mask_in_training": f"{_CODE}: the background is trained",
     "use_mask_in_fusion": f"{_CODE}: depth is cleared outside the alpha mask",
     "fusion.voxel": f"{_OURS}: from the depth maps",
@@ -86,6 +87,7 @@ _OWN: dict[str, dict[str, str]] = {
         "crossing": f"{_OURS}: floors and walls pass by the camera",
         "use_mask_in_training": f"{_OURS}: a mask that a capture comes with says which pixels to leave out",
         "fusion.subject": f"{_OURS}: what most cameras look at",
+        "robust": f"{_OURS}: real captures are few photographs, unevenly spread (docs/decisions.md, Fog)",
     },
 }
 _PARTS: dict[str, dict[str, str]] = {

@@ -34,9 +34,6 @@ class DenseStart:
         Neighbours that must agree for a splat to start there.
     cell : float, px
         One splat starts in each cell of so many pixels of the shrunk photographs.
-    far_cell : float, px
-        Where nothing is known, splats start on a sphere around everything, one in each cell of so many pixels: sky and
-        bare walls are explained from behind, or they will be by sheets before the cameras. 0 = none.
     max_views : int
         Photographs that are swept, evenly chosen.
     """
@@ -51,7 +48,6 @@ class DenseStart:
     agree: float = 0.02
     votes: int = 2
     cell: float = 3.0
-    far_cell: float = 6.0
     max_views: int = 120
 
 
@@ -113,7 +109,7 @@ def check_robust(where: str, start: DenseStart | None, free: FreeSpace | None, d
         least = {"side": 16, "planes": 4, "neighbours": 1, "radius": 1, "votes": 1, "max_views": 2}
         for name, low in least.items():
             integer(f"{at}.{name}", getattr(start, name), low=low)
-        for name in ("min_angle", "max_angle", "min_ncc", "agree", "cell", "far_cell"):
+        for name in ("min_angle", "max_angle", "min_ncc", "agree", "cell"):
             number(f"{at}.{name}", getattr(start, name), low=0.0)
         require(start.cell >= 1, f"{at}.cell must be at least 1 px, got {start.cell}")
         require(start.min_angle < start.max_angle, f"{at}.min_angle must be below max_angle, got {start.min_angle}")

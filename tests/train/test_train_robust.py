@@ -21,6 +21,7 @@ from gs2d.recipes import refine, surface, two_dgs, with_exposure, with_robustnes
 from gs2d.schedule import scale_schedule
 from gs2d.splats import Splats
 from gs2d.train import events
+from gs2d.train.backdrop import backdrop_color
 from gs2d.train.free_space import FreeSpaceMaps
 from gs2d.train.loop import Trainer
 from gs2d.train.plane_sweep import start_points, sweep_views
@@ -29,7 +30,7 @@ from gs2d.train.robust import Robustness
 
 WALL = 4.0  # the wall is the plane z = 4; cameras stand at z = 0 and look along z
 WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
-SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0, far_cell=4.0)
+SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
 
 
 def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -96,28 +97,24 @@ def test_a_sweep_finds_the_depth_of_a_textured_wall_and_says_nothing_of_a_bare_o
     assert (bare > 0).mean() < 0.1
 
 
-def test_training_starts_on_the_wall_and_far_behind_what_is_not_known() -> None:
+def test_training_starts_on_the_wall_facing_the_cameras() -> None:
     cloud = start_points(wall(), swept_wall(), SMALL)  # type: ignore[arg-type]
-    z = cloud.points[:, 2]
-    on_wall = np.abs(z / WALL - 1) < 0.03
-    far = ~on_wall & (z > 1.3 * WALL)
-    assert on_wall.sum() > 200
-    assert far.sum() > 10
-    assert (on_wall | far).mean() > 0.97
+    assert len(cloud) > 200
+    assert (np.abs(cloud.points[:, 2] / WALL - 1) < 0.05).mean() > 0.97
     assert cloud.normals is not None
-    assert np.median(np.abs(cloud.normals[on_wall & (np.abs(cloud.normals).sum(axis=1) > 0)][:, 2])) > 0.9
-    assert cloud.colors is not None
-    assert np.median(np.abs(cloud.colors[far].astype(int) - 128)) < 10  # mostly the grey of the bare part
-    without = start_points(wall(), swept_wall(), replace(SMALL, far_cell=0.0))  # type: ignore[arg-type]
-    assert (without.points[:, 2] < 1.3 * WALL).mean() > 0.99
+    turned = np.abs(cloud.normals).sum(axis=1) > 0
+    assert np.median(np.abs(cloud.normals[turned][:, 2])) > 0.9
 
 
-def test_the_far_places_enclose_every_camera() -> None:
-    cloud = start_points(wall(), swept_wall(), SMALL)  # type: ignore[arg-type]
-    centers = np.stack([view.camera.center for view in wall().train])
-    far = cloud.points[cloud.points[:, 2] > 1.3 * WALL]
-    middle = centers.mean(axis=0)
-    assert np.linalg.norm(far - middle, axis=1).min() > np.linalg.norm(centers - middle, axis=1).max() + WALL
+def test_sparse_points_start_splats_where_no_swept_one_is_near() -> None:
+    scene = wall()
+    assert scene.points is not None
+    alone = np.array([[0.0, 0.0, 9.0]])
+    more = replace(scene, points=PointCloud(np.concatenate([scene.points.points, alone])))
+    cloud = start_points(more, swept_wall(), SMALL)  # type: ignore[arg-type]
+    assert (cloud.points == alone).all(axis=1).sum() == 1
+    assert len(cloud) - len(start_points(scene, swept_wall(), SMALL)) == 1  # type: ignore[arg-type]
+    assert len(cloud) < len(scene.points) + sum((d > 0).sum() for d in swept_wall().depths)  # type: ignore[attr-defined]
 
 
 def test_pixels_that_a_mask_leaves_out_have_no_depth() -> None:
@@ -275,6 +272,19 @@ def test_exposures_begin_with_the_gains_of_points_where_the_recipe_says_so() -> 
         trainer = Trainer(scene, recipe, GENERIC, backend="auto")
         assert trainer.state.exposures is not None
         assert float(trainer.state.exposures.transforms()[:, 0, 0].std(correction=0)) == pytest.approx(spread, abs=0.03)
+
+
+# -- the colour behind everything ------------------------------------------------------------------------------------
+def test_the_backdrop_is_the_colour_of_what_shows_no_sparse_points() -> None:
+    assert backdrop_color(wall()) == pytest.approx((0.5, 0.5, 0.5), abs=0.02)
+
+
+def test_photographs_with_alpha_or_without_known_points_have_no_backdrop() -> None:
+    assert backdrop_color(make_scene()) is None
+    view = wall().train[0]
+    opaque = np.concatenate([view.image(), np.full((HEIGHT, WIDTH, 1), 255, np.uint8)], axis=2)
+    cut_out = View.from_arrays(view.name, view.camera, opaque)
+    assert backdrop_color(replace(wall(), train=(cut_out, *wall().train[1:]))) is None
 
 
 # -- what cannot be trained with ------------------------------------------------------------------------------------

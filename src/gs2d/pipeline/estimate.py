@@ -79,6 +79,7 @@ def start_text(event: Initialised) -> str:
     """What training starts from, in words."""
     sources = {
         "points": "points of the capture",
+        "sweep": "places on which neighbouring photographs agree, and points of the capture",
         "depths": "points of the capture and of its known depths",
         "random": "random points in the box the cameras look at",
     }

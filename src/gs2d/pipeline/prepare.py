@@ -21,13 +21,14 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined import with_found_poses
-from gs2d.protocols import GENERIC, FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
+from gs2d.protocols import BLACK, GENERIC, FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
 from gs2d.recipe import Recipe, validate
 from gs2d.recipe_json import apply_overrides, from_json, to_json
 from gs2d.recipes import get_recipe, with_depth_prior, with_exposure, with_normal_prior, with_poses, with_robustness
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.schedule import scale_schedule
+from gs2d.train.backdrop import backdrop_color
 from gs2d.train.cached_views import is_cacheable
 from gs2d.train.loop import raster_settings
 from gs2d.train.point_gains import point_gains
@@ -222,6 +223,16 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
     return _recipe_of(options, robust=robust, exposure=exposure)
 
 
+def with_backdrop(protocol: Protocol, recipe: Recipe, scene: Scene, on_event: OnEvent) -> Protocol:
+    """Return the protocol with the colour of sky and bare walls behind everything, where training is robust."""
+    color = backdrop_color(scene) if recipe.free_space is not None and protocol.background == BLACK else None
+    if color is None:
+        return protocol
+    shown = ", ".join(f"{value:.2f}" for value in color)
+    on_event(Notice(f"background ({shown}): the colour of what shows no sparse points"))
+    return replace(protocol, background=color)
+
+
 def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     """Check the options, cheapest first, then read the capture.
 
@@ -237,6 +248,7 @@ def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
     recipe = fit_recipe(options, scene, protocol, on_event)
+    protocol = with_backdrop(protocol, recipe, scene, on_event)
     digest = with_priors(digest, scene, recipe, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:

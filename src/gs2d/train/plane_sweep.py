@@ -125,17 +125,12 @@ def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
 
 
 def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud:
-    """Points to start from: swept ones, sparse ones where none is near, and far ones where nothing is known."""
+    """Return points to start from: swept ones, and sparse ones where none of those is near."""
     found = [_swept(sweep, index, settings) for index in range(len(sweep.views))]
     swept = _thin(_joined(found), settings.cell)
     parts = [(swept.places, swept.colors, swept.normals)]
     if scene.points is not None and len(scene.points):
         parts.append(_apart(scene.points, swept, settings.cell))
-    if settings.far_cell > 0:
-        shell = _shell(sweep)
-        shells = [_far(sweep, index, settings, *shell) for index in range(len(sweep.views))]
-        far = _thin(_joined(shells), settings.far_cell)
-        parts.append((far.places, far.colors, far.normals))
     places, colors, normals = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return PointCloud(places, np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8), normals)
 
@@ -172,38 +167,6 @@ def _swept(sweep: Sweep, index: int, settings: DenseStart) -> _Found:
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     colors = view.color.permute(1, 2, 0).numpy()
     return _Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], sweep.scores[index][kept])
-
-
-def _shell(sweep: Sweep) -> tuple[np.ndarray, float]:
-    """Centre [3] and radius, wu, of a sphere around all cameras and all that they are known to show.
-
-    What is put there hides nothing from any camera. At the end of a view's own depths it would stand before others.
-    """
-    centers = np.stack([-view.T[:3, :3].T @ view.T[:3, 3] for view in sweep.views])
-    middle = centers.mean(axis=0)
-    reach = np.linalg.norm(centers - middle, axis=1).max()
-    return middle, float(reach + max(view.far for view in sweep.views))
-
-
-def _far(sweep: Sweep, index: int, settings: DenseStart, middle: np.ndarray, radius: float) -> _Found:
-    """Places on the shell, facing its middle, where nothing nearer is known."""
-    view = sweep.views[index]
-    stride = max(1, round(settings.far_cell))
-    unknown = np.logical_and(view.usable, sweep.depths[index] == 0)
-    for column, row in np.floor(view.pixels).astype(np.int64):
-        unknown[max(0, row - stride) : row + stride + 1, max(0, column - stride) : column + stride + 1] = False
-    grid = np.zeros_like(unknown)
-    grid[stride // 2 :: stride, stride // 2 :: stride] = view.far > 0
-    kept = unknown & grid
-    center = -view.T[:3, :3].T @ view.T[:3, 3]
-    rays = unproject(view, np.ones(kept.shape))[kept] - center
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-    along = rays @ (center - middle)  # |center + t ray - middle| = radius
-    distance = -along + np.sqrt(along**2 + radius**2 - ((center - middle) ** 2).sum())
-    places = center + distance[:, None] * rays
-    colors = F.avg_pool2d(view.color[None], stride, 1, stride // 2, count_include_pad=False)[0].permute(1, 2, 0).numpy()
-    colors = colors[: kept.shape[0], : kept.shape[1]]
-    return _Found(places, colors[kept], (middle - places) / radius, distance / view.K[0, 0], np.zeros(len(places)))
 
 
 def _apart(points: PointCloud, swept: _Found, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,44 @@
+"""The colour behind everything: that of sky and bare walls, where structure from motion found nothing.
+
+No splat can be placed there by what photographs agree on. Over black, training explains such pixels by sheets before
+the cameras, and new views have black holes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from gs2d.data.scene import Scene
+
+APART = 1 / 20  # of the longer side: pixels farther from every sparse point are taken to be bare
+MAX_VIEWS = 60  # that are asked, evenly chosen
+STRIDE = 7  # every so many of those pixels
+
+
+def backdrop_color(scene: Scene) -> tuple[float, float, float] | None:
+    """Return the median colour, in [0, 1], of the pixels of training views that are far from every sparse point.
+
+    None where photographs have an alpha channel, which says what is empty, or the capture does not say which points
+    they show, or no pixel is bare.
+    """
+    if scene.observe is None or scene.train[0].alpha() is not None:
+        return None
+    observed = scene.observe()
+    found = []
+    for view in scene.train[:: max(1, -(-len(scene.train) // MAX_VIEWS))]:
+        bare = np.ones((view.camera.height, view.camera.width), dtype=bool)
+        column, row = np.floor(observed.in_view(view.name, view.camera, min_track=2).pixels).astype(np.int64).T
+        bare[row, column] = False
+        if bare.all():
+            continue  # not one point: nothing is known of this view
+        bare = distance_transform_edt(bare) > APART * max(bare.shape)
+        mask = view.mask()
+        if mask is not None:
+            bare &= mask
+        found.append(view.target((0.0, 0.0, 0.0))[bare][::STRIDE])
+    colors = np.concatenate(found) if found else np.zeros((0, 3))
+    if not len(colors):
+        return None
+    red, green, blue = (round(float(value), 3) for value in np.median(colors, axis=0))
+    return red, green, blue

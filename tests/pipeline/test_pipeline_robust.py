@@ -1,0 +1,122 @@
+"""Which captures are trained robustly, and in which exposure a view is that nobody photographed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.camera import look_at
+from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.scene import Scene, View
+from gs2d.errors import RecipeError
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare import fit_recipe
+from gs2d.protocols import DTU, GENERIC
+
+COUNT = 12
+
+
+def ring(gains: np.ndarray, test: int = 0) -> Scene:
+    """Views on a ring around grey points, each of one grey that is 0.5 times its gain."""
+    views = []
+    for angle, gain in zip(np.linspace(0, 2 * np.pi, len(gains), endpoint=False), gains, strict=True):
+        camera = look_at(
+            3 * np.array([np.cos(angle), np.sin(angle), 0.0]), np.zeros(3), np.array([0.0, 0, 1]), width=16, height=16,
+            fx=16.0,
+        )  # fmt: skip
+        image = np.full((16, 16, 3), round(127.5 * gain), np.uint8)
+        views.append(View.from_arrays(f"{len(views):02d}", camera, image))
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (80, 3))
+    seen = {view.name: np.arange(80) for view in views}
+    observed = ObservedPoints(points, np.full(80, 0.5), np.full(80, len(views)), seen)
+    split = len(views) - test
+    bounds = np.array([[-1.0] * 3, [1.0] * 3])
+    return Scene(
+        "ring", "colmap", tuple(views[:split]), tuple(views[split:]), None, 3.3, bounds, observe=lambda: observed
+    )
+
+
+def options(**changes: object) -> TrainOptions:
+    return TrainOptions(scene=Path("capture"), out=Path("run"), schedule_scale=0.1, **changes)  # type: ignore[arg-type]
+
+
+EQUAL, VARIED = ring(np.ones(COUNT)), ring(1 + 0.2 * np.sin(np.arange(COUNT)))
+BLIND = replace(EQUAL, observe=None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "scene", "protocol", "robust", "exposure"),
+    [
+        ({}, EQUAL, GENERIC, True, False),
+        ({}, VARIED, GENERIC, True, True),
+        ({}, VARIED, DTU, False, False),
+        ({}, BLIND, GENERIC, False, False),
+        ({"robust": "off"}, VARIED, GENERIC, False, False),
+        ({"robust": "on"}, VARIED, DTU, True, True),
+        ({"exposure": False}, VARIED, GENERIC, True, False),
+        ({"exposure": True}, EQUAL, GENERIC, True, True),
+        ({"exposure": True, "robust": "off"}, EQUAL, GENERIC, False, True),
+    ],
+)
+def test_training_is_robust_where_protocol_and_capture_allow_it(
+    asked: dict[str, object], scene: Scene, protocol: object, robust: bool, exposure: bool
+) -> None:
+    recipe = fit_recipe(options(**asked), scene, protocol, lambda _: None)  # type: ignore[arg-type]
+    for part in (recipe.dense_start, recipe.free_space, recipe.opacity_decay):
+        assert (part is not None) == robust
+    assert (recipe.exposure is not None) == exposure
+
+
+def test_what_was_decided_is_said() -> None:
+    said: list[Event] = []
+    fit_recipe(options(), VARIED, GENERIC, said.append)
+    fit_recipe(options(), BLIND, GENERIC, said.append)
+    assert [event.text for event in said if isinstance(event, Notice)] == [
+        "exposures of the photographs: 0.80 to 1.20 times their mean; learned for each",
+        "no dense start and no known free space: the capture does not say which points are seen where",
+    ]
+
+
+def test_a_part_can_be_left_out_or_changed_by_its_name() -> None:
+    recipe = fit_recipe(options(overrides=("dense_start=null", "free_space.nearer=0.8")), EQUAL, GENERIC, print)
+    assert recipe.dense_start is None
+    assert recipe.free_space is not None
+    assert recipe.free_space.nearer == 0.8
+
+
+def test_an_unknown_word_is_refused() -> None:
+    from gs2d.pipeline.prepare import check_train_options
+
+    with pytest.raises(RecipeError, match="--robust must be one of auto, on, off, got maybe"):
+        check_train_options(options(robust="maybe"))
+
+
+# -- the exposure of a view that nobody photographed ----------------------------------------------------------------
+def predicted(gains: np.ndarray) -> float:
+    """The gain that the last view of the ring would have, by those of the others."""
+    scene = ring(gains, test=1)
+    transforms = {view.name: torch.eye(3, 4) * g for view, g in zip(scene.train, gains[:-1], strict=True)}
+    found = with_predicted(transforms, scene)
+    assert set(found) == {view.name for view in scene.views}
+    assert all(torch.equal(found[name], transform) for name, transform in transforms.items())
+    return float(found[scene.test[0].name][0, 0])
+
+
+def test_where_neighbours_have_similar_exposures_a_view_between_them_has_theirs() -> None:
+    gains = 1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False))
+    assert predicted(gains) == pytest.approx(gains[-1], abs=0.05)
+
+
+def test_where_neighbours_say_nothing_a_view_has_the_mean_exposure() -> None:
+    gains = 1 + 0.3 * (-1.0) ** np.arange(24)  # each is the opposite of its neighbours
+    assert predicted(gains) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_run_without_exposures_predicts_none() -> None:
+    assert with_predicted({}, ring(np.ones(4), test=1)) == {}
