@@ -194,7 +194,8 @@ def rasterize_with(
     *,
     exact_masks: bool = True,
 ) -> RenderOutput:
-    """:func:`rasterize` on a given variant of the library; ``exact_masks=False`` turns off culling inside tiles."""
+    """:func:`rasterize` on a given variant of the library; ``exact_masks=False`` turns off culling inside tiles,
+    and all of splats that have no ellipse."""
     _check_tensors(splats, settings, library.dtype)
     if gradient_rows is not None:
         if tuple(gradient_rows.shape) != (len(splats),) or gradient_rows.dtype != torch.bool:
@@ -247,8 +248,10 @@ def splat_errors_with(
     settings: RasterSettings,
     mask: Tensor | None = None,
     occlusion: bool = False,
+    *,
+    exact_masks: bool = True,
 ) -> Tensor:
-    """:func:`splat_errors` on a given variant of the library."""
+    """:func:`splat_errors` on a given variant of the library; ``exact_masks`` as in :func:`rasterize_with`."""
     _check_tensors(splats, settings, library.dtype)
     expected = (camera.height, camera.width, 3)
     if tuple(image.shape) != expected or image.dtype != library.dtype or image.device.type != "cpu":
@@ -265,7 +268,7 @@ def splat_errors_with(
     native = library.function(
         "gs2d_splat_errors", ctypes.c_int, [ctypes.c_void_p] * 4 + [ctypes.c_int, ctypes.c_void_p]
     )
-    view, parameters = _view(camera, settings, True), _parameters(tensors)
+    view, parameters = _view(camera, settings, exact_masks), _parameters(tensors)
     given = (ctypes.byref(view), ctypes.byref(parameters), _address(image), _address(mask))
     _check(native(*given, int(occlusion), _address(errors)))
     return errors

@@ -8,8 +8,10 @@
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
 #define GS2D_HD __host__ __device__ __forceinline__
+#define GS2D_UNROLL _Pragma("unroll")
 #else
 #define GS2D_HD inline __attribute__((always_inline))
+#define GS2D_UNROLL _Pragma("GCC unroll 16")
 #endif
 
 namespace gs2d {

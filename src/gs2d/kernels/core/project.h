@@ -188,6 +188,7 @@ template <class V> struct Footprint {
     V ex, ey, a, b, c;
     V slope, half, inv_y2, y_right;  // the same ellipse by rows: see Chords in tile.h
     V disc2;                     // low-pass disc: radius^2, widened
+    V k;                         // radius of the disc on the splat's plane, widened
     V x_min, y_min, x_max, y_max;  // exact box of both, px, not clipped
     mask_t<V> crosses;           // the disc reaches the camera plane: no ellipse, no box
     mask_t<V> unbounded;         // crosses, or so nearly that the ellipse cannot be trusted
@@ -253,6 +254,7 @@ GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S l
     o.slope = sxy / wyy, o.half = one / sqrt(o.a), o.inv_y2 = one / (wyy * V(S(1.004)));
     o.y_right = sxy * sqrt(V(S(1.004)) / wxx);
     o.disc2 = fma(radius, radius * V(S(1.0002)), V(S(1e-3)));
+    o.k = sqrt(fma(k2, V(S(1.0002)), V(S(1e-4))));
     return o;
 }
 

@@ -52,6 +52,57 @@ template <class V> GS2D_HD void reach_in_rows(const Chords<V>& s, V y0, V y1, V&
     right = max(right, select(near, s.cx + d, -far)), left = min(left, select(near, s.cx - d, far));
 }
 
+// What is seen of a disc that reaches the camera plane has no ellipse, but it is convex, and bounded where it is beyond `near`. It lies
+// inside half planes a dx + b dy + c >= 0, dx and dy from the projected centre; and there is the low-pass disc (docs/math.md, "Footprint").
+template <class V> struct HalfPlane {
+    V a, b, c;
+};
+constexpr int DIRECTIONS = 8, SIDES = DIRECTIONS + 1;
+constexpr double OUTLINE_SLACK = 1e-5;  // of the sum of the absolute terms: the kernels' X, Y and I are off by some 1e-6 of it
+template <class V> struct Outline {
+    HalfPlane<V> sides[SIDES];
+    V disc2;
+    mask_t<V> unknown;  // not finite: covers everything
+};
+
+// Of the planes X, Y, I of a record where (X^2 + Y^2) / I^2 <= k^2 and 0 < I <= 1 / near, in an image of that size.
+template <class V>
+GS2D_HD Outline<V> outline_of(V au, V bu, V av, V bv, V ai, V bi, V iz, V cx, V cy, V k, V disc2, V near, V width, V height) {
+    // (cos, sin) of multiples of 45 degrees: X cos + Y sin <= |(X, Y)| <= k I
+    const V h = V(0.70710678f), zero = V(0), one = V(1), eps = V(float(OUTLINE_SLACK));
+    const V cosines[DIRECTIONS] = {one, h, zero, -h, -one, -h, zero, h}, sines[DIRECTIONS] = {zero, h, one, h, zero, -h, -one, -h};
+    const V reach_x = max(abs(cx), abs(width - cx)) + V(TILE_PX), reach_y = max(abs(cy), abs(height - cy)) + V(TILE_PX);
+    const V size_i = fma(abs(ai), reach_x, fma(abs(bi), reach_y, abs(iz)));
+    const V size = fma(abs(au) + abs(av), reach_x, fma(abs(bu) + abs(bv), reach_y, k * size_i)), inv_near = one / near;
+    Outline<V> o;
+    GS2D_UNROLL
+    for (int i = 0; i < DIRECTIONS; ++i) {
+        const V c = cosines[i], s = sines[i];
+        o.sides[i] = {fma(k, ai, -fma(c, au, s * av)), fma(k, bi, -fma(c, bu, s * bv)), fma(eps, size, k * iz)};
+    }
+    o.sides[DIRECTIONS] = {-ai, -bi, fma(eps, size_i + inv_near, inv_near - iz)};
+    o.disc2 = disc2;
+    o.unknown = invert(size + inv_near < V(1e30f));
+    return o;
+}
+
+// What an outline holds of the rows y0 to y1, from left to right, all from the projected centre; nothing where left > right.
+template <class V> GS2D_HD void reach_in_rows(const Outline<V>& s, V y0, V y1, V& left, V& right) {
+    const V far = V(1e30f), zero = V(0);
+    left = -far, right = far;
+    GS2D_UNROLL
+    for (int i = 0; i < SIDES; ++i) {  // each side where its best row is; NaN and a = 0 take nothing away
+        const HalfPlane<V> h = s.sides[i];
+        const V x = -(max(h.b * y0, h.b * y1) + h.c) / h.a;
+        left = select(h.a > zero, max(x, left), left), right = select(h.a < zero, min(x, right), right);
+    }
+    const auto none = left > right;
+    const V dy = min(max(zero, y0), y1), d2 = fnma(dy, dy, s.disc2), d = sqrt(max(d2, zero));
+    const auto near = d2 >= zero;
+    left = min(select(none, far, left), select(near, -d, far)), right = max(select(none, -far, right), select(near, d, -far));
+    left = select(s.unknown, -far, left), right = select(s.unknown, far, right);
+}
+
 // The exact box of a footprint, px, not clipped.
 template <class S> struct PixelBox {
     S x_min, y_min, x_max, y_max;
@@ -73,6 +124,21 @@ GS2D_HD TileRectangle tile_rectangle(const PixelBox<S>& o, bool unbounded, int w
     const int tx1 = tile_floor(x1 - half, tiles_x), ty1 = tile_floor(y1 - half, tiles_y);
     return {(unsigned short)tx0, (unsigned short)ty0, (unsigned short)(tx1 < tiles_x ? tx1 + 1 : tiles_x),
             (unsigned short)(ty1 < tiles_y ? ty1 + 1 : tiles_y)};
+}
+
+// Tiles x0 to x1 of a row whose pixel centres may be between left and right, px.
+template <class S> GS2D_HD bool tiles_between(S left, S right, int width, int tiles_x, int& x0, int& x1) {
+    const S margin = S(0.05), half = S(0.5), from = left - margin, to = right + margin;
+    if (!(from <= S(width) - half && to >= half && from <= to)) return false;
+    x0 = tile_floor(from - half, tiles_x), x1 = tile_floor(to - half, tiles_x);
+    x1 = x1 < tiles_x ? x1 + 1 : tiles_x;
+    return true;
+}
+
+// The rectangle that holds all of the rows so far and tiles x0 to x1 of row y; start with {0, 0, 0, 0}.
+GS2D_HD TileRectangle with_row(const TileRectangle& r, int x0, int x1, int y) {
+    if (r.x1 <= r.x0) return {(unsigned short)x0, (unsigned short)y, (unsigned short)x1, (unsigned short)(y + 1)};
+    return {(unsigned short)(x0 < r.x0 ? x0 : r.x0), r.y0, (unsigned short)(x1 > r.x1 ? x1 : r.x1), (unsigned short)(y + 1)};
 }
 
 // Rule 19, "box": the tiles that a square (centre and half side, px) touches; none where it is not finite.

@@ -71,7 +71,7 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
                 if (t % LANES == 0) {
                     alignas(64) real x[LANES], y[LANES];
                     for (int k = 0; k < LANES; ++k) x[k] = tile_x(t + k), y[k] = tile_y(t + k);
-                    blocks_touched(footprint, load(x), load(y), touched);
+                    blocks_touched(f, footprint, load(x), load(y), touched);
                 }
                 const real x0 = tile_x(t), y0 = tile_y(t);
                 const real* target = &f.target[(size_t(y0) / TILE * f.tiles_x + size_t(x0) / TILE) * PLANES * PIXELS];
@@ -103,7 +103,7 @@ bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, rea
             if ((e - begin) % LANES == 0) {
                 uint32_t splats[LANES];
                 for (int k = 0; k < LANES; ++k) splats[k] = f.entries[e + k < end ? e + k : end - 1].splat();
-                blocks_touched(Footprints(f, splats), V(real(a.x0)), V(real(a.y0)), touched);
+                blocks_touched(f, Footprints(f, splats), V(real(a.x0)), V(real(a.y0)), touched);
             }
             const uint32_t splat = f.entries[e].splat();
             const Record<V> s = broadcast(&f.records[size_t(splat) * RECORD]);

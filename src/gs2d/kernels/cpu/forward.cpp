@@ -137,10 +137,10 @@ int gather(const Frame& f, TileWork& w, const Entry* entries, int n, const TileA
             }
         }
         const Footprints footprints(f, splats);
-        blocks_touched(footprints, x0, y0, touched);
+        blocks_touched(f, footprints, x0, y0, touched);
         const uint32_t plain = bits(plain_over_tile(f, footprints, x0, y0));
         for (int j = 0; j < LANES && i + j < n; ++j) {
-            const uint32_t blocks = (f.view.exact_masks ? touched[j] : ALL_BLOCKS) & wanted;
+            const uint32_t blocks = touched[j] & wanted;
             w.splats[m] = splats[j];
             w.plain[m] = plain >> j & 1;
             w.touched[m] = blocks;

@@ -50,7 +50,7 @@ struct View {
     double fx, fy, cx, cy;
     double near, far, alpha_min, alpha_max, transmittance_min, error_cutoff, lowpass_px;
     double background[3];
-    int32_t width, height, sh_degree, exact_masks;  // exact_masks = 0: no culling inside tiles (tests)
+    int32_t width, height, sh_degree, exact_masks;  // exact_masks = 0: no culling inside tiles, none of what has no ellipse (tests)
     int32_t crossing;                               // rule 19: CROSSING_*
 };
 
@@ -82,7 +82,7 @@ inline bool wants_geometry(const ParameterGradients& g) {
 // Box tests per (tile, splat), in pixels: see Footprint.
 struct CullRecord {
     real ex, ey, slope, half;
-    real inv_y2, y_right, disc2, plain_from;  // disc2 < 0: unbounded, covers everything; plain_from: see is_plain
+    real inv_y2, y_right, disc2, plain_from;  // disc2 < 0: no ellipse but an outline, and ex is its k; plain_from: see is_plain
 };
 
 using TileRect = TileRectangle;

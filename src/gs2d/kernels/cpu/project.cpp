@@ -50,6 +50,25 @@ void box_group(Frame& f, const Group& g, int64_t i, uint32_t boxed, V k2, real* 
     }
 }
 
+// The tiles that the outline of a splat reaches, LANES rows of tiles at a time.
+TileRect outlined_rectangle(const Frame& f, int64_t splat) {
+    const real* const r = &f.records[splat * RECORD];
+    const View& v = f.view;
+    const Outline<V> outline = outline_of(V(r[2]), V(r[3]), V(r[4]), V(r[5]), V(r[6]), V(r[7]), V(r[8]), V(r[0]), V(r[1]), V(f.cull[splat].ex),
+                                          V(-f.cull[splat].disc2), V(real(v.near)), V(real(v.width)), V(real(v.height)));
+    TileRect rect = {0, 0, 0, 0};
+    for (int y = 0; y < f.tiles_y; y += LANES) {
+        alignas(64) real left[LANES], right[LANES];
+        const V top = fma(iota(), V(real(TILE)), V(real(y * TILE) + real(0.5))) - V(r[1]);
+        V from, to;
+        reach_in_rows(outline, top, top + V(real(TILE - 1)), from, to);
+        store(left, from + V(r[0])), store(right, to + V(r[0]));
+        for (int i = 0, x0, x1; i < LANES && y + i < f.tiles_y; ++i)
+            if (tiles_between(left[i], right[i], v.width, f.tiles_x, x0, x1)) rect = with_row(rect, x0, x1, y + i);
+    }
+    return rect;
+}
+
 }  // namespace
 
 bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
@@ -81,7 +100,8 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const V fields[RECORD] = {r.cx, r.cy, r.au, r.bu, r.av, r.bv, r.ai, r.bi,
                                       r.iz, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
             store_rows<RECORD>(&f.records[i * RECORD], RECORD, lanes, fields);
-            const V cull[8] = {o.ex, o.ey, o.slope, o.half, o.inv_y2, o.y_right, select(o.unbounded, V(-1), o.disc2), plain_from(r, V(real(f.view.lowpass_px)))};
+            const V cull[8] = {select(o.unbounded, o.k, o.ex), o.ey, o.slope, o.half, o.inv_y2, o.y_right,
+                               select(o.unbounded, -o.disc2, o.disc2), plain_from(r, V(real(f.view.lowpass_px)))};
             store_rows<8>(reinterpret_cast<real*>(&f.cull[i]), 8, lanes, cull);
             alignas(64) real box[4][LANES], depth[LANES];
             store(depth, g.frame.p.z);
@@ -93,7 +113,9 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             for (int l = 0; l < lanes; ++l) {
                 if (!((alive & ~boxed) >> l & 1)) continue;
                 const PixelBox<real> o_l = {box[0][l], box[1][l], box[2][l], box[3][l]};
-                f.rects[i + l] = tile_rectangle(o_l, unbounded >> l & 1, f.view.width, f.view.height, f.tiles_x, f.tiles_y);
+                const bool outlined = f.view.exact_masks && unbounded >> l & 1;
+                f.rects[i + l] = outlined ? outlined_rectangle(f, i + l)
+                                          : tile_rectangle(o_l, unbounded >> l & 1, f.view.width, f.view.height, f.tiles_x, f.tiles_y);
                 if (radii) radii[i + l] = clipped_radius(o_l, crosses >> l & 1, f.view.width, f.view.height);
             }
         }

@@ -1,4 +1,5 @@
 // The vector wrapper's own arithmetic, for the tests.
+#include "core/tile.h"
 #include "cpu/export.h"
 #include "cpu/simd.h"
 
@@ -86,4 +87,13 @@ GS2D_EXPORT uint32_t gs2d_selftest_nonzero(const uint32_t* in) {
     LaneBits of[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) of[b] = LaneBits(in[b]);
     return nonzero(of);
+}
+
+// in: [11, LANES], what outline_of takes of LANES splats; image: near, width, height. Out: what each holds of the rows y0 to y1.
+GS2D_EXPORT void gs2d_selftest_outline(const real* in, const real* image, real y0, real y1, real* left, real* right) {
+    V v[11], from, to;
+    for (int k = 0; k < 11; ++k) v[k] = load(in + k * LANES);
+    const Outline<V> outline = outline_of(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], V(image[0]), V(image[1]), V(image[2]));
+    reach_in_rows(outline, V(y0) - v[8], V(y1) - v[8], from, to);
+    store(left, from), store(right, to);
 }

@@ -137,7 +137,7 @@ class RowsAhead {
 // What decides where splats reach a tile, one splat a lane; and whether each is unbounded.
 struct Footprints {
     V ex, ey, slope, half, inv_y2, y_right, disc2, plain_from;  // of the cull record
-    V cx, cy, ai, bi, iz;                                       // of the record
+    V cx, cy, au, bu, av, bv, ai, bi, iz;                       // of the record
 
     // Of splats[0 .. LANES).
     Footprints(const Frame& f, const uint32_t* splats) {
@@ -150,13 +150,34 @@ struct Footprints {
             transpose(r + k);
         }
         ex = c[0], ey = c[1], slope = c[2], half = c[3], inv_y2 = c[4], y_right = c[5], disc2 = c[6], plain_from = c[7];
-        cx = r[0], cy = r[1], ai = r[6], bi = r[7], iz = r[8];
+        cx = r[0], cy = r[1], au = r[2], bu = r[3], av = r[4], bv = r[5], ai = r[6], bi = r[7], iz = r[8];
     }
 };
 
+// As blocks_touched, for the splats without an ellipse: only their masks are written.
+__attribute__((noinline)) inline void outlined_blocks(const Frame& f, const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
+    const View& v = f.view;
+    const Outline<V> outline = outline_of(s.au, s.bu, s.av, s.bv, s.ai, s.bi, s.iz, s.cx, s.cy, s.ex, -s.disc2, V(real(v.near)),
+                                          V(real(v.width)), V(real(v.height)));
+    LaneInts touched = {};
+    for (int y = BLOCKS / BLOCKS_X - 1; y >= 0; --y) {
+        const V first = tile_y + V(real(y * BLOCK_H) + real(0.5)) - s.cy;
+        V left, right;
+        reach_in_rows(outline, first, first + V(real(BLOCK_H - 1)), left, right);
+        touched = shifted<BLOCKS_X>(touched);
+        for (int x = 0; x < BLOCKS_X; ++x) {
+            const V x0 = tile_x + V(real(x * BLOCK_W) + real(0.5)) - s.cx, x1 = x0 + V(real(BLOCK_W - 1));
+            touched = with_bits(touched, (right >= x0) & (left <= x1), 1u << x);
+        }
+    }
+    alignas(64) uint32_t found[LANES];
+    store(found, touched);
+    for (uint32_t left = bits(s.disc2 < V(0)); left; left &= left - 1) masks[__builtin_ctz(left)] = found[__builtin_ctz(left)];
+}
+
 // Bit b of masks[i]: the ellipse or the low-pass disc of splat i reaches a pixel centre of block b, or nearly so. A footprint
 // reaches each row of blocks in one interval. tile_x, tile_y: the tile's first pixel.
-inline void blocks_touched(const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
+inline void blocks_touched(const Frame& f, const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
     const Chords<V> chords = {s.ex - tile_x, s.ey - tile_y, s.slope,       s.half, s.inv_y2, s.y_right,
                               s.cx - tile_x, s.cy - tile_y, s.disc2};
     LaneInts touched = {};
@@ -171,7 +192,10 @@ inline void blocks_touched(const Footprints& s, V tile_x, V tile_y, uint32_t* ma
             touched = with_bits(touched, (right >= x0) & (left <= x1), 1u << x);
         }
     }
-    store(masks, with_bits(touched, s.disc2 < V(0), ALL_BLOCKS));
+    store(masks, touched);
+    if (any(s.disc2 < V(0))) outlined_blocks(f, s, tile_x, tile_y, masks);
+    if (!f.view.exact_masks)
+        for (int i = 0; i < LANES; ++i) masks[i] = ALL_BLOCKS;
 }
 
 }  // namespace gs2d

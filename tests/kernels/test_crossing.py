@@ -1,0 +1,161 @@
+"""Splats without an ellipse, because their disc reaches the camera plane: culled by tiles and blocks, the same bits.
+
+``exact_masks=False`` is the old way: such a splat enters every tile and is met at every pixel.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
+from torch import Tensor
+
+from gs2d.camera import Camera
+from gs2d.kernels.library import Library
+from gs2d.render import cpu
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.7))
+KINDS = ("crossing", "crossing", "near_plane", "huge", "edge_on", "plain")
+
+
+def crossing_scene(seed: int, count: int = 60) -> tuple[Splats, Camera]:
+    """Many tiles, most splats across the camera plane; some are slivers, some a thousand times as large."""
+    rng = np.random.default_rng(seed)
+    camera = random_camera(rng).resized(int(rng.integers(40, 130)), int(rng.integers(40, 100)))
+    splats = random_splats(rng, camera, count, KINDS)
+    stretch = rng.choice([0.0, 0.0, 0.0, -9.0, 3.0, 7.0], size=(count, 2))
+    aside = rng.normal(size=(count, 3)) * rng.choice([0.0, 0.5, 3.0], size=(count, 1))
+    splats = replace(
+        splats, log_scales=splats.log_scales + torch.tensor(stretch), means=splats.means + torch.tensor(aside)
+    )
+    return splats, camera
+
+
+def everything(
+    library: Library, splats: Splats, camera: Camera, settings: RasterSettings, *, exact: bool
+) -> dict[str, Tensor]:
+    """Images, radii, gradients and splat errors of one view, by name."""
+    leaves = requiring_grad(splats.to(dtype=library.dtype))
+    probe = torch.zeros(len(splats), 4, dtype=library.dtype, requires_grad=True)
+    output = cpu.rasterize_with(library, leaves, camera, settings, probe, exact_masks=exact)
+    generator = torch.Generator().manual_seed(1)
+    images = [getattr(output, name) for name in IMAGES]
+    torch.autograd.backward(images, [torch.randn(i.shape, generator=generator, dtype=i.dtype) for i in images])
+    found = {name: getattr(output, name).detach() for name in (*IMAGES, "radii")}
+    found |= {f"d_{name}": tensor.grad for name, tensor in (*leaves.items(), ("probe", probe))}  # type: ignore[misc]
+    photo = torch.rand(camera.height, camera.width, 3, generator=generator, dtype=library.dtype)
+    for occlusion in (False, True):
+        found[f"errors_{occlusion}"] = cpu.splat_errors_with(
+            library, leaves.detach(), camera, photo, settings, None, occlusion, exact_masks=exact
+        )
+    return found
+
+
+@pytest.mark.parametrize("change", [{}, {"near": 0.02, "error_cutoff": 5.0}, {"crossing": "box"}], ids=str)
+def test_culling_splats_without_an_ellipse_changes_no_bit(any_native: Library, change: dict[str, float]) -> None:
+    settings = replace(SETTINGS, **change)  # type: ignore[arg-type]
+    seen = 0
+    for seed in range(8):
+        splats, camera = crossing_scene(seed)
+        culled, full = (everything(any_native, splats, camera, settings, exact=exact) for exact in (True, False))
+        for name, tensor in full.items():
+            assert torch.equal(culled[name], tensor), (seed, name)
+        seen += int((full["d_sh0"][full["radii"] == max(camera.width, camera.height) / 2] != 0).any(2).sum())
+    assert seen > 15  # of those that cross
+
+
+# --------------------------------------------------------------------------------------------- outlines against pixels
+
+
+def outlines(rng: np.random.Generator, lanes: int, kind: str) -> np.ndarray:
+    """What outline_of takes of random splats [11, lanes]: au, bu, av, bv, ai, bi, iz, cx, cy, k, disc2."""
+    coefficients = rng.normal(size=(6, lanes)) * 10 ** rng.uniform(-3, 0, size=(6, lanes))
+    iz, k = 10 ** rng.uniform(-1.5, 0.5, lanes), rng.uniform(0.01, 4, lanes)
+    center = rng.uniform(-30, 90, size=(2, lanes))
+    if kind == "far":  # a centre far outside of the image: large terms that cancel in a pixel that is seen
+        center *= 10 ** rng.uniform(1, 4, size=(2, lanes))
+        dx, dy = rng.uniform(0, [[64], [48]], size=(2, lanes)) - center
+        inverse, part = rng.uniform(0.1, 6, lanes), 0.6 * k * rng.normal(size=(2, lanes))
+        wanted = (*(part * inverse), inverse - iz)  # X, Y and I - iz there
+        for row, value in zip((0, 2, 4), wanted, strict=True):
+            coefficients[row + 1] = (value - coefficients[row] * dx) / dy
+    if kind == "extreme":
+        coefficients *= 10.0 ** rng.integers(-30, 31, size=(6, lanes))
+    if kind == "not finite":
+        coefficients[rng.integers(0, 6, lanes), np.arange(lanes)] = rng.choice([np.nan, np.inf, -np.inf], lanes)
+    if kind == "along the axes":
+        coefficients[rng.integers(0, 6, lanes), np.arange(lanes)] = 0
+        coefficients[rng.integers(0, 6, lanes), np.arange(lanes)] = 0
+    return np.stack([*coefficients, iz, *center, k, 0.5 * k**2])
+
+
+def hits(outline: np.ndarray, x: np.ndarray, y: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [H, W] that the kernels blend, and 1 / z there."""
+    au, bu, av, bv, ai, bi, iz, cx, cy, k, disc2 = outline
+    dx, dy = x - cx, y - cy
+    with np.errstate(all="ignore"):
+        X, Y, I = au * dx + bu * dy, av * dx + bv * dy, iz + (ai * dx + bi * dy)
+        z = 1 / I
+        ray = (I > 0) & (z >= near) & ((X * z) ** 2 + (Y * z) ** 2 <= k * k)
+    return ray | (dx * dx + dy * dy <= disc2), I
+
+
+@pytest.mark.parametrize("kind", ["usual", "far", "extreme", "not finite", "along the axes"])
+def test_an_outline_holds_every_pixel_that_is_hit(any_native: Library, kind: str) -> None:
+    real = np.dtype(np.float64 if any_native.dtype == torch.float64 else np.float32)
+    rng = np.random.default_rng(3)
+    width, height, near = 64, 48, real.type(0.2)
+    x, y = np.meshgrid(np.arange(width, dtype=real) + real.type(0.5), np.arange(height, dtype=real) + real.type(0.5))
+    found = signs = 0
+    for _ in range(40):
+        given = outlines(rng, any_native.lanes, kind).astype(real)
+        hit, inverse = zip(*(hits(column, x, y, near) for column in given.T), strict=True)
+        for first, rows in ((0, 16), (16, 16), (32, 4), (36, 4), (40, 2), (47, 1)):
+            left, right = reach(any_native, given, (near, width, height), first + 0.5, first + rows - 0.5)
+            for lane, (cx, lowest, highest) in enumerate(zip(given[7], left, right, strict=True)):
+                columns = np.flatnonzero(hit[lane][first : first + rows].any(axis=0)).astype(real) + real.type(0.5) - cx
+                found += len(columns)
+                part = inverse[lane][first : first + rows]
+                signs += bool((part > 0).any() and (part < 0).any())
+                assert (lowest <= columns).all(), (lane, first)
+                assert (columns <= highest).all(), (lane, first)
+    assert found > 300
+    assert signs > 100 or kind in ("far", "not finite")  # rows where 1 / z changes its sign
+
+
+def reach(
+    library: Library, given: np.ndarray, image: tuple[float, int, int], y0: float, y1: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right end of what each outline holds of the rows y0 to y1, from its centre."""
+    real = ctypes.c_double if library.dtype == torch.float64 else ctypes.c_float
+    pointer = ctypes.c_void_p
+    function = library.function("gs2d_selftest_outline", None, [pointer, pointer, real, real, pointer, pointer])
+    given, numbers = np.ascontiguousarray(given), np.array(image, dtype=given.dtype)
+    left, right = np.empty(library.lanes, given.dtype), np.empty(library.lanes, given.dtype)
+    function(given.ctypes.data, numbers.ctypes.data, y0, y1, left.ctypes.data, right.ctypes.data)
+    return left, right
+
+
+def test_outlines_are_tight(any_native: Library) -> None:
+    """In rows of four pixels they hold hardly more columns than are hit, beside one or two at the ends."""
+    real = np.dtype(np.float64 if any_native.dtype == torch.float64 else np.float32)
+    rng = np.random.default_rng(4)
+    width, height, near = 64, 48, 0.2
+    x, y = np.meshgrid(np.arange(width, dtype=real) + real.type(0.5), np.arange(height, dtype=real) + real.type(0.5))
+    wanted = held = 0
+    for _ in range(30):
+        given = outlines(rng, any_native.lanes, "usual").astype(real)
+        hit = [hits(column, x, y, real.type(near))[0] for column in given.T]
+        for first in range(0, height, 4):
+            left, right = reach(any_native, given, (near, width, height), first + 0.5, first + 3.5)
+            for lane, cx in enumerate(given[7]):
+                wanted += int(hit[lane][first : first + 4].any(axis=0).sum())
+                held += int(((x[0] - cx >= left[lane]) & (x[0] - cx <= right[lane])).sum())
+    assert wanted > 10_000
+    assert held < 1.15 * wanted
