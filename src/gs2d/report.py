@@ -18,6 +18,7 @@ import numpy as np
 from gs2d.camera import Camera
 from gs2d.disk import atomic_write
 from gs2d.io.run import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, open_run
+from gs2d.report_capture import capture_section
 from gs2d.report_curves import curves, read_history
 from gs2d.report_exposure import exposure_section
 from gs2d.report_guard import Guard, OnFailure
@@ -143,10 +144,10 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
 
 
 def _of_views(record: RunRecord, part: Guard) -> list[str]:
-    """The sections about exposures, poses and priors, where the recipe has them."""
+    """The sections about cameras, exposures, poses and priors, where the capture or the recipe has them."""
     recipe, last = record.definition.get("recipe"), record.stages[-1] if record.stages else {}
     learned: Mapping[str, Any] = recipe if isinstance(recipe, Mapping) else {}
-    parts = []
+    parts = [part("photographs", lambda: capture_section(record.path, record.definition))]
     if learned.get("exposure"):
         section = part("exposures", lambda: exposure_section(record.path / EXPOSURE, last))
         parts += ["<h2>Exposure of the photographs</h2>", section]

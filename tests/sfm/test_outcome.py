@@ -19,7 +19,7 @@ from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run import RunFolder
 from gs2d.pipeline.poses import PosesOptions, find_poses
 from gs2d.sfm.outcome import Piece, camera_line, check_any, why_not_placed
-from gs2d.sfm.solve import Facts, Group, Request, check_installed, solve
+from gs2d.sfm.solve import Facts, Group, Request, Solved, check_installed, solve
 from gs2d.sfm.workplace import check_out, put_in_place, workplace
 
 
@@ -51,6 +51,7 @@ PIECES = [piece("a", "b", "c"), piece("x", "y", "z")]
 def test_the_reason_for_a_photograph_without_a_place(name: str, expected: str) -> None:
     facts = Facts({**FEATURES, "lonely": 500, "y": 900}, FACTS.matches)
     assert why_not_placed(name, PIECES, facts) == expected
+    assert why_not_placed(name, PIECES, facts, {name: "it was taken out"}) == "it was taken out"
 
 
 @pytest.mark.parametrize(
@@ -80,12 +81,12 @@ def request(work: Path) -> Request:
     return Request("images", database, output, (group,), ("a.jpg",), "exhaustive", 1, 1, 64, 1, 0)
 
 
-def follow(work: Path, code: str) -> tuple[list[object], list[dict[str, object]]]:
+def follow(work: Path, code: str) -> tuple[list[object], Solved]:
     """Run a worker of these lines of Python, in which ``say(...)`` sends a message."""
     program = "import json, os, sys\ndef say(**m): print(json.dumps(m), flush=True)\n" + code
     seen: list[object] = []
-    models = solve(request(work), lambda *step: seen.append(step), command=(sys.executable, "-c", program))
-    return seen, models
+    solved = solve(request(work), lambda *step: seen.append(step), command=(sys.executable, "-c", program))
+    return seen, solved
 
 
 def test_what_the_worker_tells_becomes_phases_and_steps(tmp_path: Path) -> None:
@@ -93,9 +94,26 @@ def test_what_the_worker_tells_becomes_phases_and_steps(tmp_path: Path) -> None:
         "assert json.load(open(sys.argv[1]))['groups'][0]['camera_model'] == 'OPENCV'\n"
         "say(phase='cameras', total=5); say(done=2); say(done=5); say(models=[{'upright': True}])"
     )
-    seen, models = follow(tmp_path, code)
+    seen, solved = follow(tmp_path, code)
     assert seen == [("placing cameras", 0, 5), ("placing cameras", 2, 5), ("placing cameras", 5, 5)]
-    assert models == [{"upright": True}]
+    assert solved == Solved([{"upright": True}], {}, {})
+
+
+def test_the_second_round_counts_its_own_pairs(tmp_path: Path) -> None:
+    """Three pairs are in the database when it begins; two more come."""
+    code = (
+        "import sqlite3, time\n"
+        "base = sqlite3.connect(json.load(open(sys.argv[1]))['database'], isolation_level=None)\n"
+        "base.execute('CREATE TABLE two_view_geometries (rows INTEGER)')\n"
+        "add = lambda: base.execute('INSERT INTO two_view_geometries VALUES (20)')\n"
+        "add(); add(); add()\n"
+        "say(phase='again', total=2); time.sleep(0.3); add(); add(); time.sleep(1.5)\n"
+        "say(models=[], lens={'chosen': 'RADIAL'}, refused={'a': 'no'})"
+    )
+    seen, solved = follow(tmp_path, code)
+    assert seen[0] == ("matching pairs once more", 0, 2)
+    assert ("matching pairs once more", 2, 2) in seen
+    assert solved == Solved([], {"chosen": "RADIAL"}, {"a": "no"})
 
 
 @pytest.mark.parametrize(

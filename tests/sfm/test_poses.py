@@ -26,6 +26,7 @@ from gs2d.errors import RunError
 from gs2d.images import read_image
 from gs2d.pipeline.events import Event, Phase
 from gs2d.pipeline.poses import PosesOptions, find_poses
+from gs2d.sfm.lens import MODELS
 from gs2d.sfm.workplace import workplace
 from room_photos import FOCAL, SIZE, UP, Room, room_picture, textures, write_room
 
@@ -80,7 +81,7 @@ def test_the_capture_has_what_training_reads_and_nothing_else(room: Room) -> Non
     assert (scene.format, len(scene.train), len(scene.test)) == ("colmap", 10, 2)
     assert scene.points is not None
     assert len(scene.points) == room.printed["points"] > 500
-    assert any("undistorted on load" in note for note in scene.notes)  # 12 photographs share it: OPENCV
+    assert not any("undistorted on load" in note for note in scene.notes)  # drawn by a pinhole: no lens was needed
     picture = read_image(room.capture / "poses.png")
     assert picture.shape[0] > 300
     assert (np.ptp(picture.astype(int), axis=2) > 60).sum() > 500  # red cameras
@@ -90,7 +91,9 @@ def test_what_is_known_of_each_photograph_is_printed_and_written(room: Room) -> 
     written = json.loads((room.capture / "poses.json").read_text())
     assert {**written, "capture": str(room.capture)} == room.printed
     assert (written["count"], written["placed"], written["up"]) == (12, 12, "+z")
-    assert written["cameras"][0]["model"] == "OPENCV"
+    assert written["cameras"][0]["model"] == written["lens"]["chosen"] == "SIMPLE_PINHOLE"
+    assert [trial["model"] for trial in written["lens"]["trials"]] == list(MODELS)
+    assert written["lens"]["about"].startswith("lens: SIMPLE_PINHOLE 0.")
     assert written["mean_error_px"] < 0.5
     assert 20 < written["median_angle_degrees"] < 60  # the arc is 60 degrees wide
     rows = {row["name"]: row for row in written["photographs"]}

@@ -96,7 +96,7 @@ class Finding:
     cameras: Literal["auto", "one", "each"] = "auto"
     """Which photographs share a camera: same folder, size, camera, lens and focal length; all; none."""
     camera_model: LensModel = "auto"
-    """Lens (auto: OPENCV where 8 or more photographs share a camera, else SIMPLE_RADIAL)."""
+    """Lens (auto: with one focal length; the simplest that observations held out do not speak against)."""
     matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
     """Pairs to match: all; next ones by name (frames of a video); next and most similar ones. auto: all up to 150."""
     overlap: int = 10

@@ -22,17 +22,17 @@ from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.options import paths_of
 from gs2d.sfm.frames import MOST_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
+from gs2d.sfm.lens import START, lens_line
 from gs2d.sfm.outcome import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
 from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, read_photos
 from gs2d.sfm.picture import write_picture
-from gs2d.sfm.solve import Facts, Group, Request, check_installed, read_facts, solve
+from gs2d.sfm.solve import Facts, Group, Request, Solved, check_installed, read_facts, solve
 from gs2d.sfm.stage import stage_photos
 from gs2d.sfm.workplace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workplace
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar")
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
-SHARED_ENOUGH = 8  # photographs of one camera that tell more than its focal length and one distortion
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
     "cameras", "camera_model", "matching", "overlap", "neighbours", "max_size", "feature_size", "frames", "seed"
 )  # fmt: skip
@@ -53,7 +53,7 @@ class PosesOptions:
     cameras : "auto", "one" or "each"
         Which photographs share a camera: those of the same folder, size, camera, lens and focal length; all; none.
     camera_model : str
-        A name of ``CAMERA_MODELS``, or "auto": OPENCV where ``SHARED_ENOUGH`` photographs share it, else SIMPLE_RADIAL.
+        A name of ``CAMERA_MODELS``, or "auto": of those with one focal length, the one that ``sfm.lens`` chooses.
     matching : str
         A name of ``MATCHINGS``; "auto" is "exhaustive" up to ``ALL_PAIRS`` photographs, then "similar".
     overlap, neighbours : int
@@ -121,11 +121,11 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             capture = work / "capture"
             staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
             request = _request(options, work, photos, sizes, groups, threads)
-            done = solve(request, _progress(on_event))
-            pieces = [read_piece(capture / SPARSE / str(i), facts) for i, facts in enumerate(done)]
+            solved = solve(request, _progress(on_event))
+            pieces = [read_piece(capture / SPARSE / str(i), done) for i, done in enumerate(solved.models)]
             facts = read_facts(Path(request.database))
             check_any(pieces, facts, options.photos)
-            result = _result(options, request, photos, staged, pieces, facts)
+            result = _result(options, request, photos, staged, pieces, facts, solved)
             result["seconds"] = round(time.monotonic() - started, 1)
             on_event(Phase("checking the capture", 0))
             with attempted(POSES_PNG, "", on_event):
@@ -137,8 +137,8 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     except BaseException:
         remove_made(made)
         raise
-    for doubt in _doubts(result):
-        on_event(Notice(doubt))
+    for line in filter(None, (result["lens"]["about"], *_doubts(result))):
+        on_event(Notice(line))
     return {"capture": str(options.out), **result}
 
 
@@ -235,7 +235,7 @@ def _request(
         groups=tuple(
             Group(
                 tuple(photos[i].name for i in group),
-                _camera_model(options, len(group)),
+                START if options.camera_model == "auto" else options.camera_model,
                 sizes[group[0]],
                 str(photos[group[0]].source.resolve()),
             )
@@ -248,13 +248,8 @@ def _request(
         feature_size=options.feature_size,
         threads=threads,
         seed=options.seed,
+        asked_lens=None if options.camera_model == "auto" else options.camera_model,
     )
-
-
-def _camera_model(options: PosesOptions, photographs: int) -> str:
-    if options.camera_model != "auto":
-        return options.camera_model
-    return "OPENCV" if photographs >= SHARED_ENOUGH else "SIMPLE_RADIAL"
 
 
 def _progress(on_event: OnEvent) -> Any:
@@ -276,6 +271,7 @@ def _result(
     staged: Sequence[str],
     pieces: Sequence[Piece],
     facts: Facts,
+    solved: Solved,
 ) -> dict[str, Any]:
     """All that is known about the capture, for ``poses.json``."""
     best = pieces[0]
@@ -284,7 +280,7 @@ def _result(
     for photo, how in zip(photos, staged, strict=True):
         row = {"name": photo.name, "source": photo.label, "file": how, "features": facts.features.get(photo.name, 0)}
         placed = photo.name in best.names
-        reason = {} if placed else {"reason": why_not_placed(photo.name, pieces, facts)}
+        reason = {} if placed else {"reason": why_not_placed(photo.name, pieces, facts, solved.refused)}
         rows.append({**row, "placed": placed, **reason})
     return {
         "photos": str(options.photos.resolve()),
@@ -306,6 +302,7 @@ def _result(
             }
             for number, count in sorted(per_camera.items())
         ],
+        "lens": {**solved.lens, "about": lens_line(solved.lens)},
         "other_models": [
             {"folder": f"{SPARSE}/{i}", "photos": sorted(piece.names), "points": len(piece.points.xyz)}
             for i, piece in enumerate(pieces[1:], start=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from gs2d.sfm.solve import Facts
 
 _MOST_ANGLES = 2000
 FEW_FEATURES = 50  # of a photograph: fewer verify nothing
+_NONE: Mapping[str, str] = MappingProxyType({})
 _SHOOTING = "take photographs a step apart, each showing two thirds of what the one before shows"
 
 
@@ -105,8 +107,13 @@ def check_any(pieces: Sequence[Piece], facts: Facts, root: Path) -> None:
     )
 
 
-def why_not_placed(name: str, pieces: Sequence[Piece], facts: Facts) -> str:
-    """The reason, as far as it is known, why a photograph has no camera in the first piece."""
+def why_not_placed(name: str, pieces: Sequence[Piece], facts: Facts, refused: Mapping[str, str] = _NONE) -> str:
+    """The reason, as far as it is known, why a photograph has no camera in the first piece.
+
+    ``refused`` are those that found a place in the second round and lost it again, with what is known of them.
+    """
+    if name in refused:
+        return refused[name]
     for number, piece in enumerate(pieces[1:], start=1):
         if name in piece.names:
             return f"in a separate piece (sparse/{number}): too little in it is seen from the photographs of sparse/0"

@@ -27,12 +27,15 @@ POLL_SECONDS = 0.5
 _LITTLE_SPACE = 64 << 20  # bytes; what SQLite could not write is given back when it gives up
 # Modules are looked for where this process does: `-m` would first take a random.py of the folder one is in.
 _WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.worker import main; main(sys.argv[1])"
-_COUNTED = {"features": "keypoints", "matching": "two_view_geometries"}  # phase -> table that grows by one a step
+_COUNTED = {"features": "keypoints", "matching": "two_view_geometries", "again": "two_view_geometries"}  # a row a step
 _PHASES = {
     "features": "finding features",
     "comparing": "finding similar photographs",
     "matching": "matching pairs",
     "cameras": "placing cameras",
+    "lenses": "comparing lenses",
+    "again": "matching pairs once more",
+    "cameras again": "placing cameras once more",
 }
 
 
@@ -64,6 +67,8 @@ class Request:
         Next photographs, and similar ones, that each is matched with where not all pairs are.
     feature_size : int
         Longer side on which features are found, px.
+    asked_lens : str or None
+        The model that the user wants; None: lenses are compared.
     """
 
     images: str
@@ -77,6 +82,7 @@ class Request:
     feature_size: int
     threads: int
     seed: int
+    asked_lens: str | None = None
 
 
 def check_installed() -> None:
@@ -85,8 +91,27 @@ def check_installed() -> None:
         raise BackendError(MISSING)
 
 
-def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Find the cameras; returns what was done to each model that was written, the largest first (none: no model).
+@dataclass(frozen=True)
+class Solved:
+    """What the worker did.
+
+    Attributes
+    ----------
+    models : list of dict
+        What was done to each model that was written, the largest first; none: there is no model.
+    lens : dict
+        What was decided about the lens (``lens.lens_line``); empty without a model.
+    refused : dict of str to str
+        Photographs that found a place and were taken out again, with the reason.
+    """
+
+    models: list[dict[str, Any]]
+    lens: dict[str, Any]
+    refused: dict[str, str]
+
+
+def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] = ()) -> Solved:
+    """Find the cameras.
 
     Parameters
     ----------
@@ -109,42 +134,44 @@ def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] =
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=environment, encoding="utf-8"
         )
         try:
-            models, phase = _follow(process, Path(request.database), on_progress)
+            solved, phase = _follow(process, Path(request.database), on_progress)
         finally:
             process.kill()
             process.wait()
             for pipe in (process.stdin, process.stdout):
                 if pipe is not None:
                     pipe.close()
-    if models is None:
+    if solved is None:
         raise DataError(_last_words(phase, process.returncode, work / "worker.log"))
-    return models
+    return solved
 
 
-def _follow(
-    process: subprocess.Popen[str], database: Path, on_progress: OnProgress
-) -> tuple[list[dict[str, Any]] | None, str]:
+def _follow(process: subprocess.Popen[str], database: Path, on_progress: OnProgress) -> tuple[Solved | None, str]:
     """Pass progress on until the worker has finished or died."""
     lines: queue.Queue[str | None] = queue.Queue()
     assert process.stdout is not None
     reader = threading.Thread(target=_read_lines, args=(process.stdout, lines), daemon=True)
     reader.start()
-    phase, total, models = "", 0, None
+    phase, total, before = "", 0, 0
+    solved = None
     while True:
         try:
             line = lines.get(timeout=POLL_SECONDS)
         except queue.Empty:
             if phase in _COUNTED:
-                on_progress(_PHASES[phase], min(_rows(database, _COUNTED[phase]), total), total)
+                done = max(_rows(database, _COUNTED[phase]) - before, 0)
+                on_progress(_PHASES[phase], min(done, total), total)
             continue
         if line is None:
             process.wait()
             reader.join()
-            return models, phase
+            return solved, phase
         message = json.loads(line)
-        models = message.get("models", models)
+        if "models" in message:
+            solved = Solved(message["models"], message.get("lens", {}), message.get("refused", {}))
         if "phase" in message:
             phase, total = message["phase"], message["total"]
+            before = _rows(database, _COUNTED[phase]) if phase == "again" else 0  # those of the first time
             on_progress(_PHASES[phase], 0, total)
         if "done" in message:
             on_progress(_PHASES[phase], message["done"], total)

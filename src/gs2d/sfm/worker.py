@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.sfm import second
+from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
 from gs2d.sfm.similar import neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import rotation_to_z, up_direction
 
@@ -40,7 +42,7 @@ def main(request_path: str) -> None:
     pycolmap.set_random_seed(request["seed"])
     find_features(pycolmap, request, say)
     match(pycolmap, request, say)
-    say(models=map_(pycolmap, request, say))
+    say(**map_(pycolmap, request, say))
 
 
 def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
@@ -121,12 +123,45 @@ def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int,
         database.close()
 
 
-def map_(pycolmap: Any, request: dict[str, Any], say: Say) -> list[dict[str, Any]]:
-    """Cameras and points from the matches; every connected piece becomes a model, upright where it can be."""
+def map_(pycolmap: Any, request: dict[str, Any], say: Say) -> dict[str, Any]:
+    """Cameras and points from the matches; every connected piece becomes a model, upright where it can be.
+
+    Returns
+    -------
+    dict
+        ``models``: what was done to each, the largest first; ``lens``: what was decided about it; ``refused``: the
+        reason for each photograph that the second round placed and took out again.
+    """
+    pieces = _first_round(pycolmap, request, say)
+    lens: dict[str, Any] = {}
+    refused: dict[str, str] = {}
+    if pieces:
+        lens = _settle_lens(pycolmap, request, pieces[0], say)
+        pieces[0], refused = _second_round(pycolmap, request, pieces[0], lens, say)
+        placed = _names(pieces[0])
+        pieces[1:] = [piece for piece in pieces[1:] if not _names(piece) <= placed]
+    models = [_write(pycolmap, piece, Path(request["output"]) / str(i)) for i, piece in enumerate(pieces)]
+    return {"models": models, "lens": lens, "refused": refused}
+
+
+def _options(pycolmap: Any, request: dict[str, Any]) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = 1 if len(request["in_order"]) <= REPEATABLE else request["threads"]
+    options.num_threads = _threads(request)
     options.min_model_size = SMALLEST_MODEL
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = request["seed"]
+    return options
+
+
+def _threads(request: dict[str, Any]) -> int:
+    return 1 if len(request["in_order"]) <= REPEATABLE else int(request["threads"])
+
+
+def _names(piece: Any) -> set[str]:
+    return {image.name for image in piece.images.values() if image.has_pose}
+
+
+def _first_round(pycolmap: Any, request: dict[str, Any], say: Say) -> list[Any]:
+    """Models from nothing, the largest first."""
     total = len(request["in_order"])
     say(phase="cameras", total=total)
     placed = 0
@@ -142,11 +177,88 @@ def map_(pycolmap: Any, request: dict[str, Any], say: Say) -> list[dict[str, Any
     work = Path(request["database"]).with_name("pieces")
     work.mkdir()
     found = pycolmap.incremental_mapping(
-        request["database"], request["images"], str(work), options, "", count(2), count(1)
+        request["database"], request["images"], str(work), _options(pycolmap, request), "", count(2), count(1)
     )
     pieces = sorted(found.values(), key=lambda piece: (-piece.num_reg_images(), -piece.num_points3D()))
-    kept = [piece for piece in pieces if piece.num_reg_images() >= SMALLEST_MODEL and piece.num_points3D()]
-    return [_write(pycolmap, piece, Path(request["output"]) / str(i)) for i, piece in enumerate(kept)]
+    return [piece for piece in pieces if piece.num_reg_images() >= SMALLEST_MODEL and piece.num_points3D()]
+
+
+def _settle_lens(pycolmap: Any, request: dict[str, Any], piece: Any, say: Say) -> dict[str, Any]:
+    """Compare lenses where none was asked for, or where the one that was is doubtful; the best is in the model then."""
+    asked = request["asked_lens"]
+    if asked == "OPENCV_FISHEYE" or (asked and not any(map(doubts, piece.cameras.values()))):
+        return {"chosen": asked, "asked": asked, "trials": []}
+    say(phase="lenses", total=len(models_to_try(asked)))
+    trials = try_lenses(
+        pycolmap, piece, asked=asked, seed=request["seed"], threads=_threads(request), on_done=lambda i: say(done=i)
+    )
+    if asked:  # it is what the user wants; that it is doubted is said
+        chosen = asked
+    else:
+        best = choose(trials)
+        chosen = best.model
+        if chosen != START:
+            apply(pycolmap, piece, best, threads=_threads(request))
+    return {
+        "chosen": chosen,
+        "asked": asked,
+        "trials": [{"model": t.model, "error_px": t.error, "doubts": list(t.doubts)} for t in trials],
+    }
+
+
+def _second_round(
+    pycolmap: Any, request: dict[str, Any], piece: Any, lens: dict[str, Any], say: Say
+) -> tuple[Any, dict[str, str]]:
+    """The model with photographs that only less strict rules place, and why others were taken out again."""
+    names, placed = request["in_order"], _names(piece)
+    lost = [name for name in names if name not in placed]
+    if not lost:
+        return piece, {}
+    pairs = sorted(second.partners(lost, names, placed, _likeness(pycolmap, request, names)))
+    if not pairs:
+        return piece, {}
+    second.match_again(pycolmap, request, pairs, piece.cameras, lambda: say(phase="again", total=len(pairs)))
+    say(phase="cameras again", total=len(lost))
+    found = itertools.count(1)
+    options = second.relax(_options(pycolmap, request))
+    if lens["chosen"] == "OPENCV" and not lens["asked"]:  # one focal length for both axes
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
+    start, work = (Path(request["database"]).with_name(name) for name in ("first", "again"))
+    for folder in (start, work):
+        folder.mkdir()
+    piece.write(str(start))
+    database, images = request["database"], request["images"]
+    count = lambda: say(done=min(next(found), len(lost)))  # noqa: E731 - a callback without arguments
+    models = pycolmap.incremental_mapping(database, images, str(work), options, str(start), lambda: None, count)
+    larger = max(models.values(), key=lambda model: int(model.num_reg_images()), default=piece)
+    if not _names(larger) > placed:  # nothing was won, or something lost
+        return piece, {}
+    refused = second.refuse_unsupported(larger, _names(larger) - placed)
+    if _names(larger) == placed:  # none was right: the model of before has not been bent by them
+        return piece, refused
+    if refused:
+        adjust(pycolmap, larger, tied=not options.ba_refine_focal_length, threads=_threads(request))
+        drop_outliers(pycolmap, larger)
+    return larger, refused
+
+
+def _likeness(pycolmap: Any, request: dict[str, Any], names: list[str]) -> Callable[[str, str], float]:
+    """How much two photographs share: verified matches, and where they were not compared, how alike they look."""
+    if request["matching"] != "exhaustive":
+        near = {frozenset((names[i], names[j])) for i, j in _similar(pycolmap, request, lambda **_: None)}
+    else:
+        near = set()
+    database = pycolmap.Database.open(request["database"])
+    try:
+        name = {image.image_id: image.name for image in database.read_all_images()}
+        pairs, counts = database.read_two_view_geometry_num_inliers()
+        shared = {
+            frozenset(name[i] for i in pycolmap.pair_id_to_image_pair(pair)): float(count)
+            for pair, count in zip(pairs, counts, strict=True)
+        }
+    finally:
+        database.close()
+    return lambda a, b: shared.get(frozenset((a, b)), 0.0) + 0.5 * (frozenset((a, b)) in near)
 
 
 def _write(pycolmap: Any, piece: Any, folder: Path) -> dict[str, Any]:

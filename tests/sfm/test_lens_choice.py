@@ -1,0 +1,125 @@
+"""Which lens is taken: what is implausible is doubted, and held-out observations decide, on models made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from synthetic_model import HEIGHT, WIDTH, synthetic_model
+
+from gs2d.sfm.lens import MODELS, Trial, apply, choose, doubts, lens_line, models_to_try, try_lenses
+
+F, CX, CY = 520.0, 320.0, 240.0
+
+
+@pytest.fixture(scope="module")
+def pycolmap(colmap: None) -> Any:
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    return pycolmap
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "expected"),
+    [
+        ("SIMPLE_PINHOLE", (F, CX, CY), []),
+        ("SIMPLE_RADIAL", (F, CX, CY, -0.15), []),
+        ("RADIAL", (F, CX, CY, -0.24, 0.28), []),  # the castle's
+        ("OPENCV", (F, F * 1.01, CX, CY, -0.1, 0.02, 0.002, -0.003), []),
+        ("OPENCV_FISHEYE", (300.0, 300.0, CX, CY, 0.02, 0.0, 0.0, 0.0), []),
+        ("OPENCV", (1298.8, 1447.9, CX, CY, 0, 0, 0, 0), ["fx / fy is 0.897, where pixels are square"]),
+        ("OPENCV", (F, F, CX, CY, 0, 0, -0.0175, 0), ["its tangential distortion is -0.0175"]),
+        ("SIMPLE_PINHOLE", (F, CX + 80, CY), ["its principal point is 12 % of the size off the middle"]),
+        ("SIMPLE_PINHOLE", (100.0, CX, CY), ["its focal length is 0.16 of the longer side"]),
+        ("SIMPLE_PINHOLE", (9000.0, CX, CY), ["its focal length is 14.06 of the longer side"]),
+        ("SIMPLE_RADIAL", (F, CX, CY, -0.9), ["its distortion folds the picture back before the corner"]),
+        ("SIMPLE_RADIAL", (F, CX, CY, 0.9), ["its distortion moves the corner by 53 %"]),
+        ("SIMPLE_PINHOLE", (float("nan"), CX, CY), ["its parameters are no numbers of a lens"]),
+    ],
+)
+def test_a_lens_that_cannot_be_is_doubted(
+    pycolmap: Any, model: str, params: tuple[float, ...], expected: list[str]
+) -> None:
+    """k r^2 = 0.9 (400 / 520)^2 = 0.53 at the corner; with -0.9 the radius turns at r = 0.61 < 0.77."""
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(params))
+    assert doubts(camera) == expected
+
+
+def trial(model: str, error: float, *doubted: str) -> Trial:
+    return Trial(model, error, doubted, {}, {})
+
+
+def test_each_parameter_must_save_a_hundredth_of_the_held_out_error() -> None:
+    plain, one, two, four = (trial(model, 1.0) for model in MODELS)
+    assert choose([plain, one, two, four]).model == "SIMPLE_PINHOLE"
+    assert choose([plain, replace(one, error=0.995), two, four]).model == "SIMPLE_PINHOLE"
+    assert choose([plain, replace(one, error=0.97), replace(two, error=0.965), four]).model == "SIMPLE_RADIAL"
+    assert choose([plain, one, replace(two, error=0.9), replace(four, error=0.89)]).model == "RADIAL"
+    assert choose([plain, one, two, replace(four, error=0.8)]).model == "OPENCV"
+
+
+def test_a_doubtful_lens_is_not_chosen_unless_all_are() -> None:
+    assert choose([trial("SIMPLE_PINHOLE", 1.0), trial("SIMPLE_RADIAL", 0.5, "it folds")]).model == "SIMPLE_PINHOLE"
+    both = [trial("SIMPLE_PINHOLE", 1.0, "too wide"), trial("SIMPLE_RADIAL", 0.5, "it folds")]
+    assert choose(both).model == "SIMPLE_RADIAL"
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", (F, CX, CY)),
+        ("SIMPLE_RADIAL", (F, CX, CY, -0.12)),
+        ("RADIAL", (F, CX, CY, -0.25, 0.3)),
+        ("OPENCV", (F, F, CX, CY, -0.1, 0.05, 0.006, -0.008)),
+    ],
+)
+def test_the_lens_that_took_the_photographs_is_found(pycolmap: Any, model: str, params: tuple[float, ...]) -> None:
+    """From cameras that were placed as SIMPLE_RADIAL."""
+    piece = synthetic_model(pycolmap, model, params)
+    steps: list[int] = []
+    apply(pycolmap, piece, Trial("SIMPLE_RADIAL", 0, (), {1: [F, CX, CY, 0.0]}, {1: "SIMPLE_RADIAL"}), threads=1)
+    trials = try_lenses(pycolmap, piece, seed=0, threads=1, on_done=steps.append)
+    best = choose(trials)
+    assert best.model == model
+    assert steps == [1, 2, 3, 4]
+    assert best.error < 0.6  # noise of 0.3 px along each axis: 0.38 in the mean, plus that of the points
+    apply(pycolmap, piece, best, threads=1)
+    camera = piece.camera(1)
+    assert camera.model.name == model
+    assert camera.focal_length_x == camera.focal_length_y == pytest.approx(F, rel=0.01)
+    assert piece.num_reg_images() == 12
+
+
+def test_a_camera_of_few_photographs_gets_no_rich_lens(pycolmap: Any) -> None:
+    piece = synthetic_model(pycolmap, "SIMPLE_RADIAL", (F, CX, CY, -0.1), count=6)
+    trials = try_lenses(pycolmap, piece, seed=0, threads=1, on_done=lambda _: None)
+    assert [t.models[1] for t in trials] == ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "SIMPLE_RADIAL", "SIMPLE_RADIAL"]
+
+
+def test_a_lens_that_was_asked_for_is_compared_with_simpler_ones_as_it_is(pycolmap: Any) -> None:
+    """Pixels that are not square: asked for, two focal lengths are free; the doubt and all figures are said."""
+    piece = synthetic_model(pycolmap, "OPENCV", (F, 1.15 * F, CX, CY, 0.0, 0.0, 0.0, 0.0))
+    trials = try_lenses(pycolmap, piece, asked="OPENCV", seed=0, threads=1, on_done=lambda _: None)
+    assert (
+        [t.model for t in trials] == models_to_try("OPENCV") == ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
+    )
+    asked = trials[-1]
+    assert asked.cameras[1][1] / asked.cameras[1][0] == pytest.approx(1.15, rel=0.01)
+    assert asked.error < 0.6 < trials[0].error
+    assert asked.doubts[0].startswith("fx / fy is 0.8")
+
+
+def test_what_was_decided_is_one_line_with_its_numbers() -> None:
+    rows = [("SIMPLE_PINHOLE", 1.4287, []), ("SIMPLE_RADIAL", 1.3926, []), ("OPENCV", 1.39, ["p is 0.02"])]
+    trials = [{"model": model, "error_px": error, "doubts": found} for model, error, found in rows]
+    assert lens_line({"chosen": "SIMPLE_RADIAL", "asked": None, "trials": trials}) == (
+        "lens: SIMPLE_RADIAL 1.393 px on observations held out; SIMPLE_PINHOLE 1.429, OPENCV 1.390; "
+        "doubted: OPENCV: p is 0.02; each further parameter must save 1 %"
+    )
+    line = lens_line({"chosen": "OPENCV", "asked": "OPENCV", "trials": trials})
+    assert line.startswith(
+        "the lens that was asked for is doubtful (--camera-model auto would compare): OPENCV 1.390 px"
+    )
+    assert lens_line({"chosen": "OPENCV", "asked": "OPENCV", "trials": []}) == lens_line({}) == ""

@@ -1,0 +1,92 @@
+"""The second round: which pairs are compared again, and which photographs the model does not support."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic_model import synthetic_model
+
+from gs2d.sfm.second import LEAST_SEEN, NEXT, PARTNERS, partners, refuse_unsupported
+
+NAMES = [f"{i:03}.jpg" for i in range(40)]
+LENS = (520.0, 320.0, 240.0)
+
+
+@pytest.fixture(scope="module")
+def pycolmap(colmap: None) -> Any:
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    return pycolmap
+
+
+def test_partners_are_those_that_look_alike_and_those_that_were_taken_before_and_after() -> None:
+    alike = {f"{i:03}.jpg": float(i) for i in range(20, 40)}
+    pairs = partners(["010.jpg"], NAMES, set(NAMES) - {"010.jpg", "011.jpg"}, lambda _a, b: alike.get(b, 0.0))
+    near = {f"{i:03}.jpg" for i in (7, 8, 9, 11, 12, 13)}
+    assert NEXT == 3
+    expected = near | {f"{i:03}.jpg" for i in range(40 - PARTNERS, 40)}
+    assert {a if b == "010.jpg" else b for a, b in pairs} == expected
+    assert all(a < b for a, b in pairs)
+
+
+def test_two_that_have_no_place_are_one_pair() -> None:
+    pairs = partners(["000.jpg", "001.jpg"], NAMES[:3], {"002.jpg"}, lambda _a, _b: 0.0)
+    assert pairs == {("000.jpg", "001.jpg"), ("000.jpg", "002.jpg"), ("001.jpg", "002.jpg")}
+
+
+def test_a_photograph_that_the_model_supports_stays(pycolmap: Any) -> None:
+    piece = synthetic_model(pycolmap, "SIMPLE_PINHOLE", LENS)
+    assert refuse_unsupported(piece, ["003.jpg", "not placed.jpg"]) == {}
+    assert piece.num_reg_images() == 12
+
+
+def test_a_photograph_in_a_wrong_place_is_taken_out(pycolmap: Any) -> None:
+    """Moved so that what it shows is many pixels off."""
+    piece = synthetic_model(pycolmap, "SIMPLE_PINHOLE", LENS)
+    image = next(image for image in piece.images.values() if image.name == "003.jpg")
+    pose = image.cam_from_world()
+    moved = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0.02, 0.0, 0.0]))
+    image.frame.rig_from_world = moved
+    refused = refuse_unsupported(piece, ["003.jpg", "004.jpg"])
+    assert list(refused) == ["003.jpg"]
+    assert "px off where it fits best (0." in refused["003.jpg"]
+    assert {im.name for im in piece.images.values() if im.has_pose} == {f"{i:03}.jpg" for i in range(12) if i != 3}
+
+
+def test_photographs_that_agree_with_each_other_only_are_taken_out(pycolmap: Any) -> None:
+    """Four share points that none of the others sees, as photographs of another room do."""
+    piece = synthetic_model(pycolmap, "SIMPLE_PINHOLE", LENS)
+    new = {image.image_id for image in piece.images.values() if image.name >= "008.jpg"}
+    for number in sorted(piece.point3D_ids()):
+        elements = [(e.image_id, e.point2D_idx) for e in piece.point3D(number).track.elements]
+        apart = new if number % 2 else {i for i, _ in elements} - new
+        for image, index in elements:
+            if image not in apart and piece.exists_point3D(number):
+                piece.delete_observation(image, index)
+    refused = refuse_unsupported(piece, [f"{i:03}.jpg" for i in range(8, 12)])
+    assert sorted(refused) == ["008.jpg", "009.jpg", "010.jpg", "011.jpg"]
+    assert refused["008.jpg"].startswith("only 0 points of known place agree")
+    assert f"expected {LEAST_SEEN} or more" in refused["008.jpg"]
+    assert piece.num_reg_images() == 8
+
+
+def test_one_that_passed_supports_the_next(pycolmap: Any) -> None:
+    """What 011 shows is seen by 009 and 010 only: it has a place where one of them is settled and the other passes."""
+
+    def lonely() -> Any:
+        piece = synthetic_model(pycolmap, "SIMPLE_PINHOLE", LENS)
+        for number in sorted(piece.point3D_ids()):
+            track = piece.point3D(number).track
+            seen = {piece.image(e.image_id).name: (e.image_id, e.point2D_idx) for e in track.elements}
+            apart = seen.keys() - {"009.jpg", "010.jpg", "011.jpg"} if number % 2 else {"011.jpg"} & seen.keys()
+            for name in sorted(apart):
+                if piece.exists_point3D(number):
+                    piece.delete_observation(*seen[name])
+        return piece
+
+    assert refuse_unsupported(lonely(), ["011.jpg"]) == {}
+    assert refuse_unsupported(lonely(), ["010.jpg", "011.jpg"]) == {}
+    assert refuse_unsupported(lonely(), ["009.jpg", "010.jpg", "011.jpg"]) == {}

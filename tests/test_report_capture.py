@@ -1,0 +1,74 @@
+"""The report of a run says how the cameras of its photographs were found."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gs2d.errors import DataError
+from gs2d.images import write_image
+from gs2d.report_capture import capture_section
+
+FOUND: dict[str, Any] = {
+    "count": 3,
+    "placed": 2,
+    "points": 1234,
+    "photos_per_point": 4.25,
+    "mean_error_px": 0.82,
+    "cameras": [{"about": "SIMPLE_RADIAL of 2 photographs, 1000x1000, f = 1317 px (42 degrees wide)"}],
+    "lens": {"about": "lens: SIMPLE_RADIAL 1.393 px on observations held out; SIMPLE_PINHOLE 1.429"},
+    "photographs": [
+        {"source": "a.jpg", "placed": True, "features": 4000},
+        {"source": "b.jpg", "placed": True, "features": 4000},
+        {"source": "<c>.jpg", "placed": False, "features": 2100, "reason": "21 matches with a.jpg at best"},
+    ],
+}
+
+
+def capture(folder: Path, found: dict[str, Any]) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "poses.json").write_text(json.dumps(found))
+    write_image(folder / "poses.png", np.full((60, 120, 3), 0.5))
+    return folder
+
+
+def test_photographs_without_a_place_the_lens_and_the_picture_are_in_the_report(tmp_path: Path) -> None:
+    capture(tmp_path / "capture", FOUND)
+    html = capture_section(tmp_path, {})
+    assert "2 of 3 photographs have a place; 1,234 points" in html
+    assert "&lt;c&gt;.jpg" in html
+    assert "21 matches with a.jpg at best" in html
+    assert "Lens: SIMPLE_RADIAL 1.393 px on observations held out" in html
+    assert "f = 1317 px" in html
+    assert "data:image/jpeg;base64," in html
+
+
+def test_a_capture_beside_the_run_is_found_by_its_path_and_all_placed_leaves_no_table(tmp_path: Path) -> None:
+    found = {**FOUND, "placed": 2, "count": 2, "photographs": FOUND["photographs"][:2]}
+    there = capture(tmp_path / "elsewhere", found)
+    html = capture_section(tmp_path / "run", {"scene": {"path": str(there)}})
+    assert "2 of 2 photographs" in html
+    assert "without a place" not in html
+
+
+def test_cameras_from_elsewhere_have_no_section(tmp_path: Path) -> None:
+    assert capture_section(tmp_path, {"scene": {"path": str(tmp_path)}}) == ""
+    assert capture_section(tmp_path, {}) == ""
+
+
+def test_a_capture_of_before_lenses_were_compared_says_what_it_has(tmp_path: Path) -> None:
+    capture(tmp_path / "capture", {name: value for name, value in FOUND.items() if name != "lens"})
+    assert "2 of 3 photographs" in capture_section(tmp_path, {})
+
+
+def test_a_picture_that_is_gone_is_said_and_a_broken_file_is_an_error(tmp_path: Path) -> None:
+    folder = capture(tmp_path / "capture", FOUND)
+    (folder / "poses.png").unlink()
+    assert "poses.png does not show" in capture_section(tmp_path, {})
+    (folder / "poses.json").write_text("{}")
+    with pytest.raises(DataError, match=r"poses\.json must be as `gs2d poses` writes it, got another entry"):
+        capture_section(tmp_path, {})
