@@ -112,11 +112,11 @@ def why_not_placed(name: str, pieces: Sequence[Piece], facts: Facts, refused: Ma
 
     ``refused`` are those that found a place in the second round and lost it again, with what is known of them.
     """
-    if name in refused:
-        return refused[name]
     for number, piece in enumerate(pieces[1:], start=1):
         if name in piece.names:
             return f"in a separate piece (sparse/{number}): too little in it is seen from the photographs of sparse/0"
+    if name in refused:
+        return refused[name]
     features = facts.features.get(name, 0)
     if features < FEW_FEATURES:
         return f"{features} features: blurred, or nothing in it has texture"
