@@ -21,6 +21,7 @@ from gs2d.camera import Camera
 from gs2d.errors import BackendError, Gs2dError
 from gs2d.extras import install
 from gs2d.geometry import focus_point
+from gs2d.view_clip import ClipBox
 from gs2d.view_exact import ExactPictures, Frame, Render
 from gs2d.view_splats import Preview
 
@@ -133,6 +134,8 @@ class Viewer:
         self._splats: Any = None
         self._exact: ExactPictures | None = None
         self._stages: dict[str, Stage] = {}
+        self._preview: Preview | None = None
+        self.clip: ClipBox | None = None
         self._showing = (
             threading.Lock()
         )  # held by whoever changes the splats: browsers' threads, and that of a training
@@ -185,13 +188,15 @@ class Viewer:
         with self._showing:
             stage, drawn = self._stages[self._chosen.value], self._drawn.value
             if load:
-                self._show_splats(stage.preview(), visible=drawn == "preview")
+                self._preview = stage.preview()
+                self._show_splats(self._preview, visible=drawn == "preview")
                 self._exact.scene(stage.render)
             elif self._splats is not None:
                 self._splats.visible = drawn == "preview"
             self._exact.draw(drawn if drawn in PICTURES[1:] else None)
 
     def _show_splats(self, splats: Preview, *, visible: bool) -> None:
+        splats = splats if self.clip is None else self.clip.clipped(splats)
         with self._server.atomic():
             if self._splats is not None:
                 self._splats.remove()
@@ -205,6 +210,16 @@ class Viewer:
                 position=self._frame.inside(np.zeros(3)),
                 visible=visible,
             )
+
+    def add_clip_box(self, box: np.ndarray, source: str, *, of_run: bool) -> None:
+        """Sliders for a box [2, 3] wu that clips the preview, and the commands that cut ``source`` to it."""
+
+        def show() -> None:
+            with self._showing:
+                if self._preview is not None:
+                    self._show_splats(self._preview, visible=self._drawn.value == "preview")
+
+        self.clip = ClipBox(self._server, self._frame, box, source, show, of_run=of_run)
 
     def add_status(self, text: str) -> Callable[[str], None]:
         """A line of text above all else, in Markdown; returns what changes it."""

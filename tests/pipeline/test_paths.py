@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gs2d.camera import Camera, look_at
-from gs2d.pipeline.paths import flight_cameras, orbit_cameras, stops, tour
+from gs2d.pipeline.paths import flight_cameras, orbit_cameras, photographed_arc, stops, tour
 from tiny import ball_cameras
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -113,3 +113,35 @@ def test_a_circle_lies_level_though_all_look_down_from_one_side() -> None:
     circle = orbit_cameras(ball_cameras(40)[30:39:4], 8)
     heights = [camera.center[2] for camera in circle]
     np.testing.assert_allclose(heights, heights[0], atol=1e-6)
+
+
+def test_an_orbit_stays_within_the_arc_that_was_photographed() -> None:
+    turns = np.radians(np.linspace(-40, 70, 12))
+    spread = [looking(((3 + a) * np.cos(a), (3 + a) * np.sin(a), 0.5 + a), (0, 0, 0)) for a in turns]
+    orbit = orbit_cameras(spread, 48, np.zeros(3))
+    centers = np.array([camera.center for camera in orbit])
+    angles = np.arctan2(centers[:, 1], centers[:, 0])
+    assert turns[0] - 1e-6 <= angles.min() < turns[0] + 0.01
+    assert turns[-1] - 0.01 < angles.max() <= turns[-1] + 1e-6
+    radii = np.linalg.norm(centers[:, :2], axis=1)
+    np.testing.assert_allclose(radii, 3 + angles, atol=0.35)  # as far as the photographs there, and as high
+    np.testing.assert_allclose(centers[:, 2], 0.5 + angles, atol=0.35)
+    assert paces(orbit).max() < 0.4  # also from the last frame on: it swings back
+    assert np.linalg.norm(centers[-1] - centers[0]) < 0.1
+    for camera in orbit:
+        np.testing.assert_allclose(camera.forward, -camera.center / np.linalg.norm(camera.center), atol=1e-9)
+
+
+def test_an_orbit_is_a_whole_circle_where_cameras_stand_all_around() -> None:
+    orbit = orbit_cameras(ring(7), 36)
+    angles = np.sort([np.arctan2(camera.center[1], camera.center[0]) for camera in orbit])
+    np.testing.assert_allclose(np.diff(angles), np.radians(10), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "start", "width"),
+    [((0, 90, 180, 270), None, None), ((350, 0, 20), 350, 30), ((10, 100, 190), 10, 180), ((45,), 45, 0)],
+)
+def test_the_arc_is_what_the_widest_gap_leaves(degrees: tuple[int, ...], start: int | None, width: int | None) -> None:
+    arc = photographed_arc(np.radians(degrees))
+    assert arc is None if start is None else np.allclose(np.degrees(arc), (start, width))

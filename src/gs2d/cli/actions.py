@@ -253,7 +253,7 @@ def export(command: c.Export, console: Console) -> None:
     """``gs2d export``."""
     from gs2d.pipeline.jobs import export_run
 
-    result = export_run(command.run, command.out, command.layout)
+    result = export_run(command.run, command.out, command.layout, bbox=command.bbox)
     console.say(
         f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, layout {result['layout']}"
     )

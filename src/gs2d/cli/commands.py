@@ -145,7 +145,8 @@ class Render(Common):
     split: Literal["test", "train"] = "test"
     """Which views."""
     orbit: int = 0
-    """Instead of the views, so many frames of a circle around the scene."""
+    """Instead of the views, so many frames of a circle around the subject, or to and fro where only a part of the
+    circle was photographed."""
     flight: int = 0
     """Instead of the views, so many frames of a smooth flight along the photographs."""
     out: Path | None = None
@@ -217,6 +218,8 @@ class Export(Common):
     layout: Literal["2dgs", "3dgs", "compressed", "spz", "splat"] | None = None
     """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open; compressed:
     PlayCanvas's and SuperSplat's PLY; spz: Niantic's, the smallest; splat: antimatter15's, one colour a splat."""
+    bbox: Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")] = None
+    """Only the splats with their centres in this box (`gs2d view` and subject.json have numbers)."""
 
 
 @dataclass(frozen=True, kw_only=True)

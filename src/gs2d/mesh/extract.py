@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gs2d.mesh.consistency import depth_noise
+from gs2d.mesh.evidence import Cleaned, clean
 from gs2d.mesh.frames import Frame, Spool
 from gs2d.mesh.fuse import fuse
 from gs2d.mesh.integrate import fusion_backend
@@ -33,6 +34,7 @@ class Extraction:
     faces_removed: int
     levels: int = 1  # of the nest of an unbounded scene
     backend: str = "reference"  # what fused: never "auto"
+    cleaned: Cleaned | None = None  # where it was made to hold what the views saw, and no more
 
 
 def extract(
@@ -52,6 +54,7 @@ def extract(
     threads: int | None = None,
     backend: str = "auto",
     folder: str | os.PathLike[str] | None = None,
+    by_evidence: bool = False,
 ) -> Extraction:
     """Fuse frames into a mesh.
 
@@ -74,6 +77,8 @@ def extract(
         What fuses, see ``fuse``.
     folder : path, optional
         Where the temporary file goes.
+    by_evidence : bool
+        Leave only what enough views saw, in no more faces than their pixels carry (``evidence.clean``).
 
     Raises
     ------
@@ -105,8 +110,13 @@ def extract(
             if truncation is None:
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
         volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
-    whole = marching_cubes(volume, min_weight=min_weight)
-    return _extraction(whole, limits, [volume], min_faces=min_faces, keep=keep, backend=backend)
+        whole = marching_cubes(volume, min_weight=min_weight)
+        found = _extraction(whole, limits, [volume], min_faces=min_faces, keep=keep, backend=backend)
+        if not by_evidence:
+            return found
+        del volume, whole
+        cleaned = clean(found.mesh, spool, len(spool), limits.truncation)
+        return replace(found, mesh=cleaned.mesh, cleaned=cleaned)
 
 
 def extract_unbounded(

@@ -13,6 +13,7 @@ import torch
 
 from gs2d.camera import Camera
 from gs2d.data import View
+from gs2d.data.subject import OBJECT, read_subject
 from gs2d.disk import check_writable
 from gs2d.errors import DataError, RunError
 from gs2d.evaluate.lpips import load_lpips
@@ -35,14 +36,14 @@ from gs2d.io.splat_formats import ENDINGS, LAYOUTS, layout_of, read_disks, write
 from gs2d.pipeline.attempts import again, attempted, reason_of
 from gs2d.pipeline.events import Missing, Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
-from gs2d.pipeline.options import EvaluateOptions, MeshOptions
+from gs2d.pipeline.options import Box, EvaluateOptions, MeshOptions
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.refined import aligned
 from gs2d.pipeline.scoring import score_views, split_metrics
-from gs2d.pipeline.subject import meshed_subject
+from gs2d.pipeline.subject import meshed_subject, within
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.splats import Splats
 
@@ -175,7 +176,9 @@ def render_run(
     if moving:
         image = np.zeros((1, 1, 3), np.uint8)
         seen = [view.camera for view in job.scene.train]
-        cameras = orbit_cameras(seen, orbit) if orbit else flight_cameras(seen, flight)
+        subject = read_subject(path)
+        focus = None if subject is None or subject.kind != OBJECT else subject.center
+        cameras = orbit_cameras(seen, orbit, focus) if orbit else flight_cameras(seen, flight)
         views = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, image)) for i, camera in enumerate(cameras)]
     else:
         chosen = job.scene.test if split == "test" else job.scene.train
@@ -319,13 +322,15 @@ def evaluate_run(
     return result
 
 
-def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, Any]:
+def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None) -> dict[str, Any]:
     """Write the splats of a run, or of a file of flat splats, in another layout.
 
     Parameters
     ----------
     layout : str or None
         A name of ``io.splat_formats.LAYOUTS``; None: by the ending of ``out``.
+    bbox : six floats, optional
+        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, wu.
 
     Raises
     ------
@@ -342,6 +347,7 @@ def export_run(path: Path, out: Path, layout: str | None = None) -> dict[str, An
     if path.is_file() and out.resolve() == path.resolve():
         raise RunError(f"--out {out} is the file that is read; choose another name")
     splats = read_disks(path) if path.is_file() else finished_splats(open_run(path))
+    splats = splats if bbox is None else within(splats, bbox)
     notes = write_layout(out, splats, layout)
     size = out.stat().st_size
     return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes)}

@@ -11,6 +11,8 @@ from scipy.interpolate import Akima1DInterpolator
 from gs2d.camera import Camera, look_at
 from gs2d.geometry import focus_point, up_direction
 
+_UNSEEN_ARC = np.radians(100.0)  # without a camera: nobody photographed that side; orbits have gaps of up to 60
+_FADE = 0.15  # of the arc: over so much of it distances and heights of photographs are averaged
 _MOST_IN_TOUR = 300  # cameras; more are passed by without being looked at
 _DETOUR = 1.6  # a way in the order of names may be so many times longer than a short one
 _FRAMES_A_STOP = 15  # of a flight: half a second from one photograph to the next
@@ -20,26 +22,72 @@ _LEVEL = 0.1  # a level camera's x axis rises no more than this
 _STEEP = 0.98  # how far down a camera may look and still be kept level
 
 
-def orbit_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A circle through the middle of where the cameras are, around the point they look at.
+def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | None = None) -> list[Camera]:
+    """Return a circle through the middle of where the cameras are, around what they look at.
 
-    The axis is what is up; radius and height are those of the median camera.
+    The axis is what is up; radius and height are those of the median camera. Where the photographs leave a part of the
+    circle out (``photographed_arc``), the path swings to and fro over the rest, at the distance and the height of the
+    photographs there: what nobody photographed is not shown.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    frames : int
+    focus : ndarray [3], optional
+        What is looked at, wu (default: the point nearest to the optical axes).
     """
-    focus = focus_point(cameras)
+    focus = focus_point(cameras) if focus is None else np.asarray(focus, np.float64)
     up = up_direction(cameras)
     arms = np.array([camera.center for camera in cameras]) - focus  # [V, 3]
     heights = arms @ up
-    radii = np.linalg.norm(arms - heights[:, None] * up, axis=1)
-    radius, height = float(np.median(radii)), float(np.median(heights))
-    side = arms[0] - heights[0] * up
-    side /= np.linalg.norm(side)
+    flat = arms - heights[:, None] * up
+    radii = np.linalg.norm(flat, axis=1)
+    side = flat[int(np.argmax(radii > 1e-9 * radii.max()))]
+    side = side / max(float(np.linalg.norm(side)), 1e-300)
     other = np.cross(up, side)
+    angles = np.arctan2(flat @ other, flat @ side)
+    arc = photographed_arc(angles)
+    if arc is None:
+        turns = np.linspace(0, 2 * np.pi, frames, endpoint=False)
+        places = [(angle, float(np.median(radii)), float(np.median(heights))) for angle in turns]
+    else:
+        start, width = arc
+        turns = start + width / 2 * (1 - np.cos(2 * np.pi * np.arange(frames) / frames))  # slow where it turns round
+        places = [(angle, *_photographed_at(angle, angles, radii, heights, width)) for angle in turns]
     like = cameras[0]
-    circle = []
-    for angle in np.linspace(0, 2 * np.pi, frames, endpoint=False):
-        eye = focus + height * up + radius * (np.cos(angle) * side + np.sin(angle) * other)
-        circle.append(look_at(eye, focus, up, width=like.width, height=like.height, fx=like.fx, fy=like.fy))
-    return circle
+    return [
+        look_at(
+            focus + height * up + radius * (np.cos(angle) * side + np.sin(angle) * other),
+            *(focus, up),
+            **{"width": like.width, "height": like.height, "fx": like.fx, "fy": like.fy},
+        )
+        for angle, radius, height in places
+    ]
+
+
+def photographed_arc(angles: np.ndarray) -> tuple[float, float] | None:
+    """Return where the cameras' arc starts and how wide it is, rad; None if they stand all around.
+
+    Parameters
+    ----------
+    angles : ndarray [V]
+        Directions from the middle to the cameras, rad.
+    """
+    ordered = np.sort(np.mod(angles, 2 * np.pi))
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    widest = int(gaps.argmax())
+    if gaps[widest] < _UNSEEN_ARC:
+        return None
+    return float(ordered[(widest + 1) % len(ordered)]), float(2 * np.pi - gaps[widest])
+
+
+def _photographed_at(
+    angle: float, angles: np.ndarray, radii: np.ndarray, heights: np.ndarray, width: float
+) -> tuple[float, float]:
+    """Radius and height of the photographs around a direction: a mean that fades over a part of the arc."""
+    off = np.abs(np.mod(angles - angle + np.pi, 2 * np.pi) - np.pi)
+    weights = np.exp(-0.5 * (off / max(_FADE * width, 0.05)) ** 2) + 1e-12
+    return float(np.average(radii, weights=weights)), float(np.average(heights, weights=weights))
 
 
 def flight_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:

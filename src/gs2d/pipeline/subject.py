@@ -9,7 +9,7 @@ import torch
 
 from gs2d.camera import Camera
 from gs2d.data.subject import OBJECT, Sight, Subject, find_subject, given_subject, middle_weights, read_subject, shown
-from gs2d.errors import DataError, ProtocolError
+from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.files import write_json
 from gs2d.io.run import SUBJECT, RunFolder
 from gs2d.pipeline.events import Notice, OnEvent
@@ -73,6 +73,25 @@ def meshed_subject(run: RunFolder, job: Job, splats: Splats, options: MeshOption
     subject = subject_of(run, job, splats, on_event, box=given)
     wanted = given is not None or (job.protocol.fusion.subject and not own)
     return subject if wanted and subject.kind == OBJECT else None
+
+
+def within(splats: Splats, box: Sequence[float]) -> Splats:
+    """Return the splats whose centres lie in a box, x0 y0 z0 x1 y1 z1, wu.
+
+    Raises
+    ------
+    RunError
+        The numbers are no box, or there is no splat in it.
+    """
+    corners = np.asarray(box, np.float64)
+    if corners.shape != (6,) or not (corners[:3] < corners[3:]).all():
+        raise RunError(f"--bbox must be a lower corner and a higher one, x0 y0 z0 x1 y1 z1, got {list(box)}")
+    low, high = torch.from_numpy(corners).to(splats.means).split(3)
+    inside = ((splats.means >= low) & (splats.means <= high)).all(dim=1)
+    if not bool(inside.any()):
+        least, most = (f(dim=0).values.tolist() for f in (splats.means.min, splats.means.max))
+        raise RunError(f"--bbox must hold splats, got none of {len(splats):,}; they lie from {least} to {most}")
+    return splats.rows(inside)
 
 
 def subject_line(subject: Subject) -> str:

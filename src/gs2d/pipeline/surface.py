@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -29,6 +30,7 @@ from gs2d.render.types import RenderOutput
 from gs2d.splats import Splats
 
 OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
+ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
 LARGEST = 1e12  # wu; depth and voxels are 32-bit numbers, of which squares and cubes are taken
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
@@ -120,6 +122,20 @@ def extract_mesh(
         "volume_bytes": result.volume_bytes,
         "components": result.components,
         "faces_removed": result.faces_removed,
+        **_cleaned_facts(result),
+    }
+
+
+def _cleaned_facts(result: Extraction) -> dict[str, Any]:
+    """What was left of the surface, where it was made to hold what the views saw."""
+    if result.cleaned is None:
+        return {}
+    found = result.cleaned
+    return {
+        "pixels": round(found.pixels),
+        "faces_per_pixel": len(result.mesh.faces) / max(found.pixels, 1.0),
+        "area_unsupported": found.unsupported,
+        "area_apart": found.small,
     }
 
 
@@ -167,7 +183,8 @@ def _extract(
     bbox = None if options.bbox is None else np.asarray(options.bbox, np.float64).reshape(2, 3)
     bbox = bbox if subject is None else subject.box
     own = bbox is not None or options.unbounded
-    fuse_frames = extract_unbounded if options.unbounded else extract
+    subject_only = fusion.subject and not options.unbounded
+    fuse_frames = extract_unbounded if options.unbounded else partial(extract, by_evidence=subject_only)
     if isinstance(frames, Spool):
         on_event(Phase("fusing", 0))
     result = fuse_frames(
@@ -202,7 +219,15 @@ def fusion_frame(job: Job, view: View, output: RenderOutput, depth: str) -> Fram
     for pixels in (mask, view.known()):  # beyond the photograph nothing has said how far the surface is
         if pixels is not None:
             valid = valid & pixels
+    if job.protocol.fusion.subject:
+        valid = valid & one_surface(output)
     return Frame(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
+
+
+def one_surface(output: RenderOutput) -> np.ndarray:
+    """Return where the light of a pixel ends in one place [H, W]: not at the rim of a thing, nor in fog."""
+    mean, median = output.depth_mean, output.depth_median
+    return np.asarray(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy())
 
 
 def surface_color(output: RenderOutput, job: Job) -> torch.Tensor:

@@ -15,6 +15,7 @@ import torch
 
 from gs2d.camera import Camera, look_at
 from gs2d.data import View
+from gs2d.data.subject import read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.images import to_uint8
 from gs2d.io.ply import read_mesh
@@ -94,10 +95,20 @@ def open_viewer(path: Path, options: ViewOptions = ViewOptions(), on_event: OnEv
             viewer.add_cameras(shots(content.views, content.settings, on_event))
         first = content.cameras[0] if content.cameras else from_aside(frame, up)
         viewer.look_from(first, frame.origin)
+        viewer.add_clip_box(_first_box(path, centers), str(path), of_run=is_run(path))
     except BaseException:
         viewer.close()
         raise
     return viewer
+
+
+def _first_box(path: Path, centers: np.ndarray) -> np.ndarray:
+    """The box of the subject [2, 3], else that of most splats."""
+    subject = read_subject(path) if is_run(path) else None
+    if subject is not None:
+        return subject.box
+    finite = centers[np.isfinite(centers).all(axis=1)]
+    return np.percentile(finite, (2, 98), axis=0) if len(finite) else np.array([[-1.0] * 3, [1.0] * 3])
 
 
 def serve(viewer: Viewer, on_event: OnEvent = ignore) -> None:

@@ -1,0 +1,193 @@
+"""What the photographs say about each part of a mesh, and a mesh that holds no more than they do.
+
+A view supports a vertex if it looks at its front and has its own surface there; it contradicts it if it sees farther.
+Sheets before a camera, ribbons at depth edges and shreds of background are supported by few views, and go; faces are as
+many as the pixels that saw the surface best, not as the voxels that it was cut from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gs2d.camera import Camera
+from gs2d.mesh.frames import DepthMap
+from gs2d.mesh.surface import components, select_faces
+from gs2d.triangles import Mesh
+
+VIEWS = 3.0  # that support a vertex
+FEW_VIEWS = 12  # in a capture, of which two are enough
+SMALL = 0.01  # of the largest component's area: smaller ones go
+FACES_A_PIXEL = 2.0  # a depth map has as many
+GRAZING = 0.1  # cosine between a view's ray and a face, below which the view does not see it
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the views say of the vertices of a mesh.
+
+    Attributes
+    ----------
+    support : ndarray [P] int32
+        Views that saw it.
+    against : ndarray [P] int32
+        Views that see farther at its place.
+    density : ndarray [P] float32
+        Pixels per wu^2 of surface in the view that saw it best.
+    """
+
+    support: np.ndarray
+    against: np.ndarray
+    density: np.ndarray
+
+
+def least_views(count: int) -> int:
+    """Return how many of ``count`` views must have seen a surface."""
+    return min(int(VIEWS), count) if count >= FEW_VIEWS else min(2, count)
+
+
+def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
+    """Compare a mesh with the depth maps that it was fused from.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    maps : iterable of DepthMap
+    tolerance : float
+        wu. Depths that differ by less are of one surface.
+    """
+    vertices = mesh.vertices.astype(np.float32)
+    normals = _normals(mesh)
+    support = np.zeros(len(vertices), np.int32)
+    against = np.zeros(len(vertices), np.int32)
+    density = np.zeros(len(vertices), np.float32)
+    for item in maps:
+        rows, z, seen, facing = _look(item, vertices, normals)
+        met = (seen > 0) & (np.abs(seen - z) <= tolerance) & (facing > GRAZING)
+        support[rows] += met
+        against[rows] += seen > z + tolerance
+        camera = item.camera
+        near = np.float32(camera.fx * camera.fy) * facing / (z * z)
+        density[rows[met]] = np.maximum(density[rows[met]], near[met])
+    return Evidence(support, against, density)
+
+
+def _look(
+    item: DepthMap, vertices: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of the vertices in the picture, their depths, the view's own there, and the cosine at which it sees them."""
+    camera: Camera = item.camera
+    at = vertices @ camera.rotation.T.astype(np.float32) + camera.T_cam_world[:3, 3].astype(np.float32)
+    z = np.where(at[:, 2] > 0, at[:, 2], np.float32(np.nan))
+    column, row = camera.fx * at[:, 0] / z + camera.cx, camera.fy * at[:, 1] / z + camera.cy
+    rows = np.flatnonzero((column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height))
+    seen = item.depth[row[rows].astype(np.int64), column[rows].astype(np.int64)]
+    arm = camera.center.astype(np.float32) - vertices[rows]
+    facing = (arm * normals[rows]).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), np.float32(1e-30))
+    return rows, z[rows], seen, facing
+
+
+def _normals(mesh: Mesh) -> np.ndarray:
+    """Unit normals [P, 3] of the vertices, by the areas of their faces."""
+    corners = mesh.vertices.astype(np.float32)[mesh.faces]
+    of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = mesh.faces.ravel()
+    total = np.stack(
+        [np.bincount(flat, np.repeat(of_face[:, axis], 3), len(mesh.vertices)) for axis in range(3)], axis=1
+    )
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30), np.float32)
+
+
+def areas(mesh: Mesh) -> np.ndarray:
+    """Return the areas [F] of the faces, wu^2."""
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    return np.asarray(
+        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    )
+
+
+def pixels(mesh: Mesh, evidence: Evidence) -> float:
+    """Return how many pixels the surface has, each part of it in the view that saw it best."""
+    return float((areas(mesh) * evidence.density[mesh.faces].mean(axis=1)).sum()) if len(mesh.faces) else 0.0
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """A mesh that holds what the views saw, and what was found on the way.
+
+    Attributes
+    ----------
+    mesh : Mesh
+    pixels : float
+        That its surface has, each part of it in the view that saw it best.
+    unsupported, small : float
+        Parts of the area that went because too few views saw them, and because they lay apart.
+    """
+
+    mesh: Mesh
+    pixels: float
+    unsupported: float
+    small: float
+
+
+def clean(mesh: Mesh, maps: Iterable[DepthMap], count: int, tolerance: float) -> Cleaned:
+    """Leave of a mesh what the views saw, in as many faces as they carry.
+
+    Parameters
+    ----------
+    maps : iterable of DepthMap
+        Those that it was fused from, ``count`` of them.
+    tolerance : float
+        As for ``gather``.
+    """
+    evidence = gather(mesh, maps, tolerance)
+    seen, of_seen = supported(mesh, evidence, least_views(count))
+    whole, of_whole = large_components(seen, of_seen)
+    found = pixels(whole, of_whole)
+    total = max(float(areas(mesh).sum()), 1e-300)
+    parts = [float(areas(part).sum()) / total for part in (seen, whole)]
+    small = simplified_to(whole, int(FACES_A_PIXEL * found))
+    return Cleaned(small, found, 1 - parts[0], parts[0] - parts[1])
+
+
+def supported(mesh: Mesh, evidence: Evidence, views: int) -> tuple[Mesh, Evidence]:
+    """Return the part of a mesh that so many views saw, and more than see through it, and what is said of it."""
+    good = (evidence.support >= views) & (evidence.support > evidence.against)
+    kept = good[mesh.faces].sum(axis=1) >= 2  # the border may hang over by a vertex
+    return _selected(mesh, evidence, kept)
+
+
+def large_components(mesh: Mesh, evidence: Evidence, share: float = SMALL) -> tuple[Mesh, Evidence]:
+    """Return a mesh without components of less than ``share`` of the area of the largest."""
+    if not len(mesh.faces):
+        return mesh, evidence
+    of_face = components(mesh)
+    area = np.bincount(of_face, areas(mesh))
+    return _selected(mesh, evidence, (area >= share * area.max())[of_face])
+
+
+def _selected(mesh: Mesh, evidence: Evidence, faces: np.ndarray) -> tuple[Mesh, Evidence]:
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces[faces]] = True
+    rest = Evidence(evidence.support[used], evidence.against[used], evidence.density[used])
+    return select_faces(mesh, faces), rest
+
+
+def simplified_to(mesh: Mesh, faces: int) -> Mesh:
+    """Return a mesh of about so many faces, by quadric edge collapse; vertices have the colour nearest to them."""
+    if len(mesh.faces) <= max(faces, 4):
+        return mesh
+    import fast_simplification  # here: importing it takes longer than most commands
+
+    vertices = mesh.vertices.astype(np.float64)
+    middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0
+    scaled = np.ascontiguousarray((vertices - middle) / size, np.float32)
+    triangles = np.ascontiguousarray(mesh.faces, np.int32)
+    points, left = fast_simplification.simplify(scaled, triangles, target_count=max(faces, 4))
+    points = points * size + middle
+    colors = None if mesh.colors is None else mesh.colors[cKDTree(vertices).query(points)[1]]
+    small = Mesh(points.astype(mesh.vertices.dtype), np.asarray(left, np.int32), colors)
+    return select_faces(small, np.ones(len(small.faces), bool))
