@@ -76,7 +76,7 @@ OPTIONAL = (
     Wanted("sfm", "cameras of photographs (gs2d reconstruct, poses)", _packages("sfm", "pycolmap")),
     Wanted("ffmpeg", "videos instead of photographs", _programs(_FFMPEG, "ffmpeg", "ffprobe")),
     Wanted("heic", "HEIC photographs, as of an iPhone", _heic),
-    Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas", "fast-simplification")),
+    Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas")),
     Wanted("view", "viewer in the browser (gs2d view, --viewer)", _packages("view", "viser")),
     Wanted("films", "films (gs2d render --video x.mp4)", _films),
     Wanted("slurm", "runs as Slurm jobs (--slurm)", _packages("slurm", "submitit")),

@@ -32,7 +32,7 @@ from gs2d.pipeline.surface import OPAQUE, extract_mesh
 from gs2d.splats import Splats
 from gs2d.triangles import Mesh
 
-PACKAGES = ("xatlas", "fast_simplification")  # of the extra `texture`
+PACKAGES = ("xatlas",)  # of the extra `texture`
 
 
 def texture_run(

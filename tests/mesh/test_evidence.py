@@ -1,0 +1,104 @@
+"""A mesh holds what its views saw: sheets that few saw go, faces are as many as pixels, borders and colours stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gs2d.mesh.evidence import FACES_A_PIXEL, areas, clean, gather, least_views, simplified_to
+from gs2d.mesh.extract import extract
+from gs2d.mesh.frames import Frame, depth_map
+from gs2d.triangles import Mesh
+from surface_shapes import orbit, sphere_depth
+
+BOX = np.array([[-2.0, -2, -2], [2, 2, 2]])
+
+
+def frames(count: int, *, sheets: int = 0) -> list[Frame]:
+    """A coloured ball from all round; the first views have a sheet before it, in a corner of their pictures."""
+    made = []
+    for number, camera in enumerate(orbit(count, 4.0, size=32, focal=40.0)):
+        depth = sphere_depth(camera, 1.0)
+        if number < sheets:
+            depth[:10, :10] = 2.6
+        color = np.full((camera.height, camera.width, 3), (200, 40, 90), np.uint8)
+        made.append(Frame(camera, depth, color))
+    return made
+
+
+def off_the_ball(mesh: Mesh) -> float:
+    """The part of the area that lies away from the ball."""
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    area = areas(mesh)
+    return float(area[np.abs(np.linalg.norm(middle, axis=1) - 1) > 0.15].sum() / area.sum())
+
+
+def test_a_sheet_that_one_view_saw_goes_and_the_ball_stays_whole() -> None:
+    seen = frames(14, sheets=1)
+    before, after = (extract(seen, bbox=BOX, voxel=0.1, threads=1, by_evidence=cleans) for cleans in (False, True))
+    assert off_the_ball(before.mesh) > 0.01  # there was a sheet
+    assert off_the_ball(after.mesh) == 0.0
+    assert areas(after.mesh).sum() == pytest.approx(4 * np.pi, rel=0.07)
+    assert before.cleaned is None
+    assert after.cleaned is not None
+    assert after.cleaned.unsupported + after.cleaned.small > 0.01
+
+
+def test_faces_are_no_more_than_the_pixels_that_saw_them_carry_and_keep_colour_and_shape() -> None:
+    found = extract(frames(14), bbox=BOX, voxel=0.06, threads=1, by_evidence=True)
+    assert found.cleaned is not None
+    # a pixel at distance 3 is 3 / 40 wide, and the best view of each part looks nearly straight at it
+    assert found.cleaned.pixels == pytest.approx(4 * np.pi * (40 / 3) ** 2, rel=0.3)
+    assert len(found.mesh.faces) <= 1.05 * FACES_A_PIXEL * found.cleaned.pixels
+    assert np.abs(np.linalg.norm(found.mesh.vertices, axis=1) - 1).max() < 0.1
+    assert found.mesh.colors is not None
+    assert (np.abs(found.mesh.colors.astype(int) - (200, 40, 90)).max(axis=0) <= 1).all()
+
+
+def test_vertices_know_who_saw_them_and_who_sees_through_them() -> None:
+    cameras = orbit(12, 4.0, size=64, focal=80.0)
+    ahead = cameras[0].center / np.linalg.norm(cameras[0].center)
+    side = np.cross(ahead, [0.0, 0, 1])
+    side /= np.linalg.norm(side)
+    small = 0.02 * np.array([side, np.cross(ahead, side), -side])
+    near, sheet = (radius * ahead + small for radius in (1.0, 1.6))
+    mesh = Mesh(np.concatenate([near, sheet]).astype(np.float32), np.array([[0, 1, 2], [3, 4, 5]], np.int32), None)
+    outwards = np.cross(near[1] - near[0], near[2] - near[0]) @ ahead > 0
+    mesh = mesh if outwards else replace(mesh, faces=mesh.faces[:, ::-1].copy())
+    maps = [depth_map(Frame(camera, sphere_depth(camera, 1.0))) for camera in cameras]
+    evidence = gather(mesh, maps, 0.1)
+    assert (evidence.support[:3] >= 1).all()
+    assert (evidence.against[:3] == 0).all()
+    assert (evidence.support[3:] == 0).all()
+    assert (evidence.against[3:] >= 1).all()
+    assert evidence.density[:3] == pytest.approx((80 / 3) ** 2, rel=0.05)
+    turned = gather(replace(mesh, faces=mesh.faces[:, ::-1].copy()), maps, 0.1)
+    assert (turned.support == 0).all()  # nobody looks at its back
+
+
+def test_few_photographs_need_fewer_witnesses() -> None:
+    assert [least_views(count) for count in (1, 2, 11, 12, 300)] == [1, 2, 2, 3, 3]
+
+
+def test_a_mesh_of_nothing_that_was_seen_is_empty_and_no_error() -> None:
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), None)
+    camera = orbit(1, 4.0)[0]
+    found = clean(mesh, [depth_map(Frame(camera, np.zeros((camera.height, camera.width))))], 1, 0.1)
+    assert (len(found.mesh.faces), found.pixels, found.unsupported) == (0, 0.0, 1.0)
+
+
+def test_an_open_border_stays_where_it_was_when_faces_go() -> None:
+    n = 41
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
+    vertices = np.stack([x.ravel(), y.ravel(), 0.05 * np.sin(6 * x.ravel())], axis=1).astype(np.float32)
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + 1, corner + n], 1), np.stack([corner + 1, corner + n + 1, corner + n], 1)]
+    )
+    small = simplified_to(Mesh(vertices, faces.astype(np.int32), None), 600)
+    assert len(small.faces) <= 620
+    assert areas(small).sum() == pytest.approx(areas(Mesh(vertices, faces.astype(np.int32), None)).sum(), rel=0.01)
+    np.testing.assert_allclose(small.vertices[:, :2].min(axis=0), 0, atol=0.01)
+    np.testing.assert_allclose(small.vertices[:, :2].max(axis=0), 1, atol=0.01)

@@ -1,0 +1,83 @@
+"""The subject of a tiny run: written beside its results, taken by the mesh where it should be, and overridden."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.data.subject import OBJECT, read_subject
+from gs2d.errors import ProtocolError, RunError
+from gs2d.io.ply import read_mesh, read_splats
+from gs2d.io.run import RunFolder
+from gs2d.pipeline.events import Notice
+from gs2d.pipeline.jobs import export_run, finished_splats
+from gs2d.pipeline.options import MeshOptions
+from gs2d.pipeline.prepare import protocol_from_json, reload_job
+from gs2d.pipeline.subject import meshed_subject, within
+from gs2d.pipeline.surface import extract_mesh
+from gs2d.protocols import PROTOCOLS
+
+BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
+
+
+def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(undisturbed: RunFolder) -> None:
+    subject = read_subject(undisturbed.path)
+    assert subject is not None
+    job, splats = reload_job(undisturbed, lambda _: None), finished_splats(undisturbed)
+    assert job.protocol.name == "nerf-synthetic"
+    assert meshed_subject(undisturbed, job, splats, MeshOptions(), lambda _: None) is None
+    assert [name for name, protocol in PROTOCOLS.items() if protocol.fusion.subject] == ["generic"]
+
+
+def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: RunFolder, tmp_path: Path) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    job, splats, said = reload_job(run, lambda _: None), finished_splats(run), []
+    subject = meshed_subject(run, job, splats, MeshOptions(subject_box=BOX), said.append)
+    assert subject is not None
+    assert (subject.kind, subject.box.ravel().tolist()) == (OBJECT, list(BOX))
+    assert json.loads((run.path / "subject.json").read_text())["min"] == list(BOX[:3])
+    assert said == [
+        Notice(
+            "subject: 1 x 1.2 x 1.4 wu, box -0.5 -0.6 -0.7 0.5 0.6 0.7 (the box was given); --scene takes everything"
+        )
+    ]
+    out = tmp_path / "part.ply"
+    generic = replace(job, protocol=replace(job.protocol, fusion=PROTOCOLS["generic"].fusion))
+    result = extract_mesh(generic, splats, MeshOptions(voxel=0.05), out, lambda _: None, subject=subject)
+    vertices = read_mesh(out).vertices
+    assert (np.abs(vertices) <= np.array(BOX[3:]) + 0.05 * 8).all()
+    assert {"pixels", "faces_per_pixel"} <= result.keys()
+    for options in (MeshOptions(whole_scene=True), MeshOptions(bbox=BOX), MeshOptions(unbounded=True)):
+        assert meshed_subject(run, generic, splats, options, said.append) is None
+        with pytest.raises(ProtocolError, match="exclude each other"):
+            meshed_subject(run, generic, splats, replace(options, subject_box=BOX), said.append)
+
+
+def test_runs_of_before_there_was_a_subject_still_open() -> None:
+    from dataclasses import asdict
+
+    for protocol in PROTOCOLS.values():
+        data = asdict(protocol)
+        del data["fusion"]["subject"]
+        assert protocol_from_json(data) == protocol
+
+
+def test_splats_are_exported_within_a_box(undisturbed: RunFolder, tmp_path: Path) -> None:
+    splats = finished_splats(undisturbed)
+    means = splats.means.sort(dim=0).values
+    low, high = means[len(means) // 4].tolist(), means[-1].add(1).tolist()
+    result = export_run(undisturbed.path, tmp_path / "part.ply", "2dgs", bbox=(*low, *high))
+    part = read_splats(tmp_path / "part.ply")
+    expected = (splats.means >= torch.tensor(low)).all(dim=1)
+    assert 0 < result["splats"] == int(expected.sum()) < len(splats)
+    assert torch.equal(part.means, splats.means[expected])
+    with pytest.raises(RunError, match="got none of"):
+        within(splats, (100, 100, 100, 101, 101, 101))
+    with pytest.raises(RunError, match="lower corner and a higher one"):
+        within(splats, (1, 0, 0, 0, 1, 1))
