@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from surface_shapes import orbit, sphere_depth
 
 from gs2d.mesh.evidence import FACES_A_PIXEL, areas, clean, gather, least_views, simplified_to
 from gs2d.mesh.extract import extract
 from gs2d.mesh.frames import Frame, depth_map
 from gs2d.triangles import Mesh
-from surface_shapes import orbit, sphere_depth
 
 BOX = np.array([[-2.0, -2, -2], [2, 2, 2]])
 
