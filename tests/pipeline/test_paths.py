@@ -109,10 +109,12 @@ def test_stops_of_a_walk_are_even_and_in_order_and_those_of_a_cloud_lie_far_apar
     assert sorted(stops(cloud, 4).tolist()) == [0, 1, 3, 5]
 
 
-def test_a_circle_lies_level_though_all_look_down_from_one_side() -> None:
-    circle = orbit_cameras(ball_cameras(40)[30:39:4], 8)
-    heights = [camera.center[2] for camera in circle]
-    np.testing.assert_allclose(heights, heights[0], atol=1e-6)
+def test_an_orbit_is_level_though_all_look_down_from_one_side() -> None:
+    cameras = ball_cameras(40)[30:39:4]
+    orbit = orbit_cameras(cameras, 8)
+    np.testing.assert_allclose([camera.rotation[0] @ UP for camera in orbit], 0, atol=1e-6)
+    heights = [camera.center[2] for camera in cameras]
+    assert all(min(heights) - 0.1 < camera.center[2] < max(heights) + 0.1 for camera in orbit)
 
 
 def test_an_orbit_stays_within_the_arc_that_was_photographed() -> None:
@@ -126,7 +128,7 @@ def test_an_orbit_stays_within_the_arc_that_was_photographed() -> None:
     radii = np.linalg.norm(centers[:, :2], axis=1)
     np.testing.assert_allclose(radii, 3 + angles, atol=0.35)  # as far as the photographs there, and as high
     np.testing.assert_allclose(centers[:, 2], 0.5 + angles, atol=0.35)
-    assert paces(orbit).max() < 0.4  # also from the last frame on: it swings back
+    assert paces(orbit).max() < 0.5  # also from the last frame on: it swings back
     assert np.linalg.norm(centers[-1] - centers[0]) < 0.1
     for camera in orbit:
         np.testing.assert_allclose(camera.forward, -camera.center / np.linalg.norm(camera.center), atol=1e-9)

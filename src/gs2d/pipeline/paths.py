@@ -55,14 +55,11 @@ def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | No
         turns = start + width / 2 * (1 - np.cos(2 * np.pi * np.arange(frames) / frames))  # slow where it turns round
         places = [(angle, *_photographed_at(angle, angles, radii, heights, width)) for angle in turns]
     like = cameras[0]
-    return [
-        look_at(
-            focus + height * up + radius * (np.cos(angle) * side + np.sin(angle) * other),
-            *(focus, up),
-            **{"width": like.width, "height": like.height, "fx": like.fx, "fy": like.fy},
-        )
-        for angle, radius, height in places
-    ]
+    circle = []
+    for angle, radius, height in places:
+        eye = focus + height * up + radius * (np.cos(angle) * side + np.sin(angle) * other)
+        circle.append(look_at(eye, focus, up, width=like.width, height=like.height, fx=like.fx, fy=like.fy))
+    return circle
 
 
 def photographed_arc(angles: np.ndarray) -> tuple[float, float] | None:
