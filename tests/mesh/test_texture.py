@@ -248,7 +248,7 @@ def test_the_size_of_a_texture_follows_the_pixels() -> None:
 
 
 def test_a_missing_package_is_one_line_with_the_remedy() -> None:
-    with pytest.raises(BackendError, match=r"pip install 'xatlas>=.*' 'fast-simplification>="):
+    with pytest.raises(BackendError, match=r"pip install 'xatlas>="):
         atlas_module.required("no_such_package_of_gs2d")
 
 

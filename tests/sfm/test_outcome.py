@@ -280,7 +280,7 @@ def test_the_doctor_says_whether_the_extra_is_there(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def version(name: str) -> str:
-        if name in ("pycolmap", "fast-simplification"):
+        if name in ("pycolmap", "xatlas"):
             raise importlib.metadata.PackageNotFoundError(name)
         return "1.2.3"
 
@@ -289,5 +289,5 @@ def test_the_doctor_says_whether_the_extra_is_there(
     text = capsys.readouterr().out
     remedy = "\n       to get it: pip install 'pycolmap>=4.2'\n"
     assert f"  no   cameras of photographs (gs2d reconstruct, poses): pycolmap missing{remedy}" in text
-    assert "  no   textured meshes (--texture): fast-simplification missing\n" in text
+    assert "  no   textured meshes (--texture): xatlas missing\n" in text
     assert "  yes  runs as Slurm jobs (--slurm): submitit 1.2.3\n" in text
