@@ -180,7 +180,7 @@ def simplified_to(mesh: Mesh, faces: int) -> Mesh:
     """Return a mesh of about so many faces, by quadric edge collapse; vertices have the colour nearest to them."""
     if len(mesh.faces) <= max(faces, 4):
         return mesh
-    import fast_simplification  # here: importing it takes longer than most commands
+    import fast_simplification  # type: ignore[import-untyped]  # here: it is slow to import
 
     vertices = mesh.vertices.astype(np.float64)
     middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0
