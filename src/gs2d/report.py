@@ -27,6 +27,7 @@ from gs2d.report_links import links
 from gs2d.report_pictures import hero, mesh_section, view_sections
 from gs2d.report_poses import poses_section
 from gs2d.report_priors import priors_section
+from gs2d.report_subject import subject_section
 from gs2d.report_surface import surface_scores
 from gs2d.report_terms import glossary, titles_of
 
@@ -125,6 +126,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
         glossary(),
         "<h2>Surface</h2>",
         part("scores of the surface", lambda: surface_scores(record.surface, record.surface_reason, record.path)),
+        part("picture of the subject", lambda: subject_section(record.path)),
         part("pictures of the mesh", lambda: mesh_section(record.path / MESH, cameras)),
         "<h2>Every stage beside the photographs</h2>",
         part("pictures of the stages", lambda: view_sections(renders, expected_stages=stages)),

@@ -22,6 +22,7 @@ from gs2d.pipeline.prepare import protocol_from_json, reload_job
 from gs2d.pipeline.subject import meshed_subject, within
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.protocols import PROTOCOLS
+from gs2d.report_subject import subject_section
 
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 
@@ -29,6 +30,9 @@ BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(undisturbed: RunFolder) -> None:
     subject = read_subject(undisturbed.path)
     assert subject is not None
+    shown = subject_section(undisturbed.path)  # in the report: words, the box and the picture
+    assert subject.why in shown
+    assert "data:image/jpeg;base64," in shown
     job, splats = reload_job(undisturbed, lambda _: None), finished_splats(undisturbed)
     assert job.protocol.name == "nerf-synthetic"
     assert meshed_subject(undisturbed, job, splats, MeshOptions(), lambda _: None) is None

@@ -9,13 +9,14 @@ import torch
 
 from gs2d.camera import Camera
 from gs2d.data.subject import OBJECT, Sight, Subject, find_subject, given_subject, middle_weights, read_subject, shown
-from gs2d.errors import DataError, ProtocolError, RunError
+from gs2d.errors import DataError, DiskError, ProtocolError, RunError
 from gs2d.io.files import write_json
-from gs2d.io.run import SUBJECT, RunFolder
+from gs2d.io.run import RENDERS, SUBJECT, RunFolder, make_folder
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.prepare import Job
 from gs2d.render.api import rasterize
+from gs2d.report_subject import PICTURE, write_subject_picture
 from gs2d.splats import Splats
 
 MOST_VIEWS = 64  # cameras, evenly chosen, that vote
@@ -55,7 +56,19 @@ def subject_of(
         raise ProtocolError(str(error)) from error
     write_json(run.file(SUBJECT), subject.to_json())
     on_event(Notice(subject_line(subject)))
+    _draw(run, job, subject, on_event)
     return subject
+
+
+def _draw(run: RunFolder, job: Job, subject: Subject, on_event: OnEvent) -> None:
+    """Write the picture for the report; a full disk costs the picture, not the mesh."""
+    points = np.zeros((0, 3)) if job.scene.points is None else np.asarray(job.scene.points.points, np.float64)
+    try:
+        make_folder(run.file(RENDERS))
+        cameras = [view.camera for view in job.scene.train]
+        write_subject_picture(run.file(RENDERS) / PICTURE, subject, cameras, points)
+    except DiskError as error:
+        on_event(Notice(f"no picture of the subject: {error}"))
 
 
 def meshed_subject(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Subject | None:

@@ -1,0 +1,86 @@
+"""The picture of a subject: cameras, sparse points and the box, from above and from the side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.data.subject import OBJECT, Subject, read_subject
+from gs2d.disk import atomic_write
+from gs2d.images import read_image
+from gs2d.io.run import RENDERS
+from gs2d.report_html import escape, picture
+
+PICTURE = "subject.png"
+MOST_POINTS = 8000
+SPAN = 1.3  # times the farthest camera's or corner's distance from the middle: what the picture shows
+_CAMERA, _BOX = "#d62728", "#111111"
+
+
+def write_subject_picture(path: Path, subject: Subject, cameras: Sequence[Camera], points: np.ndarray) -> None:
+    """Draw a subject among the training cameras and sparse points [P, 3] of a capture, as PNG.
+
+    Raises
+    ------
+    DiskError
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    axes = plane_axes(subject.up)  # rows: right, ahead, up
+    middle = subject.box.mean(axis=0)
+    corners = np.array([[subject.box[i >> k & 1, k] for k in range(3)] for i in range(8)])
+    edges = [(i, i | 1 << k) for i in range(8) for k in range(3) if not i >> k & 1]
+    centers = np.array([camera.center for camera in cameras])
+    reach = SPAN * max(float(np.linalg.norm(np.concatenate([centers, corners]) - middle, axis=1).max()), 1e-9)
+    arrows = 0.08 * reach * np.array([camera.forward for camera in cameras])
+    shown = points[:: max(1, -(-len(points) // MOST_POINTS))]
+    figure = Figure(figsize=(10, 5), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    for place, (name, upwards) in enumerate((("from above", 1), ("from the side", 2)), start=1):
+        plane = axes[[0, upwards]].T  # [3, 2]
+        plot = figure.add_subplot(1, 2, place)
+        plot.plot(*((shown - middle) @ plane).T, ",", color="#8899aa")
+        box = (corners - middle) @ plane
+        plot.add_collection(LineCollection([box[[a, b]] for a, b in edges], colors=_BOX, linewidths=1.0))
+        start, end = (centers - middle) @ plane, (centers + arrows - middle) @ plane
+        plot.add_collection(LineCollection(list(np.stack([start, end], axis=1)), colors=_CAMERA, linewidths=0.9))
+        plot.plot(*start.T, ".", color=_CAMERA, markersize=4)
+        plot.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", title=name, xticks=[], yticks=[])
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})
+
+
+def plane_axes(up: np.ndarray) -> np.ndarray:
+    """Return right, ahead and up [3, 3] for pictures of a capture in which ``up`` [3] is up."""
+    up = up / np.linalg.norm(up)
+    right = np.cross(np.eye(3)[int(np.abs(up).argmin())], up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(up, right), up])
+
+
+def subject_section(run: Path) -> str:
+    """Return what the cameras look at, in words and as a picture; nothing for runs of before it was found.
+
+    Raises
+    ------
+    DataError
+        ``subject.json`` or the picture is damaged.
+    """
+    subject = read_subject(run)
+    if subject is None:
+        return ""
+    what = "The subject" if subject.kind == OBJECT else "No subject, the whole scene"
+    numbers = " ".join(f"{value:.4g}" for value in subject.box.ravel())
+    text = f"<p>{what}: {escape(subject.why)}. Box (<code>--subject-box</code>): <code>{numbers}</code></p>"
+    drawn = run / RENDERS / PICTURE
+    if not drawn.is_file():
+        return text
+    caption = "Training cameras (red), sparse points, and the box of the subject."
+    return text + picture(
+        read_image(drawn) / np.float32(255), caption, alt="cameras, points and the subject", width=1000
+    )
