@@ -25,7 +25,7 @@ from gs2d.errors import DataError
 from gs2d.page import MOST_SPLATS, Seen, pack, texels_of, write_page
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.report_images import normal_picture
+from gs2d.report_images import depth_picture, normal_picture
 from gs2d.splats import Splats
 
 ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
@@ -185,6 +185,7 @@ def test_the_page_is_one_file_that_loads_nothing_and_holds_what_it_is_told(tmp_p
         "main",
     }
     facts = json.loads(page.texts["facts"])
+    assert facts["origin"] == ORIGIN.tolist()
     assert [camera["name"] for camera in facts["cameras"]] == ["</script>.png", "2.png"]
     assert np.allclose(facts["cameras"][0]["t"], at_origin(CAMERA).T_cam_world[:3, 3])
     packed = pack(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
@@ -232,14 +233,11 @@ def test_a_browser_draws_what_the_rasterizer_draws(tmp_path: Path, crossing: str
     ours = output.color.clamp(0, 1).numpy()
     assert likeness(tmp_path, "view=0&bare", ours) > 48
     if crossing == "draw":
-        text = (
-            (tmp_path / "scene.html")
-            .read_text()
-            .replace("let shown = 0, here, target, kind = 0;", "let shown = 0, here, target, kind = 1;")
-        )
-        (tmp_path / "scene.html").write_text(text)
-        normals = normal_picture(output.normal.numpy(), output.alpha.numpy())
-        assert likeness(tmp_path, "bare", normals) > 35  # where two faces cancel, normals are noise
+        alpha = output.alpha.numpy()
+        normals = normal_picture(output.normal.numpy(), alpha)
+        assert likeness(tmp_path, "view=0&bare&kind=normals", normals) > 35  # where two faces cancel, normals are noise
+        depths = depth_picture(output.depth_mean.numpy(), alpha, (2.0, 6.0))
+        assert likeness(tmp_path, "view=0&bare&kind=depth&depths=2,6", depths) > 35
 
 
 def likeness(folder: Path, fragment: str, ours: np.ndarray) -> float:

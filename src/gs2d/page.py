@@ -24,8 +24,10 @@ import numpy as np
 import torch
 
 from gs2d.camera import Camera
+from gs2d.data.subject import OBJECT, Subject
 from gs2d.disk import atomic_write
 from gs2d.errors import DataError
+from gs2d.page_start import guessed_subject, home_camera, photographed_arc
 from gs2d.render.types import CROSSING, RasterSettings
 from gs2d.splats import Splats
 
@@ -36,6 +38,11 @@ PARTS = {  # script elements: id -> file, type
     "final-frag": ("final.frag", "x-shader/x-fragment"),
     "sorter": ("sorter.js", "text/plain"),
 }
+SCRIPTS = ("camera.js", "viewer.js", "panel.js")  # one script, in this order
+HINT = (
+    '<span class="mouse">Drag to turn, wheel to come closer, ? for more.</span>'
+    '<span class="finger">One finger turns, two fingers come closer and shift.</span>'
+)
 MOST_SPLATS = 5_000_000  # rows of 2048 texels, 3 a splat: what a texture of 8192 rows, which any GPU has, can hold
 CLIPPED = 1e-4  # of the SH coefficients of one place may be cut off: the steps of the others are smaller then
 WORD_BYTES = 32  # of a splat, without its SH coefficients above degree 0
@@ -144,6 +151,7 @@ def write_page(
     unit: float,
     up: np.ndarray,
     sh_degree: int = 3,
+    subject: Subject | None = None,
 ) -> dict[str, Any]:
     """Write the page.
 
@@ -152,18 +160,20 @@ def write_page(
     path : path
     splats : Splats
     views : sequence of Seen
-        At least one; the page opens at the first.
+        At least one.
     settings : RasterSettings
         As they were trained with.
     title : str
     focus : ndarray [3] wu
-        What is turned round.
+        What the views look at; places are stored relative to it.
     unit : float, wu
         About how far away it is seen from.
     up : ndarray [3]
         Unit.
     sh_degree : int
         Of the stored coefficients at most: 45, 24, 9 or 0 bytes a splat.
+    subject : Subject, optional
+        What is shown first and turned about. Default: something around the focus.
 
     Returns
     -------
@@ -175,19 +185,28 @@ def write_page(
     DataError, DiskError
     """
     packed = pack(splats, focus, min(sh_degree, settings.sh_degree), settings.alpha_min)
+    if subject is None:
+        subject = guessed_subject([view.camera for view in views], focus, unit, up)
     shade = "#" + "".join(f"{round(255 * part):02x}" for part in settings.background)
     is_dark = sum(settings.background) < 1.5
+    told = json.dumps(_facts(packed, views, settings, unit, up, subject), allow_nan=False)
     zipped = base64.b64encode(gzip.compress(packed.data, 6, mtime=0)).decode()
     values = {
         "title": html.escape(title),
         "count": f"{packed.count:,}",
         "background": shade,
         "ink": "#eee" if is_dark else "#222",
+        "onink": "#222" if is_dark else "#fff",
         "paper": "rgba(0,0,0,.55)" if is_dark else "rgba(255,255,255,.75)",
-        "facts": json.dumps(_facts(packed, views, settings, unit, up), allow_nan=False).replace("<", "\\u003c"),
+        "panel": "rgba(24,26,30,.93)" if is_dark else "rgba(255,255,255,.95)",
+        "hint": HINT,
+        "boxrows": "\n".join(_box_row(i) for i in range(3)),
+        "boxname": "the subject's box" if subject.kind == OBJECT else "the first box",
+        "aboutwhat": "the subject" if subject.kind == OBJECT else "what is in the middle of the picture",
+        "facts": told.replace("<", "\\u003c"),
         "parts": "\n".join(_part(name, *part) for name, part in PARTS.items()),
         "splats": zipped,
-        "viewer": _text("viewer.js"),
+        "viewer": "\n\n".join(map(_text, SCRIPTS)),
     }
     text = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _text("page.html"))
     with atomic_write(Path(path)) as file:
@@ -203,10 +222,27 @@ def _part(name: str, file: str, kind: str) -> str:
     return f'<script type="{kind}" id="{name}">\n{_text(file)}\n</script>'
 
 
+def _box_row(axis: int) -> str:
+    """The two numbers of the clip box along an axis."""
+    name = "xyz"[axis]
+    inputs = "".join(
+        f'<input type="number" data-side="{side}" data-axis="{axis}" aria-label="{word} {name}">'
+        for side, word in (("low", "least"), ("high", "largest"))
+    )
+    return f'<div class="row"><b class="{name}" aria-hidden="true">{name}</b>{inputs}</div>'
+
+
 def _facts(
-    packed: Packed, views: Sequence[Seen], settings: RasterSettings, unit: float, up: np.ndarray
+    packed: Packed,
+    views: Sequence[Seen],
+    settings: RasterSettings,
+    unit: float,
+    up: np.ndarray,
+    subject: Subject,
 ) -> Mapping[str, Any]:
     """What the page is told beside the splats; places are relative to the packed origin."""
+    cameras = [view.camera for view in views]
+    arc = photographed_arc(cameras, subject, up)
     return {
         "splats": packed.count,
         "degree": packed.degree,
@@ -219,7 +255,16 @@ def _facts(
         "crossing": CROSSING.index(settings.crossing),
         "crossingCutoff": settings.error_cutoff,
         "background": list(settings.background),
-        "focus": [0.0, 0.0, 0.0],
+        "origin": packed.origin.tolist(),
+        "subject": {
+            "object": subject.kind == OBJECT,
+            "center": (subject.center - packed.origin).tolist(),
+            "low": (subject.low - packed.origin).tolist(),
+            "high": (subject.high - packed.origin).tolist(),
+            "radius": subject.radius,
+            "home": home_camera(cameras, subject, arc, up),
+            "arc": {"middle": arc.middle.tolist(), "half": arc.half, "low": arc.low, "high": arc.high},
+        },
         "unit": unit,
         "up": up.tolist(),
         "cameras": [_camera(view, packed.origin) for view in views],

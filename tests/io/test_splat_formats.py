@@ -177,17 +177,21 @@ def test_spz_of_version_2_is_read(tmp_path: Path) -> None:
     assert sigmoid(g.opacity_logits)[0] == pytest.approx(254.5 / 255)
 
 
-def test_spz_says_what_it_could_not_hold(tmp_path: Path) -> None:
+def test_spz_says_in_one_line_how_many_splats_it_clipped(tmp_path: Path) -> None:
     splats = a_scene(10)
+    assert write_spz(tmp_path / "a.spz", Gaussians.of(splats)) == ()  # rounding alone is not told
     splats.log_scales[:2] = -12.0
     splats.log_scales[2, 0] = 7.0
     splats.shN[3, 0, 0] = 1.5
-    notes = write_spz(tmp_path / "a.spz", Gaussians.of(splats))
-    assert [note.split(",")[0] for note in notes] == [
-        "2 of 10 splats are smaller than 4.5e-5 units",
-        "1 of 10 splats are larger than 379 units",
-        "1 of 10 splats have SH coefficients beyond 1",
-    ]
+    splats.sh0[[0, 4]] = 5.0  # 0.15 * 5 + 0.5 = 1.25: a byte ends at 1; splat 0 counts once
+    assert write_spz(tmp_path / "a.spz", Gaussians.of(splats)) == (
+        "5 of 10 splats did not fit into SPZ and were clipped to what it holds: 2 smaller than 4.5e-5 units, 1 larger "
+        "than 379 units, 2 colours far beyond black or white, 1 colours that change too much with the view (SH beyond "
+        "1)",
+    )
+    back = read_spz(tmp_path / "a.spz")[0]  # those whose colour did change by more than half a step of 1 / 255
+    moved = np.abs(0.15 * (back.sh0 - Gaussians.of(splats).sh0)).max(axis=1) > 0.51 / 255
+    assert np.flatnonzero(moved).tolist() == [0, 4]
     splats.means[0, 0] = 1e7
     with pytest.raises(DataError, match="SPZ holds positions up to 8388607 units, got 1e"):
         write_spz(tmp_path / "b.spz", Gaussians.of(splats))

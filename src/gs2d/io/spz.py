@@ -46,7 +46,7 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> tuple[str, 
     Returns
     -------
     tuple of str
-        What the format could not hold, one sentence each.
+        How many splats the format could not hold as they are, and in what; nothing where it could.
 
     Raises
     ------
@@ -108,15 +108,22 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def _losses(g: Gaussians) -> tuple[str, ...]:
-    thin = int((g.log_scales[:, :2] < -10.0 - 1 / 32).any(axis=1).sum())
-    wide = int((g.log_scales > 255 / 16 - 10.0 + 1 / 32).any(axis=1).sum())
-    steep = int((np.abs(g.shN) > 1.0).any(axis=(1, 2)).sum()) if g.shN.size else 0
+    """What clamping changed by more than rounding does: one sentence, with the number of splats, or nothing."""
+    thin = (g.log_scales[:, :2] < -10.0 - 1 / 32).any(axis=1)
+    wide = (g.log_scales > 255 / 16 - 10.0 + 1 / 32).any(axis=1)
+    vivid = (np.abs(_COLOR * g.sh0.astype(np.float64)) > 0.5 + 0.5 / 255).any(axis=1)
+    steep = (np.abs(g.shN) > 1.0).any(axis=(1, 2)) if g.shN.size else np.zeros(len(g), bool)
     every = (
-        (thin, "are smaller than 4.5e-5 units, which is what SPZ holds, and were made so large"),
-        (wide, "are larger than 379 units, which is what SPZ holds, and were made so small"),
-        (steep, "have SH coefficients beyond 1, which is what SPZ holds: their colours change less with the view"),
+        (thin, "smaller than 4.5e-5 units"),
+        (wide, "larger than 379 units"),
+        (vivid, "colours far beyond black or white"),
+        (steep, "colours that change too much with the view (SH beyond 1)"),
     )
-    return tuple(f"{count} of {len(g)} splats {text}" for count, text in every if count)
+    clipped = int((thin | wide | vivid | steep).sum())
+    if not clipped:
+        return ()
+    parts = ", ".join(f"{int(rows.sum()):,} {text}" for rows, text in every if rows.any())
+    return (f"{clipped:,} of {len(g):,} splats did not fit into SPZ and were clipped to what it holds: {parts}",)
 
 
 def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:

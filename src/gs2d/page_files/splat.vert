@@ -11,7 +11,8 @@ uniform vec3 shift, eye;           // x_cam = turn x + shift; the camera's centr
 uniform vec4 lens;                 // fx, fy, cx, cy, px
 uniform vec2 size;                 // of the picture, px
 uniform float near, alphaMin, lowpass, crossingCutoff;
-uniform int degree, stored, crossing, kind;  // crossing: 0 draw, 1 cull, 2 box; kind: 0 colour, 1 normals
+uniform int degree, stored, crossing, kind;  // crossing: 0 draw, 1 cull, 2 box; kind: 0 colour, 1 normals, 2 depth
+uniform vec3 boxLow, boxHigh;      // only splats whose means lie between are drawn
 uniform float scales[15];          // of the 8-bit coefficients, by place
 
 flat out vec2 center;
@@ -64,6 +65,7 @@ void main() {
     gl_Position = NOWHERE;
     uvec4 first = texel(splats, 2 * int(row)), second = texel(splats, 2 * int(row) + 1);
     vec3 mean = uintBitsToFloat(first.xyz);
+    if (any(lessThan(mean, boxLow)) || any(greaterThan(mean, boxHigh))) return;
     vec2 s = exp(unpackHalf2x16(first.w));
     vec4 q = normalize(vec4(unpackSnorm2x16(second.x), unpackSnorm2x16(second.y)));  // w, x, y, z
     vec2 redGreen = unpackHalf2x16(second.z), blueOpacity = unpackHalf2x16(second.w);
@@ -110,8 +112,10 @@ void main() {
     if (kind == 1) {
         vec3 seen = (facing > 0.0 ? -n : n) * turn;  // n turn = turn^T n: back to the world
         paint = vec4(0.5 + 0.5 * seen, opacity);
-    } else {
+    } else if (kind == 0) {
         paint = vec4(colorAlong(normalize(toSplat), vec3(redGreen, blueOpacity.x)), opacity);
+    } else {
+        paint = vec4(vec3(0.0), opacity);
     }
     vec2 corner = mix(low, high, vec2(gl_VertexID & 1, gl_VertexID >> 1)) / size;
     gl_Position = vec4(2.0 * corner.x - 1.0, 1.0 - 2.0 * corner.y, 0.0, 1.0);

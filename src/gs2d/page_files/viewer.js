@@ -1,19 +1,5 @@
 // Draws the splats of this page as gs2d does: discs met by rays, back to front, by WebGL 2. No network, no libraries.
-"use strict";
-const $ = (id) => document.getElementById(id);
-const facts = JSON.parse($("facts").textContent);
 const TEXELS = 2048; // a row of the textures
-
-// ---- small vectors; matrices are rows, world to camera ----
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const plus = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
-const times = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
-const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => times(a, 1 / Math.hypot(...a));
-const turned = (v, axis, angle) => {
-  const c = Math.cos(angle), s = Math.sin(angle);
-  return plus(plus(times(v, c), cross(axis, v), s), axis, dot(axis, v) * (1 - c));
-};
 
 async function unpacked() {
   const text = $("splats").textContent.trim();
@@ -52,53 +38,11 @@ function table(gl, buffer, begin, texels) {
   return texture;
 }
 
-// ---- where the visitor is: right, down, ahead (unit, world), eye, and a lens in px of a picture of w x h ----
-const start = (i) => {
-  const c = facts.cameras[i], [right, down, ahead] = [c.R.slice(0, 3), c.R.slice(3, 6), c.R.slice(6, 9)];
-  const eye = times(plus(plus(times(right, c.t[0]), down, c.t[1]), ahead, c.t[2]), -1);
-  return { right, down, ahead, eye, w: c.w, h: c.h, fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy };
-};
-let shown = 0, here, target, kind = 0;
-
-function goTo(i) {
-  shown = (i + facts.cameras.length) % facts.cameras.length;
-  here = start(shown);
-  const reach = Math.max(dot(plus(facts.focus, here.eye, -1), here.ahead), 0.1 * facts.unit);
-  target = plus(here.eye, here.ahead, reach);
-  $("view").textContent = facts.cameras[shown].name;
-  touched();
-}
-
-function orbit(dx, dy) {
-  const swing = (axis, angle) => {
-    here.eye = plus(target, turned(plus(here.eye, target, -1), axis, angle));
-    for (const name of ["right", "down", "ahead"]) here[name] = unit(turned(here[name], axis, angle));
-  };
-  swing(facts.up, dot(facts.up, here.down) > 0 ? dx : -dx);
-  const steep = (ahead) => Math.abs(dot(ahead, facts.up)), next = turned(here.ahead, here.right, -dy);
-  if (steep(next) < 0.995 || steep(next) < steep(here.ahead)) swing(here.right, -dy); // beyond, all would turn round
-  touched();
-}
-
-function pan(dx, dy) {
-  const reach = Math.hypot(...plus(target, here.eye, -1)) / here.fx / fit();
-  const move = plus(times(here.right, -dx * reach), here.down, -dy * reach);
-  here.eye = plus(here.eye, move);
-  target = plus(target, move);
-  touched();
-}
-
-function zoom(factor) {
-  const reach = Math.hypot(...plus(target, here.eye, -1));
-  const least = 0.02 * facts.unit, next = Math.min(Math.max(reach * factor, least), 50 * facts.unit);
-  here.eye = plus(target, here.ahead, -next);
-  touched();
-}
-
 // ---- drawing ----
 const canvas = $("canvas");
 const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
 let splatProgram, finalProgram, splatTable, shTable, orderBuffer, frameBuffer, picture, pictureSize = "";
+let range = [0, 1], fixed, sample; // depths at the ends of the scale, those that were asked for; some of the means
 let count = 0, drawn = 0, asked = 0, waiting = false, dirty = false, moving = 0, fine = 1, coarse = 1;
 const worker = new Worker(URL.createObjectURL(new Blob([$("sorter").textContent], { type: "text/javascript" })));
 
@@ -152,13 +96,28 @@ function frame() {
   const began = performance.now();
   sized(width, height);
   render(width, height);
+  overlay();
   if (!still) {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits: how long does a picture take here?
     const took = performance.now() - began;
     coarse = took > 60 ? Math.max(0.25, coarse * 0.8) : took < 25 ? Math.min(1, coarse * 1.1) : coarse;
     setTimeout(() => { if (!dirty) requestAnimationFrame(frame); dirty = true; }, 300); // sharp again, once at rest
   }
+  told();
+  if (spinning) spin();
   document.body.dataset.drawn = drawn === asked && still ? "still" : "moving";
+}
+
+function depths() {
+  // Nearest and farthest depth worth a colour: most of what lies in the picture.
+  const found = [];
+  for (let i = 0; i < sample.length; i += 3) {
+    const mean = [sample[i], sample[i + 1], sample[i + 2]];
+    if (inPicture(here, mean) && inBox(mean)) found.push(dot(plus(mean, here.eye, -1), here.ahead));
+  }
+  found.sort((a, b) => a - b);
+  const at = (share) => found[Math.round(share * (found.length - 1))];
+  return found.length > 9 && at(0.97) > at(0.03) ? [at(0.03), at(0.97)] : [facts.near, facts.near + 2 * facts.unit];
 }
 
 function render(width, height) {
@@ -179,6 +138,10 @@ function render(width, height) {
   gl.uniform2f(at.size, width, height);
   gl.uniform1f(at.height, height);
   gl.uniform1i(at.kind, kind);
+  if (kind === 2) range = fixed || depths();
+  gl.uniform2f(at.range, ...range);
+  gl.uniform3f(at.boxLow, ...(box.on ? box.low : [-1e30, -1e30, -1e30]));
+  gl.uniform3f(at.boxHigh, ...(box.on ? box.high : [1e30, 1e30, 1e30]));
   [splatTable, shTable].forEach((texture, i) => {
     gl.activeTexture(gl.TEXTURE0 + i);
     gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -203,6 +166,8 @@ async function begin() {
   shTable = table(gl, buffer, 32 * n, facts.stored * n);
   const words = new Float32Array(buffer, 0, 8 * n), means = new Float32Array(3 * n);
   for (let i = 0; i < n; ++i) means.set(words.subarray(8 * i, 8 * i + 3), 3 * i);
+  const every = Math.max(1, Math.floor(n / 4000));
+  sample = Float32Array.from({ length: 3 * Math.floor(n / every) }, (_, i) => means[3 * every * Math.floor(i / 3) + (i % 3)]);
   worker.postMessage({ means }, [means.buffer]);
   [orderBuffer, frameBuffer, picture] = [gl.createBuffer(), gl.createFramebuffer(), gl.createTexture()];
   gl.bindBuffer(gl.ARRAY_BUFFER, orderBuffer);
@@ -219,39 +184,12 @@ async function begin() {
   gl.useProgram(finalProgram.made);
   gl.uniform3f(finalProgram.at.background, ...facts.background);
   listen();
-  goTo(Number(new URLSearchParams(location.hash.slice(1)).get("view")) || 0);
+  const asked = new URLSearchParams(location.hash.slice(1)), kinds = ["colours", "normals", "depth"];
+  if (asked.has("depths")) fixed = asked.get("depths").split(",").map(Number);
+  if (asked.has("view")) goTo(Number(asked.get("view")) || 0);
+  else home();
+  show(Math.max(0, kinds.indexOf(asked.get("kind"))));
   $("wait").remove();
-}
-
-function listen() {
-  const fingers = new Map();
-  const spread = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a.x - b.x, a.y - b.y); };
-  canvas.onpointerdown = (e) => { canvas.setPointerCapture(e.pointerId); fingers.set(e.pointerId, { x: e.clientX, y: e.clientY }); };
-  canvas.onpointerup = canvas.onpointercancel = (e) => fingers.delete(e.pointerId);
-  canvas.onpointermove = (e) => {
-    const before = fingers.get(e.pointerId);
-    if (!before) return;
-    const [dx, dy] = [e.clientX - before.x, e.clientY - before.y], two = fingers.size === 2, apart = two ? spread() : 0;
-    fingers.set(e.pointerId, { x: e.clientX, y: e.clientY });
-    if (two) { zoom(apart / Math.max(spread(), 1)); pan(dx / 2, dy / 2); }
-    else if (e.buttons & 2 || e.shiftKey) pan(dx, dy);
-    else orbit(dx * 0.006, dy * 0.006);
-  };
-  canvas.onwheel = (e) => { e.preventDefault(); zoom(Math.exp(0.0015 * Math.max(-200, Math.min(200, e.deltaY)))); };
-  canvas.oncontextmenu = (e) => e.preventDefault();
-  const keys = { ArrowLeft: () => goTo(shown - 1), ArrowRight: () => goTo(shown + 1), n: () => show(1 - kind), "+": () => zoom(0.9), "-": () => zoom(1.1) };
-  onkeydown = (e) => keys[e.key] && !e.ctrlKey && !e.metaKey && keys[e.key]();
-  onresize = touched;
-  $("before").onclick = keys.ArrowLeft;
-  $("after").onclick = keys.ArrowRight;
-  $("kind").onclick = keys.n;
-  canvas.addEventListener("webglcontextlost", () => failed(Error("the graphics card gave up; reload the page")));
-}
-
-function show(next) {
-  kind = next;
-  $("kind").textContent = kind ? "colours" : "normals";
-  touched();
 }
 
 function failed(error) {
@@ -261,5 +199,3 @@ function failed(error) {
   line.id = "failed";
   document.body.append(line);
 }
-
-begin().catch(failed);

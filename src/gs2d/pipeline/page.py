@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.data import View
+from gs2d.data.subject import Subject, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.run import PAGE, is_run, open_run
 from gs2d.io.splat_formats import read_disks
@@ -76,16 +77,32 @@ def page_run(
     views = [] if job is None else _some(job.scene.train)
     cameras = [view.camera for view in views]
     frame = frame_around(cameras, splats.means.cpu().numpy())
+    subject = _subject(path, on_event) if of_run and cameras else None
     up = up_direction(cameras) if cameras else np.array([0.0, 0.0, 1.0])
     seen = [Seen(view.name, view.camera) for view in views] or [Seen("from aside", from_aside(frame, up))]
     settings = settings_without_run(splats) if job is None else job.settings
     on_event(Phase("writing the page", 0))
     written = write_page(
-        *(out, splats, seen, settings), title=title, focus=frame.origin, unit=frame.unit, up=up, sh_degree=sh_degree
+        *(out, splats, seen, settings),
+        title=title,
+        focus=frame.origin,
+        unit=frame.unit,
+        up=up,
+        sh_degree=sh_degree,
+        subject=subject,
     )
     if written["bytes"] > LARGE:
         on_event(Notice(f"{written['bytes'] / 1e6:.0f} MB are much for a page: --sh-degree 1 or 0 makes it smaller"))
     return {"file": str(out), "views": len(seen), **written}
+
+
+def _subject(folder: Path, on_event: OnEvent) -> Subject | None:
+    """What the run says that it is about; None where it says nothing, or its file is damaged, which is told."""
+    try:
+        return read_subject(folder)
+    except DataError as error:
+        on_event(Notice(f"the page opens at what the cameras look at: {error}"))
+        return None
 
 
 def _some(views: tuple[View, ...]) -> list[View]:

@@ -1,0 +1,233 @@
+"""The page of splats in a browser: where it opens, how it is turned, how far it goes, its clip box, its help."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from browser import Page, browser, require_browser
+from gs2d.camera import look_at
+from gs2d.data.subject import Subject
+from gs2d.page import Seen, write_page
+from gs2d.page_start import guessed_subject, home_camera, photographed_arc
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
+from gs2d.splats import Splats
+
+ORIGIN = np.array([100.0, -200.0, 50.0])
+UP = np.array([0.0, 0.0, 1.0])
+SETTINGS = RasterSettings(near=0.05, background=(0.2, 0.5, 0.9), sh_degree=0)
+WIDTH, HEIGHT = 240, 160
+
+
+def seen_from(degrees: float, *, height: float = 1.0, away: float = 4.0) -> Seen:
+    angle = np.radians(degrees)
+    eye = ORIGIN + np.array([away * np.cos(angle), away * np.sin(angle), height])
+    camera = look_at(eye, ORIGIN, UP, width=WIDTH, height=HEIGHT, fx=200.0)
+    return Seen(f"{degrees:g}.jpg", camera)
+
+
+ONE_SIDE = [seen_from(degrees) for degrees in (-40, -20, 0, 20, 40)]
+SUBJECT = Subject("object", ORIGIN - 0.6, ORIGIN + 0.6, ORIGIN, UP, "a test")
+
+
+def two_balls() -> Splats:
+    """A red splat at y = +0.3 and a green one at y = -0.3."""
+    means = torch.from_numpy(ORIGIN + np.array([[0.0, 0.3, 0.0], [0.0, -0.3, 0.0]]))
+    quats = torch.tensor([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]] * 2)  # faces x
+    colors = (torch.tensor([[[0.9, 0.1, 0.1]], [[0.1, 0.9, 0.1]]]).double() - 0.5) / 0.28209479177387814
+    return Splats(means, quats, torch.full((2, 2), -2.0).double(), torch.full((2,), 3.0).double(), colors,
+                  torch.zeros(2, 0, 3).double())  # fmt: skip
+
+
+def write(path: Path, views: list[Seen] = ONE_SIDE) -> Path:
+    write_page(path, two_balls(), views, SETTINGS, title="two balls", focus=ORIGIN, unit=4.0, up=UP, subject=SUBJECT)
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    require_browser()
+    path = write(tmp_path_factory.mktemp("page") / "scene.html")
+    with browser() as tab:
+        tab.size(640, 420)
+        tab.open(f"file://{path}")
+        still(tab)
+        yield tab
+        assert tab.errors == []
+
+
+def still(page: Page) -> None:
+    """Wait until what is seen is drawn in full."""
+    page.until("document.body.dataset.drawn === 'still'")
+
+
+def values(page: Page, *names: str) -> list[Any]:
+    return list(json.loads(page.ask(f"JSON.stringify([{', '.join(names)}])")))
+
+
+# -- without a browser -------------------------------------------------------------------------------------------------
+def test_a_one_sided_capture_has_an_arc_and_opens_in_its_middle() -> None:
+    cameras = [view.camera for view in ONE_SIDE]
+    arc = photographed_arc(cameras, SUBJECT, UP)
+    np.testing.assert_allclose(arc.middle, [1, 0, 0], atol=1e-9)
+    assert np.degrees(arc.half) == pytest.approx(40 + 12)
+    rise = np.degrees(np.arctan2(1.0, 4.0))
+    assert np.degrees([arc.low, arc.high]) == pytest.approx([rise - 12, rise + 20])
+    assert home_camera(cameras, SUBJECT, arc, UP) == 2
+
+
+def test_a_ring_of_cameras_has_no_arc_and_opens_at_a_usual_height() -> None:
+    ring = [seen_from(degrees, height=1.0 if degrees else 4.0).camera for degrees in range(0, 360, 30)]
+    arc = photographed_arc(ring, SUBJECT, UP)
+    assert arc.half == pytest.approx(np.pi)
+    assert home_camera(ring, SUBJECT, arc, UP) != 0  # the one from high above
+
+
+def test_cameras_in_a_room_look_at_no_object() -> None:
+    def outwards(degrees: float) -> Any:
+        camera = seen_from(degrees, away=0.5).camera
+        return look_at(camera.center, 2 * camera.center - ORIGIN, UP, width=WIDTH, height=HEIGHT, fx=200.0)
+
+    assert guessed_subject([outwards(d) for d in range(0, 360, 45)], ORIGIN, 0.5, UP).kind == "scene"
+    assert guessed_subject([view.camera for view in ONE_SIDE], ORIGIN, 4.0, UP).kind == "object"
+    assert guessed_subject([], ORIGIN, 4.0, UP).kind == "scene"
+
+
+# -- in a browser ------------------------------------------------------------------------------------------------------
+def test_it_opens_where_a_photograph_was_taken_with_the_subject_in_the_middle(page: Page) -> None:
+    page.key("h")
+    eye, target, ahead = (np.array(value) for value in values(page, "here.eye", "target", "here.ahead"))
+    np.testing.assert_allclose(eye, ONE_SIDE[2].camera.center - ORIGIN, atol=1e-6)
+    np.testing.assert_allclose(target, 0, atol=1e-9)
+    np.testing.assert_allclose(ahead, -eye / np.linalg.norm(eye), atol=1e-6)
+    still(page)
+    picture = page.picture()
+    assert np.abs(picture[210, 320 - 4 : 320 + 4] - [0.2, 0.5, 0.9]).max() > 0.02  # the balls, not the background alone
+    # all of the subject's ball fits into the window: 2 asin(radius / away) of the view, 10 % to spare
+    needed = 2.2 * 200 * np.tan(np.arcsin(SUBJECT.radius / np.linalg.norm(eye)))
+    assert values(page, "here.h")[0] == pytest.approx(min(needed, HEIGHT))
+
+
+def test_dragging_turns_about_the_subject_and_stops_at_the_end_of_the_arc(page: Page) -> None:
+    page.key("h")
+    page.drag((320, 160), (360, 160))
+    eye, target = (np.array(value) for value in values(page, "here.eye", "target"))
+    np.testing.assert_allclose(target, 0, atol=1e-9)
+    assert np.linalg.norm(eye) == pytest.approx(np.hypot(4, 1))
+    assert np.degrees(np.arctan2(eye[1], eye[0])) == pytest.approx(-np.degrees(40 * 0.006), abs=1)
+    for _ in range(6):
+        page.drag((100, 160), (400, 160), steps=3)
+    eye = np.array(values(page, "here.eye")[0])
+    assert -53 < np.degrees(np.arctan2(eye[1], eye[0])) < -10  # 40 degrees and 12 of margin
+    for start, end in ((40, 300), (300, 40)):  # towards the zenith, and towards the floor
+        for _ in range(4):
+            page.drag((320, start), (320, end), steps=8)
+        rise = np.degrees(np.arcsin(values(page, "here.eye")[0][2] / np.hypot(4, 1)))
+        assert 14 - 12 - 0.1 < rise < 14 + 20 + 0.1
+        assert abs(rise - 14) > 5  # it did turn
+    assert values(page, "$('note').hidden") == [True]
+    page.ask("$('free').click()")
+    for _ in range(3):
+        page.drag((100, 160), (400, 160), steps=4)
+    still(page)
+    assert values(page, "$('note').hidden") == [False]  # now it is a guess, and said
+    page.ask("$('free').click()")
+    page.key("h")
+    still(page)
+    assert values(page, "$('note').hidden") == [True]
+
+
+def test_the_wheel_stops_before_the_subject_and_before_the_void(page: Page) -> None:
+    page.key("h")
+    for delta, least, most in ((-200, 0.1 * SUBJECT.radius, 0.2 * SUBJECT.radius), (200, 6.0, 8.0)):
+        for _ in range(20):
+            page.mouse("mouseWheel", 320, 160, deltaX=0, deltaY=delta)
+        assert least < np.linalg.norm(values(page, "here.eye")[0]) < most
+    page.click("#home")
+    assert np.linalg.norm(values(page, "here.eye")[0]) == pytest.approx(np.hypot(4, 1))
+
+
+def test_the_clip_box_cuts_what_is_drawn_and_its_numbers_are_an_option(page: Page) -> None:
+    page.key("h")
+    page.click("#box")
+    assert page.ask("$('bbox').value") == "--bbox 99.400 -200.600 49.400 100.600 -199.400 50.600"
+    page.ask("$('boxpanel').querySelector('[data-side=high][data-axis=\"1\"]').focus()")
+    page.ask("document.activeElement.select()")
+    page.send("Input.insertText", text="-200")
+    assert page.ask("$('bbox').value") == "--bbox 99.400 -200.600 49.400 100.600 -200.000 50.600"
+    still(page)
+    page.ask("document.body.classList.add('bare'); $('boxpanel').hidden = true; $('lines').style.display = 'none'")
+    page.until("document.body.dataset.drawn === 'still'")
+    cut = page.picture()
+    red, green = ((cut[..., k] > 0.6) & (cut[..., 2] < 0.4) for k in (0, 1))
+    assert green.sum() > 50
+    assert red.sum() == 0
+    page.ask("document.body.classList.remove('bare')")
+    page.ask("boxed(true)")
+    handle = page.middle("circle[data-side=high][data-axis='2']")
+    page.drag(handle, (handle[0], handle[1] + 30))
+    high = float(page.ask("$('bbox').value").split()[-1])
+    assert 50.0 < high < 50.55  # the top came down
+    page.ask("$('subjectbox').click(); boxed(false)")
+    assert page.ask("numbers()") == "99.400 -200.600 49.400 100.600 -199.400 50.600"
+
+
+def test_a_phone_has_every_button_in_sight_turns_and_pinches(page: Page) -> None:
+    page.size(375, 667, phone=True)
+    try:
+        page.key("h")
+        shown = page.ask(
+            "[...document.querySelectorAll('#bar button')].map((b) => b.getBoundingClientRect())"
+            ".every((r) => r.left >= 0 && r.right <= innerWidth && r.bottom <= innerHeight && r.height >= 40)"
+        )
+        assert shown
+        assert page.ask("[...document.querySelectorAll('button')].every((b) => b.textContent.trim() || b.ariaLabel)")
+        page.fingers(((180, 300), (220, 300)))
+        assert abs(values(page, "here.eye")[0][1]) > 0.3
+        away = np.linalg.norm(values(page, "here.eye")[0])
+        page.fingers(((170, 300), (120, 300)), ((200, 300), (250, 300)))
+        assert np.linalg.norm(np.subtract(*values(page, "here.eye", "target"))) < 0.7 * away
+    finally:
+        page.size(640, 420)
+        page.key("h")
+
+
+def test_keys_open_help_show_normals_and_depth_and_step_through_photographs(page: Page) -> None:
+    page.key("?")
+    assert page.ask("$('help').open")
+    page.key("n")  # not behind the help
+    page.key("Escape")
+    assert values(page, "$('help').open", "kind") == [False, 0]
+    page.key("z")
+    assert values(page, "kind", "document.querySelector('[data-kind=\"2\"]').ariaPressed") == [2, "true"]
+    page.key("c")
+    page.key("ArrowRight")
+    assert page.ask("$('view').textContent") == "20.jpg"
+    page.key("h")
+    page.key("t")
+    page.until("Math.abs(here.eye[1]) > 0.05")  # it turns by itself
+    page.key("t")
+    still(page)
+
+
+def test_a_photographed_view_is_drawn_as_the_rasterizer_draws_it_after_turning_and_coming_back(page: Page) -> None:
+    page.drag((320, 160), (380, 170))
+    page.size(WIDTH, HEIGHT)
+    try:
+        page.ask("document.body.classList.add('bare'); goTo(3)")
+        still(page)
+        page.until("drawn === asked")
+        with torch.no_grad():
+            ours = rasterize(two_balls(), ONE_SIDE[3].camera, SETTINGS, backend="reference").color.numpy()
+        error = ((page.picture() - np.clip(ours, 0, 1)) ** 2).mean()
+        assert -10 * np.log10(error) > 48
+    finally:
+        page.ask("document.body.classList.remove('bare')")
+        page.size(640, 420)
