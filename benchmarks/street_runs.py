@@ -32,6 +32,7 @@ from gs2d.io.run import MESH, METRICS, PAGE, REPORT, SPLATS
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.jobs import open_job
+from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.pipeline.scoring import score_views
@@ -207,16 +208,21 @@ def summary_of(scores: Mapping[str, ImageMetrics]) -> dict[str, Any] | None:
 
 
 def score_run(path: Path) -> dict[str, Any]:
-    """Scores of a run's splats: both splits, with colours matched, and the sparse points that test views hide."""
+    """Scores of a run's splats: both splits, with colours matched, and the sparse points that test views hide.
+
+    Test views have the exposure that the training photographs around them predict, as in the run's own scores, and none
+    in "test_plain".
+    """
     run, job, splats = open_job(path, None, ignore)
     drawing = (job.settings, job.backend)
-    exposures = read_exposures(run, job.recipe)
+    exposures = with_predicted(read_exposures(run, job.recipe), job.scene)
 
     def scores(views: Sequence[View], **how: Any) -> dict[str, Any] | None:
         return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, **how))
 
     return {
-        "test": scores(job.scene.test),
+        "test": scores(job.scene.test, exposures=exposures),
+        "test_plain": scores(job.scene.test),
         "test_matched": scores(job.scene.test, match=True),
         "train": scores(job.scene.train, exposures=exposures),
         "hidden": hidden_share(job, splats),
