@@ -1,0 +1,189 @@
+"""Fog in new views of real captures, and what each part of robust training does against it: docs/decisions.md, "Fog".
+
+::
+
+    python -m benchmarks.fog CAPTURE[:DOWNSCALE] ... [--variants off robust ...] [--scale 0.05] [--out FILE.json]
+
+Trains each capture (with the sparse points that its photographs show: COLMAP's) once for each variant, every 8th view
+held out, and measures: PSNR and SSIM of test views, the worst one, PSNR after an affine fit of colour (what exposure
+explains), PSNR of training views, sparse points hidden in test views (mean and worst view), the share of the blending
+weight of all training views that lies clearly nearer to a camera than 99 % of the sparse points, splats and CPU
+seconds. One thread; CPU seconds of a shared machine are comparable within one run only, and only roughly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gs2d.data import Scene, View, load_scene
+from gs2d.evaluate.hidden_points import HiddenPoints, hidden_points, total
+from gs2d.evaluate.images import image_metrics, psnr_float
+from gs2d.exposure import fit_exposure
+from gs2d.pipeline.exposure import Transforms, named, photographed
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.prepare import fit_recipe, with_backdrop
+from gs2d.protocols import GENERIC, Protocol
+from gs2d.recipe import Recipe
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
+from gs2d.sh import C0
+from gs2d.splats import Splats
+from gs2d.train.loop import Trainer
+
+NEAR_PERCENTILE, NEARER = 1.0, 0.9  # of the depths of sparse points in the photographs that show them; a margin
+TRAINING_VIEWS = 12  # that are scored, evenly chosen
+
+
+def _without(field: str) -> Callable[[Recipe], Recipe]:
+    return lambda recipe: replace(recipe, **{field: None})  # type: ignore[arg-type]
+
+
+VARIANTS: Mapping[str, tuple[dict[str, Any], Callable[[Recipe], Recipe]]] = {  # options, and a change of the recipe
+    "off": ({"robust": "off"}, lambda recipe: recipe),
+    "robust": ({}, lambda recipe: recipe),
+    "no dense start": ({}, _without("dense_start")),
+    "no free space": ({}, _without("free_space")),
+    "no decay": ({}, _without("opacity_decay")),
+    "no exposure": ({"exposure": False}, lambda recipe: recipe),
+    "black background": ({}, lambda recipe: recipe),
+    "off, exposure": ({"robust": "off", "exposure": True}, lambda recipe: recipe),
+}
+
+
+def train_variant(scene: Scene, name: str, recipe: str, scale: float, seed: int) -> tuple[Trainer, float]:
+    """Train a scene with a variant; the trainer, and CPU seconds."""
+    asked, change = VARIANTS[name]
+    options = TrainOptions(
+        scene=Path("."), out=Path("."), recipe=recipe, schedule_scale=scale, seed=seed, **asked
+    )  # only its recipe is used
+    start = time.process_time()
+    fitted = fit_recipe(options, scene, GENERIC, lambda event: None)
+    protocol: Protocol = GENERIC
+    if name != "black background":
+        protocol = with_backdrop(GENERIC, fitted, scene, lambda event: None)
+    trainer = Trainer(scene, change(fitted), protocol, backend="cpu")
+    trainer.run()
+    return trainer, time.process_time() - start
+
+
+@torch.no_grad()
+def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
+    """The figures of a trained scene."""
+    transforms = with_predicted(named(scene.train, trainer.state.exposures), scene)
+    settings, splats = trainer.settings, trainer.splats
+    tests = [_score(scene, view, splats, settings, transforms) for view in scene.test]
+    chosen = scene.train[:: max(1, len(scene.train) // TRAINING_VIEWS)]
+    trains = [_score(scene, view, splats, settings, transforms) for view in chosen]
+    hidden = [score.pop("points") for score in tests]
+    return {
+        "test": {key: float(np.mean([score[key] for score in tests])) for key in ("psnr", "ssim", "fitted")},
+        "worst": min(score["psnr"] for score in tests),
+        "train": float(np.mean([score["psnr"] for score in trains])),
+        "hidden": total(hidden).share,
+        "hidden_worst": max((points.share or 0.0 for points in hidden), default=0.0),
+        "near_weight": near_weight(scene, splats, settings),
+        "splats": len(splats),
+    }
+
+
+def _score(
+    scene: Scene, view: View, splats: Splats, settings: RasterSettings, transforms: Transforms
+) -> dict[str, Any]:
+    output = rasterize(splats, view.camera, settings, backend="cpu")
+    color = photographed(view, output.color, transforms, settings.background)
+    target, pixels = torch.from_numpy(view.target(settings.background)), view.mask()
+    mask = None if pixels is None else torch.from_numpy(pixels)
+    everywhere = torch.ones(target.shape[:2], dtype=torch.bool) if mask is None else mask
+    fit = fit_exposure(output.color, target, everywhere)
+    fitted = output.color @ fit[:, :3].T + fit[:, 3]
+    points = HiddenPoints(0, 0)
+    if scene.observe is not None:
+        points = hidden_points(output.depth_median.numpy(), scene.observe().in_view(view.name, view.camera))
+    return {
+        "psnr": psnr_float(color, target, mask),
+        "fitted": psnr_float(fitted, target, mask),
+        "ssim": image_metrics(color, target, mask, backend_name="cpu").ssim.value,
+        "points": points,
+    }
+
+
+def near_weight(scene: Scene, splats: Splats, settings: RasterSettings) -> float:
+    """Share of the blending weight of all training views by splats nearer to its camera than nearly all points are.
+
+    The weight of a splat in a view is the derivative of the sum of all pixels with respect to its colour.
+    """
+    assert scene.observe is not None
+    observed = scene.observe()
+    depths = [observed.in_view(view.name, view.camera).depth for view in scene.train]
+    limit = NEARER * float(np.percentile(np.concatenate(depths), NEAR_PERCENTILE))
+    near, whole = 0.0, 0.0
+    for view in scene.train:
+        parts = {name: tensor.detach() for name, tensor in splats.items()}
+        parts["sh0"] = torch.full_like(parts["sh0"], 0.5).requires_grad_()
+        with torch.enable_grad():
+            output = rasterize(Splats(**parts), view.camera, replace(settings, sh_degree=0), backend="cpu")
+            output.color.sum().backward()  # type: ignore[no-untyped-call]
+        assert parts["sh0"].grad is not None
+        weight = parts["sh0"].grad[:, 0, 0] / C0
+        depth = view.camera.project(splats.means.numpy().astype(np.float64))[1]
+        near += float(weight[torch.from_numpy(depth < limit)].sum())
+        whole += float(weight.sum())
+    return near / whole if whole else 0.0
+
+
+def show(rows: Sequence[dict[str, Any]]) -> str:
+    """The figures as a Markdown table."""
+    lines = [
+        "| capture | variant | test | worst | SSIM | colour fitted | training | hidden | worst | near | splats | CPU |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        test = row["test"]
+        lines.append(
+            f"| {row['capture']} | {row['variant']} | {test['psnr']:.2f} | {row['worst']:.2f} | {test['ssim']:.3f} "
+            f"| {test['fitted']:.2f} | {row['train']:.2f} | {row['hidden']:.2%} | {row['hidden_worst']:.1%} "
+            f"| {row['near_weight']:.1%} | {row['splats']:,} | {row['cpu_seconds']:.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the arguments, and train."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="+", metavar="CAPTURE[:DOWNSCALE]")
+    parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=["off", "robust"])
+    parser.add_argument("--recipe", default="2dgs")
+    parser.add_argument("--scale", type=float, default=0.05)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    rows = []
+    for capture in args.captures:
+        path, _, downscale = capture.partition(":")
+        scene = load_scene(path, downscale=int(downscale or 1))
+        if scene.observe is None or not scene.test:
+            raise SystemExit(f"{path} must say which sparse points its photographs show, and have test views")
+        for variant in args.variants:
+            trainer, seconds = train_variant(scene, variant, args.recipe, args.scale, args.seed)
+            about = {"capture": Path(path).name, "downscale": int(downscale or 1), "variant": variant}
+            how = {"recipe": args.recipe, "scale": args.scale, "seed": args.seed}
+            rows.append({**about, **how, **measure(scene, trainer), "cpu_seconds": seconds})
+            print(show(rows[-1:]).splitlines()[-1], flush=True)
+            if args.out is not None:
+                args.out.write_text(json.dumps(rows, indent=1) + "\n")
+    print(show(rows))
+
+
+if __name__ == "__main__":
+    main()
