@@ -5,25 +5,24 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import IO, Any
 
 from rich import box
 from rich.console import Console as RichConsole
+from rich.live import Live
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
-from gs2d.cli.layout import wrapped
-from gs2d.pipeline.events import Event, Missing, Notice, Phase, StageDone, Step
+from gs2d.cli.bar import Bar
+from gs2d.cli.layout import records, wrapped
+from gs2d.cli.whole import WholeRun
+from gs2d.pipeline.events import Event, Expected, Missing, Notice, Phase, Plan, StageDone, Step
+
+LOG_SECONDS, LOG_SHARE = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
+_ANY_WIDTH = 10_000  # columns
+_NO_SCREENS = ("dumb", "unknown")  # values of TERM: no cursor that goes back
 
 
 class _Screen(RichConsole):
@@ -46,6 +45,11 @@ def _screen(file: IO[str], **settings: Any) -> _Screen:
     return _Screen(file=file, highlight=False, color_system=color, **settings)  # type: ignore[arg-type]
 
 
+def _has_cursor(file: IO[str] | None) -> bool:
+    """Whether lines can be drawn over: not in a file or a pipe, whatever the colours, nor on a dumb terminal."""
+    return file is not None and file.isatty() and os.environ.get("TERM", "") not in _NO_SCREENS
+
+
 class Console:
     """The screen. With ``quiet`` nothing but results asked for as JSON; with ``as_json`` stdout carries only JSON."""
 
@@ -55,10 +59,13 @@ class Console:
         self._before_each = before_each  # event; may raise
         self._out = _screen(sys.stdout, soft_wrap=True)
         self._err = _screen(sys.stderr)
-        self._progress: Progress | None = None
-        self._task: TaskID | None = None
+        self._interactive = _has_cursor(sys.stderr)
+        self._whole = WholeRun()
+        self._live: Live | None = None
+        self._bar: Bar | None = None
         self._named: set[str] = set()  # phases that a log file has heard of
         self.missing: list[Missing] = []  # what could not be made, for the end of the command
+        self._logged = (0.0, 0)  # s, steps done: at the last line of a log file
 
     def on_event(self, event: Event) -> None:
         """Draw an event of the pipeline."""
@@ -67,49 +74,64 @@ class Console:
             self.missing.append(event)
         if self.quiet:
             return
-        if isinstance(event, Phase):
+        if isinstance(event, Plan):
+            self._whole.on_plan(event)
+        elif isinstance(event, Expected):
+            self._whole.on_expected(event)
+        elif isinstance(event, Phase):
+            self._whole.on_phase(event)
             self._begin(event)
         elif isinstance(event, Step):
-            if self._progress is not None and self._task is not None:
-                self._progress.update(self._task, completed=event.done, detail=escape(event.detail))
+            self._whole.on_step(event.done)
+            self._step(event)
         elif isinstance(event, Notice):
-            self._err.print(f"[yellow]note[/yellow] {escape(event.text)}", soft_wrap=True)
+            self._note(event.text)
         elif isinstance(event, Missing):
             self._err.print(f"[red]not made[/red] {escape(event.what)}: {escape(event.reason)}", soft_wrap=True)
         elif isinstance(event, StageDone):
-            self._err.print(escape(stage_line(event.metrics)), soft_wrap=True)
+            self._lines(wrapped(stage_line(event.metrics), self._err.width, rest="  "))
+
+    def _note(self, text: str) -> None:
+        """Print a notice; on a terminal its lines break between words."""
+        first, *rest = wrapped(text, self._err.width - 5) if self._err.is_terminal else [text]
+        self._err.print(f"[yellow]note[/yellow] {escape(first)}", soft_wrap=True)
+        self._lines([f"     {line}" for line in rest])
+
+    def _lines(self, lines: Sequence[str]) -> None:
+        for line in lines if self._err.is_terminal else [" ".join(map(str.strip, lines))]:
+            if line:
+                self._err.print(line, markup=False, soft_wrap=True)
 
     def _begin(self, phase: Phase) -> None:
-        if not self._err.is_terminal:  # a log file: one line a phase, no bars
+        self._bar = Bar(phase, self._whole)
+        if not self._interactive:  # a log file: one line a phase, and now and then how far it is
             if phase.name not in self._named:
-                self._err.print(f"{phase.name} ({phase.total})" if phase.total else phase.name)
+                self._err.print(f"{phase.name} ({phase.total})" if phase.total else phase.name, markup=False)
             self._named.add(phase.name)
+            self._logged = (time.monotonic(), phase.done)
+        elif self._live is None:
+            self._live = Live(self._bar, console=self._err, transient=True, refresh_per_second=4)
+            self._live.start()
+        else:
+            self._live.update(self._bar)
+
+    def _step(self, step: Step) -> None:
+        if self._bar is None:
             return
-        if self._progress is None:
-            self._progress = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(bar_width=24),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TextColumn("left"),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[detail]}"),
-                console=self._err,
-                transient=True,
-                speed_estimate_period=20,
-            )
-            self._progress.start()
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-        self._task = self._progress.add_task(
-            escape(phase.name), total=phase.total or None, completed=phase.done, detail=""
-        )
+        self._bar.step(step.done, step.detail)
+        total, (at, done) = self._bar.phase.total, self._logged
+        late = time.monotonic() - at >= LOG_SECONDS
+        if not self._interactive and total and late and LOG_SHARE * total <= step.done - done:
+            self._logged = (time.monotonic(), step.done)
+            words = [f"{self._bar.phase.name}: {step.done:,} of {total:,}, {self._bar.left()}", self._whole.line()]
+            self._err.print("; ".join(filter(None, words)), markup=False, soft_wrap=True)
 
     def close(self) -> None:
         """Take the progress bar off the screen."""
-        if self._progress is not None:
-            self._progress.stop()
-            self._progress = self._task = None
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+        self._bar = None
 
     def flush(self) -> None:
         """Write what stdout still holds: a full disk or a closed pipe is heard of here, not when Python shuts down."""
@@ -139,7 +161,13 @@ class Console:
             table.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=True)
         for row in rows:
             table.add_row(*(escape(cell) for cell in row))
-        self._out.print(table, soft_wrap=False)
+        needed = self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
+        if self._out.width < needed and (self._out.is_terminal or "COLUMNS" in os.environ):
+            for line in records(columns, rows):
+                self._out.print(line, markup=False)
+        else:  # a pipe or a file has room for every table
+            screen = self._out if needed <= self._out.width else _screen(sys.stdout, width=needed)
+            screen.print(table, soft_wrap=False)
 
     def result(self, value: Any) -> None:
         """The result of the command, for programs: JSON on stdout, if it was asked for."""

@@ -11,9 +11,10 @@ from gs2d.data.toy_poses import TRUTH as TRUE_POSES
 from gs2d.errors import RunError
 from gs2d.io.run import RunFolder, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import OnEvent, Phase, Step, ignore
+from gs2d.pipeline.events import OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.plan import DEMO
 from gs2d.pipeline.train import check_viewer, train, use_threads
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
@@ -67,6 +68,7 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
         overwrite = True
     check_viewer(TrainOptions(scene=capture, out=options.out, viewer=options.viewer, viewer_port=options.viewer_port))
     use_threads(options.threads)
+    on_event(Plan(DEMO))
     if not (options.resume and (capture / "transforms_train.json").exists()):
         total = options.train_views + options.test_views
         on_event(Phase("photographing the demo scene", total))

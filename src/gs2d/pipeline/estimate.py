@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 
 from gs2d.errors import Gs2dError
+from gs2d.pipeline.events import duration
 from gs2d.pipeline.prepare import Job
 from gs2d.train.events import Initialised
 from gs2d.train.loop import Trainer
@@ -56,15 +57,6 @@ def _seconds(trainer: Trainer, iterations: int) -> float | None:
         if len(taken) >= FEWEST and time.perf_counter() - begun > MEASURED_SECONDS:
             break
     return statistics.median(taken) if len(taken) >= FEWEST else None
-
-
-def duration(seconds: float) -> str:
-    """A time as people say it: "40 s", "12 min", "3.5 h", "2.1 days"."""
-    for unit, size, until in (("s", 1, 90), ("min", 60, 90 * 60), ("h", 3600, 48 * 3600)):
-        if seconds < until:
-            digits = 1 if unit == "h" and seconds < 10 * size else 0
-            return f"{seconds / size:.{digits}f} {unit}"
-    return f"{seconds / 86400:.1f} days"
 
 
 def estimate_text(found: Estimate, iterations: int) -> str:

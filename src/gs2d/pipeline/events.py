@@ -88,7 +88,40 @@ class Missing:
     error: Exception | None = None
 
 
-Event = Phase | Step | Notice | StageDone | Missing
+@dataclass(frozen=True)
+class Part:
+    """A part of a whole run: several phases, which a person would call one thing.
+
+    Attributes
+    ----------
+    name : str
+    begins : tuple of str
+        How the names of its own phases begin; any other phase belongs to the part in which it comes.
+    of_training : float or None
+        About how long it takes, as a share of the time of training; None: nobody knows beforehand.
+    """
+
+    name: str
+    begins: tuple[str, ...]
+    of_training: float | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the whole run consists of, in order. A plan of some of the parts of the plan before says nothing new."""
+
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Training, which has not begun, will take between so many seconds, as its first iterations tell."""
+
+    least: float
+    most: float
+
+
+Event = Phase | Step | Notice | StageDone | Missing | Plan | Expected
 OnEvent = Callable[[Event], None]
 
 
@@ -102,3 +135,12 @@ def counted(items: Sequence[T] | Iterable[T], name: str, total: int, on_event: O
     for done, item in enumerate(items, start=1):
         yield item
         on_event(Step(done))
+
+
+def duration(seconds: float) -> str:
+    """A time as people say it: "40 s", "12 min", "3.5 h", "2.1 days"."""
+    for unit, size, until in (("s", 1, 90), ("min", 60, 90 * 60), ("h", 3600, 48 * 3600)):
+        if seconds < until:
+            digits = 1 if unit == "h" and seconds < 10 * size else 0
+            return f"{seconds / size:.{digits}f} {unit}"
+    return f"{seconds / 86400:.1f} days"

@@ -19,8 +19,9 @@ from gs2d.errors import DataError, RunError
 from gs2d.io.files import write_json
 from gs2d.io.run import make_folder, now, remove_made
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
+from gs2d.pipeline.events import Notice, OnEvent, Phase, Plan, Step, counted, ignore
 from gs2d.pipeline.options import paths_of
+from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.frames import MOST_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
 from gs2d.sfm.lens import START, lens_line
 from gs2d.sfm.outcome import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
@@ -101,6 +102,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     DataError, RunError, DiskError
     """
     started = time.monotonic()
+    on_event(Plan(PLACED))
     check_installed()
     check_poses_options(options)
     video = look_into(options.photos) if is_video(options.photos) else None

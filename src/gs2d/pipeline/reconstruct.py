@@ -17,9 +17,10 @@ from gs2d.io.files import read_json
 from gs2d.io.run import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
 from gs2d.mesh.atlas import required
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.events import Notice, OnEvent, Plan, ignore
 from gs2d.pipeline.jobs import report_again
 from gs2d.pipeline.options import TrainOptions, paths_of
+from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
 from gs2d.pipeline.poses import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.prepare import check_train_options
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
@@ -135,6 +136,7 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
     Gs2dError
     """
     quality = _check(options)
+    on_event(Plan((*PLACED, *(TEXTURED_TOO if options.texture else TRAINED))))
     capture = options.out / CAPTURE
     if options.resume and (capture / POSES_JSON).exists():
         poses = _same_poses(capture, options)

@@ -14,9 +14,10 @@ from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, PAGE, REPORT, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
 from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, ignore
+from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
 from gs2d.pipeline.refined import FoundPoses, found_poses, write_poses
@@ -57,6 +58,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": options.allowed}
     check_claim(options.out, **claim)  # type: ignore[arg-type]
     use_threads(options.threads)
+    on_event(Plan(TRAINED))
     job = prepare(options, on_event)
     if options.overwrite:
         check_sources(job, options)
@@ -77,8 +79,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         start = choose_start(run, job, options, on_event)
         if options.estimate and start.state is None:
-            for text in foretold(job):
-                on_event(Notice(text))
+            for event in foretold(job):
+                on_event(event)
         with MeshFrames(job) as frames:
             splats, exposures, poses = train_stages(run, job, options, start, watch, [frames.visit])
             write_exposures(run, exposures, on_event)
@@ -220,17 +222,18 @@ def train_stages(
     return state.splats, named(job.scene.train, state.exposures), poses
 
 
-def foretold(job: Job) -> list[str]:
+def foretold(job: Job) -> list[Event]:
     """What a person wants to know before hours of training: which photographs do not train, and how long it takes."""
     from gs2d.pipeline.estimate import estimate, estimate_text
 
     found, test, views = estimate(job), len(job.scene.test), len(job.scene.views)
-    lines = [] if found is None else [estimate_text(found, job.recipe.iterations)]
+    told: list[Event] = []
+    if found is not None:
+        told += [Expected(found.least, found.most), Notice(estimate_text(found, job.recipe.iterations))]
     if test:
-        lines.append(
-            f"{test} of {views} photographs do not train, they score the result (--test-every 0 trains on all)"
-        )
-    return lines
+        text = f"{test} of {views} photographs do not train, they score the result (--test-every 0 trains on all)"
+        told.append(Notice(text))
+    return told
 
 
 def finish(

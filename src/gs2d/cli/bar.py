@@ -1,0 +1,58 @@
+"""The lines that are drawn while a phase runs, for a terminal of any width."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from gs2d.cli.whole import WholeRun
+from gs2d.pipeline.events import Phase, duration
+
+_WIDEST, _LEAST = 32, 6  # columns of a bar; with fewer there is none
+_FULL, _EMPTY = "\u2501", "\u2500"
+
+
+class Bar:
+    """A phase: its name, a bar, counts, the time left; below what it is about, and the whole run."""
+
+    def __init__(self, phase: Phase, whole: WholeRun, clock: Callable[[], float] = time.monotonic) -> None:
+        self.phase, self._whole, self._clock = phase, whole, clock
+        self.done, self.detail = phase.done, ""
+        self._began = clock()
+
+    def step(self, done: int, detail: str = "") -> None:
+        """Count a step."""
+        self.done, self.detail = done, detail
+
+    def left(self) -> str:
+        """Return "3 min left", or how long the phase has taken where nobody can tell."""
+        elapsed = self._clock() - self._began
+        seconds = self.phase.seconds_left(self.done, elapsed)
+        return duration(elapsed) if seconds is None else f"{duration(seconds)} left"
+
+    def lines(self, width: int, *, ascii_only: bool = False) -> Iterator[Text]:
+        """Draw it: never wider than ``width``."""
+        counts = f"{self.done:,}/{self.phase.total:,}" if self.phase.total else ""
+        tail = "  ".join(word for word in (counts, self.left()) if word)
+        name = _cut(self.phase.name, max(width - len(tail) - 2, 8))
+        room = min(width - len(name) - len(tail) - 4, _WIDEST)
+        line = Text(name, no_wrap=True, overflow="ellipsis")
+        if self.phase.total and room >= _LEAST:
+            full, empty = ("#", "-") if ascii_only else (_FULL, _EMPTY)
+            filled = min(room * self.done // self.phase.total, room)
+            line.append("  ").append(full * filled, "cyan").append(empty * (room - filled), "dim")
+        yield line.append("  " + tail)
+        if self.detail:
+            yield Text(_cut("  " + self.detail, width), no_wrap=True)
+        if whole := self._whole.line():
+            yield Text(_cut(whole, width), no_wrap=True, style="dim")
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield from self.lines(options.max_width - 1, ascii_only=options.ascii_only)
+
+
+def _cut(text: str, width: int) -> str:
+    return text if len(text) <= width else text[: max(width - 3, 1)] + "..."

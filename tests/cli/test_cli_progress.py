@@ -1,0 +1,194 @@
+"""What is drawn while a command works: bars of any width, sparse lines in a log, the time left of the whole run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from gs2d.cli.bar import Bar
+from gs2d.cli.console import Console
+from gs2d.cli.whole import Left, WholeRun, between
+from gs2d.pipeline import plan
+from gs2d.pipeline.events import Expected, Notice, Phase, Plan, Step
+from terminal import ESCAPES, raw_screen_of
+
+DRAWN = textwrap.dedent(
+    """
+    import time
+    from gs2d.cli.console import Console
+    from gs2d.pipeline.events import Notice, Phase, Plan, Step
+    from gs2d.pipeline.plan import TRAINED
+    console = Console(quiet=False, as_json=False)
+    console.on_event(Plan(TRAINED))
+    console.on_event(Phase("training 2dgs-r", 6000))
+    for done in (1000, 2000, 3000):
+        time.sleep(0.3)
+        console.on_event(Step(done, "surface 3,000/3,000  36,422 splats  loss 0.0712  and more than fits in a line"))
+    console.on_event(Notice("a note that is much longer than one line of a narrow terminal has columns, word by word"))
+    console.close()
+    console.table("", ["stage", "iterations", "splats", "PSNR train", "PSNR test", "SSIM"],
+                  [["surface", "3,000", "36,422", "22.36", "19.79", "0.6940"]])
+    """
+)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (tmp_path / "drawn.py").write_text(DRAWN, encoding="utf-8")
+    paths = [str(tmp_path), *sys.path]
+    monkeypatch.setenv("PYTHONPATH", ":".join(paths))
+    return "drawn"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal")
+@pytest.mark.parametrize("columns", [60, 80])
+def test_bars_notes_and_tables_fit_the_terminal(columns: int, module: str) -> None:
+    raw = raw_screen_of([], columns=columns, command=module)
+    assert "\x1b[" in raw
+    lines = [line for part in ESCAPES.sub("", raw).split("\n") for line in part.split("\r")]
+    assert max(map(len, lines)) <= columns
+    assert any(line.startswith("training 2dgs-r  ") and "3,000/6,000  " in line and "left" in line for line in lines)
+    assert any(line.startswith("part 1 of 3: training; whole run: ") for line in lines)
+    assert any(line.startswith("note a note that is") for line in lines)
+    assert any("22.36" in line for line in lines)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal")
+def test_a_dumb_terminal_gets_no_escape_and_no_color_no_style(module: str) -> None:
+    dumb = raw_screen_of([], columns=60, command=module, env={"TERM": "dumb"})
+    assert "\x1b" not in dumb
+    assert "training 2dgs-r (6000)\n" in dumb
+    plain = raw_screen_of([], columns=60, command=module, env={"NO_COLOR": "1"})
+    assert not [code for code in ESCAPES.findall(plain) if code.endswith("m")]
+    assert "3,000/6,000" in plain
+
+
+def test_a_log_file_gets_a_line_a_phase_and_now_and_then_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr("gs2d.cli.console.time.monotonic", clock)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    console = Console(quiet=False, as_json=False)
+    console.on_event(Phase("training 2dgs", 1000))
+    for done in range(10, 1001, 10):  # a minute a tenth
+        clock.now += 6.0
+        console.on_event(Step(done))
+    err = ESCAPES.sub("", capsys.readouterr().err).splitlines()
+    assert err[0] == "training 2dgs (1000)"
+    assert err[1].startswith("training 2dgs: 100 of 1,000, ")
+    assert len(err) == 11
+
+
+def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
+    quiet, as_json = Console(quiet=True, as_json=True), Console(quiet=False, as_json=True)
+    for console in (quiet, as_json):
+        for event in (Plan(plan.TRAINED), Phase("training", 3), Step(1), Notice("n")):
+            console.on_event(event)
+        console.table("", ["a"], [["b"]])
+        console.say("text")
+        console.result({"a": 1})
+    out, err = capsys.readouterr()
+    assert out == '{\n  "a": 1\n}\n' * 2
+    assert err == "training (3)\nnote n\n"
+
+
+def test_a_table_is_whole_in_a_pipe_and_a_record_a_row_where_it_does_not_fit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = ["recipe", *(f"column {i}" for i in range(12))]
+    rows = [["2dgs", *(f"{i}.5" for i in range(12))]]
+    monkeypatch.delenv("COLUMNS", raising=False)
+    Console(quiet=False, as_json=False).table("", columns, rows)
+    wide = capsys.readouterr().out
+    assert any("column 0" in line and "column 11" in line for line in wide.splitlines())
+    assert "..." not in wide
+    monkeypatch.setenv("COLUMNS", "60")
+    Console(quiet=False, as_json=False).table("", columns, rows)
+    narrow = capsys.readouterr().out.splitlines()
+    assert narrow[0] == "recipe 2dgs"
+    assert narrow[1].split() == ["column", "0", "0.5"]
+    assert len(narrow) == 13
+
+
+def test_a_bar_gives_way_to_counts_where_there_is_no_room() -> None:
+    bar = Bar(Phase("reading what is known beforehand", 12_345), WholeRun())
+    bar.step(6_000)
+    for width in (20, 40, 60, 80):
+        drawn = [line.plain for line in bar.lines(width)]
+        assert "6,000/12,345" in drawn[0]
+        assert len(drawn[0]) <= max(width, 38)
+    assert "#" in next(bar.lines(80, ascii_only=True)).plain
+
+
+def test_the_whole_run_is_unknown_until_training_is_measured_and_then_a_range() -> None:
+    clock = Clock()
+    whole = WholeRun(clock)
+    whole.on_plan(Plan((*plan.PLACED, *plan.TRAINED)))
+    assert whole.line() == ""
+    whole.on_phase(Phase("finding features", 10))
+    assert whole.line() == "part 2 of 7: features; whole run: known once training begins"
+    whole.on_phase(Phase("reading photographs", 10))  # of another part before: within this one
+    assert whole.line().startswith("part 2 of 7")
+    whole.on_plan(Plan(plan.TRAINED))  # of `train` within `reconstruct`
+    whole.on_expected(Expected(100.0, 400.0))
+    whole.on_phase(Phase("training 2dgs", 1000))
+    shares = sum(part.of_training or 0.0 for part in plan.TRAINED)
+    assert whole.left() == Left(pytest.approx(100 * (1 + shares / 2)), pytest.approx(400 * (1 + shares * 2)))
+    clock.now = 100.0
+    whole.on_step(500)  # from its own speed: 100 s more, or half as much again
+    left = whole.left()
+    assert left is not None
+    assert left.least == pytest.approx(100 + 200 * shares / 2)
+    assert left.most == pytest.approx(150 + 250 * shares * 2)
+    whole.on_phase(Phase("scoring test views", 8))  # within training: not a step of it
+    whole.on_step(8)
+    assert whole.line().startswith("part 5 of 7: training; whole run: ")
+    clock.now = 200.0
+    whole.on_phase(Phase("rendering depth", 40))
+    assert whole.line().startswith("part 6 of 7: mesh; whole run: ")
+
+
+def test_the_next_run_of_a_sweep_begins_from_nothing() -> None:
+    clock = Clock()
+    whole = WholeRun(clock)
+    for _ in range(2):
+        whole.on_plan(Plan(plan.TRAINED))
+        assert whole.line() == ""
+        whole.on_phase(Phase("training 2dgs", 100))
+        assert whole.left() is None
+        clock.now += 50.0
+        whole.on_step(50)
+        assert whole.line().startswith("part 1 of 3: training; whole run: 60 s to ")
+        whole.on_phase(Phase("writing the report", 0))
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "text"),
+    [(240, 250, "about 4 min"), (240, 540, "4 to 9 min"), (50, 200, "50 s to 3 min"), (0, 20, "0 to 20 s")],
+)
+def test_two_bounds_are_said_in_one_unit_if_they_have_one(least: float, most: float, text: str) -> None:
+    assert between(Left(least, most)) == text
+
+
+def test_every_planned_part_is_begun_by_a_phase_of_the_pipeline() -> None:
+    source = "".join(path.read_text(encoding="utf-8") for path in Path(plan.__file__).parents[1].rglob("*.py"))
+    for part in (*plan.PLACED, *plan.TEXTURED_TOO, *plan.DEMO):
+        assert any(f'"{begin}' in source.replace('f"', '"') for begin in part.begins), part
+
+
+def test_help_in_a_pipe_is_plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "from gs2d.cli import run; run(['--help'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "\x1b" not in done.stdout
