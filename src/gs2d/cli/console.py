@@ -156,18 +156,27 @@ class Console:
         """A table for people, on stdout; the first column is text, the others are figures."""
         if self.quiet or self.as_json:
             return
-        table = Table(title=escape(title) or None, title_justify="left", box=box.SIMPLE)
-        for i, column in enumerate(columns):
-            table.add_column(escape(column), justify="left" if i == 0 else "right", no_wrap=True)
-        for row in rows:
-            table.add_row(*(escape(cell) for cell in row))
-        needed = self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
+        table, needed = self._table(title, columns, rows, frame=box.SIMPLE)
+        if self._out.width < needed:
+            table, needed = self._table(title, columns, rows, frame=None)  # needs less room
         if self._out.width < needed and (self._out.is_terminal or "COLUMNS" in os.environ):
             for line in records(columns, rows):
                 self._out.print(line, markup=False)
         else:  # a pipe or a file has room for every table
             screen = self._out if needed <= self._out.width else _screen(sys.stdout, width=needed)
             screen.print(table, soft_wrap=False)
+
+    def _table(
+        self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, frame: box.Box | None
+    ) -> tuple[Table, int]:
+        """A table, and how many columns of the terminal it needs."""
+        head, gap = escape(title) or None, "" if frame else " "
+        table = Table(title=head, title_justify="left", box=frame, padding=(0, 1 if frame else 0), pad_edge=False)
+        for i, column in enumerate(columns):
+            table.add_column(gap * bool(i) + escape(column), justify="left" if i == 0 else "right", no_wrap=True)
+        for row in rows:
+            table.add_row(*(gap * bool(i) + escape(cell) for i, cell in enumerate(row)))
+        return table, self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
 
     def result(self, value: Any) -> None:
         """The result of the command, for programs: JSON on stdout, if it was asked for."""

@@ -106,7 +106,9 @@ class WholeRun:
                 growth = 1 + (GROWTH - 1) * (1 - fraction) if self._is_training else 1.0
                 return Left(seconds, seconds * growth)
         expected = self._expected(self._parts[self._now])
-        return expected and Left(max(expected.least - spent, 0.0), max(expected.most - spent, 0.0))
+        if expected is None or expected.most <= spent:  # longer than it should take: nobody can tell
+            return None
+        return Left(max(expected.least - spent, 0.0), expected.most - spent)
 
     def _expected(self, part: Part) -> Left | None:
         if part.name == _TRAINING:
