@@ -122,6 +122,18 @@ def test_a_table_is_whole_in_a_pipe_and_a_record_a_row_where_it_does_not_fit(
     assert len(narrow) == 13
 
 
+def test_a_table_loses_its_frame_before_it_loses_its_rows(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
+    monkeypatch.setenv("COLUMNS", "60")
+    row = ["refine", "1,000", "234", "50,123", "12.3", "21.82", "19.63", "0.5520"]
+    Console(quiet=False, as_json=False).table("", columns, [row])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 60
+    assert [line.split() for line in lines if line.startswith("refine")] == [row]
+
+
 def test_a_bar_gives_way_to_counts_where_there_is_no_room() -> None:
     bar = Bar(Phase("reading what is known beforehand", 12_345), WholeRun())
     bar.step(6_000)
@@ -158,6 +170,8 @@ def test_the_whole_run_is_unknown_until_training_is_measured_and_then_a_range() 
     clock.now = 200.0
     whole.on_phase(Phase("rendering depth", 40))
     assert whole.line().startswith("part 6 of 7: mesh; whole run: ")
+    clock.now = 1000.0  # longer than it should take
+    assert whole.line() == "part 6 of 7: mesh"
 
 
 def test_the_next_run_of_a_sweep_begins_from_nothing() -> None:
