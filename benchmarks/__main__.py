@@ -32,10 +32,12 @@ from benchmarks.workload import FULL, QUICK, name_of, room_workload, trained_wor
 def report(path: Path, name: str, document: dict[str, Any]) -> None:
     """A few figures of a workload as soon as it is done; the file holds all that is done."""
     result = document["workloads"][name]
-    ms, share, iteration = result["best_ms"], result["fma_fraction"], result["iteration_ms"]
+    ms, iteration = result["best_ms"], result["iteration_ms"]
+    executed, useful = result["fma_fraction_executed"], result["fma_fraction"]
     print(
         f"{name}: best forward {ms['raster_forward']} + backward {ms['raster_backward']} ms, of peak FMA "
-        f"{share['forward']:.3f} / {share['backward']:.3f}, iteration "
+        f"{executed['forward']:.3f} / {executed['backward']:.3f} executed ({useful['forward']:.3f} / "
+        f"{useful['backward']:.3f} useful), iteration "
         f"{' / '.join(str(iteration[f'stage{i}']) for i in (1, 2, 3))} ms, "
         f"{result['bytes_per_splat']} bytes a splat, probe {result['probe']['fma_gflops']} GFLOP/s",
         flush=True,

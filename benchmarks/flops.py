@@ -1,9 +1,11 @@
 """Floating-point operations of one splat at one pixel, counted by hand.
 
-Two counts. ``USEFUL``, 69 forward and 119 backward, is what the formulas of docs/math.md take when each pixel is worked
-out by itself: the plane from its six coefficients, the low-pass filter, a polynomial of degree 5 for 2^x, 1 / z and z;
-it was what the loops executed until November 2026. ``EXECUTED`` is what they execute now, for the same images, from
-``kernels/core/blend.h``: a loop that leaves work out does not get slower by it, so both are reported.
+Two counts. ``EXECUTED`` is what the loops execute, from ``kernels/core/blend.h``; its share of peak is the headline:
+it says how well the machine is used. ``USEFUL`` stands beside it: what the formulas of docs/math.md take when each
+pixel is worked out by itself. A loop that leaves work out does not get slower by it: then the second share grows where
+the first does not. Forward, 67: offsets 2, the plane from its six coefficients 10, 1 / I 1, u and v 2, rho3d 3, the
+low-pass filter 4, log2 alpha 2, a polynomial of degree 5 for 2^x 13, compositing 30 as below. Backward, 119. (The
+forward count was 69 before; results of then say so in ``flops_per_visible_pair``.)
 
 A fused multiply-add counts 2, any other addition, subtraction, multiplication, division or rounding 1; comparisons,
 selects, minima, maxima, loads and the exponent's integer arithmetic count nothing. Executed, with AVX-512, for a pair
@@ -28,7 +30,7 @@ whose splat is plain (``is_plain``), as nearly all are (with AVX2 2^x has one te
 
 from __future__ import annotations
 
-USEFUL = {"forward": 69, "backward": 119}
+USEFUL = {"forward": 67, "backward": 119}
 EXECUTED = {"forward": 19 + 30, "backward": 19 + 76}  # the backward pass computes the intersection again
 
 
