@@ -37,7 +37,7 @@ DECODE_THREADS = 2
 SHOWN_SKIPS = 3
 MOST_VIEWS = 1_000_000
 ROBUST = ("auto", "on", "off")
-DIFFERS = 0.05  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
+DIFFERS = 0.03  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
 LATER_FIELDS = (  # of recipes, that run folders of before there were such lack
     *("exposure", "poses", "multiview", "depth_prior", "normal_prior"),
     *("dense_start", "free_space", "opacity_decay"),
