@@ -63,6 +63,17 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         assert tab.errors == []
 
 
+@pytest.fixture(autouse=True)
+def as_at_first(request: pytest.FixtureRequest) -> None:
+    """Each test begins at the opening view, whatever the one before left behind."""
+    if "page" in request.fixturenames:
+        tab = request.getfixturevalue("page")
+        tab.size(640, 420)
+        tab.ask("$('help').close(); limited = true; $('free').checked = false; document.body.classList.remove('bare');"
+                "boxed(false); show(0); home(); document.activeElement.blur()")  # fmt: skip
+        still(tab)
+
+
 def still(page: Page) -> None:
     """Wait until what is seen is drawn in full."""
     page.until("document.body.dataset.drawn === 'still'")
@@ -134,8 +145,7 @@ def test_dragging_turns_about_the_subject_and_stops_at_the_end_of_the_arc(page: 
         assert abs(rise - 14) > 5  # it did turn
     assert values(page, "$('note').hidden") == [True]
     page.ask("$('free').click()")
-    for _ in range(3):
-        page.drag((100, 160), (400, 160), steps=4)
+    page.drag((100, 160), (400, 160), steps=4)  # 103 degrees on
     still(page)
     assert values(page, "$('note').hidden") == [False]  # now it is a guess, and said
     page.ask("$('free').click()")
@@ -163,6 +173,7 @@ def test_the_clip_box_cuts_what_is_drawn_and_its_numbers_are_an_option(page: Pag
     page.send("Input.insertText", text="-200")
     assert page.ask("$('bbox').value") == "--bbox 99.400 -200.600 49.400 100.600 -200.000 50.600"
     still(page)
+    page.ask("document.activeElement.blur()")
     page.ask("document.body.classList.add('bare'); $('boxpanel').hidden = true; $('lines').style.display = 'none'")
     page.until("document.body.dataset.drawn === 'still'")
     cut = page.picture()

@@ -50,6 +50,7 @@ const fit = () => Math.min(canvas.clientWidth / here.w, canvas.clientHeight / he
 
 function touched() {
   moving = performance.now();
+  document.body.dataset.drawn = "moving";
   if (!dirty) requestAnimationFrame(frame);
   dirty = true;
 }
