@@ -119,6 +119,7 @@ def test_the_catalogue_is_what_tyro_parses() -> None:
         flags = {flag for head in heads for flag in re.findall(r"(--[a-z][a-z0-9-]+)", head)}
         known = {flag for option in options_of(command) for flag in option.flags}
         assert flags - {"--help"} == known, name
+    assert "--no-page" in {flag for option in options_of(NAMES["train"]) for flag in option.flags}
 
 
 @pytest.mark.parametrize("words", ["--version", "-V", "version", "train --version"])

@@ -70,7 +70,7 @@ class Option:
     @property
     def usage(self) -> str:
         """Return how it is written, with its value."""
-        value = f"{self.count} {self.metavar}S" if (self.count or 0) > 1 else self.metavar
+        value = f"{self.count} {self.metavar}S" if (self.count or 0) > 1 and " " not in self.metavar else self.metavar
         value += " ..." if self.count is None and "..." not in value else ""
         return " ".join(word for word in (self.name if self.flags else "", "" if self.kind is bool else value) if word)
 
@@ -97,8 +97,10 @@ def options_of(kind: type) -> tuple[Option, ...]:
 def _option(kind: type, field: dataclasses.Field[Any], inner: Any, marks: tuple[Any, ...]) -> Option:
     settings = next((mark for mark in marks if hasattr(mark, "metavar")), None)  # what `tyro.conf.arg` made
     name = (settings and settings.name) or field.name
-    flags = () if _POSITIONAL in marks else ("--" + name.replace("_", "-"), *((settings and settings.aliases) or ()))
     value, choices, count = _value(inner)
+    switched_off = "no-" if value is bool and field.default is True else ""  # what is on is switched off
+    written = "--" + switched_off + name.replace("_", "-")
+    flags = () if _POSITIONAL in marks else (written, *((settings and settings.aliases) or ()))
     owner = next(base for base in kind.__mro__ if field.name in vars(base).get("__annotations__", {}))
     metavar = (settings and settings.metavar) or _metavar(name, value, choices, positional=not flags)
     return Option(
