@@ -27,6 +27,7 @@ FLOORS = {
     "recipe": 1,
     "recipes": 1,
     "protocols": 1,
+    "grades": 1,
     "schedule": 1,
     "paper": 1,
     "camera": 2,

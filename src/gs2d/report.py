@@ -17,7 +17,7 @@ import numpy as np
 
 from gs2d.camera import Camera
 from gs2d.disk import atomic_write
-from gs2d.io.run import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, open_run
+from gs2d.io.run import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, VERDICT, open_run
 from gs2d.report_capture import capture_section
 from gs2d.report_curves import curves, read_history
 from gs2d.report_exposure import exposure_section
@@ -30,6 +30,7 @@ from gs2d.report_priors import priors_section
 from gs2d.report_subject import subject_section
 from gs2d.report_surface import surface_scores
 from gs2d.report_terms import glossary, titles_of
+from gs2d.report_verdict import graded, verdict_section
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 
@@ -118,6 +119,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
     body = [
         f'<div class="eyebrow">gs2d report</div><h1>{escape(title)}</h1>',
         part("summary", lambda: f'<p class="lead">{verdict(record)}</p>'),
+        part("verdict", lambda: verdict_section(record.path / VERDICT)),
         part("pictures at the top", lambda: hero(renders)),
         "<h2>Files</h2>",
         part("list of files", lambda: links(record.path)),
@@ -189,7 +191,7 @@ def verdict(record: RunRecord) -> str:
     if not scored:
         return f"No stage of {recipe} is finished and scored yet."
     first, last = scored[0], scored[-1]
-    text = f"{recipe} reaches <b>{last[split]['psnr']:.2f} dB</b> PSNR on the {split} views"
+    text = f"{recipe} reaches {graded(last[split]['psnr'], split)} PSNR on the {split} views"
     if isinstance(last[split].get("ssim"), int | float):
         text += f" (SSIM {last[split]['ssim']:.4f})"
     if first is not last:
@@ -251,7 +253,7 @@ def stage_table(record: RunRecord) -> str:
             figure(stage.get("seconds"), 1),
             figure(_scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
         ]
-    words = "PSNR and SSIM: means over the views, of pictures rounded to 8 bits. Higher is better, the best is green."
+    words = "PSNR and SSIM: means over the views, of pictures rounded to 8 bits. Higher is better, the best is bold."
     legend = f'<p class="soft">{words}{_other_conventions(record)}</p>' if shown else ""
     notes = [legend, _reasons(record.stages, splits), _clone_note(record)]
     return table(columns, rows, titles=titles_of(columns)) + "".join(notes)

@@ -42,7 +42,7 @@ RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
 PRIORS = "priors"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
-EXPOSURE, POSES, SUBJECT = "exposure.json", "poses.json", "subject.json"
+EXPOSURE, POSES, SUBJECT, VERDICT = "exposure.json", "poses.json", "subject.json", "verdict.json"
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
 _UNREADABLE = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
@@ -187,7 +187,8 @@ class RunFolder:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
         for name in (CHECKPOINTS, RENDERS, SURFACE):
             shutil.rmtree(self.file(name), ignore_errors=True)
-        for name in (EVENTS, METRICS, SPLATS, EXPOSURE, POSES, SUBJECT, MESH, TEXTURED, REPORT, PAGE, RUN_JSON):
+        results = (SPLATS, EXPOSURE, POSES, SUBJECT, VERDICT, MESH, TEXTURED, REPORT, PAGE)
+        for name in (EVENTS, METRICS, *results, RUN_JSON):
             self.file(name).unlink(missing_ok=True)
 
     def discard(self) -> None:

@@ -27,6 +27,7 @@ from gs2d.io.run import (
     SPLATS,
     SURFACE,
     TEXTURED,
+    VERDICT,
     RunFolder,
     make_folder,
     open_run,
@@ -45,6 +46,8 @@ from gs2d.pipeline.refined import aligned
 from gs2d.pipeline.scoring import score_views, split_metrics
 from gs2d.pipeline.subject import meshed_subject, within
 from gs2d.pipeline.surface import extract_mesh
+from gs2d.pipeline.verdict_file import write_verdict
+from gs2d.pipeline.verdict_measures import Collector
 from gs2d.splats import Splats
 
 MOST_FRAMES = 100_000  # of an orbit or a flight
@@ -303,9 +306,11 @@ def evaluate_run(
         best = tuple(aligned(splats, job.scene.test, *drawing, job.scene.extent, on_event))
         scores = score_views(splats, best, *drawing, name=name, on_event=on_event, lpips=lpips)
         result |= split_metrics(scores, "test_aligned", "test")
+    collected = Collector(job.scene, job.settings.background)
     for split, views in (("train", job.scene.train), ("test", job.scene.test)):
         name = f"scoring {split} views"
-        scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, exposures=exposures)
+        more: dict[str, Any] = {"exposures": exposures, "split": split, "visitors": [collected.visit]}
+        scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, **more)
         result |= split_metrics(scores, split)
         result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
     if truth is not None and has_mesh:
@@ -318,6 +323,8 @@ def evaluate_run(
         last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}
         stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
         run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
+        with attempted(VERDICT, again("evaluate", path), on_event):
+            result["verdict"] = write_verdict(run, job, collected)["verdict"]
     report_again(run, on_event)
     return result
 

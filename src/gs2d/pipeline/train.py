@@ -11,7 +11,7 @@ import torch
 from gs2d.data.archive import is_archive
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.ply import write_splats
-from gs2d.io.run import MESH, PAGE, REPORT, SPLATS, RunFolder, check_claim, claim_run, is_run, make_folder
+from gs2d.io.run import MESH, PAGE, REPORT, SPLATS, VERDICT, RunFolder, check_claim, claim_run, is_run, make_folder
 from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
@@ -25,6 +25,8 @@ from gs2d.pipeline.restart import Start, check_sources, choose_start
 from gs2d.pipeline.scoring import Visitor
 from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.surface import MeshFrames, extract_mesh
+from gs2d.pipeline.verdict_file import write_verdict
+from gs2d.pipeline.verdict_measures import Collector
 from gs2d.splats import Splats
 from gs2d.train import events
 from gs2d.train.state import TrainState
@@ -81,13 +83,14 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         if options.estimate and start.state is None:
             for event in foretold(job):
                 on_event(event)
+        collected = Collector(job.scene, job.settings.background)
         with MeshFrames(job) as frames:
-            splats, exposures, poses = train_stages(run, job, options, start, watch, [frames.visit])
+            splats, exposures, poses = train_stages(run, job, options, start, watch, [frames.visit, collected.visit])
             write_exposures(run, exposures, on_event)
             write_poses(run, job.scene, poses, on_event)
             job = replace(job, scene=job.scene.with_poses(poses)) if poses else job
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
-            finish(run, job, splats, mesh, on_event, frames, with_page=options.page)
+            finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
     return run
 
 
@@ -243,6 +246,7 @@ def finish(
     mesh: MeshOptions,
     on_event: OnEvent,
     frames: MeshFrames,
+    collected: Collector,
     *,
     with_page: bool,
 ) -> None:
@@ -258,6 +262,8 @@ def finish(
     if with_page and not run.file(PAGE).exists():
         with attempted(PAGE, again("page", run.path), on_event):
             page_run(run.path, on_event=on_event, job=job)
+    with attempted(VERDICT, again("evaluate", run.path), on_event):
+        write_verdict(run, job, collected)
     on_event(Phase("writing the report", 0))  # last: it links to the others
     with attempted(REPORT, again("report", run.path), on_event):
         report_run(run.path, on_event)

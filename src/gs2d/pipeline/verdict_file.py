@@ -1,0 +1,62 @@
+"""``verdict.json``: the verdict on a run and what it was judged by."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gs2d.data.subject import OBJECT, read_subject
+from gs2d.errors import DataError, RunError
+from gs2d.io.files import read_json, write_json
+from gs2d.io.run import VERDICT, RunFolder
+from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.verdict import FORMAT, judge
+from gs2d.pipeline.verdict_measures import Collector, Measures, measure, measures_from_json
+
+
+def write_verdict(run: RunFolder, job: Job, collected: Collector) -> dict[str, Any]:
+    """Judge a run and write ``verdict.json``; where no view was measured now, by what was measured before.
+
+    Returns
+    -------
+    dict
+        What the file holds.
+
+    Raises
+    ------
+    RunError
+        The views were scored, but never measured.
+    DiskError
+    """
+    if collected.failure is not None:
+        raise collected.failure
+    if collected.views:
+        learns = job.recipe.exposure is not None
+        measures = measure(job.scene, collected.views, subject=_subject(run), learns_exposure=learns)
+    else:
+        measures = _measured_before(run)
+    data = {"format": FORMAT, "verdict": judge(measures).to_json(), "measured": measures.to_json()}
+    write_json(run.file(VERDICT), data)
+    return data
+
+
+def read_verdict(run: RunFolder) -> dict[str, Any] | None:
+    """Return the verdict of a run as it was written, or None where there is none."""
+    try:
+        verdict = read_json(run.file(VERDICT))["verdict"] if run.file(VERDICT).exists() else None
+        return verdict if isinstance(verdict, dict) and {"grade", "headline", "findings"} <= verdict.keys() else None
+    except (DataError, KeyError, TypeError):
+        return None
+
+
+def _measured_before(run: RunFolder) -> Measures:
+    if not run.file(VERDICT).exists():
+        raise RunError("the views were scored before the run was broken off, and are not measured")
+    return measures_from_json(read_json(run.file(VERDICT)).get("measured") or {})
+
+
+def _subject(run: RunFolder) -> np.ndarray | None:
+    """The middle of the subject, where one was found."""
+    subject = read_subject(run.path)
+    return subject.center if subject is not None and subject.kind == OBJECT else None
