@@ -30,7 +30,7 @@ from gs2d.report_priors import priors_section
 from gs2d.report_subject import subject_section
 from gs2d.report_surface import surface_scores
 from gs2d.report_terms import glossary, titles_of
-from gs2d.report_verdict import graded, verdict_section
+from gs2d.report_verdict import graded, scaled, verdict_section
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 
@@ -249,18 +249,14 @@ def stage_table(record: RunRecord) -> str:
         rows[-1] += [_metric_cell(stage.get(split) or {}, key, digits, best) for split, key, _, digits, best in shown]
         rows[-1] += [
             figure(stage.get("splats"), 0),
-            figure(_scaled(stage.get("bytes"), 1e-6), 2),
+            figure(scaled(stage.get("bytes"), 1e-6), 2),
             figure(stage.get("seconds"), 1),
-            figure(_scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
+            figure(scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
         ]
     words = "PSNR and SSIM: means over the views, of pictures rounded to 8 bits. Higher is better, the best is bold."
     legend = f'<p class="soft">{words}{_other_conventions(record)}</p>' if shown else ""
     notes = [legend, _reasons(record.stages, splits), _clone_note(record)]
     return table(columns, rows, titles=titles_of(columns)) + "".join(notes)
-
-
-def _scaled(value: Any, factor: float) -> float | None:
-    return value * factor if isinstance(value, int | float) else None
 
 
 def _stage_name(stage: Mapping[str, Any]) -> str:

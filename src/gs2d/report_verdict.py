@@ -59,3 +59,8 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> str:
 def _advice(findings: Sequence[Mapping[str, Any]]) -> str:
     items = "".join(f"<li>{escape(f['advice'])}</li>" for f in findings if f["advice"])
     return f"<h3>What to do or to photograph next</h3><ul>{items}</ul>" if items else ""
+
+
+def scaled(value: Any, factor: float) -> float | None:
+    """A figure in another unit; None for what is no number."""
+    return value * factor if isinstance(value, int | float) else None
