@@ -10,7 +10,7 @@ from typing import Any
 from gs2d.cli import commands as c
 from gs2d.cli.console import Console, figure
 from gs2d.cli.options import Common, Training, TrainingCommon
-from gs2d.cli.verdict import verdict_lines
+from gs2d.cli.verdict import say_verdict
 from gs2d.errors import DataError, ProtocolError, RecipeError
 
 
@@ -349,9 +349,6 @@ def show_run(
     extra: dict[str, Any] | None = None,
 ) -> None:
     """The metrics of a run as a table, where its files are, and the verdict on it."""
-    from gs2d.io.run import RunFolder
-    from gs2d.pipeline.verdict_file import read_verdict
-
     if definition is not None:
         recipe, scene = definition["recipe"]["name"], definition["scene"]
         console.say(f"{recipe} on {scene['name']} ({scene['format']}, {scene['train']} + {scene['test']} views)")
@@ -376,10 +373,7 @@ def show_run(
     for name in ("report.html", "scene.html", "mesh.ply", "mesh.glb", "splats.ply"):
         if (path / name).exists():
             console.say(f"{path / name}")
-    verdict = read_verdict(RunFolder(path))
-    for line in verdict_lines(verdict) if verdict is not None else ():
-        console.say(line)
-    extra = (extra or {}) | ({} if definition is None else {"definition": definition}) | {"verdict": verdict}
+    extra = (extra or {}) | ({} if definition is None else {"definition": definition}) | say_verdict(path, console)
     console.result({"run": str(path), **metrics, **extra})
 
 

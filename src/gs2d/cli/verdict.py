@@ -4,11 +4,25 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+from gs2d.cli.console import Console
 
 WIDTH = 60  # columns: half of a small screen
 _NAMES = 14  # columns of the names of findings
 _GRADES = 8
+
+
+def say_verdict(path: Path, console: Console) -> dict[str, Any]:
+    """Print the verdict of a run; return it for the JSON, null where there is none."""
+    from gs2d.io.run import RunFolder
+    from gs2d.pipeline.verdict_file import read_verdict
+
+    verdict = read_verdict(RunFolder(path))
+    for line in verdict_lines(verdict) if verdict is not None else ():
+        console.say(line)
+    return {"verdict": verdict}
 
 
 def verdict_lines(verdict: Mapping[str, Any], width: int = WIDTH) -> list[str]:

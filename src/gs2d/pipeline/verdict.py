@@ -136,8 +136,10 @@ def _overlap(measures: Measures) -> Finding | None:
 
 def _photograph_between(far: Sequence[str], bare: Sequence[str], apart: dict[str, Neighbour]) -> str:
     if far:
-        widest = sorted(far, key=lambda name: -apart[name].degrees)[:NAMED]
-        places = "; ".join(f"{name} and {apart[name].next} ({apart[name].degrees:.0f} degrees)" for name in widest)
+        widest = sorted(far, key=lambda name: -apart[name].degrees)
+        pairs = {frozenset((name, apart[name].next)): apart[name] for name in reversed(widest)}  # each once
+        shown = sorted(pairs.values(), key=lambda n: -n.degrees)[:NAMED]
+        places = "; ".join(f"{n.name} and {n.next} ({n.degrees:.0f} degrees)" for n in shown)
         return f"Photograph from between {places}, in steps of 10 degrees."
     if bare:
         return f"Photograph what {_some(bare)} show{'s' * (len(bare) == 1)} from more places, nearer together."
