@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
     from gs2d.kernels.library import Library
 
-__all__ = ["FuseArguments", "arguments_of", "fuse_on_cpu", "fuse_on_gpu"]
+__all__ = ["FuseArguments", "arguments_of", "fuse_on_cpu", "fuse_on_gpu", "mark_on_cpu"]
 
 VOXELS = 512  # of a block
 THREADS = 128  # of a CUDA block, fuse.cu
@@ -35,6 +35,57 @@ class FuseArguments(ctypes.Structure):
         ("truncation", ctypes.c_float),
         *((name, ctypes.c_void_p) for name in ("tsdf", "weight", "color", "color_weight")),
     )
+
+
+class MarkArguments(ctypes.Structure):
+    """``MarkArguments`` of core/fuse.h."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        ("steps", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("rays", "depth", "offsets")),
+        *((name, ctypes.c_double * 3) for name in ("start", "end")),
+        ("padded", ctypes.c_int64 * 3),
+        ("marks", ctypes.c_void_p),
+    )
+
+
+def mark_on_cpu(
+    library: Library,
+    rays: np.ndarray,
+    depth: np.ndarray,
+    offsets: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+    marks: np.ndarray,
+) -> None:
+    """Mark the blocks near samples ``start + (depth + offset) rays`` that lie in the grid.
+
+    Parameters
+    ----------
+    library : Library
+    rays : ndarray [3, P] float64
+        In halves of a block for a depth of 1 wu, as all places here are.
+    depth : ndarray [P] float64 wu
+    offsets : ndarray [S] float64 wu
+    start, end : ndarray [3]
+        Of the rays; of the grid, which begins at 0.
+    marks : ndarray [X, Y, Z] bool
+        With a border of one block all round; changed.
+    """
+    rays, depth, offsets = (np.ascontiguousarray(a, np.float64) for a in (rays, depth, offsets))
+    arguments = MarkArguments(
+        count=len(depth),
+        steps=len(offsets),
+        rays=rays.ctypes.data,
+        depth=depth.ctypes.data,
+        offsets=offsets.ctypes.data,
+        start=(ctypes.c_double * 3)(*start),
+        end=(ctypes.c_double * 3)(*end),
+        padded=(ctypes.c_int64 * 3)(*marks.shape),
+        marks=marks.ctypes.data,
+    )
+    library.function("gs2d_mark_blocks", None, [ctypes.c_void_p])(ctypes.byref(arguments))
 
 
 def arguments_of(

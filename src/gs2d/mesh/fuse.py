@@ -9,16 +9,21 @@ the two sides of a thin plate do not fight.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gs2d.errors import ProtocolError
 from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.integrate import integrator
+from gs2d.mesh.integrate import fusion_backend, integrator
 from gs2d.mesh.limits import FusionLimits, backproject
 from gs2d.mesh.sampling import prepare
 from gs2d.mesh.volume import BLOCK, Budget, Volume, block_grid, check_truncation, unknown_volume
+
+if TYPE_CHECKING:
+    from gs2d.kernels.library import Library
 
 _MOST_MARKS = 1 << 27  # bytes
 _FEW_SAMPLES = 1e8  # of one depth map: seconds
@@ -61,11 +66,11 @@ def fuse(
     dims = block_grid(limits)
     budget = Budget(limits, max_bytes)
     keys = np.zeros(0, dtype=np.int64)
-    colored, count = False, 0
+    colored, count, library = False, 0, block_finder(backend, threads)
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
         budget.check_least(least_blocks(item, limits), colored)
-        keys = merged(keys, touched_blocks(item, limits, dims))
+        keys = merged(keys, touched_blocks(item, limits, dims, library))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
@@ -107,12 +112,14 @@ def _samples(item: DepthMap, depth: np.ndarray, limits: FusionLimits) -> tuple[i
     return max(1, int(np.ceil(width / half))), int(np.ceil(2 * limits.truncation / half)) + 1
 
 
-def touched_blocks(item: DepthMap, limits: FusionLimits, dims: tuple[int, int, int]) -> np.ndarray:
+def touched_blocks(
+    item: DepthMap, limits: FusionLimits, dims: tuple[int, int, int], library: Library | None = None
+) -> np.ndarray:
     """Keys [K] of the blocks near what one depth map saw: sorted, each once.
 
     Each seen pixel is sampled along its ray from one truncation before to one behind the surface, in steps of half a
     block; a sample takes the 2^3 blocks nearest to it. Where a pixel is wider than half a block, it is sampled at
-    several places of its square.
+    several places of its square. The native library does the same operations as numpy.
     """
     half = 0.5 * BLOCK * limits.voxel
     rows, columns = np.nonzero((item.depth > 0) & (item.depth <= limits.depth_limit))
@@ -121,26 +128,56 @@ def touched_blocks(item: DepthMap, limits: FusionLimits, dims: tuple[int, int, i
     depth = item.depth[rows, columns].astype(np.float64)
     parts, steps = _samples(item, depth, limits)
     shifts = (np.arange(parts) + 0.5) / parts - 0.5
+    offsets = np.linspace(-limits.truncation, limits.truncation, steps)
     # The lower of the two nearest blocks along each axis, counted from a border of one block round the grid.
     padded = (dims[0] + 2, dims[1] + 2, dims[2] + 2)
     strides = (padded[1] * padded[2], padded[2], 1)
-    start = ((item.camera.center - limits.lower) / half)[:, None]  # in half blocks, as is all below
-    end = 2 * np.asarray(dims)[:, None]
-    lowest: list[np.ndarray] = []
-    for dx in shifts:
-        for dy in shifts:
-            ray = (backproject(item.camera, np.ones(len(rows)), rows + dy, columns + dx) - item.camera.center).T / half
-            for offset in np.linspace(-limits.truncation, limits.truncation, steps):
-                at = start + (depth + offset) * ray  # [3, P]
-                cells = at[:, ((at >= 0) & (at < end)).all(axis=0)].astype(np.int64)
-                x, y, z = (cells + 1) >> 1
-                flat = x * strides[0] + y * strides[1] + z
-                lowest.append(flat[np.flatnonzero(np.diff(flat, prepend=-1))])  # neighbours mostly share a block
-    first = _distinct(lowest, padded)
+    start = (item.camera.center - limits.lower) / half  # in half blocks, as is all below
+    end = 2 * np.asarray(dims)
+    rays = (
+        (backproject(item.camera, np.ones(len(rows)), rows + dy, columns + dx) - item.camera.center).T / half
+        for dx in shifts
+        for dy in shifts
+    )
+    if library is not None and padded[0] * padded[1] * padded[2] <= _MOST_MARKS:
+        from gs2d.kernels.fusion import mark_on_cpu
+
+        marks = np.zeros(padded, bool)
+        for ray in rays:
+            mark_on_cpu(library, ray, depth, offsets, start, end, marks)
+        first = np.flatnonzero(marks)
+    else:
+        lowest = [part for ray in rays for part in _lowest_blocks(ray, depth, offsets, start, end, strides)]
+        first = _distinct(lowest, padded)
     corners = [sum(strides[axis] * (c >> axis & 1) for axis in range(3)) for c in range(8)]
     blocks = np.stack(np.unravel_index(_distinct([first + corner for corner in corners], padded), padded)) - 1
     x, y, z = blocks[:, ((blocks >= 0) & (blocks < np.asarray(dims)[:, None])).all(axis=0)]
     return (x * dims[1] + y) * dims[2] + z
+
+
+def _lowest_blocks(
+    ray: np.ndarray, depth: np.ndarray, offsets: np.ndarray, start: np.ndarray, end: np.ndarray, strides: Sequence[int]
+) -> Iterator[np.ndarray]:
+    """For each offset the blocks that ``start + (depth + offset) ray`` lies in, where that is in the grid."""
+    for offset in offsets:
+        at = start[:, None] + (depth + offset) * ray  # [3, P]
+        cells = at[:, ((at >= 0) & (at < end[:, None])).all(axis=0)].astype(np.int64)
+        x, y, z = (cells + 1) >> 1
+        flat = x * strides[0] + y * strides[1] + z
+        yield flat[np.flatnonzero(np.diff(flat, prepend=-1))]  # neighbours mostly share a block
+
+
+def block_finder(backend: str, threads: int | None) -> Library | None:
+    """The native library for ``touched_blocks``, on so many threads; None: numpy, for the reference and without it."""
+    if fusion_backend(backend) == "reference":
+        return None
+    from gs2d.kernels.library import available_variants, load
+
+    if not available_variants():
+        return None
+    library = load()
+    library.use_threads(threads or os.cpu_count() or 1)
+    return library
 
 
 def _distinct(numbers: list[np.ndarray], dims: tuple[int, int, int]) -> np.ndarray:

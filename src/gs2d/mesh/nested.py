@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gs2d.errors import ProtocolError
 from gs2d.mesh.cases import CORNERS, EDGES, case_table
 from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.fuse import least_blocks, merged, touched_blocks
+from gs2d.mesh.fuse import block_finder, least_blocks, merged, touched_blocks
 from gs2d.mesh.integrate import integrator
 from gs2d.mesh.limits import backproject
 from gs2d.mesh.nest import STEP, Nest
@@ -25,6 +26,9 @@ from gs2d.mesh.sampling import prepare
 from gs2d.mesh.surface import cell_surface, crossing, mixed_colors
 from gs2d.mesh.volume import BLOCK, VOXELS, Budget, Volume, check_truncation, unknown_volume
 from gs2d.triangles import Mesh
+
+if TYPE_CHECKING:
+    from gs2d.kernels.library import Library
 
 FAR_VIEWS = 5.0  # weight from which a voxel outside the innermost level is known: so many views seldom agree on a sky
 
@@ -66,11 +70,11 @@ def fuse_nested(
     check_truncation(nest.levels[0])
     budget = Budget(nest.levels[0], max_bytes, side=2 * nest.half, step=STEP)
     keys = [np.zeros(0, dtype=np.int64) for _ in nest.levels]
-    colored, count = False, 0
+    colored, count, library = False, 0, block_finder(backend, threads)
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
         budget.check_least(least_blocks(item, nest.levels[0]), colored)
-        for k, found in enumerate(_touched(item, nest)):
+        for k, found in enumerate(_touched(item, nest, library)):
             keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
@@ -101,7 +105,7 @@ def _truncations(item: DepthMap, nest: Nest) -> np.ndarray:
     return nest.levels[0].truncation * np.exp2(np.minimum(level, len(nest.levels) - 1))
 
 
-def _touched(item: DepthMap, nest: Nest) -> list[np.ndarray]:
+def _touched(item: DepthMap, nest: Nest, library: Library | None) -> list[np.ndarray]:
     """Keys of each level's own blocks near what a depth map saw."""
     distance = _distances(item, nest)
     first, last = nest.hole
@@ -116,7 +120,8 @@ def _touched(item: DepthMap, nest: Nest) -> list[np.ndarray]:
         step = BLOCK * limits.voxel
         lower = (limits.lower[0] - step, limits.lower[1] - step, limits.lower[2] - step)
         dims = (nest.dims[0] + 2,) * 3
-        blocks = np.stack(np.unravel_index(touched_blocks(part, replace(limits, lower=lower), dims), dims), axis=1) - 1
+        keys = touched_blocks(part, replace(limits, lower=lower), dims, library)
+        blocks = np.stack(np.unravel_index(keys, dims), axis=1) - 1
         blocks = blocks[((blocks >= 0) & (blocks < nest.dims[0])).all(axis=1)]
         if k:
             blocks = blocks[~((blocks >= first) & (blocks < last)).all(axis=1)]

@@ -24,6 +24,18 @@ template <class R> struct FuseArguments {
     R *tsdf, *weight, *color, *color_weight;  // [M, 512], [M, 512, 3]; the colours null where there are none
 };
 
+// Rays of one depth map through a grid of blocks, for kernels/fusion.py: where a depth lies on each, sampled before and
+// behind it, in halves of a block from the grid's corner.
+struct MarkArguments {
+    long long count, steps;   // rays; samples along each
+    const double* rays;       // [3, count], to depth 1
+    const double* depth;      // [count] wu
+    const double* offsets;    // [steps] wu, of a sample from the depth
+    double start[3], end[3];  // of the rays; of the grid, which begins at 0
+    long long padded[3];      // blocks, with a border of one
+    unsigned char* marks;     // [padded]: of the lower of the two nearest blocks along each axis
+};
+
 GS2D_HD float whole(float a) { return float(int(a)); }  // floor, of what is not negative
 GS2D_HD double whole(double a) { return double(int(a)); }
 

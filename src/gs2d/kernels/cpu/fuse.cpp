@@ -69,10 +69,38 @@ void fuse_block(const FuseArguments<real>& a, int64_t n) {
     }
 }
 
+constexpr int64_t RAYS = 8192;  // of a piece
+
+// Marks what rays [begin, end) meet, in the double precision and the order of operations of mesh/fuse.py. Many rays set
+// the same mark, and all to the same value.
+void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
+    const int64_t stride_x = a.padded[1] * a.padded[2], stride_y = a.padded[2];
+    for (int64_t step = 0; step < a.steps; ++step) {
+        int64_t last = -1;
+        for (int64_t i = begin; i < end; ++i) {
+            const double depth = a.depth[i] + a.offsets[step];
+            const double x = a.start[0] + depth * a.rays[i], y = a.start[1] + depth * a.rays[a.count + i];
+            const double z = a.start[2] + depth * a.rays[2 * a.count + i];
+            const bool inside = x >= 0 && x < a.end[0] && y >= 0 && y < a.end[1] && z >= 0 && z < a.end[2];
+            if (!inside) continue;
+            const int64_t block_x = (int64_t(x) + 1) >> 1, block_y = (int64_t(y) + 1) >> 1, block_z = (int64_t(z) + 1) >> 1;
+            const int64_t flat = block_x * stride_x + block_y * stride_y + block_z;
+            if (flat == last) continue;  // neighbours mostly share a block
+            last = flat;
+            __atomic_store_n(&a.marks[flat], 1, __ATOMIC_RELAXED);
+        }
+    }
+}
+
 }  // namespace
 }  // namespace gs2d
 
 using namespace gs2d;
+
+// Marks the blocks that the pixels of one depth map see something in.
+GS2D_EXPORT void gs2d_mark_blocks(const MarkArguments* arguments) {
+    parallel_ranges(arguments->count, RAYS, [&](int64_t begin, int64_t end) { mark_rays(*arguments, begin, end); });
+}
 
 // Adds one view to the blocks that it may change.
 GS2D_EXPORT void gs2d_fuse(const FuseArguments<real>* arguments) {
