@@ -24,6 +24,7 @@ FLOORS = {
     "check": 0,
     "disk": 0,
     "extras": 0,
+    "memory": 0,
     "recipe": 1,
     "recipes": 1,
     "protocols": 1,

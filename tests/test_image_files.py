@@ -127,6 +127,12 @@ def test_area_downscale_averages_blocks_and_cuts_what_is_left_over() -> None:
         area_downscale(image, 4)
 
 
+@pytest.mark.parametrize("factor", [16, 17])
+def test_white_stays_white_in_large_blocks(factor: int) -> None:
+    white = np.full((factor, 2 * factor, 3), 255, np.uint8)
+    np.testing.assert_array_equal(area_downscale(white, factor), np.full((1, 2, 3), 255))
+
+
 def test_transparent_pixels_do_not_bleed_into_the_colour() -> None:
     """Alphas 255, 85, 0, 0: alpha (255 + 85) / 4 = 85; red (200 255 + 80 85) / 340 = 170."""
     image = np.zeros((2, 2, 4), np.uint8)

@@ -179,8 +179,13 @@ def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
         return image
     count = np.uint32(factor * factor)
     if image.shape[2] == 3:
-        total = sum(part.astype(np.uint32) for part in _block_parts(image, factor))
-        return np.asarray((total + count // 2) // count).astype(np.uint8)
+        parts = _block_parts(image, factor)
+        total = parts[0].astype(np.uint16 if factor <= 16 else np.uint32)  # 16^2 (255 + 1/2) < 2^16
+        for part in parts[1:]:
+            total += part
+        total += total.dtype.type(count // 2)
+        total //= total.dtype.type(count)
+        return total.astype(np.uint8)
     height, width = image.shape[0] // factor, image.shape[1] // factor
     color = np.zeros((height, width, 3), dtype=np.uint64)
     weight = np.zeros((height, width, 1), dtype=np.uint64)

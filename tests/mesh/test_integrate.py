@@ -14,7 +14,7 @@ from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.fusion import arguments_of
 from gs2d.kernels.library import available_variants, load
 from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.fuse import fuse
+from gs2d.mesh.fuse import block_finder, fuse, touched_blocks
 from gs2d.mesh.integrate import add_natively, fusion_backend, integrator
 from gs2d.mesh.limits import sample_depths
 from gs2d.mesh.nest import derive_nest
@@ -58,6 +58,22 @@ def test_the_native_field_is_that_of_numpy_in_every_bit(
     assert expected.color_weight is not None
     assert (expected.color_weight > 0).any()
     assert_same(fuse(frames, LIMITS, threads=threads, backend="cpu"), expected)
+
+
+@pytest.mark.parametrize("voxel", [0.05, 0.004])  # finer: a pixel is wider than half a block
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_blocks_that_are_found_natively_are_those_of_numpy(
+    variant: str, voxel: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GS2D_CPU_VARIANT", variant)
+    library = block_finder("cpu", 3)
+    assert library is not None
+    assert block_finder("reference", 3) is None
+    bounds = replace(LIMITS, voxel=voxel, truncation=3 * voxel)
+    for view in views(2):
+        expected = touched_blocks(view, bounds, block_grid(bounds))
+        assert len(expected) > 50
+        np.testing.assert_array_equal(touched_blocks(view, bounds, block_grid(bounds), library), expected)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

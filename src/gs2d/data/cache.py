@@ -67,6 +67,12 @@ class ImageCache:
     def __len__(self) -> int:
         return len(self._pictures)
 
+    def clear(self) -> None:
+        """Drop all pictures; they are decoded again when somebody asks."""
+        with self._lock:
+            self._pictures.clear()
+            self._nbytes = 0
+
     def get(self, key: Hashable, decode: Callable[[], Picture]) -> Picture:
         """The picture of ``key``, decoded if it is not held."""
         with self._lock:

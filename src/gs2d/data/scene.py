@@ -15,6 +15,9 @@ from gs2d.data.cache import ImageCache, Picture
 from gs2d.data.prior_maps import ObservedPoints, PriorMaps
 from gs2d.errors import DataError
 from gs2d.images import composite
+from gs2d.memory import trim
+
+TRIM_EVERY = 16  # pictures that are decoded between giving back what decoding left: a few ms each time
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +220,11 @@ class Scene:
         """Training views, then test views."""
         return self.train + self.test
 
+    def forget(self) -> None:
+        """Drop decoded pictures from memory; a view that is asked for one decodes it again."""
+        for cache in {id(view.cache): view.cache for view in self.views}.values():
+            cache.clear()
+
     def preload(self, threads: int = 2) -> Iterator[View]:
         """Decode every picture once, yielding each view when its picture is good.
 
@@ -234,6 +242,10 @@ class Scene:
 
         with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
             try:
-                yield from pool.map(decode, self.views)
+                for number, view in enumerate(pool.map(decode, self.views), start=1):
+                    if number % TRIM_EVERY == 0:
+                        trim()
+                    yield view
             finally:
                 pool.shutdown(cancel_futures=True)
+                trim()

@@ -36,6 +36,12 @@ class Recycler:
         self._free: list[tuple[int, np.ndarray]] = []  # with the number of the request since when
         self._returned: deque[np.ndarray] = deque()
 
+    def clear(self) -> None:
+        """Give up every block that nobody holds."""
+        with self._lock:
+            self._returned.clear()
+            self._free.clear()
+
     def empty(self, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
         """Like ``torch.empty`` on the CPU: undefined contents, contiguous."""
         count = math.prod(shape)

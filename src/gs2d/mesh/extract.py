@@ -110,11 +110,13 @@ def extract(
             if truncation is None:
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
         volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
+        fused = _Fused.of([volume])
         whole = marching_cubes(volume, min_weight=min_weight)
-        found = _extraction(whole, limits, [volume], min_faces=min_faces, keep=keep, backend=backend)
+        del volume  # the largest thing there is: what follows has no use for it
+        found = _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
         if not by_evidence:
             return found
-        del volume, whole
+        del whole
         cleaned = clean(found.mesh, spool, len(spool), limits.truncation)
         return replace(found, mesh=cleaned.mesh, cleaned=cleaned)
 
@@ -181,24 +183,41 @@ def extract_unbounded(
             nest = nest.with_truncation(widen_truncation(inner, noise).truncation, noise)
         volumes = fuse_nested(spool, nest, max_bytes=max_bytes, threads=threads, backend=backend)
     far_weight = min(far_views, volumes[0].frames / 2)
+    fused = _Fused.of(volumes)
     whole = nested_marching_cubes(volumes, nest, min_weight=min_weight, far_weight=far_weight)
+    del volumes
     limits = replace(nest.levels[0], lower=nest.levels[-1].lower, upper=nest.levels[-1].upper)
-    return _extraction(whole, limits, volumes, min_faces=min_faces, keep=keep, backend=backend)
+    return _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
+
+
+@dataclass(frozen=True)
+class _Fused:
+    """What is said of volumes when they are gone."""
+
+    frames: int
+    blocks: int
+    nbytes: int
+    levels: int
+
+    @classmethod
+    def of(cls, volumes: Sequence[Volume]) -> _Fused:
+        blocks, nbytes = sum(len(volume.keys) for volume in volumes), sum(volume.nbytes for volume in volumes)
+        return cls(volumes[0].frames, blocks, nbytes, len(volumes))
 
 
 def _extraction(
-    whole: Mesh, limits: FusionLimits, volumes: Sequence[Volume], *, min_faces: int, keep: int | None, backend: str
+    whole: Mesh, limits: FusionLimits, fused: _Fused, *, min_faces: int, keep: int | None, backend: str
 ) -> Extraction:
     """Without small pieces, with the figures."""
     mesh = keep_components(whole, min_faces=min_faces, keep=keep)
     return Extraction(
         mesh=mesh,
         limits=limits,
-        frames=volumes[0].frames,
-        blocks=sum(len(volume.keys) for volume in volumes),
-        volume_bytes=sum(volume.nbytes for volume in volumes),
+        frames=fused.frames,
+        blocks=fused.blocks,
+        volume_bytes=fused.nbytes,
         components=int(components(whole).max(initial=-1)) + 1,
         faces_removed=len(whole.faces) - len(mesh.faces),
-        levels=len(volumes),
+        levels=fused.levels,
         backend=backend,
     )

@@ -16,6 +16,7 @@ from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
+from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
@@ -86,6 +87,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         collected = Collector(job.scene, job.settings.background)
         with MeshFrames(job) as frames:
             splats, exposures, poses = train_stages(run, job, options, start, watch, [frames.visit, collected.visit])
+            release(job.scene)  # before the volume of the mesh
             write_exposures(run, exposures, on_event)
             write_poses(run, job.scene, poses, on_event)
             job = replace(job, scene=job.scene.with_poses(poses)) if poses else job

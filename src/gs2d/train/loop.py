@@ -35,7 +35,7 @@ from gs2d.train.priors import with_known_points
 from gs2d.train.robust import Robustness
 from gs2d.train.rows import keep_rows
 from gs2d.train.state import Statistics, TrainState
-from gs2d.train.targets import DeviceTargets, Targets, TargetSource
+from gs2d.train.targets import TARGET_BYTES, DeviceTargets, Targets, TargetSource
 from gs2d.train.views import (
     Evaluated,
     Evaluator,
@@ -73,7 +73,7 @@ class Trainer:
     progress_every : int
         Iterations between Progress events (the last of a stage always sends one).
     target_bytes : int, optional
-        Memory for photographs: float tensors on the CPU (default 512 MiB), bytes on a GPU (default 2 GiB).
+        Memory for photographs: float tensors on the CPU (default 256 MiB), bytes on a GPU (default 2 GiB).
     stage2_cache_bytes : int
         Memory for cached views (cpu backend, stages that train only the colours of a row group); 0 = none. The first
         views that fit are cached. The result depends on it, by rounding.
@@ -257,7 +257,7 @@ class Trainer:
             or any(t.kind == "silhouette" for stage in self.recipe.stages for t in stage.losses),
             dtype=dtype,
             device=device,
-            limit_bytes=1 << 29 if limit_bytes is None else limit_bytes,
+            limit_bytes=TARGET_BYTES if limit_bytes is None else limit_bytes,
         )
 
     def _new_state(self, dtype: torch.dtype) -> TrainState:

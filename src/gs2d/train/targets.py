@@ -12,6 +12,10 @@ from torch import Tensor
 from gs2d.data.scene import View
 from gs2d.losses import TargetMaps, target_maps
 
+# Of 292 photographs of 780x520 a fifth would stay in twice as much, for less than 1 % of an iteration's time: to make a
+# target anew from its bytes takes a few ms. Small captures stay whole.
+TARGET_BYTES = 1 << 28
+
 
 @dataclass(frozen=True, eq=False)
 class Target:
@@ -63,7 +67,7 @@ class Targets:
         with_silhouettes: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
-        limit_bytes: int = 1 << 29,
+        limit_bytes: int = TARGET_BYTES,
     ) -> None:
         self._views = views
         self._background = background

@@ -1,0 +1,77 @@
+"""Memory that was freed goes back to the system, and what can be had again goes when a run says so."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.camera import look_at
+from gs2d.data import Scene, View
+from gs2d.data.cache import ImageCache, Picture
+from gs2d.kernels.recycle import Recycler
+from gs2d.pipeline.memory import release
+
+HOLES = """
+import os, sys
+from gs2d.memory import trim
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+blocks = [bytearray(60_000) for _ in range(2000)]  # below what is mapped alone: 120 MB of heap
+kept = blocks[::40]
+del blocks
+before = resident()
+done = trim()
+print(done, before - resident())
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the resident memory is read from /proc")
+def test_the_holes_between_what_stays_go_back_to_the_system() -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", HOLES], capture_output=True, text=True, check=True, env=dict(os.environ)
+    )
+    done, freed = found.stdout.split()
+    if done == "False":
+        pytest.skip("this C library has no malloc_trim")
+    assert int(freed) > 80e6
+
+
+def test_a_scene_that_forgets_its_pictures_decodes_them_again(tmp_path: Path) -> None:
+    cache, decoded = ImageCache(1 << 20), []
+    camera = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=4, height=4, fx=5.0)
+
+    def view(name: str) -> View:
+        def decode() -> Picture:
+            decoded.append(name)
+            return Picture(np.full((4, 4, 3), len(name), np.uint8))
+
+        return View(name, camera, decode, cache)
+
+    scene = Scene("s", "colmap", (view("a"),), (view("bb"),), None, 1.0, np.zeros((2, 3)))
+    assert [v.name for v in scene.preload(2)] == ["a", "bb"]
+    assert cache.nbytes == 2 * 48
+    scene.views[0].image()
+    assert sorted(decoded) == ["a", "bb"]
+    release(scene)
+    assert (cache.nbytes, len(cache)) == (0, 0)
+    assert scene.views[1].image()[0, 0, 0] == 2
+    assert len(decoded) == 3
+
+
+def test_buffers_that_nobody_holds_are_given_up() -> None:
+    recycler = Recycler(least_bytes=1024)
+    held = recycler.empty((1024,), torch.float32)
+    held[:] = 7
+    recycler.empty((2048,), torch.float32)  # dropped at once
+    assert recycler.free_bytes >= 8192
+    recycler.clear()
+    assert recycler.free_bytes == 0
+    assert bool((held == 7).all())
