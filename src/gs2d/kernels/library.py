@@ -69,6 +69,10 @@ class Library:
             self._functions[key] = function
         return function
 
+    def has(self, name: str) -> bool:
+        """Whether it exports a function: one that was built before has the same version without what came since."""
+        return hasattr(self._dll, name)
+
     def use_threads(self, n: int) -> None:
         """Let the following calls use ``n`` threads. Results do not depend on it."""
         self._dll.gs2d_set_threads(int(n))
