@@ -180,11 +180,12 @@ def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     count = np.uint32(factor * factor)
     if image.shape[2] == 3:
         parts = _block_parts(image, factor)
-        total = parts[0].astype(np.uint16 if factor <= 16 else np.uint32)  # 16^2 (255 + 1/2) < 2^16
+        wide = np.uint16 if factor <= 16 else np.uint32  # 16^2 (255 + 1/2) < 2^16
+        total = parts[0].astype(wide)
         for part in parts[1:]:
-            total += part
-        total += total.dtype.type(count // 2)
-        total //= total.dtype.type(count)
+            np.add(total, part, out=total)
+        np.add(total, wide(count // 2), out=total)
+        np.floor_divide(total, wide(count), out=total)
         return total.astype(np.uint8)
     height, width = image.shape[0] // factor, image.shape[1] // factor
     color = np.zeros((height, width, 3), dtype=np.uint64)

@@ -18,7 +18,7 @@ __all__ = ["trim"]
 def _malloc_trim() -> Callable[[int], Any] | None:
     """The call of glibc that does it; None elsewhere."""
     try:
-        return ctypes.CDLL(None).malloc_trim  # type: ignore[no-any-return]
+        return ctypes.CDLL(None).malloc_trim
     except (AttributeError, OSError, TypeError):
         return None
 
