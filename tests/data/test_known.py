@@ -134,7 +134,7 @@ def test_the_depth_of_unknown_pixels_is_not_fused(use_masks: bool) -> None:
         scene=SimpleNamespace(train=(view,)),
         settings=RasterSettings(sh_degree=0),
         backend=get_backend("reference"),
-        protocol=SimpleNamespace(use_mask_in_fusion=use_masks),
+        protocol=SimpleNamespace(use_mask_in_fusion=use_masks, fusion=SimpleNamespace(subject=False)),
     )
     frame = next(iter(surface._frames(job, splat, "median", ignore)))
     assert frame.valid is not None

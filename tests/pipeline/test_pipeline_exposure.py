@@ -13,6 +13,7 @@ import torch
 
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.data import View, toy
+from gs2d.data.subject import OBJECT, read_subject
 from gs2d.data.toy_exposure import GAINS, random_gains, with_gains
 from gs2d.errors import RunError
 from gs2d.images import read_image, write_image
@@ -135,7 +136,10 @@ def test_no_pixel_is_matched_by_itself() -> None:
 def test_any_view_can_be_rendered_in_the_exposure_of_a_photograph(run: RunFolder, tmp_path: Path) -> None:
     render_run(run.path, orbit=2, out=tmp_path, exposure_of="train/r_1.png")
     _, job, splats = open_job(run.path, 1, ignore)
-    camera = orbit_cameras([view.camera for view in job.scene.train], 2)[0]
+    subject = read_subject(run.path)
+    assert subject is not None
+    focus = subject.center if subject.kind == OBJECT else None
+    camera = orbit_cameras([view.camera for view in job.scene.train], 2, focus)[0]
     output = render_view(
         splats, View.from_arrays("0", camera, np.zeros((1, 1, 3), np.uint8)), job.settings, job.backend
     )
