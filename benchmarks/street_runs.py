@@ -29,14 +29,18 @@ from gs2d.evaluate.images import ImageMetrics
 from gs2d.io.files import read_json
 from gs2d.io.ply import read_mesh
 from gs2d.io.run import MESH, METRICS, PAGE, REPORT, SPLATS
+from gs2d.mesh.evidence import gather, pixels
+from gs2d.mesh.frames import depth_map
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.jobs import open_job
+from gs2d.pipeline.pictures import render_view
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.pipeline.scoring import score_views
 from gs2d.pipeline.subject import sights
+from gs2d.pipeline.surface import fusion_frame
 from gs2d.render.api import rasterize
 from gs2d.sfm.photos import find_photos
 from gs2d.sfm.workplace import POSES_JSON
@@ -45,6 +49,7 @@ from gs2d.triangles import Mesh
 
 POLL_SECONDS = 0.2
 PROCESS, CONSOLE, PHOTOS, PEER = "process.json", "console.txt", "photographs", "peer"
+SAME_SURFACE = 0.01  # of the scene's extent, by which a mesh and a rendered depth that saw it may differ
 TEST_EVERY = 8  # where `reconstruct` itself would hold nothing out
 UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0, "days": 86400.0}
 _DURATION = r"([\d.]+)\s*(s|min|h|days?)\b"
@@ -309,11 +314,19 @@ def measure_mesh(path: Path) -> dict[str, Any]:
     run, job, splats = open_job(path, None, ignore)
     mesh = read_mesh(run.file(MESH))
     facts: dict[str, Any] = {"faces": len(mesh.faces), "vertices": len(mesh.vertices)}
+    facts["faces_per_pixel"] = round(len(mesh.faces) / max(pixels_of(job, splats, mesh), 1.0), 3)
     try:
         subject = find_subject(sights(job, splats))
     except DataError as error:
         return facts | {"subject": str(error), "share_in_subject": None}
     return facts | {"subject": subject.kind, "share_in_subject": round(share_in_box(mesh, subject.box), 4)}
+
+
+def pixels_of(job: Job, splats: Splats, mesh: Mesh) -> float:
+    """How many pixels of the training views saw a mesh: each part of it counts in the view that saw it best."""
+    views = ((view, render_view(splats, view, job.settings, job.backend)) for view in job.scene.train)
+    maps = (depth_map(fusion_frame(job, view, output, "median")) for view, output in views)
+    return pixels(mesh, gather(mesh, maps, SAME_SURFACE * job.scene.extent))
 
 
 def share_in_box(mesh: Mesh, box: np.ndarray) -> float:
