@@ -105,3 +105,12 @@ def many_tiles() -> Case:
     camera = random_camera(rng).resized(70, 45)  # no multiple of 16, 8 or 4
     splats = random_splats(rng, camera, 150)
     return Case(5, replace(splats, log_scales=splats.log_scales - 0.7).to(dtype=torch.float32), camera)
+
+
+def crossing_tiles(seed: int) -> Case:
+    """Some of everything, most of it across the camera plane, in many tiles."""
+    rng = np.random.default_rng(seed)
+    camera = random_camera(rng).resized(90, 70)
+    splats = random_splats(rng, camera, 60, ("crossing", "crossing", "near_plane", "huge", "edge_on", "plain"))
+    splats = replace(splats, means=splats.means + torch.tensor(rng.normal(size=(60, 3)) * rng.choice([0, 2], (60, 1))))
+    return Case(seed, splats.to(dtype=torch.float32), camera)

@@ -144,8 +144,11 @@ def test_culling_inside_tiles_changes_no_bit_of_the_image_and_no_gradient(emulat
     cotangents = random_cotangents(np.random.default_rng(1), case.camera)
     a = gradients(emulator, case.splats, case.camera, cotangents, 4)
     b = gradients(emulator, case.splats, case.camera, cotangents, 4, exact_masks=False)
-    for name in a:  # the lengths of the lists change the order of the blocks, and so that of the additions
-        assert float((a[name] - b[name]).norm()) <= 1e-5 * float(a[name].norm()), name
+    # The lengths of the lists change the order of the blocks, and so that of the additions. The most is 1.1e-5, the
+    # quaternion of one splat; eight orders of the same lists, nothing culled, differ by up to 1.0e-5. In a fixed order
+    # no bit depends on culling: test_kernels_variants.py, "deterministic".
+    for name in a:
+        assert float((a[name] - b[name]).norm()) <= 3e-5 * float(a[name].norm()), name
 
 
 def test_the_order_of_threads_warps_and_blocks_does_not_change_images(emulator: Emulator) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 from emulate import Emulator
-from kernel_cases import SETTINGS, Case, cases, double, many_tiles
-from render_scenes import contraction, front_camera, random_cotangents, requiring_grad, splat, stack
+from kernel_cases import SETTINGS, Case, cases, crossing_tiles, double, many_tiles
+from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 from torch import Tensor
 
 from gs2d.camera import Camera
@@ -151,6 +151,28 @@ def test_deterministic_gradients_do_not_depend_on_order_or_culling(
         assert torch.equal(grad, shuffled[name]), name
         assert torch.equal(grad, everywhere[name]), name
         assert float((grad - atomic[name]).norm()) <= 3e-5 * float(grad.norm()), name  # 1.1e-5: quats
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, seed: int) -> None:
+    """Those that reach the camera plane: of their tiles most are not even candidates."""
+    case = crossing_tiles(seed)
+    view = cuda_passes.view_of(case.camera, SETTINGS)
+    parameters = [tensor.contiguous() for _, tensor in case.splats.items()]
+    culled, full = (cuda_passes.forward(emulator, view, parameters, exact=exact) for exact in (True, False))
+    for name in IMAGES:
+        assert torch.equal(culled.images[name], full.images[name]), name
+    assert torch.equal(culled.radii, full.radii)
+    assert len(culled.permutation) < 0.9 * len(full.permutation)
+    cotangents = random_cotangents(np.random.default_rng(seed), case.camera)
+    a, b = (
+        gradients(emulator, case, cotangents, columns=4, deterministic=True, exact_masks=exact)
+        for exact in (True, False)
+    )
+    for name, gradient in b.items():
+        assert torch.equal(a[name], gradient), name
+    crossing = full.radii == 45
+    assert int((b["sh0"][crossing] != 0).any(2).sum()) > 5
 
 
 def test_torchs_switch_asks_for_deterministic_gradients(emulator: Emulator) -> None:

@@ -156,7 +156,9 @@ class _Projected:
 PROJECTED = tuple(field.name for field in fields(_Projected))
 
 
-def _project(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, errors: bool) -> _Projected:
+def _project(
+    launcher: Launcher, view: View, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
+) -> _Projected:
     """Records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
     count, device = parameters[0].shape[0], parameters[0].device
     if count >= MOST_SPLATS:
@@ -168,7 +170,8 @@ def _project(launcher: Launcher, view: View, parameters: Sequence[Tensor], *, er
         for name in PROJECTED
     }
     if count > 0:
-        project = ProjectArguments(view=view, count=count, sh_rest=parameters[5].shape[1], errors=int(errors))
+        project = ProjectArguments(view=view, count=count, sh_rest=parameters[5].shape[1])
+        project.errors, project.exact = int(errors), int(exact)
         _fill(project, dict(zip(PARAMETERS, parameters, strict=True)))
         _fill(project, dict(arrays))
         launcher.launch("project_splats", _blocks(count), THREADS, project)
@@ -184,7 +187,7 @@ def forward(
     distortion: bool = True,
     budget: PairBudget | None = None,
 ) -> Frame:
-    """Render one view; ``exact=False`` turns off culling inside tiles (tests).
+    """Render one view; ``exact=False`` turns off culling inside tiles, and all of what has no ellipse (tests).
 
     The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device. Without
     ``distortion`` that image is NaN: it is a tenth of the blending, and few recipes want it.
@@ -194,7 +197,7 @@ def forward(
     def floats(*shape: int) -> Tensor:
         return torch.empty(shape, dtype=torch.float32, device=device)
 
-    projected = _project(launcher, view, parameters, errors=False)
+    projected = _project(launcher, view, parameters, errors=False, exact=exact)
     lists = _bin(launcher, view, projected, exact, budget)
     words = (len(lists.entries) >> 5) + len(lists.tiles) + 1
     seen = torch.zeros(words, 8, dtype=torch.int32, device=device)
@@ -244,9 +247,10 @@ def _bin(
         keys = torch.empty(candidates, dtype=torch.int16 if bits == 16 else torch.int32, device=device)
         payloads = torch.empty(candidates, dtype=torch.int32, device=device)
         emit = EmitArguments(candidates=candidates, visible=len(order), exact=int(exact))
-        for name in ("width", "height", "tiles_x", "tiles_y"):
+        for name in ("width", "height", "tiles_x", "tiles_y", "near"):
             setattr(emit, name, getattr(view, name))
-        _fill(emit, {"order": order, "ends": ends, "cull": projected.cull, "rects": projected.rects})
+        _fill(emit, {"order": order, "ends": ends})
+        _fill(emit, {name: getattr(projected, name) for name in ("cull", "records", "rects")})
         _fill(emit, {"keys": keys, "payloads": payloads})
         launcher.launch(f"emit_entries_{bits}", _blocks(candidates), THREADS, emit)
         sorted_keys, permutation = torch.sort(keys, stable=True)

@@ -71,7 +71,7 @@ class ProjectArguments(ctypes.Structure):
         ("view", View),
         *_all(ctypes.c_int64, "count", "sh_rest"),
         *_pointers(*PARAMETERS, "records", "cull", "depth_keys", "rects", "tile_counts", "radii"),
-        ("errors", ctypes.c_int32),
+        *_all(ctypes.c_int32, "errors", "exact"),
     )
 
 
@@ -80,8 +80,9 @@ class EmitArguments(ctypes.Structure):
 
     _fields_ = (
         *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y"),
+        ("near", ctypes.c_float),
         *_all(ctypes.c_int64, "candidates", "visible"),
-        *_pointers("order", "ends", "cull", "rects", "keys", "payloads"),
+        *_pointers("order", "ends", "cull", "records", "rects", "keys", "payloads"),
         ("exact", ctypes.c_int32),
     )
 

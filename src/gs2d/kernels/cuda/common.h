@@ -33,7 +33,8 @@ __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
 
 __device__ __forceinline__ bool is_finite(float a) { return abs(a) <= 3.402823466e38f; }  // false for NaN
 
-// A splat against the sub-blocks of a tile: cull record ex, ey, a, b, c, cx, cy, disc2 (negative: unbounded).
+// A splat against the sub-blocks of a tile: cull record ex, ey, a, b, c, cx, cy, disc2. disc2 < 0: no ellipse but an outline, and ex is
+// its k; then every sub-block is reached as far as this test knows.
 struct Culling {
     BoxTest<float> test;
     bool unbounded;
@@ -50,6 +51,22 @@ struct Culling {
         return unbounded | reaches(test, x, y, x + 7.f, y + 3.f);
     }
 };
+
+// The sub-blocks of the tile at (left, top) that an outline reaches, a bit each. r: the record of that splat.
+__device__ __forceinline__ uint blocks_outlined(const float* cull, const float* r, int left, int top, float near, int width, int height) {
+    const float4* from = reinterpret_cast<const float4*>(r);
+    const float4 lo = from[0], hi = from[1];
+    const Outline<float> outline =
+        outline_of(lo.z, lo.w, hi.x, hi.y, hi.z, hi.w, r[8], lo.x, lo.y, cull[0], -cull[7], near, float(width), float(height));
+    const float cx = lo.x - float(left), cy = lo.y - float(top);
+    uint mask = 0;
+    for (int row = 0; row < 4; ++row) {
+        float first, last;
+        reach_in_rows(outline, float(4 * row) + 0.5f - cy, float(4 * row) + 3.5f - cy, first, last);
+        mask |= (uint(last >= 0.5f - cx && first <= 7.5f - cx) | uint(last >= 8.5f - cx && first <= 15.5f - cx) << 1) << 2 * row;
+    }
+    return mask;
+}
 
 // A record or any other row of 16 floats on a 64-byte boundary, four at a time.
 __device__ __forceinline__ Record<float> record_of(const float4& a, const float4& b, const float4& c, const float4& d) {

@@ -9,11 +9,12 @@ namespace gs2d {
 
 struct EmitArguments {
     int width, height, tiles_x, tiles_y;
+    float near;
     int64 candidates;    // ends[visible - 1], or the room for them: then what has none is left out
     int64 visible;
     const int64* order;  // [visible]: splats by depth
     const int64* ends;   // [visible]: running sum of tile_counts in that order
-    const float* cull;
+    const float *cull, *records;
     const ushort* rects;
     void* keys;          // [candidates] int16 or int32: tile, or the sentinel
     uint* payloads;      // [candidates]: splat << 8 | mask of sub-blocks
@@ -57,15 +58,21 @@ template <class Key> __device__ __forceinline__ void emit(const EmitArguments& a
     const int tile_x = x0 + j % columns, tile_y = y0 + j / columns;
     const int left = tile_x * TILE_PX, top = tile_y * TILE_PX;
 
-    const Culling culling(a.cull + 8 * splat, left, top);
-    uint mask = 0;
+    uint mask = 0xffu;
+    if (a.exact) {
+        const float *cull = a.cull + 8 * splat, *record = a.records + RECORD * splat;
+        const Culling culling(cull, left, top);
+        if (culling.unbounded) {
+            mask = blocks_outlined(cull, record, left, top, a.near, a.width, a.height);
+        } else {
+            mask = 0;
 #pragma unroll
-    for (int b = 0; b < 8; ++b) {
-        const int bx = (b & 1) * 8, by = (b >> 1) * 4;
-        const bool inside = left + bx < a.width && top + by < a.height;
-        const bool touched = !a.exact || culling.reaches_block(b);
-        mask |= uint(inside && touched) << b;
+            for (int b = 0; b < 8; ++b) mask |= uint(culling.reaches_block(b)) << b;
+        }
     }
+    if (left + 8 >= a.width) mask &= 0x55u;  // what lies outside the image
+    for (int b = 2; b < 8; b += 2)
+        if (top + 2 * b >= a.height) mask &= (1u << b) - 1u;
     static_cast<Key*>(a.keys)[i] = Key(mask ? tile_y * a.tiles_x + tile_x : a.tiles_x * a.tiles_y);
     a.payloads[i] = uint(splat) << 8 | mask;
 }

@@ -8,13 +8,29 @@ struct ProjectArguments {
     int64 count, sh_rest;  // N; coefficients stored in shN per splat
     const float *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
     float* records;    // [N, 16]
-    float* cull;       // [N, 8], see Culling in common.h
+    float* cull;       // [N, 8], see common.h
     int* depth_keys;   // [N]; the bits of z_c, which sort as integers; those of infinity where culled
     ushort* rects;     // [N, 4]: x0, y0, x1, y1 in tiles
     int* tile_counts;  // [N]: tiles in the rectangle
     float* radii;      // [N]
     int errors;        // 1: the footprint is rho <= error_k2, whatever the opacity
+    int exact;         // 0: what has no ellipse is in every tile (tests)
 };
+
+// The tiles that an outline reaches.
+__device__ TileRectangle outlined_rectangle(const View& v, const Record<float>& r, float k, float disc2) {
+    const Outline<float> outline =
+        outline_of(r.au, r.bu, r.av, r.bv, r.ai, r.bi, r.iz, r.cx, r.cy, k, disc2, v.near, float(v.width), float(v.height));
+    TileRectangle rect = {0, 0, 0, 0};
+    for (int y = 0; y < v.tiles_y; ++y) {
+        const float top = float(y * TILE_PX) + 0.5f - r.cy;
+        float left, right;
+        int x0, x1;
+        reach_in_rows(outline, top, top + float(TILE_PX - 1), left, right);
+        if (tiles_between(left + r.cx, right + r.cx, v.width, v.tiles_x, x0, x1)) rect = with_row(rect, x0, x1, y);
+    }
+    return rect;
+}
 
 __device__ __forceinline__ SplatParameters<float> load_parameters(const ProjectArguments& a, int64 i) {
     const float *m = a.means + 3 * i, *q = a.quats + 4 * i, *l = a.log_scales + 2 * i;
@@ -49,7 +65,8 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
         rect = square_tiles(s.x, s.y, s.half, v.tiles_x, v.tiles_y);
         a.radii[i] = tiles_radius<float>(rect, v.width, v.height);
     } else {
-        rect = tile_rectangle(box, o.unbounded, v.width, v.height, v.tiles_x, v.tiles_y);
+        rect = o.unbounded && a.exact ? outlined_rectangle(v, r, o.k, o.disc2)
+                                      : tile_rectangle(box, o.unbounded, v.width, v.height, v.tiles_x, v.tiles_y);
         a.radii[i] = clipped_radius(box, o.crosses, v.width, v.height);
     }
     const int tiles = (rect.x1 - rect.x0) * (rect.y1 - rect.y0);
@@ -58,7 +75,7 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     to[0] = {r.cx, r.cy, r.au, r.bu}, to[1] = {r.av, r.bv, r.ai, r.bi};
     to[2] = {r.iz, r.log2_opacity, r.red, r.green}, to[3] = {r.blue, r.nx, r.ny, r.nz};
     float4* cull = reinterpret_cast<float4*>(a.cull + 8 * i);
-    cull[0] = {o.ex, o.ey, o.a, o.b}, cull[1] = {o.c, r.cx, r.cy, o.unbounded ? -1.f : o.disc2};
+    cull[0] = {o.unbounded ? o.k : o.ex, o.ey, o.a, o.b}, cull[1] = {o.c, r.cx, r.cy, o.unbounded ? -o.disc2 : o.disc2};
     ushort* rows = a.rects + 4 * i;
     rows[0] = rect.x0, rows[1] = rect.y0, rows[2] = rect.x1, rows[3] = rect.y1;
     a.depth_keys[i] = __float_as_int(frame.p.z), a.tile_counts[i] = tiles;

@@ -13,7 +13,7 @@ struct SlotArguments {
     float *gradients, *extras;         // [N, 16] or null, [N, 4]
 };
 
-// One warp per splat.
+// One warp per splat. A lane adds up slots of the same warps of every tile: tiles that do not see the splat change no bit, in the list or not.
 extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     const int64 place = (int64(blockIdx.x) * blockDim.x + threadIdx.x) >> 5;
     const int lane = threadIdx.x & 31;
@@ -22,10 +22,10 @@ extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     const int64 first = place > 0 ? 4 * a.ends[place - 1] : 0, last = 4 * end;
     float sum = 0.f, extra = 0.f;
     for (int64 row = first + (lane >> 4); a.slots && row < last; row += 2) sum = sum + a.slots[16 * row + (lane & 15)];
-    for (int64 row = first + (lane >> 2); row < last; row += 8) extra = extra + a.extra_slots[4 * row + (lane & 3)];
+    for (int64 row = first + (lane >> 2); lane < 16 && row < last; row += 4) extra = extra + a.extra_slots[4 * row + (lane & 3)];
     sum = sum + __shfl_xor_sync(FULL_MASK, sum, 16);
 #pragma unroll
-    for (int step = 16; step >= 4; step >>= 1) extra = extra + __shfl_xor_sync(FULL_MASK, extra, step);
+    for (int step = 8; step >= 4; step >>= 1) extra = extra + __shfl_xor_sync(FULL_MASK, extra, step);
     if (lane < 16 && a.gradients) a.gradients[16 * splat + lane] = sum;
     if (lane < 4) a.extras[4 * splat + lane] = extra;
 }
