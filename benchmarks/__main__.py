@@ -58,6 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=6.0, help="for each group of steps")
     parser.add_argument("--only", nargs="+", help="workloads whose name contains one of these")
+    parser.add_argument("--crossing", action="store_true", help="0.3 %% more splats, across the camera plane, unseen")
     parser.add_argument("--variant", help="instruction set: v4, v3 or portable (default: the best)")
     parser.add_argument("--splats", type=Path, help="a run folder or a PLY of trained splats")
     parser.add_argument("--capture", type=Path, help="the photographs they were trained on")
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.variant:
         os.environ["GS2D_CPU_VARIANT"] = args.variant  # losses and training take it from here
     sizes = [s for s in (QUICK if args.quick else FULL) if not args.only or any(o in name_of(*s) for o in args.only)]
-    workloads = [partial(room_workload, *size) for size in sizes]
+    workloads = [partial(room_workload, *size, crossing=args.crossing) for size in sizes]
     if args.splats is not None:
         workloads.append(partial(trained_workload, args.splats, args.capture, args.downscale))
     if not workloads:

@@ -14,6 +14,7 @@ from gs2d.data import load_scene
 from gs2d.io.ply import read_splats
 from gs2d.splats import Splats
 
+CROSSING = 0.003  # of the splats, in addition: what views of indoor captures hold
 PLACES = ((0.3, -0.5, -4.0), (-0.9, -0.8, -3.8), (1.2, -0.3, -3.9), (0.0, -1.4, -4.2))
 
 
@@ -62,6 +63,29 @@ def room(n: int, seed: int = 0) -> Splats:
         opacity_logits=tensor(np.log(opacity / (1 - opacity))),
         sh0=tensor(rng.normal(size=(n, 1, 3)) * 0.6),
         shN=tensor(rng.normal(size=(n, 15, 3)) * 0.1),
+    )
+
+
+def underfoot(n: int, seed: int = 0) -> Splats:
+    """n splats on the floor beneath the cameras, which reach the camera planes of some views and are seen in none.
+
+    Such splats have no ellipse on the image. Indoors there are hundreds a view: floors and walls nearby.
+    """
+    rng = np.random.default_rng(seed)
+    points = np.stack([rng.uniform(-1.2, 1.2, n), np.full(n, 0.9), rng.uniform(-4.2, -3.4, n)], axis=1)
+    normals = np.array([0.0, -1.0, 0.0]) + 0.05 * rng.normal(size=(n, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def tensor(x: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(x, dtype=np.float32))
+
+    return Splats(
+        means=tensor(points),
+        quats=tensor(_quats_of(normals, rng)),
+        log_scales=tensor(np.log(0.3) + 0.1 * rng.normal(size=(n, 2))),
+        opacity_logits=tensor(rng.uniform(-1, 2, n)),
+        sh0=tensor(0.6 * rng.normal(size=(n, 1, 3))),
+        shN=tensor(0.1 * rng.normal(size=(n, 15, 3))),
     )
 
 
@@ -123,9 +147,13 @@ def name_of(count: int, width: int, height: int) -> str:
     return f"room-{size}-{width}x{height}"
 
 
-def room_workload(count: int, width: int, height: int) -> Workload:
-    """The room with four views."""
-    return Workload(name_of(count, width, height), room(count), places(width, height))
+def room_workload(count: int, width: int, height: int, *, crossing: bool = False) -> Workload:
+    """The room with four views; with ``crossing`` there are splats behind the others that reach the camera plane."""
+    splats, name = room(count), name_of(count, width, height)
+    if crossing:
+        more = underfoot(max(1, round(CROSSING * count)))
+        splats = Splats(**{key: torch.cat([part, getattr(more, key)]) for key, part in splats.items()})
+    return Workload(name + "-crossing" * crossing, splats, places(width, height))
 
 
 def trained_workload(splats_file: Path, capture: Path, downscale: int) -> Workload:

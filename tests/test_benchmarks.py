@@ -11,9 +11,12 @@ from typing import Any
 import pytest
 import torch
 
+from gs2d.camera import Camera
 from gs2d.kernels.library import available_variants, load
+from gs2d.render.cpu import IMAGES, rasterize_with
 from gs2d.render.reference import rasterize as rasterize_reference
-from gs2d.render.types import RasterSettings
+from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.splats import Splats
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -214,6 +217,33 @@ def test_the_count_of_pairs_agrees_with_a_count_through_the_reference() -> None:
     alone = [rasterize_reference(splats.rows(torch.arange(12) == i), workload.cameras[0], settings) for i in range(12)]
     assert float(passes.forward().alpha.detach().max()) < 0.9999
     assert work.pairs == sum(int((image.alpha > 0).sum()) for image in alone)
+
+
+@needs_native
+def test_splats_underfoot_cross_the_camera_plane_and_change_no_bit_and_no_list() -> None:
+    library = load()
+    library.use_threads(1)
+    count, size = 4000, 160
+    tiles = (size // 16) ** 2
+    plain, crossing = (room_workload(count, size, size, crossing=crossing) for crossing in (False, True))
+    assert crossing.name == f"{plain.name}-crossing"
+    assert len(crossing.splats) == count + 12
+
+    def view(workload: Workload, camera: Camera, exact: bool = True) -> tuple[RenderOutput, int]:
+        splats = Splats(**{name: part.clone().requires_grad_() for name, part in workload.splats.items()})
+        output = rasterize_with(library, splats, camera, RasterSettings(sh_degree=3), exact_masks=exact)
+        return output, count_work(library, output, len(splats)).entries
+
+    for index, camera in enumerate(plain.cameras):
+        (without, listed), (images, listed_too) = view(plain, camera), view(crossing, camera)
+        for name in IMAGES:
+            assert torch.equal(getattr(images, name), getattr(without, name)), name
+        assert listed_too == listed
+        if index == 0:
+            reach = int((images.radii[count:] == size / 2).sum())  # rule 14
+            assert reach > 6
+            everywhere = view(crossing, camera, exact=False)[1] - view(plain, camera, exact=False)[1]
+            assert everywhere >= reach * tiles
 
 
 @needs_native
