@@ -148,7 +148,7 @@ def name_of(count: int, width: int, height: int) -> str:
 
 
 def room_workload(count: int, width: int, height: int, *, crossing: bool = False) -> Workload:
-    """The room with four views; with ``crossing`` there are splats behind the others that reach the camera plane."""
+    """The room with four views; ``crossing`` appends splats across the camera plane that nobody sees."""
     splats, name = room(count), name_of(count, width, height)
     if crossing:
         more = underfoot(max(1, round(CROSSING * count)))

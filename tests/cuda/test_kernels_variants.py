@@ -155,7 +155,7 @@ def test_deterministic_gradients_do_not_depend_on_order_or_culling(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, seed: int) -> None:
-    """Those that reach the camera plane: of their tiles most are not even candidates."""
+    """Those that reach the camera plane: tiles that they cannot touch are not even candidates."""
     case = crossing_tiles(seed)
     view = cuda_passes.view_of(case.camera, SETTINGS)
     parameters = [tensor.contiguous() for _, tensor in case.splats.items()]
