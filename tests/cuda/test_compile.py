@@ -133,7 +133,7 @@ def test_a_damaged_entry_is_compiled_again(tmp_path: Path, damage: str) -> None:
     again = cubin("cuda/slots.cu", "sm_90", tmp_path)
     assert again.code == whole
     assert again.log
-    assert cubin("cuda/emit.cu", "sm_90", tmp_path).log == ""
+    assert cubin("cuda/slots.cu", "sm_90", tmp_path).log == ""
 
 
 @needs_nvrtc
