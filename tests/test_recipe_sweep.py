@@ -117,7 +117,7 @@ def test_recipes_that_train_the_same_are_trained_once_and_named_twice(tmp_path: 
     ("words", "named"),
     [
         (["2dgs", "2dgs-rr"], "no recipe '2dgs-rr'; there is 2dgs-r, "),
-        ([], "`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them"),
+        ([], "gs2d sweep needs RECIPE [RECIPE ...]; see `gs2d sweep --help`"),
         (["2dgs", "--set", "refine.iterations=5"], "--set refine.iterations=5 fits no recipe of the table"),
     ],
 )

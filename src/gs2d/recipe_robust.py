@@ -72,7 +72,8 @@ class FreeSpace:
     spread : float
         Standard deviations from its centre at which a splat is looked at too, along both axes.
     floor : float
-        Where a photograph's depth is unknown, what is nearer than this fraction of the nearest depth it shows is free.
+        Where a photograph's depth is unknown, what is nearer than this fraction of the nearest sparse point in its
+        picture is free, whether the photograph was found to show that point or not.
     ball : float
         Around a camera, within this fraction of that nearest depth, is free: the photographer stood there.
     agree : float

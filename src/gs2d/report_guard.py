@@ -17,12 +17,11 @@ class Guard:
     Parameters
     ----------
     on_failure : callable or None
-        Is told what failed, once for each cause: a file that several parts need is one; None: only the page says so.
+        Is told what failed; None: only the page says so.
     """
 
     def __init__(self, on_failure: OnFailure | None) -> None:
         self._on_failure = on_failure
-        self._told: set[str] = set()
 
     def __call__(self, name: str, build: Callable[[], str]) -> str:
         """Return what ``build`` returns, or one sentence where it raises; a full disk is no matter of one part."""
@@ -31,8 +30,7 @@ class Guard:
         except Exception as error:
             if is_full(error):
                 raise
-            why = " ".join(str(error).split()) or type(error).__name__
-            if self._on_failure is not None and why not in self._told:
-                self._told.add(why)
+            if self._on_failure is not None:
                 self._on_failure(name, error)
+            why = " ".join(str(error).split()) or type(error).__name__
             return missing(f"The {name} could not be made: {why}")

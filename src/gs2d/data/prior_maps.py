@@ -89,6 +89,13 @@ class ObservedPoints:
             Points with a larger mean reprojection error are left out.
         """
         rows = self.seen.get(name, np.zeros(0, dtype=np.int64))
+        return self._project(rows, camera, min_track, max_error)
+
+    def inside(self, camera: Camera, *, min_track: int = 3, max_error: float = 2.0) -> PointsInView:
+        """Return all points that lie in a camera's picture, as :meth:`in_view`, also those that something hides."""
+        return self._project(np.arange(len(self.points)), camera, min_track, max_error)
+
+    def _project(self, rows: np.ndarray, camera: Camera, min_track: int, max_error: float) -> PointsInView:
         xyz = self.points[rows[(self.track[rows] >= min_track) & (self.error[rows] <= max_error)]]
         pixels, depth = camera.project(xyz[np.isfinite(xyz).all(axis=1)])
         inside = (pixels >= 0.5).all(axis=1) & (pixels < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)

@@ -39,6 +39,7 @@ def commands_of(job: SweepJob) -> list[str]:
     for name in ("protocol", "format", "backend", "schedule_scale", "downscale", "seed", "threads", "cache"):
         if getattr(train, name) != getattr(plain, name):
             words += [f"--{name.replace('_', '-')}", str(getattr(train, name))]
+    words += [] if train.page else ["--no-page"]
     for text in train.overrides:
         words += ["--set", text]
     lines = [shlex.join(words)]

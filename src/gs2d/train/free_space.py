@@ -19,23 +19,25 @@ from gs2d.recipe_robust import FreeSpace
 from gs2d.splats import Splats
 from gs2d.train.plane_sweep import Sweep
 
-MIN_KNOWN = 20  # pixels of known depth, below which a photograph says nothing where it knows none
-NEAREST = 2  # percentile of a photograph's known depths that stands for the nearest
 _UNKNOWN = float("inf")
 
 
 @dataclass(frozen=True, eq=False)
 class FreeView:
-    """One photograph: everything before ``limit`` [H, W] wu is free, and a ball of ``radius`` wu around the camera."""
+    """One photograph: everything before ``limit`` [H, W] wu is free, and a ball of ``radius`` wu around the camera.
+
+    ``known`` [H, W] wu is the depth of what it shows, infinite where that is not known.
+    """
 
     limit: Tensor
+    known: Tensor
     radius: float
     K: Tensor  # [3, 3]
     T: Tensor  # [4, 4] T_cam_world
 
     def to(self, device: torch.device | str) -> FreeView:
         """Return the same on a device."""
-        return FreeView(self.limit.to(device), self.radius, self.K.to(device), self.T.to(device))
+        return FreeView(self.limit.to(device), self.known.to(device), self.radius, self.K.to(device), self.T.to(device))
 
 
 class FreeSpaceMaps:
@@ -51,15 +53,21 @@ class FreeSpaceMaps:
 
     @torch.no_grad()
     def inside(self, splats: Splats) -> Tensor:
-        """Return the splats [N] bool that lie in the free space of enough photographs."""
+        """Return the splats [N] bool that lie in the free space of enough photographs, and on what fewer show.
+
+        Of each photograph one or two percent of the depths are wrong, mostly at edges; of all photographs together that
+        is much. So a place is free where more of them see through it than see a surface there.
+        """
         ends = self._ends(splats)
-        counts = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
+        against = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
+        support = torch.zeros_like(against)
         for view in self._views:
             free = (ends[0] - _center(view)).norm(dim=1) < view.radius
             for places in ends:
                 free |= _is_free(view, places)
-            counts += free
-        return counts >= self._settings.views
+            against += free
+            support += _is_shown(view, ends[0], 1 - self._settings.nearer)
+        return (against >= self._settings.views) & (against > support)
 
     def _ends(self, splats: Splats) -> list[Tensor]:
         """Places [N, 3] at which a splat is looked at: its centre, and its ends along both axes."""
@@ -78,14 +86,13 @@ def _free_view(sweep: Sweep, index: int, settings: FreeSpace) -> FreeView:
     known = np.where(sweep.agreeing(index, settings.agree) >= 1, sweep.depths[index], _UNKNOWN)
     column, row = np.floor(view.pixels).astype(np.int64).T
     np.minimum.at(known, (row, column), view.depth)
-    depths = known[np.isfinite(known)]
-    nearest = float(np.percentile(depths, NEAREST)) if len(depths) >= MIN_KNOWN else 0.0
     half = settings.window // 2
     grown = -F.max_pool2d(-torch.from_numpy(known)[None, None], settings.window, 1, half)[0, 0]
-    floor = torch.full_like(grown, settings.floor * nearest)
+    floor = torch.full_like(grown, settings.floor * view.nearest)
     limit = settings.nearer * torch.where(torch.isfinite(grown), grown, floor)
     tensors = (torch.from_numpy(np.ascontiguousarray(array)).float() for array in (view.K, view.T))
-    return FreeView(limit.float(), settings.ball * settings.floor * nearest, *tensors)
+    radius = settings.ball * settings.floor * view.nearest
+    return FreeView(limit.float(), torch.from_numpy(known).float(), radius, *tensors)
 
 
 def _center(view: FreeView) -> Tensor:
@@ -93,7 +100,20 @@ def _center(view: FreeView) -> Tensor:
 
 
 def _is_free(view: FreeView, places: Tensor) -> Tensor:
-    """Which places [N, 3] a photograph shows, and sees through."""
+    """Which places [N, 3] a photograph sees through."""
+    z, inside, row, column = _seen(view, places)
+    return inside & (z < view.limit[row, column])
+
+
+def _is_shown(view: FreeView, places: Tensor, fraction: float) -> Tensor:
+    """Which places [N, 3] lie on the surface that a photograph shows, within a fraction of its depth."""
+    z, inside, row, column = _seen(view, places)
+    known = view.known[row, column]
+    return inside & torch.isfinite(known) & ((z - known).abs() <= fraction * known)
+
+
+def _seen(view: FreeView, places: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Depth of places [N, 3] in a photograph, whether they are inside, and their rows and columns (clipped)."""
     seen = places @ (view.K @ view.T[:3, :3]).T + view.K @ view.T[:3, 3]  # (x z, y z, z)
     z = seen[:, 2]
     front = z.clamp_min(1e-12)
@@ -102,4 +122,4 @@ def _is_free(view: FreeView, places: Tensor) -> Tensor:
     inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     column = torch.nan_to_num(x, nan=0.0).clamp(0, width - 1).long()
     row = torch.nan_to_num(y, nan=0.0).clamp(0, height - 1).long()
-    return inside & (z < view.limit[row, column])
+    return z, inside, row, column

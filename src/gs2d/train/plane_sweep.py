@@ -20,6 +20,7 @@ from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.recipe_robust import DenseStart
 
 MIN_POINTS = 20  # sparse points of a view, below which its depths are unknown
+NEAREST = 2  # percentile of depth that stands for the nearest: a few sparse points are wrong
 MIN_SHARED = 8  # sparse points that neighbours must both show
 NEAR_MARGIN, FAR_MARGIN = 0.8, 1.5  # of the 1st and 99th percentile of depth: where the sweep begins and ends
 NOISE = 1e-4  # variance of grey values, [0, 1]^2, that is no texture: added to both sides of the NCC
@@ -45,6 +46,8 @@ class SmallView:
         Where the sweep begins and ends; 0 where the view shows too few points.
     pixels, depth : ndarray [M, 2] px, [M] wu
         The sparse points that it shows.
+    nearest : float, wu
+        Nearest depth of all sparse points in its picture, whether it was found to show them or not (2nd percentile).
     """
 
     color: Tensor
@@ -56,6 +59,7 @@ class SmallView:
     far: float
     pixels: np.ndarray
     depth: np.ndarray
+    nearest: float
 
     @property
     def size(self) -> tuple[int, int]:
@@ -201,7 +205,9 @@ def _shrunk(view: View, observed: ObservedPoints, factor: int) -> SmallView:
     pixels = np.minimum(shown.pixels / factor, np.array((width // factor, height // factor)) - 0.5)
     grey = (small * torch.tensor(GREY)[:, None, None]).sum(dim=1, keepdim=True)
     T = np.asarray(camera.T_cam_world, dtype=np.float64)
-    return SmallView(small[0], grey, left, K, T, NEAR_MARGIN * near, FAR_MARGIN * far, pixels, shown.depth)
+    everywhere = observed.inside(camera).depth  # smooth things have few points, and a photograph finds some of them
+    nearest = float(np.percentile(everywhere, NEAREST)) if enough else 0.0
+    return SmallView(small[0], grey, left, K, T, NEAR_MARGIN * near, FAR_MARGIN * far, pixels, shown.depth, nearest)
 
 
 def _neighbours(
