@@ -11,12 +11,13 @@ import numpy as np
 from gs2d.mesh.consistency import depth_noise
 from gs2d.mesh.evidence import Cleaned, clean
 from gs2d.mesh.frames import Frame, Spool
-from gs2d.mesh.fuse import fuse
+from gs2d.mesh.fuse import find_blocks
 from gs2d.mesh.integrate import fusion_backend
 from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths, widen_truncation
 from gs2d.mesh.nest import derive_nest
 from gs2d.mesh.nested import FAR_VIEWS, fuse_nested, nested_marching_cubes
-from gs2d.mesh.surface import components, keep_components, marching_cubes
+from gs2d.mesh.slabs import fused_surface
+from gs2d.mesh.surface import components, keep_components
 from gs2d.mesh.volume import Volume
 from gs2d.triangles import Mesh
 
@@ -109,10 +110,9 @@ def extract(
             )
             if truncation is None:
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
-        volume = fuse(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
-        fused = _Fused.of([volume])
-        whole = marching_cubes(volume, min_weight=min_weight)
-        del volume  # the largest thing there is: what follows has no use for it
+        blocks = find_blocks(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
+        fused = _Fused(blocks.frames, len(blocks.keys), blocks.nbytes, 1)
+        whole = fused_surface(spool, limits, blocks, min_weight=min_weight, threads=threads, backend=backend)
         found = _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
         if not by_evidence:
             return found

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ from gs2d.mesh.frames import DepthMap
 from gs2d.mesh.integrate import fusion_backend, integrator
 from gs2d.mesh.limits import FusionLimits, backproject
 from gs2d.mesh.sampling import prepare
-from gs2d.mesh.volume import BLOCK, Budget, Volume, block_grid, check_truncation, unknown_volume
+from gs2d.mesh.volume import BLOCK, Budget, Volume, block_bytes, block_grid, check_truncation, unknown_volume
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
@@ -60,6 +61,48 @@ def fuse(
     BackendError
         If the backend is unknown or cannot run here.
     """
+    blocks = find_blocks(frames, limits, max_bytes=max_bytes, threads=threads, backend=backend)
+    return fuse_blocks(frames, limits, blocks, threads=threads, backend=backend)
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """The blocks near what depth maps saw.
+
+    Attributes
+    ----------
+    dims, keys
+        As of a ``Volume``.
+    colored : bool
+        Whether a depth map has colour.
+    frames : int
+        How many depth maps there are.
+    """
+
+    dims: tuple[int, int, int]
+    keys: np.ndarray
+    colored: bool
+    frames: int
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of a volume of them."""
+        return len(self.keys) * block_bytes(self.colored)
+
+    def part(self, start: int, stop: int) -> Blocks:
+        """Return the blocks of these rows."""
+        return replace(self, keys=self.keys[start:stop])
+
+
+def find_blocks(
+    frames: Iterable[DepthMap],
+    limits: FusionLimits,
+    *,
+    max_bytes: int = 4 << 30,
+    threads: int | None = None,
+    backend: str = "auto",
+) -> Blocks:
+    """Find the blocks that are fused; parameters and errors as of ``fuse``."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(limits)
@@ -75,7 +118,19 @@ def fuse(
     budget.check(len(keys), colored, partial=False)
     if not len(keys):
         raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
-    volume = unknown_volume(limits, dims, keys, colored=colored, frames=count)
+    return Blocks(dims, keys, colored, count)
+
+
+def fuse_blocks(
+    frames: Iterable[DepthMap],
+    limits: FusionLimits,
+    blocks: Blocks,
+    *,
+    threads: int | None = None,
+    backend: str = "auto",
+) -> Volume:
+    """Fuse depth maps into these blocks; parameters as of ``fuse``."""
+    volume = unknown_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
     with integrator([volume], backend, threads) as add:
         for item in frames:
             add(prepare(item, limits))

@@ -17,7 +17,7 @@ from gs2d.mesh.volume import BLOCK, VOXELS, Volume
 from gs2d.triangles import Mesh
 
 _CHUNK = 512  # blocks at a time
-_EDGES = 3 * VOXELS  # of a block: those that go up from its voxels
+EDGES_OF_BLOCK = 3 * VOXELS  # of a block: those that go up from its voxels
 _EDGE_GUARD = np.float32(1e-3)  # of an edge: vertices keep off its ends, so that no triangle is a point
 
 
@@ -38,12 +38,21 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
         cameras look), colours where the volume has them. Empty where nothing is known.
     """
     edges, faces, ends = cell_surface(volume, min_weight)
-    vertices, colors = _edge_vertices(volume, edges, ends)
+    vertices, colors = edge_vertices(volume, edges, ends)
     return Mesh(vertices, faces.astype(np.int32), colors)
 
 
-def cell_surface(volume: Volume, min_weight: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cell_surface(
+    volume: Volume, min_weight: float, blocks: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the cells of a volume make, before it has positions.
+
+    Parameters
+    ----------
+    volume : Volume
+    min_weight : float
+    blocks : int, optional
+        Only the cells of the first so many blocks (default: of all).
 
     Returns
     -------
@@ -54,10 +63,11 @@ def cell_surface(volume: Volume, min_weight: float) -> tuple[np.ndarray, np.ndar
     ends : ndarray [P] int64
         The voxel at the upper end of each edge, as 512 * row + voxel; larger than that at the lower end.
     """
+    count = len(volume.keys) if blocks is None else blocks
     shifted = _neighbours(volume)
     triangles = [
-        _chunk_triangles(volume, shifted, np.arange(start, min(start + _CHUNK, len(volume.keys))), min_weight)
-        for start in range(0, len(volume.keys), _CHUNK)
+        _chunk_triangles(volume, shifted, np.arange(start, min(start + _CHUNK, count)), min_weight)
+        for start in range(0, count, _CHUNK)
     ]
     corners = np.concatenate(triangles) if triangles else np.zeros((0, 3), np.int64)
     edges, faces = _numbered(corners, len(volume.keys))
@@ -69,19 +79,19 @@ def _numbered(corners: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]
 
     Edges are marked in a table for the blocks that have some.
     """
-    row = corners // _EDGES
+    row = corners // EDGES_OF_BLOCK
     used = np.zeros(blocks, bool)
     used[row] = True
     rows = np.flatnonzero(used)
     skipped = np.zeros(blocks, np.int64)  # edges of unused blocks before each block
-    skipped[rows] = (rows - np.arange(len(rows))) * _EDGES
+    skipped[rows] = (rows - np.arange(len(rows))) * EDGES_OF_BLOCK
     compact = corners - skipped[row]
-    marks = np.zeros(len(rows) * _EDGES, bool)
+    marks = np.zeros(len(rows) * EDGES_OF_BLOCK, bool)
     marks[compact] = True
     edges = np.flatnonzero(marks)
     numbers = np.empty(len(marks), np.int32)
     numbers[edges] = np.arange(len(edges), dtype=np.int32)
-    return edges + skipped[rows][edges // _EDGES], numbers[compact]
+    return edges + skipped[rows][edges // EDGES_OF_BLOCK], numbers[compact]
 
 
 def _neighbours(volume: Volume) -> np.ndarray:
@@ -134,7 +144,7 @@ def _edge_numbers(shifted: np.ndarray, row: np.ndarray, voxel: np.ndarray, edges
     """Global number of cell edges: 3 * (512 * row + voxel) + axis, of the voxel at the edge's lower end."""
     neighbour, number = _cell_edges()
     at = voxel[:, None] * len(EDGES) + edges
-    return shifted[row[:, None], neighbour[at]] * _EDGES + number[at]
+    return shifted[row[:, None], neighbour[at]] * EDGES_OF_BLOCK + number[at]
 
 
 @cache
@@ -159,8 +169,8 @@ def _upper_ends(shifted: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.asarray(up_row * VOXELS + (up[:, 0] * BLOCK + up[:, 1]) * BLOCK + up[:, 2])
 
 
-def _edge_vertices(volume: Volume, edges: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions [P, 3] of the zero crossings on edges, and their colours."""
+def edge_vertices(volume: Volume, edges: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return positions [P, 3] of the zero crossings on edges, from their ends, and their colours."""
     low = edges // 3
     row, voxel = low // VOXELS, low % VOXELS
     at = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1)

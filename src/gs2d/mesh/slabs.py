@@ -1,0 +1,84 @@
+"""The surface of a box, slab by slab: only a slab's part of the volume is in memory at a time.
+
+Blocks do not meet in fusion, and their keys go by layers along x, so a slab is a range of keys, fused alone. The cells
+of its last layer need the first voxels of the next one, which is therefore fused twice. Vertices on the plane between
+two slabs have the same number and the same bits in both: the mesh is that of the whole volume, byte for byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from gs2d.mesh.frames import DepthMap
+from gs2d.mesh.fuse import Blocks, fuse_blocks
+from gs2d.mesh.limits import FusionLimits
+from gs2d.mesh.surface import EDGES_OF_BLOCK, cell_surface, edge_vertices
+from gs2d.mesh.volume import block_bytes
+from gs2d.triangles import Mesh
+
+SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared too often, much more and it is the peak
+
+
+def fused_surface(
+    frames: Iterable[DepthMap],
+    limits: FusionLimits,
+    blocks: Blocks,
+    *,
+    min_weight: float = 1.0,
+    slab_bytes: int = SLAB_BYTES,
+    threads: int | None = None,
+    backend: str = "auto",
+) -> Mesh:
+    """Return what ``marching_cubes(fuse(...))`` returns, without all of the volume in memory.
+
+    Parameters
+    ----------
+    frames : iterable of DepthMap
+        Read once for each slab: a sequence or a ``Spool``.
+    limits : FusionLimits
+    blocks : Blocks
+        Those that the frames touch, as ``find_blocks`` finds them.
+    min_weight : float
+        See ``marching_cubes``.
+    slab_bytes : int
+        The volume of a slab stays below it where more than one layer of blocks, and the next one, fit.
+    threads, backend
+        As for ``fuse``.
+    """
+    edges: list[np.ndarray] = []
+    vertices: list[np.ndarray] = []
+    colors: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    before = 0  # vertices of the slabs so far
+    for start, own, stop in slabs(blocks, slab_bytes):
+        volume = fuse_blocks(frames, limits, blocks.part(start, stop), threads=threads, backend=backend)
+        found, corners, ends = cell_surface(volume, min_weight, own - start)
+        points, tints = edge_vertices(volume, found, ends)
+        del volume
+        edges.append(found + start * EDGES_OF_BLOCK)
+        vertices.append(points)
+        colors += [] if tints is None else [tints]
+        faces.append(corners + before)
+        before += len(points)
+    if len(edges) == 1:
+        return Mesh(vertices[0], faces[0].astype(np.int32), colors[0] if colors else None)
+    _, first, number = np.unique(np.concatenate(edges), return_index=True, return_inverse=True)
+    tinted = np.concatenate(colors)[first] if colors else None
+    return Mesh(np.concatenate(vertices)[first], number.astype(np.int32)[np.concatenate(faces)], tinted)
+
+
+def slabs(blocks: Blocks, slab_bytes: int) -> Iterator[tuple[int, int, int]]:
+    """Yield rows (start, own, stop) of slabs: those from ``start`` to ``own`` make surface, the rest is read alone."""
+    layer = blocks.keys // (blocks.dims[1] * blocks.dims[2])
+    starts = np.searchsorted(layer, np.arange(blocks.dims[0] + 2))  # first row of each layer; none is beyond the last
+    most = slab_bytes // block_bytes(blocks.colored)
+    first = 0
+    while first < blocks.dims[0]:
+        last = first + 1  # the layer after the slab
+        while last < blocks.dims[0] and starts[last + 2] - starts[first] <= most:
+            last += 1
+        if starts[last] > starts[first]:
+            yield int(starts[first]), int(starts[last]), int(starts[last + 1])
+        first = last

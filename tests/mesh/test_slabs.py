@@ -1,0 +1,64 @@
+"""The surface is made slab by slab: the same mesh, byte for byte, with a part of the volume in memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_shapes import orbit, sphere_depth
+
+from gs2d.mesh.frames import DepthMap, Frame, depth_map
+from gs2d.mesh.fuse import find_blocks, fuse, fuse_blocks
+from gs2d.mesh.limits import derive_limits, sample_depths
+from gs2d.mesh.slabs import fused_surface, slabs
+from gs2d.mesh.surface import marching_cubes
+from gs2d.mesh.volume import block_bytes
+
+
+def maps(*, colored: bool) -> list[DepthMap]:
+    """A ball from all round, with colours that differ from pixel to pixel."""
+    random = np.random.default_rng(0)
+    found = []
+    for camera in orbit(6, 4.0, size=32, focal=40.0):
+        color = random.integers(0, 255, (camera.height, camera.width, 3)).astype(np.uint8) if colored else None
+        found.append(depth_map(Frame(camera, sphere_depth(camera, 1.0), color)))
+    return found
+
+
+@pytest.mark.parametrize("colored", [False, True])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_the_mesh_of_slabs_is_that_of_the_whole_volume(colored: bool, share: float) -> None:
+    seen = maps(colored=colored)
+    limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.05)
+    blocks = find_blocks(seen, limits, threads=1)
+    most = int(share * blocks.nbytes)
+    assert len(list(slabs(blocks, most))) > 1
+    whole = marching_cubes(fuse(seen, limits, threads=1))
+    parts = fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)
+    assert len(whole.faces) > 1000
+    np.testing.assert_array_equal(parts.vertices, whole.vertices)
+    np.testing.assert_array_equal(parts.faces, whole.faces)
+    assert parts.faces.dtype == whole.faces.dtype
+    assert (parts.colors is None) == (whole.colors is None) == (not colored)
+    if colored:
+        np.testing.assert_array_equal(parts.colors, whole.colors)
+
+
+def test_no_slab_takes_more_memory_than_it_may_unless_it_is_one_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = maps(colored=False)
+    limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.04)
+    blocks = find_blocks(seen, limits, threads=1)
+    most = blocks.nbytes // 2
+    held: list[int] = []
+
+    def recorded(*arguments: object, **options: object) -> object:
+        volume = fuse_blocks(*arguments, **options)  # type: ignore[arg-type]
+        held.append(volume.nbytes)
+        return volume
+
+    monkeypatch.setattr("gs2d.mesh.slabs.fuse_blocks", recorded)
+    fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)
+    assert len(held) > 1
+    assert max(held) <= most
+    rows = list(slabs(blocks, block_bytes(False)))  # no layer fits: each is a slab, with the next one
+    assert [start for start, _, _ in rows[1:]] == [own for _, own, _ in rows[:-1]]
+    assert (rows[0][0], rows[-1][1]) == (0, len(blocks.keys))
