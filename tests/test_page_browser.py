@@ -217,6 +217,7 @@ def test_keys_open_help_show_normals_and_depth_and_step_through_photographs(page
     page.key("Escape")
     assert values(page, "$('help').open", "kind") == [False, 0]
     page.key("z")
+    page.until("kind === 2")  # the browser closes the help a little later than it says so
     assert values(page, "kind", "document.querySelector('[data-kind=\"2\"]').ariaPressed") == [2, "true"]
     page.key("c")
     page.key("ArrowRight")
