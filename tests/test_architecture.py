@@ -134,7 +134,7 @@ def test_inside_render_the_api_is_on_top() -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_files_fit_in_four_hundred_lines(path: Path) -> None:
+def test_files_have_one_subject_and_no_more_lines_than_that_takes(path: Path) -> None:
     assert len(path.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
@@ -213,3 +213,9 @@ def test_only_the_declared_dependencies_are_imported(path: Path) -> None:
         names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
         for name in names:
             assert name.split(".")[0] not in FORBIDDEN, f"{module_of(path)} imports {name}"
+
+
+def test_test_files_have_names_of_their_own() -> None:
+    """pytest imports them by their bare names: of two that share one the second is an error."""
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert len(names) == len(set(names)), sorted(name for name in set(names) if names.count(name) > 1)

@@ -25,8 +25,6 @@ UP = np.array([0.0, 0.0, 1.0])
 SETTINGS = RasterSettings(near=0.05, background=(0.2, 0.5, 0.9), sh_degree=0)
 WIDTH, HEIGHT = 240, 160
 
-pytestmark = pytest.mark.slow  # what a browser does in time depends on the machine
-
 
 def seen_from(degrees: float, *, height: float = 1.0, away: float = 4.0) -> Seen:
     angle = np.radians(degrees)

@@ -65,7 +65,6 @@ def test_pictures_enlarge_in_all_their_pixels_and_step_by_keys(page: Page) -> No
     assert not page.ask(LARGE)
 
 
-@pytest.mark.slow  # a drag ends when the browser says so: not always in time on a quick machine
 def test_a_pair_enlarges_with_its_line(page: Page) -> None:
     page.click(".wipe .larger")
     assert page.ask(LARGE)
@@ -79,7 +78,6 @@ def test_a_pair_enlarges_with_its_line(page: Page) -> None:
     assert not page.ask(LARGE)
 
 
-@pytest.mark.slow  # a drag ends when the browser says so: not always in time on a quick machine
 def test_a_phone_reads_it_without_moving_sideways_and_wipes_by_finger(page: Page) -> None:
     page.size(375, 812, phone=True)
     try:

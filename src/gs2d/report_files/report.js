@@ -88,4 +88,5 @@ box.onkeydown = (e) => {
   const step = { ArrowLeft: -1, ArrowRight: 1 }[e.key];
   if (step && e.target.type !== "range") open(shown + step);
 };
-box.onclose = () => stage.replaceChildren();
+// The event comes after the closing: it may be open again by then.
+box.onclose = () => box.open || stage.replaceChildren();
