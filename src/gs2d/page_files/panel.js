@@ -151,7 +151,7 @@ function listen() {
     "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1.1),
   };
   onkeydown = (e) => {
-    const typing = e.target.matches("input") || $("help").open;
+    const typing = e.target.matches("input:not([type=checkbox])") || $("help").open;
     if (!typing && keys[e.key] && !e.ctrlKey && !e.metaKey && !e.altKey) {
       $("hint").hidden = true;
       keys[e.key]();
