@@ -26,6 +26,7 @@ import numpy as np
 from benchmarks.timing import machine
 from gs2d.camera import Camera, look_at
 from gs2d.mesh.consistency import depth_noise
+from gs2d.mesh.evidence import gather
 from gs2d.mesh.frames import DepthMap, Frame, depth_map
 from gs2d.mesh.fuse import fuse
 from gs2d.mesh.integrate import BACKENDS, fusion_backend
@@ -111,6 +112,7 @@ def run(
         volumes = [timed("fuse", lambda: fuse(maps, limits, threads=threads, backend=backend))]
         mesh = timed("marching cubes", lambda: marching_cubes(volumes[0]))
     mesh = timed("components", lambda: keep_components(mesh))
+    timed("evidence", lambda: gather(mesh, maps, limits.truncation))
     error = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).max() / limits.voxel
     return Result(
         views=views,

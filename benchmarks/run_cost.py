@@ -50,6 +50,8 @@ PARTS = (
     Rule("render", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
     Rule("photographs", (("gs2d/images.py", ""), ("data/scene.py", ""), ("data/capture.py", ""), ("data/lens.py", ""))),
     Rule("metrics", (("evaluate/images.py", ""), ("gs2d/losses.py", ""), ("kernels/ops.py", ""))),
+    Rule("evidence", tuple(("mesh/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),
+    Rule("clean by evidence", (("mesh/evidence.py", ""),)),
     Rule("blocks", (("mesh/fuse.py", ""),)),
     Rule("integrate", (("mesh/integrate.py", ""), ("mesh/sampling.py", ""))),
     Rule("depth maps", (("mesh/frames.py", ""), ("mesh/limits.py", ""), ("mesh/consistency.py", ""))),

@@ -78,6 +78,30 @@ def test_vertices_know_who_saw_them_and_who_sees_through_them() -> None:
     assert (turned.support == 0).all()  # nobody looks at its back
 
 
+def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = [depth_map(frame) for frame in frames(5, sheets=2)]
+    mesh = extract(frames(5), bbox=BOX, voxel=0.1, threads=1).mesh
+    whole = gather(mesh, made, 0.1)
+    monkeypatch.setattr("gs2d.mesh.evidence.VERTICES_AT_ONCE", 37)
+    parts = gather(mesh, made, 0.1)
+    for name in ("support", "against", "density"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    for at in range(0, len(mesh.vertices), 29):  # one by one, in double precision
+        support, against, least = 0, 0, np.inf
+        for item in made:
+            x, y, z = item.camera.rotation @ mesh.vertices[at] + item.camera.T_cam_world[:3, 3]
+            column, row = item.camera.fx * x / z + item.camera.cx, item.camera.fy * y / z + item.camera.cy
+            seen = item.depth[int(row), int(column)]
+            normal = mesh.vertices[at] / np.linalg.norm(mesh.vertices[at])  # of a ball, nearly
+            arm = item.camera.center - mesh.vertices[at]
+            facing = normal @ arm / np.linalg.norm(arm)
+            least = min(least, abs(abs(seen - z) - 0.1), abs(facing - 0.1) / 3)
+            support += bool(seen > 0 and abs(seen - z) <= 0.1 and facing > 0.1)
+            against += bool(seen > z + 0.1)
+        if least > 0.02:  # neither nearly beyond the tolerance nor nearly grazing
+            assert (whole.support[at], whole.against[at]) == (support, against)
+
+
 def test_few_photographs_need_fewer_witnesses() -> None:
     assert [least_views(count) for count in (1, 2, 11, 12, 300)] == [1, 2, 2, 3, 3]
 

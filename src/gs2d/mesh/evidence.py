@@ -22,6 +22,7 @@ VIEWS = 3.0  # that support a vertex
 FEW_VIEWS = 12  # in a capture, of which two are enough
 SMALL = 0.01  # of the largest component's area: smaller ones go
 FACES_A_PIXEL = 2.0  # a depth map has as many
+VERTICES_AT_ONCE = 1 << 15  # by all views in turn: what is made of so many stays in a core's cache
 GRAZING = 0.1  # cosine between a view's ray and a face, below which the view does not see it
 
 
@@ -59,35 +60,53 @@ def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
     tolerance : float
         wu. Depths that differ by less are of one surface.
     """
-    vertices = mesh.vertices.astype(np.float32)
-    normals = _normals(mesh)
-    support = np.zeros(len(vertices), np.int32)
-    against = np.zeros(len(vertices), np.int32)
-    density = np.zeros(len(vertices), np.float32)
+    places, normals = mesh.vertices.T, _normals(mesh).T
+    parts = [slice(start, start + VERTICES_AT_ONCE) for start in range(0, len(mesh.vertices), VERTICES_AT_ONCE)]
+    xyz = [np.ascontiguousarray(places[:, part], np.float32) for part in parts]
+    ahead = [np.ascontiguousarray(normals[:, part]) for part in parts]
+    support = np.zeros(len(mesh.vertices), np.int32)
+    against = np.zeros(len(mesh.vertices), np.int32)
+    density = np.zeros(len(mesh.vertices), np.float32)
     for item in maps:
-        rows, z, seen, facing = _look(item, vertices, normals)
-        met = (seen > 0) & (np.abs(seen - z) <= tolerance) & (facing > GRAZING)
-        support[rows] += met
-        against[rows] += seen > z + tolerance
-        camera = item.camera
-        near = np.float32(camera.fx * camera.fy) * facing / (z * z)
-        density[rows[met]] = np.maximum(density[rows[met]], near[met])
+        for part, vertices, normal in zip(parts, xyz, ahead, strict=True):
+            _count(item, vertices, normal, tolerance, support[part], against[part], density[part])
     return Evidence(support, against, density)
 
 
-def _look(
-    item: DepthMap, vertices: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the vertices in the picture, their depths, the view's own there, and the cosine at which it sees them."""
+def _count(
+    item: DepthMap,
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    tolerance: float,
+    support: np.ndarray,
+    against: np.ndarray,
+    density: np.ndarray,
+) -> None:
+    """Add what one view says of some vertices [3, P] with normals [3, P] to the counts, in place."""
     camera: Camera = item.camera
-    at = vertices @ camera.rotation.T.astype(np.float32) + camera.T_cam_world[:3, 3].astype(np.float32)
-    z = np.where(at[:, 2] > 0, at[:, 2], np.float32(np.nan))
-    column, row = camera.fx * at[:, 0] / z + camera.cx, camera.fy * at[:, 1] / z + camera.cy
+    rows, z, seen = _look(item, vertices)
+    against[rows[seen > z + tolerance]] += 1
+    here = np.flatnonzero((seen > 0) & (np.abs(seen - z) <= tolerance))
+    rows, z = rows.take(here), z.take(here)
+    arm = camera.center.astype(np.float32)[:, None] - vertices.take(rows, axis=1)  # [:, rows] would be strided
+    length = np.sqrt((arm * arm).sum(axis=0))
+    facing = (arm * normals.take(rows, axis=1)).sum(axis=0) / np.maximum(length, np.float32(1e-30))
+    front = np.flatnonzero(facing > GRAZING)
+    rows, z = rows.take(front), z.take(front)
+    support[rows] += 1
+    near = np.float32(camera.fx * camera.fy) * facing.take(front) / (z * z)
+    density[rows] = np.maximum(density.take(rows), near)
+
+
+def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices of the vertices [3, P] that lie in the picture, their depths, and what the view itself sees there."""
+    camera: Camera = item.camera
+    x, y, z = camera.rotation.astype(np.float32) @ vertices + camera.T_cam_world[:3, 3:].astype(np.float32)
+    z[~(z > 0)] = np.nan
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     rows = np.flatnonzero((column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height))
-    seen = item.depth[row[rows].astype(np.int64), column[rows].astype(np.int64)]
-    arm = camera.center.astype(np.float32) - vertices[rows]
-    facing = (arm * normals[rows]).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), np.float32(1e-30))
-    return rows, z[rows], seen, facing
+    seen = item.depth[row.take(rows).astype(np.int64), column.take(rows).astype(np.int64)]
+    return rows, z.take(rows), seen
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
