@@ -42,7 +42,7 @@ from gs2d.evaluate.images import ImageMetrics, image_metrics
 from gs2d.images import read_image, write_image
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import matched_by_halves
-from gs2d.pipeline.jobs import open_job
+from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.prepare import Job
 
 OWN_ITERATIONS = 30_000

@@ -33,7 +33,7 @@ from gs2d.mesh.evidence import gather, pixels
 from gs2d.mesh.frames import depth_map
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import read_exposures
-from gs2d.pipeline.jobs import open_job
+from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.pictures import render_view
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare import Job

@@ -26,7 +26,7 @@ from gs2d.images import write_image
 from gs2d.io.ply import read_mesh
 from gs2d.io.run import MESH, open_run
 from gs2d.mesh.bake import bilinear
-from gs2d.pipeline.jobs import finished_splats
+from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.options import TextureOptions
 from gs2d.pipeline.prepare import read_scene, reload_job
 from gs2d.pipeline.texture import textured_mesh

@@ -9,7 +9,7 @@ import pytest
 
 from ball_runs import options
 from gs2d.pipeline.events import ignore
-from gs2d.pipeline.jobs import open_job
+from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.train import train
 from tiny import write_capture
 

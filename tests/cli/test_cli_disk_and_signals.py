@@ -125,15 +125,12 @@ def test_an_interrupt_that_somebody_swallowed_is_heard_at_the_next_event(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from gs2d.pipeline import jobs
-
     def swallowing(*_args: object) -> None:
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), number)
             time.sleep(5)
 
-    monkeypatch.setattr(jobs, "use_threads", swallowing, raising=False)
-    monkeypatch.setattr("gs2d.pipeline.train.use_threads", swallowing)
+    monkeypatch.setattr("gs2d.pipeline.finished.use_threads", swallowing)
     assert run(["render", str(trained), "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "interrupted\n"
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

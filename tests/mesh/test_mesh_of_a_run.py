@@ -19,7 +19,8 @@ from gs2d.io.run import RunFolder
 from gs2d.kernels.library import available_variants
 from gs2d.mesh.integrate import Add, integrator
 from gs2d.mesh.volume import Volume
-from gs2d.pipeline.jobs import finished_splats, mesh_run
+from gs2d.pipeline.finished import finished_splats
+from gs2d.pipeline.jobs import mesh_run
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.prepare import check_same_run, reload_job
 from gs2d.pipeline.surface import extract_mesh

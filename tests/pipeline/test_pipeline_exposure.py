@@ -22,7 +22,8 @@ from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.exposure import matched_by_halves, read_exposures
 from gs2d.pipeline.figures import rank_run
-from gs2d.pipeline.jobs import evaluate_run, open_job, render_run, report_run
+from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.jobs import evaluate_run, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.paths import orbit_cameras
 from gs2d.pipeline.pictures import render_view

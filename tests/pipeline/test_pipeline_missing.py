@@ -44,14 +44,14 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
         ("train.extract_mesh", ProtocolError("no depth"), "mesh.ply", "no depth", "gs2d mesh {run}"),
         ("train.extract_mesh", MemoryError("much"), "mesh.ply", "fault in gs2d: MemoryError: much", "gs2d mesh {run}"),
         (
-            "jobs.report_run",
+            "train.report_run",
             OSError("broken data stream"),
             "report.html",
             "fault in gs2d: OSError: broken data stream",
             "gs2d report {run}",
         ),
         (
-            "page.page_run",
+            "train.page_run",
             ZeroDivisionError(),
             "scene.html",
             "fault in gs2d: ZeroDivisionError: no message",
@@ -92,7 +92,7 @@ def test_a_full_disk_ends_the_run_all_the_same(
     capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = disk_error(finished / "report.html", OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr("gs2d.pipeline.jobs.report_run", failing(full))
+    monkeypatch.setattr("gs2d.pipeline.train.report_run", failing(full))
     with pytest.raises(DiskError, match="No space left"):
         train(options(capture, finished, resume=True))
 

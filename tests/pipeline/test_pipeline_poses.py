@@ -21,7 +21,8 @@ from gs2d.geometry import camera_extent, common_motion, moved, similarity_motion
 from gs2d.io.run import POSES, RunFolder
 from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.jobs import evaluate_run, open_job, render_run, report_run
+from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.jobs import evaluate_run, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.pictures import render_view, shown_cameras
 from gs2d.pipeline.prepare import build_recipe, prepare, reload_job

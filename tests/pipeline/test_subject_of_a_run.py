@@ -16,7 +16,8 @@ from gs2d.errors import ProtocolError, RunError
 from gs2d.io.ply import read_mesh, read_splats
 from gs2d.io.run import RunFolder
 from gs2d.pipeline.events import Notice
-from gs2d.pipeline.jobs import export_run, finished_splats
+from gs2d.pipeline.finished import finished_splats
+from gs2d.pipeline.jobs import export_run
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.prepare import protocol_from_json, reload_job
 from gs2d.pipeline.subject import meshed_subject, within

@@ -15,7 +15,8 @@ from gs2d.pipeline.events import OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.plan import DEMO
-from gs2d.pipeline.train import check_viewer, train, use_threads
+from gs2d.pipeline.threads import use_threads
+from gs2d.pipeline.train import check_viewer, train
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 TITLE = "gs2d demo: a still life whose true surface is known"

@@ -18,7 +18,7 @@ from gs2d.errors import Gs2dError
 from gs2d.io.run import RunFolder, load_tensors, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.exposure import photographed, read_exposures
-from gs2d.pipeline.jobs import finished_splats
+from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.pictures import choose_views, render_view, share_of_group, splatted
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.restart import stage_end

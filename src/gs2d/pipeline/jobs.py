@@ -18,7 +18,7 @@ from gs2d.disk import check_writable
 from gs2d.errors import DataError, RunError
 from gs2d.evaluate.lpips import load_lpips
 from gs2d.images import write_image
-from gs2d.io.ply import read_mesh, read_splats
+from gs2d.io.ply import read_mesh
 from gs2d.io.run import (
     LOCK,
     MESH,
@@ -37,59 +37,21 @@ from gs2d.io.splat_formats import ENDINGS, LAYOUTS, layout_of, read_disks, write
 from gs2d.pipeline.attempts import again, attempted, reason_of
 from gs2d.pipeline.events import Missing, Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
+from gs2d.pipeline.finished import finished_splats, open_job
 from gs2d.pipeline.options import Box, EvaluateOptions, MeshOptions
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras
 from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
 from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.refined import aligned
 from gs2d.pipeline.scoring import score_views, split_metrics
 from gs2d.pipeline.subject import meshed_subject, within
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.pipeline.verdict_file import write_verdict
 from gs2d.pipeline.verdict_measures import Collector
-from gs2d.splats import Splats
 
 MOST_FRAMES = 100_000  # of an orbit or a flight
 FPS = 30.0
-
-
-def finished_splats(run: RunFolder) -> Splats:
-    """The splats of a finished run.
-
-    Raises
-    ------
-    RunError
-        Not finished yet, or the file was damaged.
-    """
-    path = run.file(SPLATS)
-    if not path.exists():
-        raise RunError(f"{run.path} is not finished: no {SPLATS}; continue it with `gs2d train ... --resume`")
-    splats = read_splats(path)
-    whole = torch.stack([tensor.unsqueeze(-1).flatten(1).isfinite().all(dim=1) for _, tensor in splats.items()])
-    broken = len(splats) - int(whole.all(dim=0).sum())
-    if broken:
-        raise RunError(
-            f"{path} must hold finite numbers, got NaN or infinity in {broken} splats, which would not be drawn; "
-            "it was damaged: delete it and continue with `gs2d train ... --resume`"
-        )
-    return splats
-
-
-def open_job(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Job, Splats]:
-    """A finished run, what defines it, and its splats on the device of its backend.
-
-    Raises
-    ------
-    RunError, DataError
-    """
-    from gs2d.pipeline.train import use_threads
-
-    use_threads(threads)
-    run = open_run(path)
-    splats = finished_splats(run)
-    job = reload_job(run, on_event)
-    return run, job, splats.to(job.backend.device)
 
 
 def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") -> Path:

@@ -21,8 +21,8 @@ from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.prepare import Job
-from gs2d.pipeline.train import Watch
 from gs2d.pipeline.view import drawn, frame_around, shots
+from gs2d.pipeline.watch import Watch
 from gs2d.splats import Splats
 from gs2d.train import events as train_events
 from gs2d.train.state import TrainState

@@ -14,7 +14,7 @@ from gs2d.io.run import PAGE, is_run, open_run
 from gs2d.io.splat_formats import read_disks
 from gs2d.page import Seen, write_page
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
-from gs2d.pipeline.jobs import finished_splats
+from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.view import frame_around, from_aside, settings_without_run

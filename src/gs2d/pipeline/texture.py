@@ -22,7 +22,8 @@ from gs2d.mesh.atlas import required, simplified, unwrap
 from gs2d.mesh.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
-from gs2d.pipeline.jobs import mesh_run, open_job
+from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.jobs import mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.pictures import render_view

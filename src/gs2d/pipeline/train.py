@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-import torch
-
 from gs2d.data.archive import is_archive
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.ply import write_splats
@@ -16,8 +14,11 @@ from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
+from gs2d.pipeline.jobs import report_run
+from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.page import page_run
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.prepare import Job, check_same_run, prepare
 from gs2d.pipeline.recorder import Recorder
@@ -26,11 +27,13 @@ from gs2d.pipeline.restart import Start, check_sources, choose_start
 from gs2d.pipeline.scoring import Visitor
 from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.surface import MeshFrames, extract_mesh
+from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.verdict_file import write_verdict
 from gs2d.pipeline.verdict_measures import Collector
+from gs2d.pipeline.watch import Watch
 from gs2d.splats import Splats
 from gs2d.train import events
-from gs2d.train.state import TrainState
+from gs2d.view import free_port, required_viser
 
 
 def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
@@ -96,39 +99,12 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     return run
 
 
-class Watch:
-    """Nobody watches a training; ``pipeline.live.Live`` has the same methods."""
-
-    def __init__(self, on_event: OnEvent) -> None:
-        self._tell = on_event
-
-    def on_event(self, event: Event) -> None:
-        """Pass an event of the pipeline on."""
-        self._tell(event)
-
-    def on_training_event(self, event: events.Event, state: TrainState) -> None:
-        """Nothing is shown."""
-
-    def scored(self, psnr: float | None) -> None:
-        """Nothing is shown."""
-
-    @property
-    def waiting(self) -> bool:
-        """Whether there is something to do in a turn."""
-        return False
-
-    def turn(self) -> None:
-        """Nothing was asked for."""
-
-
 @contextmanager
 def watched(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[Watch]:
     """The page of a training while it lasts, if one is asked for."""
     if not options.viewer:
         yield Watch(on_event)
         return
-    from gs2d.pipeline.live import open_live
-
     live = open_live(job, options, on_event)
     try:
         yield live
@@ -149,27 +125,8 @@ def check_viewer(options: TrainOptions) -> None:
         if options.viewer_port is not None:
             raise RecipeError("--viewer-port belongs to --viewer, which was not given; give both")
         return
-    from gs2d.view import free_port, required_viser
-
     required_viser()
     free_port("127.0.0.1", options.viewer_port, option="--viewer-port")
-
-
-MOST_THREADS = 1024  # each has a stack: far more of them end in errors that name anything but the cause
-
-
-def use_threads(threads: int | None) -> None:
-    """Set the CPU threads of torch and of the native kernels.
-
-    Raises
-    ------
-    RecipeError
-        Not a number from 1 to ``MOST_THREADS``.
-    """
-    if threads is not None:
-        if not 1 <= threads <= MOST_THREADS:
-            raise RecipeError(f"--threads must be a whole number from 1 to {MOST_THREADS}, got {threads}")
-        torch.set_num_threads(threads)
 
 
 @contextmanager
@@ -253,9 +210,6 @@ def finish(
     with_page: bool,
 ) -> None:
     """Write what the user came for: the splats, and then each thing that is made of them, whatever the others do."""
-    from gs2d.pipeline.jobs import report_run
-    from gs2d.pipeline.page import page_run
-
     write_splats(run.file(SPLATS), splats)
     with attempted(MESH, again("mesh", run.path), on_event):
         subject = meshed_subject(run, job, splats, mesh, on_event)

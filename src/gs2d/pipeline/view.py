@@ -23,11 +23,11 @@ from gs2d.io.run import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_ru
 from gs2d.io.splat_formats import read_disks
 from gs2d.io.textured import glb_bytes, glb_turn
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
-from gs2d.pipeline.jobs import finished_splats
+from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.surface import OPAQUE
-from gs2d.pipeline.train import use_threads
+from gs2d.pipeline.threads import use_threads
 from gs2d.render.api import rasterize
 from gs2d.render.backend import Backend, get_backend
 from gs2d.render.types import RasterSettings

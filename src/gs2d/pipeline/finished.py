@@ -1,0 +1,51 @@
+"""A finished run, opened again: its splats, and what defines it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from gs2d.errors import RunError
+from gs2d.io.ply import read_splats
+from gs2d.io.run import SPLATS, RunFolder, open_run
+from gs2d.pipeline.events import OnEvent
+from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.threads import use_threads
+from gs2d.splats import Splats
+
+
+def finished_splats(run: RunFolder) -> Splats:
+    """Return the splats of a finished run.
+
+    Raises
+    ------
+    RunError
+        Not finished yet, or the file was damaged.
+    """
+    path = run.file(SPLATS)
+    if not path.exists():
+        raise RunError(f"{run.path} is not finished: no {SPLATS}; continue it with `gs2d train ... --resume`")
+    splats = read_splats(path)
+    whole = torch.stack([tensor.unsqueeze(-1).flatten(1).isfinite().all(dim=1) for _, tensor in splats.items()])
+    broken = len(splats) - int(whole.all(dim=0).sum())
+    if broken:
+        raise RunError(
+            f"{path} must hold finite numbers, got NaN or infinity in {broken} splats, which would not be drawn; "
+            "it was damaged: delete it and continue with `gs2d train ... --resume`"
+        )
+    return splats
+
+
+def open_job(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Job, Splats]:
+    """Return a finished run, what defines it, and its splats on the device of its backend.
+
+    Raises
+    ------
+    RunError, DataError
+    """
+    use_threads(threads)
+    run = open_run(path)
+    splats = finished_splats(run)
+    job = reload_job(run, on_event)
+    return run, job, splats.to(job.backend.device)

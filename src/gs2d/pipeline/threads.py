@@ -1,0 +1,23 @@
+"""How many CPU threads a command uses."""
+
+from __future__ import annotations
+
+import torch
+
+from gs2d.errors import RecipeError
+
+MOST_THREADS = 1024  # each has a stack: far more of them end in errors that name anything but the cause
+
+
+def use_threads(threads: int | None) -> None:
+    """Set the CPU threads of torch and of the native kernels.
+
+    Raises
+    ------
+    RecipeError
+        Not a number from 1 to ``MOST_THREADS``.
+    """
+    if threads is not None:
+        if not 1 <= threads <= MOST_THREADS:
+            raise RecipeError(f"--threads must be a whole number from 1 to {MOST_THREADS}, got {threads}")
+        torch.set_num_threads(threads)
