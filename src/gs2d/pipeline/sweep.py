@@ -19,7 +19,7 @@ from typing import Any
 from gs2d.errors import Gs2dError
 from gs2d.io.files import read_json, write_json
 from gs2d.io.run import MESH, SPLATS, RunFolder, make_folder, now
-from gs2d.pipeline.events import Event, Missing, Notice, OnEvent, Phase, StageDone, ignore
+from gs2d.pipeline.events import Event, Missing, Notice, OnEvent, Phase, StageDone, Step, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.sweep_claims import FOREIGN_SECONDS, Claim, holder, take_claim
 
@@ -208,6 +208,29 @@ def work(
             stages.release()
             claim.release()
         after_job(job)
+
+
+def watch(
+    sweep: Sweep, on_event: OnEvent, after_job: Callable[[SweepJob], None], each_round: Callable[[], None]
+) -> None:
+    """Tell the user how far other processes are, until all jobs are settled."""
+    settled: set[str] = set()
+    on_event(Phase("jobs", len(sweep.jobs)))
+    while True:
+        fresh = [job for job in sweep.jobs if job.name not in settled and sweep.settled(job)]
+        for job in fresh:
+            settled.add(job.name)
+            record = sweep.record(job)
+            if record["state"] == "failed":
+                on_event(Notice(f"{job.name} failed: {record['reason']}"))
+            after_job(job)
+        left = [job for job in sweep.jobs if job.name not in settled]
+        running = [job.name for job in left if sweep.record(job)["state"] == "running"]
+        on_event(Step(len(settled), ", ".join(running)))
+        if not left:
+            return
+        each_round()
+        time.sleep(POLL_SECONDS)
 
 
 def _take_one(sweep: Sweep, jobs: Sequence[SweepJob]) -> tuple[SweepJob, Claim, StageClaims] | None:

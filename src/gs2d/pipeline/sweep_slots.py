@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from multiprocessing.process import BaseProcess
 from typing import Any
 
 from gs2d.errors import BackendError, RunError
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
-from gs2d.pipeline.sweep import MAX_DEATHS, POLL_SECONDS, Sweep, SweepJob, work
+from gs2d.pipeline.events import OnEvent
+from gs2d.pipeline.sweep import MAX_DEATHS, Sweep, SweepJob, watch, work
+from gs2d.pipeline.sweep_slurm import run_on_slurm
 
 
 def run_sweep(
@@ -49,8 +49,6 @@ def run_sweep(
     if slots is not None and slots < 1:
         raise BackendError(f"--slots must be a whole number >= 1, got {slots}")
     if slurm is not None:
-        from gs2d.pipeline.sweep_slurm import run_on_slurm
-
         run_on_slurm(sweep, on_event, slots=slots or 1, parameters=slurm, after_job=after_job)
         return
     gpus = gpu_count(backend)
@@ -135,26 +133,3 @@ def revive(sweep: Sweep, processes: list[BaseProcess], start: Callable[[int], Ba
                     "try --slots 1, which shows why"
                 )
             processes[index] = start(index)
-
-
-def watch(
-    sweep: Sweep, on_event: OnEvent, after_job: Callable[[SweepJob], None], each_round: Callable[[], None]
-) -> None:
-    """Tell the user how far others are, until all jobs are settled."""
-    settled: set[str] = set()
-    on_event(Phase("jobs", len(sweep.jobs)))
-    while True:
-        fresh = [job for job in sweep.jobs if job.name not in settled and sweep.settled(job)]
-        for job in fresh:
-            settled.add(job.name)
-            record = sweep.record(job)
-            if record["state"] == "failed":
-                on_event(Notice(f"{job.name} failed: {record['reason']}"))
-            after_job(job)
-        left = [job for job in sweep.jobs if job.name not in settled]
-        running = [job.name for job in left if sweep.record(job)["state"] == "running"]
-        on_event(Step(len(settled), ", ".join(running)))
-        if not left:
-            return
-        each_round()
-        time.sleep(POLL_SECONDS)

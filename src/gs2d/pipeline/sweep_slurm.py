@@ -9,8 +9,7 @@ from typing import Any
 from gs2d.errors import BackendError, RunError
 from gs2d.extras import install
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.sweep import Sweep, SweepJob, work
-from gs2d.pipeline.sweep_slots import watch
+from gs2d.pipeline.sweep import Sweep, SweepJob, watch, work
 
 
 def run_on_slurm(
