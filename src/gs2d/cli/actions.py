@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from gs2d.cli import commands as c
-from gs2d.cli.console import Console, figure
-from gs2d.cli.options import Common, Training, TrainingCommon
-from gs2d.cli.verdict import say_verdict
+from gs2d.cli.console import Console
+from gs2d.cli.options import Common, Training, TrainingCommon, training_values
+from gs2d.cli.tables import score_rows, show_run, show_surface
 from gs2d.errors import DataError, ProtocolError, RecipeError
 
 
@@ -61,24 +60,6 @@ def training_options(command: TrainingCommon, training: Training, **own: Any) ->
     return TrainOptions(**training_values(training), **{name: getattr(command, name) for name in common}, **own)
 
 
-def training_values(training: Training) -> dict[str, Any]:
-    """Values of the pipeline's options of training: two flags of the command line are one of its fields.
-
-    Raises
-    ------
-    RecipeError
-        Both flags are given.
-    """
-    from gs2d.errors import RecipeError
-
-    given = values(Training, training)
-    if given.pop("no_exposure"):
-        if training.exposure:
-            raise RecipeError("--exposure and --no-exposure contradict each other, got both; leave one out")
-        return {**given, "exposure": False}
-    return {**given, "exposure": True if training.exposure else None}
-
-
 def train(command: c.Train, console: Console) -> None:
     """``gs2d train``."""
     from gs2d.pipeline.train import train as run_training
@@ -86,11 +67,6 @@ def train(command: c.Train, console: Console) -> None:
     run = run_training(train_options(command), console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console)
-
-
-def values(kind: type[Any], options: Any) -> dict[str, Any]:
-    """The fields that ``options`` has of a group of options, by name; not those of its own."""
-    return {field.name: getattr(options, field.name) for field in fields(kind)}
 
 
 def demo(command: c.Demo, console: Console) -> None:
@@ -236,17 +212,17 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
     )
     result = evaluate_run(command.run, options, console.on_event, threads=command.threads)
     console.close()
-    rows = [row for split in ("train", "test") for row in _both_scores(split, result.get(split))]
+    rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]
     if command.match_exposure:
-        rows += _both_scores("test, matched", result["test_matched"])
+        rows += score_rows("test, matched", result["test_matched"])
     if command.match_poses:
-        rows += _both_scores("test, aligned", result["test_aligned"])
+        rows += score_rows("test, aligned", result["test_aligned"])
     console.table("", ["views", "pictures", "PSNR dB", "SSIM", "LPIPS 0..1", "LPIPS -1..1"], rows)
     for split in ("train", "test"):
         reason = (result.get(split) or {}).get("lpips_reason") or result.get(f"{split}_reason")
         if reason:
             console.say(f"{split}: {reason}")
-    _surface_table(result.get("surface"), console)
+    show_surface(result.get("surface"), console)
     console.result(result)
 
 
@@ -338,62 +314,3 @@ def info(command: c.Info, console: Console) -> None:
         for part in value if isinstance(value, list) else [value]:
             console.say(f"{name}: {part}")
     console.result(facts)
-
-
-# -- tables ----------------------------------------------------------------------------------------------------
-def show_run(
-    path: Path,
-    metrics: dict[str, Any],
-    console: Console,
-    definition: dict[str, Any] | None = None,
-    extra: dict[str, Any] | None = None,
-) -> None:
-    """The metrics of a run as a table, where its files are, and the verdict on it."""
-    if definition is not None:
-        recipe, scene = definition["recipe"]["name"], definition["scene"]
-        console.say(f"{recipe} on {scene['name']} ({scene['format']}, {scene['train']} + {scene['test']} views)")
-    rows = []
-    for stage in metrics["stages"]:
-        seen = stage.get("test") or stage.get("train") or {}
-        rows.append(
-            [
-                stage["name"],
-                f"{stage['iterations']:,}",
-                figure(stage["seconds"], 0),
-                f"{stage['splats']:,}",
-                figure(stage["bytes"] / 1e6, 1),
-                figure((stage.get("train") or {}).get("psnr"), 2),
-                figure((stage.get("test") or {}).get("psnr"), 2),
-                figure(seen.get("ssim"), 4),
-            ]
-        )
-    columns = ["stage", "iter.", "seconds", "splats", "MB", "PSNR train", "test", "SSIM"]
-    console.table("", columns, rows)
-    _surface_table(metrics.get("surface"), console)
-    for name in ("report.html", "scene.html", "mesh.ply", "mesh.glb", "splats.ply"):
-        if (path / name).exists():
-            console.say(f"{path / name}")
-    extra = (extra or {}) | ({} if definition is None else {"definition": definition}) | say_verdict(path, console)
-    console.result({"run": str(path), **metrics, **extra})
-
-
-def _both_scores(split: str, metrics: dict[str, Any] | None) -> list[list[str]]:
-    """Two rows: from 8-bit pictures, as the official evaluation takes them, and from floats."""
-    scores = metrics or {}
-    rounded = [figure(scores.get("psnr"), 2), figure(scores.get("ssim"), 4)]
-    floats = [figure(scores.get("psnr_float"), 2), figure(scores.get("ssim_float"), 4)]
-    lpips = [figure(scores.get(name), 4) for name in ("lpips", "lpips_signed")]
-    return [[split, "8 bit", *rounded, *lpips], ["", "floats", *floats, "", ""]]
-
-
-def _surface_table(surface: dict[str, Any] | None, console: Console) -> None:
-    if not surface:
-        return
-    rows = [
-        [f"{row['threshold']:.4g}", *(figure(row[name], 4) for name in ("precision", "recall", "f_score"))]
-        for row in surface.get("thresholds") or []
-    ]
-    if rows:
-        console.table("", ["surface within", "precision", "recall", "F-score"], rows)
-    if surface.get("chamfer") is not None:
-        console.say(f"Chamfer distance {surface['chamfer']:.5g} {surface.get('unit', 'world units')}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import arg
+
+from gs2d.errors import RecipeError
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
 LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
@@ -111,3 +113,24 @@ class Finding:
     """Frames to take of a video, each the sharpest of its stretch (needs ffmpeg); photographs are all taken."""
     link: bool = False
     """Hard links instead of copies of the photographs: no disk is used."""
+
+
+def values(kind: type[Any], options: Any) -> dict[str, Any]:
+    """Return the fields that ``options`` has of a group of options, by name; not those of its own."""
+    return {field.name: getattr(options, field.name) for field in fields(kind)}
+
+
+def training_values(training: Training) -> dict[str, Any]:
+    """Return the values of the pipeline's options of training: two flags of the command line are one of its fields.
+
+    Raises
+    ------
+    RecipeError
+        Both flags are given.
+    """
+    given = values(Training, training)
+    if given.pop("no_exposure"):
+        if training.exposure:
+            raise RecipeError("--exposure and --no-exposure contradict each other, got both; leave one out")
+        return {**given, "exposure": False}
+    return {**given, "exposure": True if training.exposure else None}

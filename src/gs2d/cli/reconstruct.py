@@ -6,9 +6,9 @@ import shlex
 from typing import Any
 
 from gs2d.cli import commands as c
-from gs2d.cli.actions import show_run, training_values, values
 from gs2d.cli.console import Console
-from gs2d.cli.options import Finding
+from gs2d.cli.options import Finding, training_values, values
+from gs2d.cli.tables import show_run
 from gs2d.io.files import read_json
 from gs2d.io.run import PAGE
 from gs2d.pipeline.reconstruct import CAPTURE, ReconstructOptions
