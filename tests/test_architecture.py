@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import importlib
 import os
 import subprocess
@@ -106,6 +107,9 @@ def imports_of(path: Path) -> list[str]:
     return [name for name in found if name == "gs2d" or name.startswith("gs2d.")]
 
 
+MODULES = {module_of(path): path for path in FILES}
+
+
 @pytest.mark.parametrize("path", FILES, ids=module_of)
 def test_imports_only_go_down(path: Path) -> None:
     here = module_of(path)
@@ -120,6 +124,35 @@ def test_imports_only_go_down(path: Path) -> None:
         assert other in FLOORS, f"{here} imports {imported}, which has no floor"
         downwards = FLOORS[other] < FLOORS[own]
         assert downwards or (own, other) in PEERS, f"{here} (floor {FLOORS[own]}) imports {imported}"
+
+
+def module_meant(imported: str) -> str:
+    """Return the module of an imported name: ``gs2d.io.ply`` of ``gs2d.io.ply.read_splats``."""
+    parts = imported.split(".")
+    if len(parts) == 2 and parts[1] in gs2d._HOME:  # what gs2d exports is of the module that it is from
+        return gs2d._HOME[parts[1]]
+    beginnings = (".".join(parts[:length]) for length in range(len(parts), 0, -1))
+    return next(name for name in beginnings if name in MODULES)
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Return what each module imports: at its top, inside functions, and for type checkers only.
+
+    A package's ``__init__`` is a module like others: ``from gs2d.data import Scene`` is an edge to it, and it has edges
+    to the modules that it exports from; ``from gs2d.data.scene import Scene`` is no edge to it. That of gs2d itself
+    exports lazily from every floor, so that its own imports do not count.
+    """
+    graph = {module: {module_meant(name) for name in imports_of(path)} for module, path in MODULES.items()}
+    return graph | {"gs2d": set()}
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    graph = import_graph()
+    assert "gs2d.pipeline.train" in graph["gs2d.pipeline.sweep"], "an import inside a function counts too"
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail(f"a circle: {' is imported by '.join(error.args[1])}; move what they share into a module below")
 
 
 def test_inside_render_the_api_is_on_top() -> None:
