@@ -27,6 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 
 import torch
 
+from benchmarks.run_phases import LOOP, RECORDER, RUN_PHASES
 from benchmarks.sampler import Rule, Sampler, Seconds
 from benchmarks.timing import machine, peak_probe
 from gs2d.kernels.library import load
@@ -34,22 +35,10 @@ from gs2d.pipeline.demo import SCHEDULE_SCALE, DemoOptions, demo
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
 
-RECORDER, LOOP = "pipeline/recorder.py", "train/loop.py"
 PHASES = (
+    *RUN_PHASES,
     Rule("photograph the demo scene", (("data/toy.py", "write_demo_capture"),)),
-    Rule("read the capture", (("pipeline/prepare.py", "prepare"), ("pipeline/prepare.py", "reload_job"))),
-    Rule("PSNR curve", ((RECORDER, "_probe_psnr"),)),
-    Rule("pictures", (("pipeline/pictures.py", "draw_stage"),)),
-    Rule("score a stage", ((RECORDER, "_score_stage"), (RECORDER, "_score_entry"))),
-    Rule("checkpoints", ((RECORDER, "_save"),)),
-    Rule("initial splats", ((LOOP, "_new_state"),)),
-    Rule("rank by E_i", (("train/actions.py", "rank_by_error"),)),
-    Rule("fill the stage 2 cache", (("train/cached_views.py", "choose_evaluator"),)),
-    Rule("mesh", (("pipeline/surface.py", "extract_mesh"),)),
-    Rule("report", (("pipeline/jobs.py", "report_run"),)),
     Rule("evaluate", (("pipeline/jobs.py", "evaluate_run"),)),
-    Rule("training iterations", ((LOOP, "step"),)),
-    Rule("enter a stage", ((LOOP, "enter"),)),
 )
 PARTS = (
     Rule("rasterizer", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),

@@ -27,23 +27,12 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch loads
 
+from benchmarks.run_phases import RUN_PHASES
 from benchmarks.sampler import CostSampler, Rule
 
-RECORDER, LOOP = "pipeline/recorder.py", "train/loop.py"
-PHASES = (  # names that a version of the code does not have are found nowhere in it
-    Rule("read the capture", (("pipeline/prepare.py", "prepare"), ("pipeline/prepare.py", "reload_job"))),
-    Rule("PSNR curve", ((RECORDER, "_probe_psnr"),)),
+PHASES = (
+    *RUN_PHASES,
     Rule("log of changes", (("pipeline/changes.py", ""),)),
-    Rule("pictures", (("pipeline/pictures.py", "draw_stage"),)),
-    Rule("score a stage", ((RECORDER, "_score_stage"), (RECORDER, "_score_entry"))),
-    Rule("checkpoints", ((RECORDER, "_save"),)),
-    Rule("initial splats", ((LOOP, "_new_state"),)),
-    Rule("rank by E_i", (("train/actions.py", "rank_by_error"),)),
-    Rule("fill the stage 2 cache", (("train/cached_views.py", "choose_evaluator"),)),
-    Rule("mesh", (("pipeline/surface.py", "extract_mesh"),)),
-    Rule("report", (("pipeline/jobs.py", "report_run"),)),
-    Rule("training iterations", ((LOOP, "step"),)),
-    Rule("enter a stage", ((LOOP, "enter"),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
 )
 PARTS = (

@@ -1,0 +1,21 @@
+"""The phases of a training run, for the samplers of ``profile_run`` and ``run_cost``."""
+
+from __future__ import annotations
+
+from benchmarks.sampler import Rule
+
+RECORDER, LOOP = "pipeline/recorder.py", "train/loop.py"
+RUN_PHASES = (  # names that a version of the code does not have are found nowhere in it
+    Rule("read the capture", (("pipeline/prepare.py", "prepare"), ("pipeline/prepare.py", "reload_job"))),
+    Rule("PSNR curve", ((RECORDER, "_probe_psnr"),)),
+    Rule("pictures", (("pipeline/pictures.py", "draw_stage"),)),
+    Rule("score a stage", ((RECORDER, "_score_stage"), (RECORDER, "_score_entry"))),
+    Rule("checkpoints", ((RECORDER, "_save"),)),
+    Rule("initial splats", ((LOOP, "_new_state"),)),
+    Rule("rank by E_i", (("train/actions.py", "rank_by_error"),)),
+    Rule("fill the stage 2 cache", (("train/cached_views.py", "choose_evaluator"),)),
+    Rule("mesh", (("pipeline/surface.py", "extract_mesh"),)),
+    Rule("report", (("pipeline/jobs.py", "report_run"),)),
+    Rule("training iterations", ((LOOP, "step"),)),
+    Rule("enter a stage", ((LOOP, "enter"),)),
+)
