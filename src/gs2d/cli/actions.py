@@ -8,7 +8,7 @@ from typing import Any
 
 from gs2d.cli import commands as c
 from gs2d.cli.console import Console
-from gs2d.cli.options import Common, Training, TrainingCommon, training_values
+from gs2d.cli.options import Common, Training, TrainingCommon, training_values, values
 from gs2d.cli.tables import score_rows, show_run, show_surface
 from gs2d.errors import DataError, ProtocolError, RecipeError
 
@@ -100,18 +100,7 @@ def mesh(command: c.Mesh, console: Console) -> None:
     from gs2d.pipeline.jobs import mesh_run
     from gs2d.pipeline.options import MeshOptions
 
-    options = MeshOptions(
-        voxel=command.voxel,
-        truncation=command.truncation,
-        depth_limit=command.depth_limit,
-        bbox=command.bbox,
-        unbounded=command.unbounded,
-        max_gib=command.max_gib,
-        depth=command.depth,
-        keep_components=command.keep_components,
-        subject_box=command.subject_box,
-        whole_scene=command.whole_scene,
-    )
+    options = MeshOptions(**values(MeshOptions, command))
     if command.texture:
         _textured_mesh(command, options, console)
         return
@@ -176,7 +165,7 @@ def view(command: c.View, console: Console) -> None:
     """``gs2d view``: until Ctrl-C."""
     from gs2d.pipeline.view import ViewOptions, open_viewer, serve
 
-    options = ViewOptions(host=command.host, port=command.port, threads=command.threads)
+    options = ViewOptions(**values(ViewOptions, command))
     viewer = open_viewer(command.path, options, console.on_event)
     try:
         console.close()
@@ -203,13 +192,7 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
     from gs2d.pipeline.jobs import evaluate_run
     from gs2d.pipeline.options import EvaluateOptions
 
-    options = EvaluateOptions(
-        ground_truth=command.ground_truth,
-        thresholds=command.thresholds,
-        lpips_weights=command.lpips_weights,
-        match_exposure=command.match_exposure,
-        match_poses=command.match_poses,
-    )
+    options = EvaluateOptions(**values(EvaluateOptions, command))
     result = evaluate_run(command.run, options, console.on_event, threads=command.threads)
     console.close()
     rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]

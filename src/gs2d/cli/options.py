@@ -116,7 +116,7 @@ class Finding:
 
 
 def values(kind: type[Any], options: Any) -> dict[str, Any]:
-    """Return the fields that ``options`` has of a group of options, by name; not those of its own."""
+    """Return the values that ``options`` has for the fields of a group of options, by name; not those of its own."""
     return {field.name: getattr(options, field.name) for field in fields(kind)}
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from gs2d.cli import commands as c
 from gs2d.cli.console import Console
+from gs2d.cli.options import values
 
 _MOST_LINES = 12  # of photographs without a place; poses.json has them all
 
@@ -15,22 +16,7 @@ def poses(command: c.Poses, console: Console) -> None:
     """``gs2d poses``."""
     from gs2d.pipeline.poses import PosesOptions, find_poses
 
-    options = PosesOptions(
-        photos=command.photos,
-        out=command.out,
-        cameras=command.cameras,
-        camera_model=command.camera_model,
-        matching=command.matching,
-        overlap=command.overlap,
-        neighbours=command.neighbours,
-        max_size=command.max_size,
-        feature_size=command.feature_size,
-        frames=command.frames,
-        link=command.link,
-        threads=command.threads,
-        seed=command.seed,
-        overwrite=command.overwrite,
-    )
+    options = PosesOptions(**values(PosesOptions, command))
     result = find_poses(options, console.on_event)
     console.close()
     for line in poses_lines(result):
