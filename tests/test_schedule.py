@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 
 from gs2d.errors import RecipeError
-from gs2d.recipe import GradDensify
+from gs2d.recipe import ALL, GradDensify
 from gs2d.recipes import RECIPES, get_recipe
-from gs2d.schedule import count_densifications, scale_schedule
+from gs2d.schedule import count_densifications, longer_steps, scale_schedule
 
 
 def test_factor_1_is_the_recipe_itself() -> None:
@@ -128,3 +128,12 @@ def test_poses_take_longer_steps_where_they_have_fewer_turns() -> None:
         assert poses.rate * math.sqrt(factor) == pytest.approx(5e-4)
         assert poses.rate_final / poses.rate == pytest.approx(0.01)
     assert poses.rate_at(50) == 0 < poses.rate_at(51)
+
+
+def test_steps_are_longer_where_there_are_fewer_and_nothing_else_changes() -> None:
+    recipe = get_recipe("2dgs-r")
+    assert longer_steps(recipe, 1.0) is recipe
+    assert longer_steps(recipe, 4.0) is recipe
+    for stage, before in zip(longer_steps(recipe, 1 / 16).stages, recipe.stages, strict=True):
+        longer = {name: 2 * getattr(before.rates, name) for name in (*ALL, "means_final")}
+        assert stage == replace(before, rates=replace(before.rates, **longer))

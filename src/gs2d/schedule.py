@@ -11,17 +11,18 @@ Pure Python; never imports torch.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import TypeVar
 
 from gs2d.errors import RecipeError
-from gs2d.recipe import Exposure, GradDensify, PoseRefinement, Recipe, Stage
+from gs2d.recipe import Exposure, GradDensify, PoseRefinement, Rates, Recipe, Stage
 from gs2d.recipe_priors import DepthPrior, NormalPrior
 
 MIN_DENSIFICATIONS = 10
 PRUNE_GRACE = 100  # iterations after a reset in which nothing is pruned for opacity
 RESET_MARGIN = 200  # iterations of densification that a reset must leave
 MIN_INIT_POINTS = 10_000
+LONGER = 0.25  # power of 1 / factor by which steps are longer: docs/decisions.md, "Fog"
 VIEWS_WAIT = 200  # iterations before exposures and poses are learned, where the schedule has them
 OfViews = TypeVar("OfViews", Exposure, PoseRefinement)
 Prior = TypeVar("Prior", DepthPrior, NormalPrior)
@@ -57,6 +58,22 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
         depth_prior=None if recipe.depth_prior is None else _scale_prior(recipe.depth_prior, factor),
         normal_prior=None if recipe.normal_prior is None else _scale_prior(recipe.normal_prior, factor),
     )
+
+
+def longer_steps(recipe: Recipe, factor: float) -> Recipe:
+    """Return the recipe with rates for a schedule ``factor`` times as long as they were chosen for.
+
+    Adam's steps do not grow with gradients: in fewer of them a splat gets as far only if each is longer. All rates of
+    splats are multiplied by ``factor ** -LONGER`` (2.1 at a twentieth); at factor 1 and above nothing changes.
+    """
+    if factor >= 1:
+        return recipe
+    names = [entry.name for entry in fields(Rates) if entry.name not in ("means_horizon", "beta1", "beta2", "eps")]
+
+    def longer(rates: Rates) -> Rates:
+        return replace(rates, **{name: getattr(rates, name) * factor**-LONGER for name in names})
+
+    return replace(recipe, stages=tuple(replace(stage, rates=longer(stage.rates)) for stage in recipe.stages))
 
 
 def _scale_prior(prior: Prior, factor: float) -> Prior:

@@ -18,6 +18,7 @@ from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prepare import fit_recipe
 from gs2d.protocols import DTU, GENERIC
+from gs2d.recipe import Rates
 
 COUNT = 12
 
@@ -71,6 +72,7 @@ def test_training_is_robust_where_protocol_and_capture_allow_it(
     for part in (recipe.dense_start, recipe.free_space, recipe.opacity_decay):
         assert (part is not None) == robust
     assert (recipe.exposure is not None) == exposure
+    assert (recipe.stages[0].rates.sh0 > Rates().sh0) == robust  # a tenth of the schedule: longer steps
 
 
 def test_what_was_decided_is_said() -> None:

@@ -27,7 +27,7 @@ from gs2d.recipe_json import apply_overrides, from_json, to_json
 from gs2d.recipes import get_recipe, with_depth_prior, with_exposure, with_normal_prior, with_poses, with_robustness
 from gs2d.render.backend import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.schedule import scale_schedule
+from gs2d.schedule import longer_steps, scale_schedule
 from gs2d.train.backdrop import backdrop_color
 from gs2d.train.cached_views import is_cacheable
 from gs2d.train.loop import raster_settings
@@ -144,7 +144,9 @@ def build_recipe(
     value = with_robustness(value) if robust else value
     if by_points and value.exposure is not None:
         value = replace(value, exposure=replace(value.exposure, initial="points"))
-    value = apply_overrides(replace(scale_schedule(value, schedule_scale), seed=seed), overrides)
+    value = scale_schedule(value, schedule_scale)
+    value = longer_steps(value, schedule_scale) if robust else value
+    value = apply_overrides(replace(value, seed=seed), overrides)
     for option, wanted, field in (
         ("--exposure", exposure, "exposure"),
         ("--refine-poses", poses, "poses"),
