@@ -192,6 +192,11 @@ def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None
         (["--schedule-scale", "-1"], "schedule scale"),
         (["--from", "nowhere"], "expected a run folder"),
         (["--format", "colmap"], "colmap"),
+        (["--subject-box", "1", "1", "1", "0", "0", "0"], "--subject-box must be a lower corner and a higher one"),
+        (["--subject-box", "0", "0", "0", "1", "1", "nan"], "got 0 0 0 1 1 nan"),
+        (["--subject-box", "0", "0", "0", "1", "1", "1", "--scene"], "--subject-box and --scene exclude each other"),
+        (["--exposure", "--no-exposure"], "--exposure and --no-exposure contradict each other"),
+        (["--robust", "perhaps"], "--robust must be auto, on or off"),
     ],
 )
 def test_options_that_make_no_sense_give_one_line_and_leave_nothing(
@@ -200,6 +205,44 @@ def test_options_that_make_no_sense_give_one_line_and_leave_nothing(
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", *TINY, *more]) == 2
     assert named.lower() in one_line(capsys.readouterr().err).lower()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [(["--schedule-scale", "0"], "schedule scale"), (["--seed", "-1"], "seed"), (["--threads", "0"], "--threads")],
+)
+def test_the_demo_refuses_what_makes_no_sense_before_it_takes_a_photograph(
+    more: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def photographed(*_words: object, **_options: object) -> None:
+        raise AssertionError("the demo began to take photographs")
+
+    monkeypatch.setattr("gs2d.pipeline.demo.write_demo_capture", photographed)
+    assert run(["demo", "--out", str(tmp_path / "run"), "--quiet", *more]) == 2
+    assert named in one_line(capsys.readouterr().err)
+    (tmp_path / "mine.txt").write_text("mine")
+    assert run(["demo", "--out", str(tmp_path), "--quiet"]) == 2
+    assert "mine.txt" in one_line(capsys.readouterr().err)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--bbox", "1", "0", "0", "0", "1", "1"], "--bbox must be a lower corner and a higher one"),
+        (["--subject-box", "0", "0", "0", "1", "inf", "1"], "--subject-box must be a lower corner"),
+        (["--subject-box", "90", "90", "90", "91", "91", "91"], "--subject-box must hold splats, got none of"),
+        (["--subject-box", "0", "0", "0", "1", "1", "1", "--unbounded"], "--subject-box and --unbounded exclude"),
+    ],
+)
+def test_a_box_that_makes_no_sense_changes_nothing_in_the_run(
+    words: list[str], named: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(trained, tmp_path / "run"))
+    before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
+    assert run(["mesh", str(copy), "--quiet", *words]) == 2
+    assert named in one_line(capsys.readouterr().err)
+    assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
 
 
 def test_a_folder_that_holds_a_run_or_something_else_is_kept(

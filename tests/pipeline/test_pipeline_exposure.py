@@ -79,9 +79,10 @@ def test_the_demo_s_training_pictures_have_gains_whose_mean_is_one(
         assert np.abs(after[..., :3] - np.minimum(before[..., :3] * np.array(gains), 255)).max() <= 0.5
     assert not (tmp_path / "plain" / GAINS).exists()
     assert (tmp_path / "varied/test/r_0.png").read_bytes() == (tmp_path / "plain/test/r_0.png").read_bytes()
-    (tmp_path / "plain").rename(tmp_path / "capture")
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "plain").rename(tmp_path / "demo" / "capture")
     with pytest.raises(RunError, match="made without --vary-exposure; resume with the same options"):
-        demo(DemoOptions(out=tmp_path, resume=True, vary_exposure=True))
+        demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_exposure=True))
 
 
 def test_the_transforms_lie_beside_the_run_and_their_mean_is_the_identity(run: RunFolder) -> None:

@@ -66,9 +66,10 @@ def test_the_demo_s_training_cameras_are_off_and_the_true_ones_beside_them(
     assert (varied / "transforms_train.json").read_bytes() != (plain / "transforms_train.json").read_bytes()
     assert (varied / "transforms_test.json").read_bytes() == (plain / "transforms_test.json").read_bytes()
     assert not (plain / TRUTH).exists()
-    plain.rename(tmp_path / "capture")
+    (tmp_path / "demo").mkdir()
+    plain.rename(tmp_path / "demo" / "capture")
     with pytest.raises(RunError, match="made without --vary-poses; resume with the same options"):
-        demo(DemoOptions(out=tmp_path, resume=True, vary_poses=True))
+        demo(DemoOptions(out=tmp_path / "demo", resume=True, vary_poses=True))
 
 
 def test_a_disturbance_has_its_size_and_no_motion_in_common() -> None:

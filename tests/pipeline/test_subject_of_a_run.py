@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gs2d.data.subject import OBJECT, read_subject
-from gs2d.errors import ProtocolError, RunError
+from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.ply import read_mesh, read_splats
 from gs2d.io.run import RunFolder
 from gs2d.pipeline.events import Notice
@@ -20,7 +20,7 @@ from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.jobs import export_run
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.prepare import protocol_from_json, reload_job
-from gs2d.pipeline.subject import meshed_subject, within
+from gs2d.pipeline.subject import meshed_subject, subject_line, within
 from gs2d.pipeline.surface import extract_mesh
 from gs2d.protocols import PROTOCOLS
 from gs2d.report_subject import subject_section
@@ -33,6 +33,8 @@ def test_training_writes_the_subject_and_only_the_generic_protocol_meshes_it(und
     assert subject is not None
     shown = subject_section(undisturbed.path)  # in the report: words, the box and the picture
     assert subject.why in shown
+    assert subject_line(subject, meshed=True).endswith("--scene takes everything")
+    assert "the mesh is of everything" in subject_line(subject, meshed=False)
     assert "data:image/jpeg;base64," in shown
     job, splats = reload_job(undisturbed, lambda _: None), finished_splats(undisturbed)
     assert job.protocol.name == "nerf-synthetic"
@@ -84,5 +86,5 @@ def test_splats_are_exported_within_a_box(undisturbed: RunFolder, tmp_path: Path
     assert torch.equal(part.means, splats.means[expected])
     with pytest.raises(RunError, match="got none of"):
         within(splats, (100, 100, 100, 101, 101, 101))
-    with pytest.raises(RunError, match="lower corner and a higher one"):
+    with pytest.raises(DataError, match="--bbox must be a lower corner and a higher one"):
         within(splats, (1, 0, 0, 0, 1, 1))

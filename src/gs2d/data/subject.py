@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.camera import Camera
-from gs2d.errors import DataError
+from gs2d.errors import DataError, ProtocolError
 from gs2d.geometry import focus_point, up_direction
 from gs2d.io.files import read_json
 from gs2d.io.run import SUBJECT
@@ -29,6 +29,7 @@ SHOWN_BY = 0.5  # of the cameras that look at the object, in the pictures of whi
 FEW_INSIDE = 0.1  # of the cameras may stand within what they look at
 TAIL = 0.5  # per cent of the votes that may lie outside the box on each side
 MARGIN = 0.05  # of the box's longest side, on every side
+LARGEST = 1e12  # wu; of a box that is given: the mesh is made in 32-bit numbers, of which squares and cubes are taken
 _STEPS = 20  # of mean shift
 _SEEDS = 16  # places that are tried
 
@@ -138,6 +139,45 @@ def read_subject(run: Path) -> Subject | None:
         raise DataError(f"{path} was damaged ({error}); delete it, and `gs2d mesh {run}` finds it again") from error
 
 
+def checked_box(box: Sequence[float], option: str) -> np.ndarray:
+    """Return both corners [2, 3] wu of a box x0 y0 z0 x1 y1 z1 that the user gave by an option.
+
+    Raises
+    ------
+    DataError
+        The numbers are no box.
+    """
+    corners = np.asarray(box, np.float64)
+    if corners.shape != (6,) or not (np.abs(corners) <= LARGEST).all() or not (corners[:3] < corners[3:]).all():
+        numbers = " ".join(f"{value:g}" for value in box)
+        raise DataError(f"{option} must be a lower corner and a higher one, x0 y0 z0 x1 y1 z1, got {numbers}")
+    return corners.reshape(2, 3)
+
+
+def check_subject_box(box: Sequence[float] | None, others: Mapping[str, bool]) -> None:
+    """Raise for a box of the subject that is none, or that is not the only choice of what is meshed.
+
+    Parameters
+    ----------
+    box : sequence of 6 floats, optional
+    others : mapping of str to bool
+        Options that choose something else, and whether they were given.
+
+    Raises
+    ------
+    DataError
+        The numbers are no box.
+    ProtocolError
+        Another choice was made too.
+    """
+    if box is None:
+        return
+    checked_box(box, "--subject-box")
+    for option, given in others.items():
+        if given:
+            raise ProtocolError(f"--subject-box and {option} exclude each other, got both; leave one out")
+
+
 def given_subject(box: Sequence[float], cameras: Sequence[Camera]) -> Subject:
     """Return the object in a box (x0 y0 z0 x1 y1 z1, wu) that the user named.
 
@@ -146,10 +186,7 @@ def given_subject(box: Sequence[float], cameras: Sequence[Camera]) -> Subject:
     DataError
         The numbers are no box.
     """
-    corners = np.asarray(box, np.float64)
-    if corners.shape != (6,) or not np.isfinite(corners).all() or not (corners[:3] < corners[3:]).all():
-        raise DataError(f"a box must be a lower corner and a higher one, x0 y0 z0 x1 y1 z1, got {list(box)}")
-    low, high = corners[:3], corners[3:]
+    low, high = checked_box(box, "--subject-box")
     return Subject(OBJECT, low, high, (low + high) / 2, up_direction(cameras), "the box was given")
 
 

@@ -9,12 +9,13 @@ from gs2d.data.toy import write_demo_capture
 from gs2d.data.toy_exposure import GAINS
 from gs2d.data.toy_poses import TRUTH as TRUE_POSES
 from gs2d.errors import RunError
-from gs2d.io.run import RunFolder, is_run, open_run
+from gs2d.io.run import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.plan import DEMO
+from gs2d.pipeline.prepare import check_train_options
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.train import check_viewer, train
 
@@ -67,7 +68,10 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
                 f"{options.out} holds a run that is not a demo; choose another --out or replace it with --overwrite"
             )
         overwrite = True
-    check_viewer(TrainOptions(scene=capture, out=options.out, viewer=options.viewer, viewer_port=options.viewer_port))
+    training = _training(options, overwrite=overwrite)
+    check_train_options(training)  # all that can be refused, before the photographs are taken: that lasts
+    check_claim(options.out, resume=options.resume, overwrite=overwrite, allowed=training.allowed)
+    check_viewer(training)
     use_threads(options.threads)
     on_event(Plan(DEMO))
     if not (options.resume and (capture / "transforms_train.json").exists()):
@@ -93,27 +97,29 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
                 f"the photographs in {capture} were made with{'out' * varied} {option}; "
                 "resume with the same options, or start again with --overwrite"
             )
-    run = train(
-        TrainOptions(
-            scene=capture,
-            out=options.out,
-            backend=options.backend,
-            seed=options.seed,
-            exposure=options.exposure,
-            viewer=options.viewer,
-            viewer_port=options.viewer_port,
-            refine_poses=options.refine_poses,
-            threads=options.threads,
-            resume=options.resume,
-            overwrite=overwrite,
-            schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
-            title=TITLE,
-            page=options.page,
-            allowed=(CAPTURE,),
-        ),
-        on_event,
-    )
+    run = train(training, on_event)
     truth = capture / TRUTH
     with attempted("scores of the surface", again("evaluate", run.path, "--ground-truth", truth), on_event):
         evaluate_run(run.path, EvaluateOptions(ground_truth=truth, match_poses=options.refine_poses), on_event)
     return run
+
+
+def _training(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
+    """What is trained."""
+    return TrainOptions(
+        scene=options.out / CAPTURE,
+        out=options.out,
+        backend=options.backend,
+        seed=options.seed,
+        exposure=options.exposure,
+        viewer=options.viewer,
+        viewer_port=options.viewer_port,
+        refine_poses=options.refine_poses,
+        threads=options.threads,
+        resume=options.resume,
+        overwrite=overwrite,
+        schedule_scale=SCHEDULE_SCALE if options.schedule_scale is None else options.schedule_scale,
+        title=TITLE,
+        page=options.page,
+        allowed=(CAPTURE,),
+    )

@@ -14,6 +14,7 @@ import torch
 
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.data.layouts import missing_lines, protocol_of
+from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.run import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
@@ -163,7 +164,7 @@ def check_train_options(options: TrainOptions) -> Recipe:
 
     Raises
     ------
-    RecipeError, ProtocolError
+    RecipeError, ProtocolError, DataError
     """
     if options.robust not in ROBUST:
         raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
@@ -183,6 +184,7 @@ def check_train_options(options: TrainOptions) -> Recipe:
         )
     if isinstance(options.protocol, str) and options.protocol != "auto":
         get_protocol(options.protocol)
+    check_subject_box(options.subject_box, {"--scene": options.whole_scene})
     return recipe
 
 

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
 
 from gs2d.camera import Camera
-from gs2d.data.subject import OBJECT, Sight, Subject, find_subject, given_subject, middle_weights, read_subject, shown
+from gs2d.data.subject import (
+    OBJECT,
+    Sight,
+    Subject,
+    check_subject_box,
+    checked_box,
+    find_subject,
+    given_subject,
+    middle_weights,
+    read_subject,
+    shown,
+)
 from gs2d.errors import DataError, DiskError, ProtocolError, RunError
 from gs2d.io.files import write_json
 from gs2d.io.run import RENDERS, SUBJECT, RunFolder, make_folder
@@ -42,6 +53,8 @@ def subject_of(
     ------
     ProtocolError
         The box is none, or the splats show no surface.
+    RunError
+        There is no splat in the box: what would be kept is a mistake.
     DataError
         ``subject.json`` is damaged.
     DiskError
@@ -49,13 +62,15 @@ def subject_of(
     known = read_subject(run.path) if box is None else None
     if known is not None:
         return known
+    if box is not None:
+        within(splats, box, "--subject-box")
     try:
         cameras = [view.camera for view in job.scene.train]
         subject = find_subject(sights(job, splats)) if box is None else given_subject(box, cameras)
     except DataError as error:
         raise ProtocolError(str(error)) from error
     write_json(run.file(SUBJECT), subject.to_json())
-    on_event(Notice(subject_line(subject)))
+    on_event(Notice(subject_line(subject, meshed=box is not None or job.protocol.fusion.subject)))
     _draw(run, job, subject, on_event)
     return subject
 
@@ -76,44 +91,46 @@ def meshed_subject(run: RunFolder, job: Job, splats: Splats, options: MeshOption
 
     Raises
     ------
-    ProtocolError, DataError, DiskError
+    ProtocolError, RunError, DataError, DiskError
     """
     given = options.subject_box
-    own = [name for name in ("bbox", "whole_scene", "unbounded") if getattr(options, name)]
-    if given is not None and own:
-        name = {"whole_scene": "--scene"}.get(own[0], f"--{own[0]}")
-        raise ProtocolError(f"--subject-box and {name} exclude each other, got both; leave one out")
+    others = {"--bbox": options.bbox is not None, "--scene": options.whole_scene, "--unbounded": options.unbounded}
+    check_subject_box(given, others)
     subject = subject_of(run, job, splats, on_event, box=given)
-    wanted = given is not None or (job.protocol.fusion.subject and not own)
+    wanted = given is not None or (job.protocol.fusion.subject and not any(others.values()))
     return subject if wanted and subject.kind == OBJECT else None
 
 
-def within(splats: Splats, box: Sequence[float]) -> Splats:
-    """Return the splats whose centres lie in a box, x0 y0 z0 x1 y1 z1, wu.
+def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Splats:
+    """Return the splats whose centres lie in a box, x0 y0 z0 x1 y1 z1, wu, which the user gave by an option.
 
     Raises
     ------
+    DataError
+        The numbers are no box.
     RunError
-        The numbers are no box, or there is no splat in it.
+        There is no splat in it.
     """
-    corners = np.asarray(box, np.float64)
-    if corners.shape != (6,) or not (corners[:3] < corners[3:]).all():
-        raise RunError(f"--bbox must be a lower corner and a higher one, x0 y0 z0 x1 y1 z1, got {list(box)}")
-    low, high = torch.from_numpy(corners).to(splats.means).split(3)
+    low, high = torch.from_numpy(checked_box(box, option)).to(splats.means)
     inside = ((splats.means >= low) & (splats.means <= high)).all(dim=1)
     if not bool(inside.any()):
-        least, most = (f(dim=0).values.tolist() for f in (splats.means.min, splats.means.max))
-        raise RunError(f"--bbox must hold splats, got none of {len(splats):,}; they lie from {least} to {most}")
+        ends = torch.cat([splats.means.min(dim=0).values, splats.means.max(dim=0).values])
+        raise RunError(f"{option} must hold splats, got none of {len(splats):,}; all lie in {_numbers(ends.tolist())}")
     return splats.rows(inside)
 
 
-def subject_line(subject: Subject) -> str:
-    """Return one line on what was found, with the numbers that --bbox takes."""
+def _numbers(box: Iterable[float]) -> str:
+    """A box as options take it."""
+    return " ".join(f"{value:.4g}" for value in box)
+
+
+def subject_line(subject: Subject, *, meshed: bool) -> str:
+    """Return one line on what was found, with the numbers that --bbox takes; ``meshed``: the mesh is of it alone."""
     if subject.kind != OBJECT:
         return f"subject: the whole scene ({subject.why}); --subject-box x0 y0 z0 x1 y1 z1 names a part of it"
+    end = "--scene takes everything" if meshed else "the mesh is of everything, --subject-box limits it"
     size = " x ".join(f"{side:.3g}" for side in subject.high - subject.low)
-    numbers = " ".join(f"{value:.4g}" for value in subject.box.ravel())
-    return f"subject: {size} wu, box {numbers} ({subject.why}); --scene takes everything"
+    return f"subject: {size} wu, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
 def sights(job: Job, splats: Splats) -> list[Sight]:

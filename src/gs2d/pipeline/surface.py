@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gs2d.data import View
-from gs2d.data.subject import Subject
+from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.disk import disk_error
 from gs2d.errors import ProtocolError
 from gs2d.evaluate.images import ImageMetrics
@@ -31,7 +31,6 @@ from gs2d.splats import Splats
 
 OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
 ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
-LARGEST = 1e12  # wu; depth and voxels are 32-bit numbers, of which squares and cubes are taken
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
 
@@ -167,9 +166,7 @@ def check_mesh_options(options: MeshOptions) -> None:
             bounds = f"between {1 / LARGEST:g} and {LARGEST:g} world units"
             raise ProtocolError(f"--{name.replace('_', '-')} must be {bounds}, got {value:g}")
     if options.bbox is not None:
-        low, high = np.asarray(options.bbox, np.float64).reshape(2, 3)
-        if not ((np.abs(options.bbox) <= LARGEST).all() and (low < high).all()):
-            raise ProtocolError(f"--bbox must be a lower corner and a higher one, got {low.tolist()} {high.tolist()}")
+        checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
         raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
 
