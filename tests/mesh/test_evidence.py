@@ -46,6 +46,14 @@ def test_a_sheet_that_one_view_saw_goes_and_the_ball_stays_whole() -> None:
     assert after.cleaned.unsupported + after.cleaned.small > 0.01
 
 
+def test_no_face_reaches_beyond_the_box_though_voxels_do() -> None:
+    box = np.array([[-0.73, -2, -2], [0.77, 2, 2]])
+    mesh = extract(frames(14), bbox=box, voxel=0.1, threads=1).mesh
+    assert mesh.vertices[:, 0].min() == pytest.approx(-0.73, abs=0.1)
+    assert mesh.vertices[:, 0].max() == pytest.approx(0.77, abs=0.1)
+    assert (np.abs(mesh.vertices[:, 0] - 0.02) <= 0.75).all()
+
+
 def test_faces_are_no_more_than_the_pixels_that_saw_them_carry_and_keep_colour_and_shape() -> None:
     found = extract(frames(14), bbox=BOX, voxel=0.06, threads=1, by_evidence=True)
     assert found.cleaned is not None

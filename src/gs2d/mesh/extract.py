@@ -17,7 +17,7 @@ from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths, widen_t
 from gs2d.mesh.nest import derive_nest
 from gs2d.mesh.nested import FAR_VIEWS, fuse_nested, nested_marching_cubes
 from gs2d.mesh.slabs import fused_surface
-from gs2d.mesh.surface import components, keep_components
+from gs2d.mesh.surface import components, inside_box, keep_components
 from gs2d.mesh.volume import Volume
 from gs2d.triangles import Mesh
 
@@ -66,7 +66,8 @@ def extract(
     limits : FusionLimits, optional
         Default: ``derive_limits`` from the frames, with ``resolution``, ``bbox``, ``voxel``, ``truncation``,
         ``depth_limit`` and ``points`` as it takes them (they may not be given together with ``limits``); a truncation
-        that is not given grows with the disagreement of the depth maps (``consistency.depth_noise``).
+        that is not given grows with the disagreement of the depth maps (``consistency.depth_noise``). With ``bbox`` no
+        face reaches beyond it.
     min_weight : float
         See ``marching_cubes``.
     min_faces, keep : int
@@ -113,6 +114,7 @@ def extract(
         blocks = find_blocks(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
         fused = _Fused(blocks.frames, len(blocks.keys), blocks.nbytes, 1)
         whole = fused_surface(spool, limits, blocks, min_weight=min_weight, threads=threads, backend=backend)
+        whole = whole if bbox is None else inside_box(whole, bbox)
         found = _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
         if not by_evidence:
             return found

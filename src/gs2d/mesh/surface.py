@@ -243,3 +243,10 @@ def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
     number = np.cumsum(used) - 1
     colors = None if mesh.colors is None else mesh.colors[used]
     return Mesh(mesh.vertices[used], number[faces].astype(np.int32).reshape(-1, 3), colors)
+
+
+def inside_box(mesh: Mesh, box: np.ndarray) -> Mesh:
+    """The faces that lie in a box [2, 3] with all their corners: volumes are of whole voxels, and reach beyond it."""
+    low, high = np.asarray(box, np.float64)
+    inside = ((mesh.vertices >= low) & (mesh.vertices <= high)).all(axis=1)
+    return select_faces(mesh, inside[mesh.faces].all(axis=1))
