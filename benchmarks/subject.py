@@ -1,0 +1,138 @@
+"""How much of a run's mesh is the subject, judged by masks of it.
+
+::
+
+    python -m benchmarks.subject RUN --masks FOLDER [--mesh FILE.ply] [--out FILE.json]
+
+FOLDER has a mask, white on the subject, for some of the photographs: ``NAME_mask.png``, or named as COLMAP's masks are.
+The middle of each face is projected into the photographs that have one, undistorted and reduced as they are for
+training. A face is inside where at least half of the photographs that have it in frame have it in the mask; one that
+none has in frame is outside. Nothing is hidden by anything: shreds before and behind the subject count as inside, what
+stands beside it in half of the photographs does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.camera import Camera
+from gs2d.data import View
+from gs2d.data.capture import Decoder
+from gs2d.data.colmap import find_mask
+from gs2d.errors import DataError, Gs2dError
+from gs2d.io.ply import read_mesh
+from gs2d.io.run import MESH, open_run
+from gs2d.pipeline.prepare import reload_job
+from gs2d.triangles import Mesh
+
+HALF = 0.5  # of the photographs that have a face in frame, which must have it in the mask
+GOAL = 0.98  # of the area
+
+
+@dataclass(frozen=True)
+class Share:
+    """What of a mesh lies in the masks of its subject.
+
+    Attributes
+    ----------
+    masks : int
+        Photographs with a mask.
+    faces, inside_faces : int
+    area : float
+        wu^2.
+    inside, unseen : float
+        Parts of the area: in the masks, and in no frame.
+    """
+
+    masks: int
+    faces: int
+    inside_faces: int
+    area: float
+    inside: float
+    unseen: float
+
+
+def share_inside(mesh: Mesh, masks: Iterable[tuple[Camera, np.ndarray]]) -> Share:
+    """Return the part of a mesh's area that lies in the masks (bool [H, W]) of the cameras.
+
+    Raises
+    ------
+    DataError
+        There is no mask, or no area.
+    """
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.faces]  # [F, 3, 3]
+    middles = corners.mean(axis=1)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    framed, within = np.zeros(len(middles), np.int64), np.zeros(len(middles), np.int64)
+    count = 0
+    for camera, mask in masks:
+        count += 1
+        pixels, depth = camera.project(middles)
+        seen = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+        column, row = pixels[seen].astype(np.int64).T
+        framed += seen
+        within[seen] += mask[row, column]
+    if not count or not areas.sum() > 0:
+        raise DataError(f"masks and a mesh with an area were expected, got {count} masks and {len(areas):,} faces")
+    inside = (framed > 0) & (within >= HALF * framed)
+    whole = float(areas.sum())
+    parts = (float(areas[chosen].sum()) / whole for chosen in (inside, framed == 0))
+    return Share(count, len(areas), int(inside.sum()), whole, *parts)
+
+
+def masks_of(views: Iterable[View], folder: Path) -> list[tuple[Camera, np.ndarray]]:
+    """Return the cameras of the photographs that have a mask in a folder, and these masks bool [H, W] as they see."""
+    found = []
+    for view in views:
+        path = (folder / view.name).with_name(f"{Path(view.name).stem}_mask.png")
+        file = path if path.is_file() else find_mask(folder, view.name)
+        if file is None or not isinstance(view.decode, Decoder):
+            continue
+        masked = replace(view.decode, frame=replace(view.decode.frame, object_mask=file))()
+        assert masked.object_mask is not None
+        found.append((view.camera, masked.object_mask))
+    return found
+
+
+def measure(run: Path, folder: Path, mesh: Path | None = None) -> dict[str, Any]:
+    """Return the figures of a run.
+
+    Raises
+    ------
+    Gs2dError
+    """
+    file = run / MESH if mesh is None else mesh
+    job = reload_job(open_run(run), lambda event: None)
+    share = share_inside(read_mesh(file), masks_of(job.scene.views, folder))
+    return {"run": run.name, "mesh": file.name, **vars(share)}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Parse the arguments, print a line, write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--masks", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--mesh", type=Path, help="another mesh than the run's")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args(arguments)
+    try:
+        found = measure(args.run, args.masks, args.mesh)
+    except Gs2dError as error:
+        raise SystemExit(f"error: {error}") from error
+    print(
+        f"{found['run']}: {found['inside']:.1%} of the mesh's area is in the masks of {found['masks']} photographs "
+        f"(goal: {GOAL:.0%}), {found['unseen']:.1%} in no frame; {found['inside_faces']:,} of {found['faces']:,} faces"
+    )
+    if args.out is not None:
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
