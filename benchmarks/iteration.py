@@ -66,15 +66,21 @@ class StageTime:
     extra_ms_of_first_by_view: float
 
 
-def iteration_times(workload: Workload, library: Library, repeats: int, name: str = "2dgs-r") -> dict[str, StageTime]:
-    """Time of an iteration of each stage of a recipe, on torch's number of threads."""
+def bench_trainer(workload: Workload, name: str = "2dgs-r") -> Trainer:
+    """A trainer that learns back pictures of the splats; every iteration of a stage does the same work."""
     scene = make_scene(workload.splats, workload.cameras)
     generator = torch.Generator().manual_seed(2)
     start = workload.splats.clone()
     start.sh0 += 0.2 * torch.randn(start.sh0.shape, generator=generator)
     recipe = get_recipe(name)
     recipe = replace(recipe, name="bench", stages=tuple(steady(stage) for stage in recipe.stages))
-    trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=TrainState(start, generator))
+    return Trainer(scene, recipe, GENERIC, backend="cpu", state=TrainState(start, generator))
+
+
+def iteration_times(workload: Workload, library: Library, repeats: int, name: str = "2dgs-r") -> dict[str, StageTime]:
+    """Time of an iteration of each stage of a recipe, on torch's number of threads."""
+    trainer = bench_trainer(workload, name)
+    scene, recipe = trainer.scene, trainer.recipe
     result = {}
     for index, stage in enumerate(recipe.stages):
         trainer.enter(index)

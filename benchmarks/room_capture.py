@@ -1,8 +1,9 @@
 """A capture as large as those of rooms that people publish: 292 photographs of 1560x1040, drawn from splats.
 
 A room with a table and things on it, all of it splats with colours of several scales, seen by our rasterizer from two
-rings inside; cameras and points are written as COLMAP's text model, pictures as JPEG. So a run on it reads, shrinks by
-two, trains on 780x520, scores and meshes as much as one on bonsai of Mip-NeRF 360, without its photographs.
+rings inside; cameras and points are written as COLMAP's text model, with the points that each picture shows, and
+pictures as JPEG. So a run on it reads, shrinks by two, trains on 780x520, scores and meshes as much as one on bonsai of
+Mip-NeRF 360, without its photographs.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ VIEWS, SIZE = 292, (1560, 1040)  # px; half of it is what bonsai has as images_4
 SPLATS, POINTS = 200_000, 60_000
 HALF = np.array([3.0, 3.0, 1.4])  # wu, of the room
 QUALITY = 92  # of the JPEG files
+FOUND = 0.15  # of the points that a picture shows: as many as a matcher finds again, about 9 pictures a point
+HIDDEN = 0.02  # of the depth, by which a point may lie behind what is drawn there
 
 
 def surfaces(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -109,29 +112,43 @@ def write_room_capture(
     (folder / "images").mkdir(parents=True, exist_ok=True)
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(seed + 1)
+    rng, found = np.random.default_rng(seed + 1), np.random.default_rng(seed + 2)
+    chosen = found.choice(splats, points, replace=False)
+    places = scene.means.numpy()[chosen] + found.normal(scale=0.004, size=(points, 3))
     rows = []
     for number, camera in enumerate(cameras, start=1):
         with torch.no_grad():
-            seen = rasterize(scene, camera, RasterSettings(sh_degree=0, with_distortion=False)).color.numpy()
-        noisy = 255 * np.clip(seen, 0, 1) + rng.normal(scale=2.0, size=seen.shape)  # as of a sensor
+            seen = rasterize(scene, camera, RasterSettings(sh_degree=0, with_distortion=False))
+        color = seen.color.numpy()
+        noisy = 255 * np.clip(color, 0, 1) + rng.normal(scale=2.0, size=color.shape)  # as of a sensor
         name = f"room_{number:04d}.jpg"
         Image.fromarray(np.rint(np.clip(noisy, 0, 255)).astype(np.uint8)).save(
             folder / "images" / name, quality=QUALITY
         )
         x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
         pose = " ".join(f"{value:.12g}" for value in (w, x, y, z, *camera.T_cam_world[:3, 3]))
-        rows.append(f"{number} {pose} 1 {name}\n\n")
+        shown, pixels = _shown(places, camera, seen.depth_median.numpy())
+        kept = found.random(len(shown)) < FOUND
+        marks = " ".join(f"{u:.2f} {v:.2f} {at + 1}" for at, (u, v) in zip(shown[kept], pixels[kept], strict=True))
+        rows.append(f"{number} {pose} 1 {name}\n{marks}\n")
         on_progress(number, views)
-    chosen = rng.choice(splats, points, replace=False)
-    places = scene.means.numpy()[chosen] + rng.normal(scale=0.004, size=(points, 3))
-    colours = painted[chosen]
     lines = [
         f"{number} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0.5\n"
-        for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, colours, strict=True), start=1)
+        for number, ((x, y, z), (r, g, b)) in enumerate(zip(places, painted[chosen], strict=True), start=1)
     ]
     (model / "points3D.txt").write_text("".join(lines))
     first = cameras[0]
     intrinsics = f"{first.fx} {first.fy} {first.cx} {first.cy}"
     (model / "cameras.txt").write_text(f"1 PINHOLE {first.width} {first.height} {intrinsics}\n")
     (model / "images.txt").write_text("".join(rows))
+
+
+def _shown(places: np.ndarray, camera: Camera, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the places [P, 3] that a picture with this depth [H, W] shows, and where [M, 2] px."""
+    pixels, z = camera.project(places)
+    inside = (z > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    rows = np.flatnonzero(inside)
+    column, row = np.floor(pixels[rows]).astype(np.int64).T
+    there = depth[row, column]
+    shown = (there > 0) & (z[rows] <= (1 + HIDDEN) * there)
+    return rows[shown], pixels[rows[shown]]

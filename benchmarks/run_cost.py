@@ -3,6 +3,7 @@
 ::
 
     python -m benchmarks.run_cost --out FILE.json --room [--capture FOLDER] [--schedule-scale 0.01]
+                                  [--set dense_start.cell=2]
     python -m benchmarks.run_cost --out FILE.json --capture FOLDER [--downscale 2] [--schedule-scale 0.05] [--threads 2]
 
 Both are one `gs2d train` in a fresh process. ``--room`` makes a capture of 292 photographs of 1560x1040
@@ -63,6 +64,7 @@ def measure(arguments: argparse.Namespace, capture: Path, out: Path) -> dict[str
                 recipe=arguments.recipe,
                 downscale=arguments.downscale,
                 schedule_scale=arguments.schedule_scale,
+                overrides=tuple(arguments.set),
                 threads=arguments.threads,
                 overwrite=True,
             )
@@ -86,6 +88,7 @@ def measure(arguments: argparse.Namespace, capture: Path, out: Path) -> dict[str
         "recipe": arguments.recipe,
         "schedule_scale": arguments.schedule_scale,
         "downscale": arguments.downscale,
+        "overrides": list(arguments.set),
         "threads": arguments.threads,
         "splats": stages[-1]["splats"],
         "wall_seconds": round(wall, 1),
@@ -118,6 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--schedule-scale", type=float)
     parser.add_argument("--recipe", default="2dgs-r")
+    parser.add_argument("--set", action="append", default=[], help="stage.field=value, as of `gs2d train`")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="the run folder; otherwise a temporary one")
     args = parser.parse_args(arguments)

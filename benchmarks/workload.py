@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -163,3 +164,26 @@ def trained_workload(splats_file: Path, capture: Path, downscale: int) -> Worklo
     views = load_scene(capture, downscale=downscale).train
     cameras = tuple(view.camera for view in views[:: max(1, len(views) // 4)][:4])
     return Workload(f"{capture.resolve().name}-{len(splats)}-{cameras[0].width}x{cameras[0].height}", splats, cameras)
+
+
+class AbsentError(Exception):
+    """What a workload is made of is not on this machine; says what."""
+
+
+def run_workload(run: Path) -> Workload:
+    """The splats of a finished run, seen by the cameras of the capture that its ``run.json`` names.
+
+    Raises
+    ------
+    AbsentError
+        The run, its splats or its capture is not there. Captures are other people's: none is in the repository.
+    """
+    if not (run / "run.json").is_file() or not (run / "splats.ply").is_file():
+        raise AbsentError(f"{run} is no finished run")
+    definition = json.loads((run / "run.json").read_text())
+    capture = Path(definition["scene"]["path"])
+    if not capture.exists():
+        raise AbsentError(f"the capture of {run} is not at {capture} any more")
+    made = trained_workload(run, capture, definition["downscale"])
+    title = definition.get("title") or definition["scene"]["name"]
+    return replace(made, name=made.name.replace(capture.resolve().name, title, 1))

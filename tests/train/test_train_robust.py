@@ -55,6 +55,20 @@ def test_a_sweep_finds_the_depth_of_a_textured_wall_and_says_nothing_of_a_bare_o
     assert (bare > 0).mean() < 0.1
 
 
+def test_a_sweep_is_the_same_whatever_is_compared_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gs2d.train.plane_sweep.PLANES_AT_ONCE", 5)
+    for one, other in zip(sweep_views(wall(), SMALL).depths, swept_wall().depths, strict=True):  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_a_sweep_frees_is_given_back_while_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    given_back: list[int] = []
+    monkeypatch.setattr("gs2d.train.plane_sweep.trim", lambda: given_back.append(1))
+    monkeypatch.setattr("gs2d.train.plane_sweep.TRIM_EVERY", 2)
+    views = len(sweep_views(wall(), SMALL).views)
+    assert len(given_back) == 2 * (views // 2 + 1)  # photographs shrunk, and depths found
+
+
 def test_training_starts_on_the_wall_facing_the_cameras() -> None:
     cloud = start_points(wall(), swept_wall(), SMALL)  # type: ignore[arg-type]
     assert len(cloud) > 200

@@ -7,8 +7,9 @@ agree become points. On the host's processor, and without any random choice: a r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.memory import trim
 from gs2d.recipe_robust import DenseStart
 
 MIN_POINTS = 20  # sparse points of a view, below which its depths are unknown
@@ -27,7 +29,11 @@ NOISE = 1e-4  # variance of grey values, [0, 1]^2, that is no texture: added to 
 MIN_TEXTURE = 2e-5  # variance of a patch below which every depth fits
 GREY = (0.3, 0.6, 0.1)
 BEST_ANGLE, NARROW, WIDE = 10.0, 4.0, 12.0  # degrees: neighbours' baselines, and how fast narrower and wider ones lose
+TRIM_EVERY = 8  # views; what is freed between results that stay was 2 GB of a capture of 292 photographs
+PLANES_AT_ONCE = 8  # 2 MB of each of what a comparison is made of, at 200 px: a core's cache
 REPEATED = 3.0  # cells: sparse points within that of a swept one start no splat of their own
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +119,19 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     observed = scene.observe()
     longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
     factor = max(1, round(longest / settings.side))
-    views = tuple(_shrunk(view, observed, factor) for view in scene.train)
+    views = tuple(_trimming(_shrunk(view, observed, factor) for view in scene.train))
     neighbours = _neighbours(scene, views, observed, settings)
-    found = [_depths(views, index, neighbours[index], settings) for index in range(len(views))]
+    found = list(_trimming(_depths(views, index, neighbours[index], settings) for index in range(len(views))))
     return Sweep(views, neighbours, tuple(depth for depth, _ in found), tuple(score for _, score in found))
+
+
+def _trimming(results: Iterable[T]) -> Iterator[T]:
+    """The results one by one; the holes that their making leaves between them are given back now and then."""
+    for done, result in enumerate(results, start=1):
+        yield result
+        if done % TRIM_EVERY == 0:
+            trim()
+    trim()
 
 
 def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
@@ -270,17 +285,22 @@ def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, radius:
     motion = other.T @ np.linalg.inv(view.T)
     turned = (torch.from_numpy(other.K @ motion[:3, :3] @ np.linalg.inv(view.K)) @ pixels).float()  # [3, HW]
     moved = torch.from_numpy(other.K @ motion[:3, 3]).float()
-    seen = turned[:, None, :] * z[None, :, None] + moved[:, None, None]  # [3, D, HW]
-    depth = seen[2].clamp_min(1e-9)
-    at = torch.stack([seen[0] / depth * (2 / columns) - 1, seen[1] / depth * (2 / rows) - 1], dim=-1)
-    inside = (at.abs() < 1).all(dim=-1) & (seen[2] > 0)
-    fetched = F.grid_sample(other.grey, at[None], align_corners=False, padding_mode="border")
-    fetched = fetched.reshape(len(z), 1, height, width)
-    mean, mine = _blurred(fetched, radius), _blurred(view.grey, radius)
-    spread = (_blurred(fetched * fetched, radius) - mean * mean).clamp_min(0)
-    common = _blurred(fetched * view.grey, radius) - mean * mine
-    ncc = common / ((spread + NOISE) * (variance + NOISE)).sqrt()
-    return torch.where(inside.reshape(len(z), height, width), ncc[:, 0], torch.full((), -1.0))
+    mine = _blurred(view.grey, radius)
+
+    def at_depths(some: Tensor) -> Tensor:
+        seen = turned[:, None, :] * some[None, :, None] + moved[:, None, None]  # [3, D, HW]
+        depth = seen[2].clamp_min(1e-9)
+        at = torch.stack([seen[0] / depth * (2 / columns) - 1, seen[1] / depth * (2 / rows) - 1], dim=-1)
+        inside = (at.abs() < 1).all(dim=-1) & (seen[2] > 0)
+        fetched = F.grid_sample(other.grey, at[None], align_corners=False, padding_mode="border")
+        fetched = fetched.reshape(len(some), 1, height, width)
+        mean = _blurred(fetched, radius)
+        spread = (_blurred(fetched * fetched, radius) - mean * mean).clamp_min(0)
+        common = _blurred(fetched * view.grey, radius) - mean * mine
+        ncc = common / ((spread + NOISE) * (variance + NOISE)).sqrt()
+        return torch.where(inside.reshape(len(some), height, width), ncc[:, 0], torch.full((), -1.0))
+
+    return torch.cat([at_depths(some) for some in z.split(PLANES_AT_ONCE)])
 
 
 def _blurred(image: Tensor, radius: int) -> Tensor:
