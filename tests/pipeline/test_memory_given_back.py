@@ -13,7 +13,7 @@ import torch
 
 from gs2d.camera import look_at
 from gs2d.data import Scene, View
-from gs2d.data.cache import ImageCache, Picture
+from gs2d.data.cache import TRIM_EVERY, ImageCache, Picture
 from gs2d.kernels.recycle import Recycler
 from gs2d.pipeline.memory import release
 
@@ -64,6 +64,16 @@ def test_a_scene_that_forgets_its_pictures_decodes_them_again(tmp_path: Path) ->
     assert (cache.nbytes, len(cache)) == (0, 0)
     assert scene.views[1].image()[0, 0, 0] == 2
     assert len(decoded) == 3
+
+
+def test_what_decoding_left_goes_back_however_a_picture_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    given_back: list[int] = []
+    monkeypatch.setattr("gs2d.data.cache.trim", lambda: given_back.append(1))
+    cache = ImageCache(1 << 20)
+    for name in range(40):
+        for _ in range(3):  # held pictures are not decoded again
+            cache.get(name, lambda: Picture(np.zeros((4, 4, 3), np.uint8)))
+    assert len(given_back) == 40 // TRIM_EVERY
 
 
 def test_buffers_that_nobody_holds_are_given_up() -> None:

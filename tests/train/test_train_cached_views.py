@@ -16,7 +16,7 @@ from gs2d.protocols import GENERIC
 from gs2d.recipe import Recipe, Stage
 from gs2d.recipes import appearance, refine
 from gs2d.train import events
-from gs2d.train.cached_views import CachedViews, is_cacheable
+from gs2d.train.cached_views import CachedViews, choose_evaluator, is_cacheable
 from gs2d.train.loop import Trainer
 from gs2d.train.state import TrainState
 from gs2d.train.views import WholeViews
@@ -119,9 +119,19 @@ def test_the_first_views_that_fit_are_cached_and_the_others_are_evaluated_plainl
 
 
 @needs_cpu
+def test_no_view_is_cached_where_most_would_not_fit(masked: Scene) -> None:
+    made = entered(masked)
+    first = views_of(made).views[0].nbytes
+    stage = made.recipe.stages[0]
+    half = first * VIEWS // 2
+    assert choose_evaluator(made._whole, made.state, stage, half - 1) is made._whole
+    assert isinstance(choose_evaluator(made._whole, made.state, stage, half), CachedViews)
+
+
+@needs_cpu
 @pytest.mark.parametrize("part", [False, True])
 def test_the_bytes_do_not_depend_on_threads_or_on_where_a_run_resumes(masked: Scene, part: bool) -> None:
-    room = views_of(entered(masked)).views[0].nbytes * 5 // 2 if part else ROOM
+    room = views_of(entered(masked)).views[0].nbytes * (2 * VIEWS - 3) // 2 if part else ROOM
     kept: list[tuple[events.Event, bytes]] = []
 
     def keep(event: events.Event) -> None:

@@ -9,6 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.memory import trim
+
+TRIM_EVERY = 16  # pictures that are decoded between giving back what decoding left: a few ms each time
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:
@@ -49,14 +53,15 @@ class Picture:
 class ImageCache:
     """Least-recently-used pictures, at most ``max_bytes`` of them.
 
-    A picture larger than the bound is handed out and not kept. Decoding happens outside the lock: threads decode
+    A picture larger than the bound is handed out and not kept. What decoding frees is given back to the system now and
+    then. Decoding happens outside the lock: threads decode
     different pictures at the same time; two threads that ask for the same one may both decode it.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = int(max_bytes)
         self._pictures: OrderedDict[Hashable, Picture] = OrderedDict()
-        self._nbytes = 0
+        self._nbytes = self._decoded = 0
         self._lock = threading.Lock()
 
     @property
@@ -82,10 +87,14 @@ class ImageCache:
                 return held
         picture = decode()
         with self._lock:
+            self._decoded += 1
+            trims = self._decoded % TRIM_EVERY == 0
             if key not in self._pictures and picture.nbytes <= self.max_bytes:
                 self._pictures[key] = picture
                 self._nbytes += picture.nbytes
                 while self._nbytes > self.max_bytes:
                     _, dropped = self._pictures.popitem(last=False)
                     self._nbytes -= dropped.nbytes
+        if trims:
+            trim()
         return picture

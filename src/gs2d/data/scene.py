@@ -17,8 +17,6 @@ from gs2d.errors import DataError
 from gs2d.images import composite
 from gs2d.memory import trim
 
-TRIM_EVERY = 16  # pictures that are decoded between giving back what decoding left: a few ms each time
-
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -242,10 +240,7 @@ class Scene:
 
         with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
             try:
-                for number, view in enumerate(pool.map(decode, self.views), start=1):
-                    if number % TRIM_EVERY == 0:
-                        trim()
-                    yield view
+                yield from pool.map(decode, self.views)
             finally:
                 pool.shutdown(cancel_futures=True)
                 trim()

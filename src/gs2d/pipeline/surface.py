@@ -22,6 +22,7 @@ from gs2d.io.ply import write_mesh
 from gs2d.mesh.extract import Extraction, extract, extract_unbounded
 from gs2d.mesh.frames import Frame, Spool, depth_map
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
+from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.scoring import SeenView
@@ -206,6 +207,7 @@ def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator
         with torch.no_grad():
             output = rasterize(splats, view.camera, settings, backend=job.backend)
         yield fusion_frame(job, view, output, depth)
+    release(job.scene)  # photographs were looked at for where they are known
     on_event(Phase("fusing", 0))
 
 

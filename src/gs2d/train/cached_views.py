@@ -17,6 +17,7 @@ from gs2d.train.views import Evaluated, Evaluator, WholeViews
 
 COLORS = frozenset({"sh0", "shN"})
 OF_COLOR = frozenset({"l1", "ssim"})  # losses that see nothing but the colour image
+LEAST_SHARE = 0.5  # of the views: a cache for fewer saves little of a stage, and takes its memory all the same
 WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
 
 
@@ -39,10 +40,11 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend_name: str, views: int)
 
 
 def choose_evaluator(whole: WholeViews, state: TrainState, stage: Stage, limit_bytes: int) -> Evaluator:
-    """Cached views where the stage allows them and ``limit_bytes`` > 0, else ``whole``."""
+    """Cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
     name, views = whole.backend.name, len(whole.scene.train)
     if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend_name=name, views=views):
-        return CachedViews(whole, state, stage, limit_bytes)
+        cached = CachedViews(whole, state, stage, limit_bytes, least=LEAST_SHARE * views)
+        return cached if cached.views else whole
     return whole
 
 
@@ -58,6 +60,8 @@ class CachedViews:
         One that ``is_cacheable``.
     limit_bytes : int
         Of all cached views together.
+    least : float
+        Where fewer views than that would fit, were all as large as the first, none is cached.
 
     Attributes
     ----------
@@ -67,7 +71,9 @@ class CachedViews:
         Of training views 0, 1, ...
     """
 
-    def __init__(self, whole: WholeViews, state: TrainState, stage: Stage, limit_bytes: int) -> None:
+    def __init__(
+        self, whole: WholeViews, state: TrainState, stage: Stage, limit_bytes: int, *, least: float = 0.0
+    ) -> None:
         self._whole = whole
         (group,) = set(stage.train.values())
         self.rows: Tensor = state.groups[group].nonzero().squeeze(1)
@@ -75,7 +81,7 @@ class CachedViews:
         settings, room = whole.settings(stage, 1), limit_bytes
         for index in range(len(whole.scene.train)):
             cached = cache_view(state.splats, whole.camera(state, index), settings, self.rows, limit_bytes=room)
-            if cached is None:
+            if cached is None or (index == 0 and cached.nbytes * least > limit_bytes):
                 break
             room -= cached.nbytes
             self.views.append(cached)
