@@ -80,7 +80,7 @@ class FreeSpace:
         Depths of the plane sweep count where a neighbour's differs by at most this fraction.
     """
 
-    every: int = 100
+    every: int = 50
     views: int = 1
     nearer: float = 0.9
     window: int = 5
