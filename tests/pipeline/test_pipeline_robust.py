@@ -12,7 +12,7 @@ import torch
 from gs2d.camera import look_at
 from gs2d.data.prior_maps import ObservedPoints
 from gs2d.data.scene import Scene, View
-from gs2d.errors import RecipeError
+from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
@@ -49,6 +49,15 @@ def options(**changes: object) -> TrainOptions:
 
 EQUAL, VARIED = ring(np.ones(COUNT)), ring(1 + 0.2 * np.sin(np.arange(COUNT)))
 BLIND = replace(EQUAL, observe=None)
+LACKS = "the model must hold sparse points, got none"
+
+
+def no_points() -> ObservedPoints:
+    """As of a COLMAP model with an empty points3D.bin."""
+    raise DataError(LACKS)
+
+
+EMPTY = replace(EQUAL, observe=no_points)
 
 
 @pytest.mark.parametrize(
@@ -58,6 +67,7 @@ BLIND = replace(EQUAL, observe=None)
         ({}, VARIED, GENERIC, True, True),
         ({}, VARIED, DTU, False, False),
         ({}, BLIND, GENERIC, False, False),
+        ({}, EMPTY, GENERIC, False, False),
         ({"robust": "off"}, VARIED, GENERIC, False, False),
         ({"robust": "on"}, VARIED, DTU, True, True),
         ({"exposure": False}, VARIED, GENERIC, True, False),
@@ -79,10 +89,14 @@ def test_what_was_decided_is_said() -> None:
     said: list[Event] = []
     fit_recipe(options(), VARIED, GENERIC, said.append)
     fit_recipe(options(), BLIND, GENERIC, said.append)
+    fit_recipe(options(), EMPTY, GENERIC, said.append)
     assert [event.text for event in said if isinstance(event, Notice)] == [
         "exposures of the photographs: 0.80 to 1.20 times their mean; learned for each",
         "no dense start and no known free space: the capture does not say which points are seen where",
+        f"no dense start and no known free space: {LACKS}",
     ]
+    with pytest.raises(DataError, match=LACKS):
+        fit_recipe(options(robust="on"), EMPTY, GENERIC, said.append)
 
 
 def test_a_part_can_be_left_out_or_changed_by_its_name() -> None:

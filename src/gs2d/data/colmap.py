@@ -97,7 +97,7 @@ def observed_points(folder: Path, kind: str) -> ObservedPoints:
     """
     points = read_points(folder, kind)
     if points is None or not len(points.ids):
-        raise DataError(f"{folder} must hold sparse points in points3D.{kind} for sparse depths, got none")
+        raise DataError(f"{folder} must hold sparse points in points3D.{kind}, got none")
     order = np.argsort(points.ids)
     track = np.zeros(len(order), dtype=np.int64)
     seen = {}

@@ -215,9 +215,11 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
     ------
     RecipeError, DataError
     """
-    robust = options.robust == "on" or (options.robust == "auto" and protocol.robust and scene.observe is not None)
-    if options.robust == "auto" and protocol.robust and scene.observe is None:
-        on_event(Notice("no dense start and no known free space: the capture does not say which points are seen where"))
+    robust = options.robust == "on" or (options.robust == "auto" and protocol.robust)
+    lacks = _lacks_points(scene) if robust and options.robust == "auto" else None
+    if lacks is not None:
+        robust = False
+        on_event(Notice(f"no dense start and no known free space: {lacks}"))
     exposure = bool(options.exposure)
     if robust and options.exposure is None and (found := point_gains(scene)) is not None:
         exposure = found.spread >= DIFFERS
@@ -225,6 +227,17 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
         what = "learned for each" if exposure else "taken to be one (--exposure learns them)"
         on_event(Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}"))
     return _recipe_of(options, robust=robust, exposure=exposure)
+
+
+def _lacks_points(scene: Scene) -> str | None:
+    """Why it is not known which sparse points the photographs show; None where it is."""
+    if scene.observe is None:
+        return "the capture does not say which points are seen where"
+    try:
+        scene.observe()
+    except DataError as error:
+        return str(error)
+    return None
 
 
 def with_backdrop(protocol: Protocol, recipe: Recipe, scene: Scene, on_event: OnEvent) -> Protocol:
