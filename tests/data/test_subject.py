@@ -120,6 +120,12 @@ def test_a_damaged_subject_is_named_with_what_to_do(tmp_path: Path, name: str, v
         read_subject(tmp_path)
 
 
+def test_a_subject_that_is_cut_off_is_named_with_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "subject.json").write_text('{"kind": "object"')
+    with pytest.raises(DataError, match=r"subject\.json was damaged.*must be JSON.*delete it, and `gs2d mesh"):
+        read_subject(tmp_path)
+
+
 def test_a_given_box_is_taken_as_it_is_or_refused() -> None:
     cameras = around(4, 5.0)
     subject = given_subject((-1, -2, -3, 1, 2, 3), cameras)

@@ -130,8 +130,8 @@ def read_subject(run: Path) -> Subject | None:
     path = Path(run) / SUBJECT
     if not path.exists():
         return None
-    data = read_json(path)
     try:
+        data = read_json(path)
         if not isinstance(data, dict):
             raise DataError(f"an object was expected, got {type(data).__name__}")
         return Subject.from_json(data)
