@@ -12,8 +12,8 @@ from benchmarks import texture
 
 from cli_runs import one_line
 from gs2d.cli import run
+from gs2d.geometry import up_direction
 from gs2d.io.ply import read_mesh, write_mesh
-from gs2d.pipeline.paths import up_direction
 from gs2d.triangles import Mesh
 from tiny import RADIUS, ball_cameras, write_ball_mesh
 

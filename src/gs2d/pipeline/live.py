@@ -17,9 +17,9 @@ from concurrent.futures import Future
 import numpy as np
 
 from gs2d.camera import Camera
+from gs2d.geometry import up_direction
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.view import drawn, frame_around, shots
 from gs2d.pipeline.watch import Watch

@@ -14,6 +14,7 @@ from gs2d.data import View
 from gs2d.disk import check_writable
 from gs2d.errors import ProtocolError, RunError
 from gs2d.exposure import take_back
+from gs2d.geometry import up_direction
 from gs2d.images import to_uint8
 from gs2d.io.ply import read_mesh
 from gs2d.io.run import MESH, TEXTURED, RunFolder
@@ -25,7 +26,6 @@ from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.jobs import mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
-from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.pictures import render_view
 from gs2d.pipeline.prepare import Job, read_scene
 from gs2d.pipeline.subject import meshed_subject

@@ -19,10 +19,9 @@ from gs2d.errors import DataError, RunError
 from gs2d.evaluate.hidden_points import hidden_points
 from gs2d.evaluate.images import ImageMetrics, psnr_float
 from gs2d.exposure import fit_exposure
-from gs2d.geometry import focus_point
+from gs2d.geometry import focus_point, up_direction
 from gs2d.io.files import read_json
 from gs2d.pipeline.exposure import GREY, matched_by_halves, over
-from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.scoring import SeenView
 from gs2d.sfm.workplace import POSES_JSON
 

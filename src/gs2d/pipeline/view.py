@@ -17,6 +17,7 @@ from gs2d.camera import Camera, look_at
 from gs2d.data import View
 from gs2d.data.subject import read_subject
 from gs2d.errors import DataError, RunError
+from gs2d.geometry import up_direction
 from gs2d.images import to_uint8
 from gs2d.io.ply import read_mesh
 from gs2d.io.run import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_run
@@ -24,7 +25,6 @@ from gs2d.io.splat_formats import read_disks
 from gs2d.io.textured import glb_bytes, glb_turn
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.paths import up_direction
 from gs2d.pipeline.prepare import Job, reload_job
 from gs2d.pipeline.surface import OPAQUE
 from gs2d.pipeline.threads import use_threads
