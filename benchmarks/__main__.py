@@ -3,12 +3,13 @@
 ::
 
     python -m benchmarks --out FILE.json [--quick] [--threads 2] [--only 20k 100k-800] [--variant v3]
-                         [--splats RUN_OR_PLY --capture FOLDER [--downscale N]]
+                         [--splats RUN_OR_PLY --capture FOLDER [--downscale N]] [--runs RUN [RUN ...]]
     python -m benchmarks compare A.json B.json
 
 The first form times every workload stage by stage; ``--quick`` takes a few seconds and only shows that everything
-works. ``--splats`` adds splats trained on photographs, seen by the cameras of their capture. The second form exits with
-1 if B is slower than A by more than noise (the rule: benchmarks/compare.py), with 2 if they cannot be compared.
+works. ``--splats`` adds splats trained on photographs, seen by the cameras of their capture; ``--runs`` those of
+finished runs, which say themselves where their captures are (absent ones are skipped, and named). The second form exits
+with 1 if B is slower than A by more than noise (the rule: benchmarks/compare.py), with 2 if they cannot be compared.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,16 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 
 from benchmarks.compare import NotComparable, compare
 from benchmarks.suite import run_suite
-from benchmarks.workload import FULL, QUICK, name_of, room_workload, trained_workload
+from benchmarks.workload import (
+    FULL,
+    QUICK,
+    AbsentError,
+    Workload,
+    name_of,
+    room_workload,
+    run_workload,
+    trained_workload,
+)
 
 
 def report(path: Path, name: str, document: dict[str, Any]) -> None:
@@ -63,6 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--splats", type=Path, help="a run folder or a PLY of trained splats")
     parser.add_argument("--capture", type=Path, help="the photographs they were trained on")
     parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--runs", type=Path, nargs="+", default=[], help="folders of finished runs")
     args = parser.parse_args(words)
     if (args.splats is None) != (args.capture is None):
         parser.error("--splats and --capture belong together")
@@ -72,6 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     workloads = [partial(room_workload, *size, crossing=args.crossing) for size in sizes]
     if args.splats is not None:
         workloads.append(partial(trained_workload, args.splats, args.capture, args.downscale))
+    workloads += runs_there(args.runs)
     if not workloads:
         there = ", ".join(name_of(*size) for size in (QUICK if args.quick else FULL))
         parser.error(f"no workload is called {' or '.join(args.only)}; there are {there}")
@@ -84,6 +96,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         on_result=partial(report, args.out),
     )
     return 0
+
+
+def runs_there(runs: Sequence[Path]) -> list[Callable[[], Workload]]:
+    """The workloads of the runs that are on this machine; the others are named, with what is missing."""
+    found: list[Callable[[], Workload]] = []
+    for run in runs:
+        try:
+            run_workload(run)
+        except AbsentError as error:
+            print(f"skipped: {error}", file=sys.stderr)
+        else:
+            found.append(partial(run_workload, run))
+    return found
 
 
 def compare_files(words: Sequence[str]) -> int:

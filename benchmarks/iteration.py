@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -31,6 +32,7 @@ from benchmarks.workload import Workload, room_workload
 from gs2d.camera import Camera
 from gs2d.data.scene import Scene, View
 from gs2d.kernels.library import Library, prepare
+from gs2d.memory import hold
 from gs2d.protocols import GENERIC
 from gs2d.recipe import Stage
 from gs2d.recipes import get_recipe
@@ -59,15 +61,20 @@ def steady(stage: Stage) -> Stage:
 
 @dataclass(frozen=True)
 class StageTime:
-    """An iteration of one stage, the multiply-add probe beside it, and what its first iteration took longer."""
+    """An iteration of one stage, the multiply-add probe beside it, and what its first iteration took longer.
+
+    Page faults are those of an iteration: memory that the system hands out anew, a microsecond or two a page of 4 kB.
+    """
 
     timing: Timing
     fma_gflops: float
     extra_ms_of_first_by_view: float
+    page_faults: float
 
 
 def bench_trainer(workload: Workload, name: str = "2dgs-r") -> Trainer:
     """A trainer that learns back pictures of the splats; every iteration of a stage does the same work."""
+    hold()  # as `gs2d train` does
     scene = make_scene(workload.splats, workload.cameras)
     generator = torch.Generator().manual_seed(2)
     start = workload.splats.clone()
@@ -89,10 +96,18 @@ def iteration_times(workload: Workload, library: Library, repeats: int, name: st
         start = time.perf_counter()
         trainer.step()
         first = 1e3 * (time.perf_counter() - start)
+        faults = page_faults()
         timing = measure(trainer.step, repeats=repeats, warmup=warmup)
+        faults = page_faults() - faults
         extra = max(0.0, first - timing.median) / len(scene.train)
-        result[stage.name] = StageTime(timing, max(before, peak_probe(library)), extra)
+        each = faults / (repeats + warmup)
+        result[stage.name] = StageTime(timing, max(before, peak_probe(library)), extra, each)
     return result
+
+
+def page_faults() -> int:
+    """How many pages this process got from the system so far, without reading a disk."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 
 
 def run(count: int, size: int, threads: int, repeats: int, recipe: str = "2dgs-r") -> dict[str, object]:
@@ -100,7 +115,10 @@ def run(count: int, size: int, threads: int, repeats: int, recipe: str = "2dgs-r
     torch.set_num_threads(threads)
     library = prepare()
     times = iteration_times(room_workload(count, size, size), library, repeats, recipe)
-    result = {name: asdict(row.timing) | {"fma_gflops": row.fma_gflops} for name, row in times.items()}
+    result = {
+        name: asdict(row.timing) | {"fma_gflops": row.fma_gflops, "page_faults": round(row.page_faults, 1)}
+        for name, row in times.items()
+    }
     facts = {
         "recipe": recipe,
         "splats": count,

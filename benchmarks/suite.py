@@ -52,6 +52,9 @@ def workload_result(library: Library, workload: Workload, seconds: float, least:
         "iteration_fma_gflops": {
             f"stage{index + 1}": rounded(row.fma_gflops) for index, row in enumerate(iterations.values())
         },
+        "iteration_page_faults": {
+            f"stage{index + 1}": round(row.page_faults, 1) for index, row in enumerate(iterations.values())
+        },
         "stage2_fill_ms_by_view": rounded(iterations["appearance"].extra_ms_of_first_by_view),
         "fma_fraction": share_of_peak(USEFUL),
         "fma_fraction_executed": share_of_peak(EXECUTED),

@@ -19,6 +19,7 @@ from gs2d.disk import disk_error
 from gs2d.errors import ProtocolError
 from gs2d.evaluate.images import ImageMetrics
 from gs2d.io.ply import write_mesh
+from gs2d.memory import trim
 from gs2d.mesh.extract import Extraction, extract, extract_unbounded
 from gs2d.mesh.frames import Frame, Spool, depth_map
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
@@ -105,6 +106,7 @@ def extract_mesh(
     usable = seen is not None and seen.complete and depth == job.protocol.fused_depth
     frames = seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
     result = _extract(job, frames, options, on_event, subject)
+    trim()
     write_mesh(out, result.mesh)
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         on_event(Notice(_cut_text(result, options)))

@@ -10,6 +10,7 @@ from gs2d.data.archive import is_archive
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.ply import write_splats
 from gs2d.io.run import MESH, PAGE, REPORT, SPLATS, VERDICT, RunFolder, check_claim, claim_run, is_run, make_folder
+from gs2d.memory import hold
 from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
@@ -88,6 +89,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             for event in foretold(job):
                 on_event(event)
         collected = Collector(job.scene, job.settings.background)
+        hold()
         with MeshFrames(job) as frames:
             splats, exposures, poses = train_stages(run, job, options, start, watch, [frames.visit, collected.visit])
             release(job.scene)  # before the volume of the mesh

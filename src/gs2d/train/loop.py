@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RunError
+from gs2d.memory import trim
 from gs2d.protocols import Protocol
 from gs2d.recipe import CloneInPlace, RankByError, Recipe, Stage, validate
 from gs2d.render import cuda
@@ -159,6 +160,7 @@ class Trainer:
         begin_stage(state, stage)
         state.statistics = None if stage.densify is None else Statistics.zeros(state.splats)
         self._check_parameters(stage, tuple(name for name, _ in state.splats.items()))
+        trim()  # what finding the first splats, ranking and cloning left
         state.entered = True
         for event in happened:
             self._on_event(event)

@@ -1,0 +1,75 @@
+"""Real captures as workloads: read from finished runs, skipped with a reason, compared at equal visible pairs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from gs2d.io.ply import write_splats
+from gs2d.kernels.library import available_variants
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks import real
+from benchmarks.__main__ import runs_there
+from benchmarks.room_capture import room_splats, write_room_capture
+from benchmarks.workload import AbsentError, run_workload
+
+pytestmark = pytest.mark.skipif(not available_variants(), reason="the native library was not built")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on a small capture, as far as a workload reads it."""
+    folder = tmp_path_factory.mktemp("real")
+    write_room_capture(folder / "capture", views=5, size=(192, 128), splats=3000, points=400)
+    run = folder / "run"
+    run.mkdir()
+    write_splats(run / "splats.ply", room_splats(1500, 3)[0])
+    scene = {"name": "capture", "path": str(folder / "capture")}
+    (run / "run.json").write_text(json.dumps({"scene": scene, "downscale": 2, "title": "den"}))
+    return run
+
+
+def test_a_run_says_where_its_photographs_are_and_how_large_it_took_them(finished: Path) -> None:
+    made = run_workload(finished)
+    assert made.name == "den-1500-96x64"
+    assert (len(made.splats), len(made.cameras)) == (1500, 4)
+
+
+def test_what_is_not_there_is_skipped_and_named(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved = tmp_path / "moved"
+    shutil.copytree(finished, moved)
+    (moved / "run.json").write_text(
+        json.dumps({"scene": {"name": "x", "path": str(tmp_path / "gone")}, "downscale": 1})
+    )
+    with pytest.raises(AbsentError, match="is not at"):
+        run_workload(moved)
+    with pytest.raises(AbsentError, match="is no finished run"):
+        run_workload(tmp_path)
+    assert len(runs_there([tmp_path, finished, moved])) == 1
+    assert capsys.readouterr().err.count("skipped: ") == 2
+
+
+def test_iterations_are_compared_at_equal_visible_pairs(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(real, "BENCH_SPLATS", 700)
+    out = tmp_path / "real.json"
+    assert real.main(["--out", str(out), "--runs", str(finished), str(tmp_path / "no"), "--rounds", "2"]) == 0
+    document = json.loads(out.read_text())
+    assert list(document["skipped"]) == ["no"]
+    (row,) = document["rows"]
+    assert set(row["rooms"]) == {"1500", "700"}
+    for room in row["rooms"].values():
+        assert room["visible_pairs"] == pytest.approx(row["visible_pairs"], rel=0.08)  # pictures of whole pixels
+    assert list(row["stages"]) == list(real.STAGES)
+    for stage in row["stages"].values():
+        assert set(stage["ratio"]) == {"1500", "700"}
+        assert min(stage["cpu_ms"].values()) > 0
