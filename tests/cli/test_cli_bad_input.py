@@ -224,6 +224,10 @@ def test_the_demo_refuses_what_makes_no_sense_before_it_takes_a_photograph(
     assert run(["demo", "--out", str(tmp_path), "--quiet"]) == 2
     assert "mine.txt" in one_line(capsys.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "mine.txt").rename(tmp_path / "capture" / "mine.txt")
+    assert run(["demo", "--out", str(tmp_path), "--quiet"]) == 2
+    assert "capture must be a demo's" in one_line(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.train import check_viewer, train
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
+CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
 TITLE = "gs2d demo: a still life whose true surface is known"
 TRAIN_VIEWS, TEST_VIEWS, SIZE = 40, 8, 256
 SCHEDULE_SCALE = 0.1
@@ -75,6 +76,7 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
     use_threads(options.threads)
     on_event(Plan(DEMO))
     if not (options.resume and (capture / "transforms_train.json").exists()):
+        _check_capture(capture)
         total = options.train_views + options.test_views
         on_event(Phase("photographing the demo scene", total))
         write_demo_capture(
@@ -102,6 +104,14 @@ def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> Ru
     with attempted("scores of the surface", again("evaluate", run.path, "--ground-truth", truth), on_event):
         evaluate_run(run.path, EvaluateOptions(ground_truth=truth, match_poses=options.refine_poses), on_event)
     return run
+
+
+def _check_capture(folder: Path) -> None:
+    """Raise for a folder with files that no demo has written, not even one that was broken off."""
+    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    others = [name for name in names if name not in CAPTURE_FILES and not name.startswith((".", "mesh_gt"))]
+    if others:
+        raise RunError(f"{folder} must be a demo's, or not be there, got {others[0]} in it; choose another --out")
 
 
 def _training(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
