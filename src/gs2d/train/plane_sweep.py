@@ -30,7 +30,7 @@ MIN_TEXTURE = 2e-5  # variance of a patch below which every depth fits
 GREY = (0.3, 0.6, 0.1)
 BEST_ANGLE, NARROW, WIDE = 10.0, 4.0, 12.0  # degrees: neighbours' baselines, and how fast narrower and wider ones lose
 TRIM_EVERY = 8  # views; what is freed between results that stay was 2 GB of a capture of 292 photographs
-PLANES_AT_ONCE = 8  # 2 MB of each of what a comparison is made of, at 200 px: a core's cache
+PLANES_AT_ONCE = 16  # 5 MB of each of what a comparison is made of, at 200 px; fewer would make threads wait more
 REPEATED = 3.0  # cells: sparse points within that of a swept one start no splat of their own
 
 T = TypeVar("T")
