@@ -42,7 +42,7 @@ done
 grep -h "cuda" "$out/doctor.txt" || true
 
 measure() {  # a command within the time that is left; a kill comes half a minute after it was to stop by itself
-    local left=$(($(date +%s) < end ? end - $(date +%s) : 1))
+    local left=$(($(date +%s) < end ? end - $(date +%s) : 0))
     timeout -k 5 $((left + 30)) "$python" -m benchmarks.gpu "$@" --minutes "$(awk "BEGIN{print $left/60}")" $dry
 }
 end=$(awk "BEGIN{print int($(date +%s) + 60 * $minutes)}")
