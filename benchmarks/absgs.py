@@ -23,17 +23,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.disk import atomic_write
+from gs2d.config.presets import ABSGS_DEFAULT
+from gs2d.core.files import atomic_write
+from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
-from gs2d.io.files import write_json
-from gs2d.io.run import machine, versions
+from gs2d.experiments.aggregate import Cell, read_cell
+from gs2d.experiments.execute import Sweep, SweepJob
+from gs2d.experiments.plan import PaperOptions, make_job, trained_recipe
+from gs2d.experiments.scenes import FoundScene, find_scenes
+from gs2d.experiments.slots import run_sweep
+from gs2d.io.run_dir import machine, versions
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.paper_plan import PaperOptions, make_job, trained_recipe
-from gs2d.pipeline.paper_rows import Cell, read_cell
-from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
-from gs2d.pipeline.sweep import Sweep, SweepJob
-from gs2d.pipeline.sweep_slots import run_sweep
-from gs2d.recipes import ABSGS_DEFAULT
 
 RECIPE = "2dgs-r-absgs-d"
 FACTORS = (1, 2, 4)  # what the thresholds of D are divided by

@@ -30,11 +30,11 @@ def serve(splats: int, size: int, threads: int, stage: int) -> None:
 
     from benchmarks.iteration import make_scene, steady
     from benchmarks.workload import room_workload
-    from gs2d.protocols import GENERIC
-    from gs2d.recipe import Recipe
-    from gs2d.recipes import two_dgs_r
-    from gs2d.train.loop import Trainer
-    from gs2d.train.state import TrainState
+    from gs2d.config.presets import two_dgs_r
+    from gs2d.config.protocols import GENERIC
+    from gs2d.config.recipe import Recipe
+    from gs2d.training.state import TrainState
+    from gs2d.training.trainer import Trainer
 
     torch.set_num_threads(threads)
     workload = room_workload(splats, size, size)

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gs2d.camera import Camera
-from gs2d.images import write_image
-from gs2d.io.ply import read_mesh
-from gs2d.report_mesh import mesh_pictures
+from gs2d.core.camera import Camera
+from gs2d.core.images import write_image
+from gs2d.io.splat_ply import read_mesh
+from gs2d.report.mesh_images import mesh_pictures
 
 
 def views_of(run: Path) -> int:

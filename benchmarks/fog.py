@@ -24,21 +24,21 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.config.protocols import GENERIC, Protocol
+from gs2d.config.recipe import Recipe
+from gs2d.core.sh import C0
+from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
-from gs2d.evaluate.hidden_points import HiddenPoints, hidden_points, total
-from gs2d.evaluate.images import image_metrics, psnr_float
-from gs2d.exposure import fit_exposure
+from gs2d.evaluation.hidden_points import HiddenPoints, hidden_points, total
+from gs2d.evaluation.images import image_metrics, psnr_float
 from gs2d.pipeline.exposure import Transforms, named, photographed
+from gs2d.pipeline.job import fit_recipe, with_backdrop
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prepare import fit_recipe, with_backdrop
-from gs2d.protocols import GENERIC, Protocol
-from gs2d.recipe import Recipe
 from gs2d.render.api import rasterize
+from gs2d.render.exposure import fit_exposure
 from gs2d.render.types import RasterSettings
-from gs2d.sh import C0
-from gs2d.splats import Splats
-from gs2d.train.loop import Trainer
+from gs2d.training.trainer import Trainer
 
 NEAR_PERCENTILE, NEARER = 1.0, 0.9  # of the depths of sparse points in the photographs that show them; a margin
 TRAINING_VIEWS = 12  # that are scored, evenly chosen

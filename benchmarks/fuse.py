@@ -24,17 +24,17 @@ from typing import TypeVar
 import numpy as np
 
 from benchmarks.timing import machine
-from gs2d.camera import Camera, look_at
-from gs2d.mesh.consistency import depth_noise
-from gs2d.mesh.evidence import gather
-from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.fuse import fuse
-from gs2d.mesh.integrate import BACKENDS, fusion_backend
-from gs2d.mesh.limits import derive_limits, sample_depths, widen_truncation
-from gs2d.mesh.nest import derive_nest
-from gs2d.mesh.nested import fuse_nested, nested_marching_cubes
-from gs2d.mesh.surface import keep_components, marching_cubes
-from gs2d.mesh.volume import Volume
+from gs2d.core.camera import Camera, look_at
+from gs2d.meshing.bounds import derive_limits, sample_depths, widen_truncation
+from gs2d.meshing.consistency import depth_noise
+from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.evidence import gather
+from gs2d.meshing.integrate import BACKENDS, fusion_backend
+from gs2d.meshing.marching_cubes import keep_components, marching_cubes
+from gs2d.meshing.tsdf import fuse
+from gs2d.meshing.unbounded import fuse_nested, nested_marching_cubes
+from gs2d.meshing.unbounded_bounds import derive_nest
+from gs2d.meshing.volume import Volume
 
 RADIUS = 0.9
 T = TypeVar("T")

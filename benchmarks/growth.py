@@ -31,18 +31,18 @@ from benchmarks.fuse import orbit, sphere_map
 from benchmarks.stages import densification_case, optimizer_step
 from benchmarks.timing import machine
 from benchmarks.workload import Workload, camera, places, room
+from gs2d.config.recipe import CloneInPlace, RankByError
+from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, Scene, View
-from gs2d.evaluate.images import image_metrics
+from gs2d.evaluation.images import image_metrics
 from gs2d.kernels.library import load
-from gs2d.mesh.fuse import fuse
-from gs2d.mesh.limits import derive_limits, sample_depths
-from gs2d.mesh.surface import keep_components, marching_cubes
-from gs2d.recipe import CloneInPlace, RankByError
+from gs2d.meshing.bounds import derive_limits, sample_depths
+from gs2d.meshing.marching_cubes import keep_components, marching_cubes
+from gs2d.meshing.tsdf import fuse
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.splats import Splats
-from gs2d.train.actions import clone_in_place, rank_by_error
-from gs2d.train.initialise import initial_splats
-from gs2d.train.state import TrainState
+from gs2d.training.initialize import initial_splats
+from gs2d.training.rank_clone import clone_in_place, rank_by_error
+from gs2d.training.state import TrainState
 
 SPLATS = (20_000, 100_000, 500_000, 1_000_000)
 PIXELS = ((400, 300), (800, 600), (1600, 1060), (3840, 2160))

@@ -29,17 +29,17 @@ import torch
 
 from benchmarks.timing import Timing, machine, measure, peak_probe
 from benchmarks.workload import Workload, room_workload
-from gs2d.camera import Camera
+from gs2d.config.presets import get_recipe
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Stage
+from gs2d.core.camera import Camera
+from gs2d.core.memory import hold
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.kernels.library import Library, prepare
-from gs2d.memory import hold
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Stage
-from gs2d.recipes import get_recipe
 from gs2d.render.api import rasterize
-from gs2d.splats import Splats
-from gs2d.train.loop import Trainer
-from gs2d.train.state import TrainState
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
 
 
 def make_scene(splats: Splats, cameras: Sequence[Camera]) -> Scene:

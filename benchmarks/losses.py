@@ -22,10 +22,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.timing import Timing, machine, measure, peak_probe
-from gs2d import losses_reference as reference
-from gs2d.camera import Camera, look_at
-from gs2d.kernels import ops
+from gs2d.core.camera import Camera, look_at
+from gs2d.kernels import losses as ops
 from gs2d.kernels.library import load, prepare
+from gs2d.losses import reference
 
 
 @dataclass(frozen=True)

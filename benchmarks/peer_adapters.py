@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.sh import sh_to_rgb
-from gs2d.splats import Splats
+from gs2d.core.camera import Camera
+from gs2d.core.sh import sh_to_rgb
+from gs2d.core.splats import Splats
 
 NEAR, ALPHA_MIN, TRANSMITTANCE_MIN = 0.2, 1.0 / 255.0, 1e-4
 THIN = 1e-3  # third standard deviation of a splat as a 3D Gaussian, relative to its smaller one

@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
 from gs2d.data.scene import View
-from gs2d.data.toy_rays import cast_camera
-from gs2d.io.ply import read_mesh, read_splats
-from gs2d.io.run import SPLATS, open_run
-from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.io.run_dir import SPLATS, open_run
+from gs2d.io.splat_ply import read_mesh, read_splats
+from gs2d.meshing.raycast import cast_camera
+from gs2d.pipeline.job import Job, reload_job
 from gs2d.render.api import rasterize
-from gs2d.splats import Splats
-from gs2d.triangles import Mesh
 
 WITHIN = (0.01, 0.03)
 

@@ -37,24 +37,27 @@ from gs2d.pipeline.train import train
 
 PHASES = (
     *RUN_PHASES,
-    Rule("photograph the demo scene", (("data/toy.py", "write_demo_capture"),)),
+    Rule("photograph the demo scene", (("synthetic/capture.py", "write_demo_capture"),)),
     Rule("evaluate", (("pipeline/jobs.py", "evaluate_run"),)),
 )
 PARTS = (
     Rule("rasterizer", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
-    Rule("losses and metrics", (("gs2d/losses.py", ""), ("kernels/ops.py", ""), ("evaluate/images.py", ""))),
-    Rule("Adam", (("train/optimizer.py", ""),)),
-    Rule("densification", (("train/densify.py", "densify_and_prune"),)),
-    Rule("densification statistics", (("train/densify.py", "accumulate"),)),
-    Rule("checks for NaN", (("train/views.py", "finite"),)),
-    Rule("photographs", (("gs2d/images.py", ""), ("data/scene.py", ""), ("train/targets.py", ""))),
-    Rule("fusion", (("mesh/fuse.py", ""), ("mesh/sampling.py", ""))),
-    Rule("depth maps", (("mesh/frames.py", ""), ("mesh/limits.py", ""), ("mesh/consistency.py", ""))),
-    Rule("marching cubes", (("mesh/surface.py", ""), ("mesh/cases.py", ""))),
-    Rule("surface score", (("evaluate/surface.py", ""), ("evaluate/distance.py", ""), ("evaluate/visibility.py", ""))),
-    Rule("neighbours", (("gs2d/geometry.py", "nearest_distances"),)),
+    Rule("losses and metrics", (("gs2d/losses/api.py", ""), ("kernels/losses.py", ""), ("evaluation/images.py", ""))),
+    Rule("Adam", (("training/adam.py", ""),)),
+    Rule("densification", (("training/densify.py", "densify_and_prune"),)),
+    Rule("densification statistics", (("training/densify.py", "accumulate"),)),
+    Rule("checks for NaN", (("training/objective.py", "finite"),)),
+    Rule("photographs", (("gs2d/core/images.py", ""), ("data/scene.py", ""), ("training/targets.py", ""))),
+    Rule("fusion", (("meshing/tsdf.py", ""), ("meshing/sampling.py", ""))),
+    Rule("depth maps", (("meshing/depth_maps.py", ""), ("meshing/bounds.py", ""), ("meshing/consistency.py", ""))),
+    Rule("marching cubes", (("meshing/marching_cubes.py", ""), ("meshing/marching_cubes_cases.py", ""))),
+    Rule(
+        "surface score",
+        (("evaluation/surface.py", ""), ("evaluation/distance.py", ""), ("evaluation/visibility.py", "")),
+    ),
+    Rule("neighbours", (("gs2d/core/transforms.py", "nearest_distances"),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
-    Rule("log and progress", ((RECORDER, ""), ("io/run.py", ""), ("io/files.py", ""), (LOOP, "_progress"))),
+    Rule("log and progress", ((RECORDER, ""), ("io/run_dir.py", ""), ("core/json_files.py", ""), (LOOP, "_progress"))),
 )
 
 

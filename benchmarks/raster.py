@@ -23,10 +23,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.timing import machine, probe
 from benchmarks.workload import camera, room
+from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library, load
 from gs2d.render.cpu import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 WORKLOADS = ((20_000, 400), (100_000, 400), (100_000, 800))
 # Blended pairs per pixel of these workloads, counted with the reference backend.

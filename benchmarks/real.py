@@ -33,7 +33,7 @@ from benchmarks.stages import Passes, count_work
 from benchmarks.timing import machine
 from benchmarks.workload import AbsentError, Workload, places, room_workload, run_workload
 from gs2d.kernels.library import Library, prepare
-from gs2d.train.loop import Trainer
+from gs2d.training.trainer import Trainer
 
 GOAL = 1.3
 BENCH_SPLATS = 20_000  # of the scene that the other benchmarks are told by

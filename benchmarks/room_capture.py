@@ -17,10 +17,10 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.splats import Splats
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 VIEWS, SIZE = 292, (1560, 1040)  # px; half of it is what bonsai has as images_4
 SPLATS, POINTS = 200_000, 60_000

@@ -38,14 +38,17 @@ PHASES = (
 )
 PARTS = (
     Rule("render", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
-    Rule("photographs", (("gs2d/images.py", ""), ("data/scene.py", ""), ("data/capture.py", ""), ("data/lens.py", ""))),
-    Rule("metrics", (("evaluate/images.py", ""), ("gs2d/losses.py", ""), ("kernels/ops.py", ""))),
-    Rule("evidence", tuple(("mesh/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),
-    Rule("clean by evidence", (("mesh/evidence.py", ""),)),
-    Rule("blocks", (("mesh/fuse.py", ""),)),
-    Rule("integrate", (("mesh/integrate.py", ""), ("mesh/sampling.py", ""))),
-    Rule("depth maps", (("mesh/frames.py", ""), ("mesh/limits.py", ""), ("mesh/consistency.py", ""))),
-    Rule("marching cubes", (("mesh/surface.py", ""), ("mesh/cases.py", ""))),
+    Rule(
+        "photographs",
+        (("gs2d/core/images.py", ""), ("data/scene.py", ""), ("data/build.py", ""), ("data/undistort.py", "")),
+    ),
+    Rule("metrics", (("evaluation/images.py", ""), ("gs2d/losses/api.py", ""), ("kernels/losses.py", ""))),
+    Rule("evidence", tuple(("meshing/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),
+    Rule("clean by evidence", (("meshing/evidence.py", ""),)),
+    Rule("blocks", (("meshing/tsdf.py", ""),)),
+    Rule("integrate", (("meshing/integrate.py", ""), ("meshing/sampling.py", ""))),
+    Rule("depth maps", (("meshing/depth_maps.py", ""), ("meshing/bounds.py", ""), ("meshing/consistency.py", ""))),
+    Rule("marching cubes", (("meshing/marching_cubes.py", ""), ("meshing/marching_cubes_cases.py", ""))),
 )
 
 

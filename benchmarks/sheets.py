@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gs2d.evaluate.images import psnr_8bit
-from gs2d.io.ply import read_splats
-from gs2d.io.run import open_run
-from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.core.splats import Splats
+from gs2d.evaluation.images import psnr_8bit
+from gs2d.io.run_dir import open_run
+from gs2d.io.splat_ply import read_splats
+from gs2d.pipeline.job import Job, reload_job
 from gs2d.render.api import rasterize
-from gs2d.splats import Splats
-from gs2d.train.views import seen_rows
+from gs2d.training.objective import seen_rows
 
 
 @torch.no_grad()

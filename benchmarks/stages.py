@@ -15,17 +15,17 @@ from torch import Tensor
 from benchmarks.memory import ViewWork
 from benchmarks.timing import Probe, Timing, probe, summary
 from benchmarks.workload import Workload
-from gs2d.kernels import ops
+from gs2d.config.presets import two_dgs_r
+from gs2d.config.recipe import GradDensify
+from gs2d.core.splats import Splats
+from gs2d.kernels import losses as ops
 from gs2d.kernels.library import Library
-from gs2d.recipe import GradDensify
-from gs2d.recipes import two_dgs_r
 from gs2d.render.cpu import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
-from gs2d.train.densify import densify_and_prune
-from gs2d.train.optimizer import begin_stage
-from gs2d.train.optimizer_fused import native_adam_step
-from gs2d.train.state import Statistics, TrainState
+from gs2d.training.adam import begin_stage
+from gs2d.training.adam_fused import native_adam_step
+from gs2d.training.densify import densify_and_prune
+from gs2d.training.state import Statistics, TrainState
 
 NATIVE = ("project", "sort", "bin", "blend_forward", "index_slots", "blend_backward", "project_backward")
 FORWARD_STAGES = 4  # of NATIVE; the others belong to the backward pass

@@ -33,8 +33,8 @@ from typing import Any
 from benchmarks.street_peer import measure_peer
 from benchmarks.street_runs import PEER, measure_run
 from benchmarks.timing import machine
+from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
-from gs2d.io.files import write_json
 
 
 @dataclass(frozen=True)

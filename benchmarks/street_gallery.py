@@ -9,7 +9,7 @@ from typing import Protocol
 from PIL import Image
 
 from benchmarks.figure import pictures_of, views_of
-from gs2d.io.run import MESH, METRICS
+from gs2d.io.run_dir import MESH, METRICS
 
 HEIGHT, GAP, QUALITY = 240, 4, 85  # px, px, of JPEG
 KINDS = ("color", "normal")

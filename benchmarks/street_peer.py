@@ -35,15 +35,15 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from benchmarks.street_runs import Process, summary_of, watch_process
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.images import read_image, write_image
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
-from gs2d.evaluate.images import ImageMetrics, image_metrics
-from gs2d.images import read_image, write_image
+from gs2d.evaluation.images import ImageMetrics, image_metrics
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import matched_by_halves
 from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.prepare import Job
+from gs2d.pipeline.job import Job
 
 OWN_ITERATIONS = 30_000
 OWN = {"refine-every": 500, "densify-from": 500, "sh-degree-interval": 1000}  # of 30,000 iterations

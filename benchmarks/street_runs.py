@@ -21,31 +21,31 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.core.json_files import read_json
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.data.subject import find_subject
 from gs2d.errors import DataError
-from gs2d.evaluate.hidden_points import hidden_points, total
-from gs2d.evaluate.images import ImageMetrics
-from gs2d.io.files import read_json
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import MESH, METRICS, PAGE, REPORT, SPLATS
-from gs2d.mesh.evidence import gather, pixels
-from gs2d.mesh.frames import depth_map
+from gs2d.evaluation.hidden_points import hidden_points, total
+from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
+from gs2d.io.splat_ply import read_mesh
+from gs2d.meshing.depth_maps import depth_map
+from gs2d.meshing.evidence import gather, pixels
+from gs2d.pipeline.evaluate import score_views
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.pictures import render_view
+from gs2d.pipeline.job import Job
+from gs2d.pipeline.mesh import fusion_frame
 from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
-from gs2d.pipeline.scoring import score_views
+from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import sights
-from gs2d.pipeline.surface import fusion_frame
 from gs2d.render.api import rasterize
-from gs2d.sfm.photos import find_photos
-from gs2d.sfm.workplace import POSES_JSON
-from gs2d.splats import Splats
-from gs2d.triangles import Mesh
+from gs2d.sfm.images import find_photos
+from gs2d.sfm.workspace import POSES_JSON
 
 POLL_SECONDS = 0.2
 PROCESS, CONSOLE, PHOTOS, PEER = "process.json", "console.txt", "photographs", "peer"

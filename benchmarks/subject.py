@@ -22,15 +22,15 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh
 from gs2d.data import View
-from gs2d.data.capture import Decoder
-from gs2d.data.colmap import find_mask
+from gs2d.data.build import Decoder
+from gs2d.data.readers.colmap import find_mask
 from gs2d.errors import DataError, Gs2dError
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import MESH, open_run
-from gs2d.pipeline.prepare import reload_job
-from gs2d.triangles import Mesh
+from gs2d.io.run_dir import MESH, open_run
+from gs2d.io.splat_ply import read_mesh
+from gs2d.pipeline.job import reload_job
 
 HALF = 0.5  # of the photographs that have a face in frame, which must have it in the mask
 GOAL = 0.98  # of the area

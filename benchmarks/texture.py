@@ -19,18 +19,18 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.images import write_image
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.data import View
-from gs2d.data.toy_rays import Hits, cast_camera
-from gs2d.images import write_image
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import MESH, open_run
-from gs2d.mesh.bake import bilinear
+from gs2d.io.run_dir import MESH, open_run
+from gs2d.io.splat_ply import read_mesh
+from gs2d.meshing.bake import bilinear
+from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.pipeline.finished import finished_splats
+from gs2d.pipeline.job import read_scene, reload_job
 from gs2d.pipeline.options import TextureOptions
-from gs2d.pipeline.prepare import read_scene, reload_job
 from gs2d.pipeline.texture import textured_mesh
-from gs2d.triangles import Mesh, TexturedMesh
 
 SAMPLES = 2  # rays a pixel along each axis
 

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.splats import Splats
 from gs2d.data import load_scene
-from gs2d.io.ply import read_splats
-from gs2d.splats import Splats
+from gs2d.io.splat_ply import read_splats
 
 CROSSING = 0.003  # of the splats, in addition: what views of indoor captures hold
 PLACES = ((0.3, -0.5, -4.0), (-0.9, -0.8, -3.8), (1.2, -0.3, -3.9), (0.0, -1.4, -4.2))

@@ -1,9 +1,9 @@
-"""What Open3D 0.19 says of the seeded scenes in ``tests/evaluate/oracle_scenes.py``.
+"""What Open3D 0.19 says of the seeded scenes in ``tests/helpers/oracle_scenes.py``.
 
-An independent check of ``gs2d.evaluate``, which never imports Open3D. Run once, in an environment of its own::
+An independent check of ``gs2d.evaluation``, which never imports Open3D. Run once, in an environment of its own::
 
     python -m venv /somewhere/oracle && /somewhere/oracle/bin/pip install open3d-cpu==0.19.0
-    /somewhere/oracle/bin/python scripts/oracle_open3d.py > tests/evaluate/oracle_open3d.json
+    /somewhere/oracle/bin/python scripts/oracle_open3d.py > tests/helpers/oracle_open3d.json
 
 Tanks and Temples: cropping, thinning, RANSAC over camera centres, ICP with scale and nearest distances are Open3D's, in
 the steps and with the criteria of the official script. DTU: points on every triangle, one triangle at a time, thinned
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "evaluate"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 from oracle_scenes import OBSERVED_RESOLUTION, TAU, dtu_scene, tnt_scene
 
 registration = o3d.pipelines.registration

@@ -22,10 +22,9 @@ import torch
 from benchmarks.timing import machine
 from gs2d.kernels.cuda import diagnose, launch
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.mesh import integrate
-from gs2d.render import backend as backends
-from gs2d.render import cuda
-from gs2d.render.backend import Backend, get_backend
+from gs2d.meshing import integrate
+from gs2d.render import backends, cuda
+from gs2d.render.backends import Backend, get_backend
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -183,7 +182,7 @@ def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
         device = torch.device("cuda", torch.cuda.current_device())
         yield Bench(backend, launch.launcher_for(device), False, end)
         return
-    sys.path.insert(0, str(ROOT / "tests" / "cuda"))
+    sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     from emulate import Emulator
 
     with tempfile.TemporaryDirectory() as folder:

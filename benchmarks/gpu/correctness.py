@@ -18,14 +18,15 @@ from torch import Tensor
 
 from benchmarks.gpu.bench import ROOT, Bench, run_program
 from benchmarks.gpu.probes import ceilings
-from gs2d.kernels.cuda import launch, ops
+from gs2d.core.splats import Splats
+from gs2d.kernels.cuda import launch
+from gs2d.kernels.cuda import losses as ops
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
 from gs2d.kernels.cuda.nearest import NEIGHBOURS, build_tree, choose_spread, find_nearest
-from gs2d.kernels.fusion import arguments_of, fuse_on_gpu
+from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
 from gs2d.render import cuda, reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 TOOLS = ("memcheck", "racecheck", "initcheck")
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
@@ -66,7 +67,7 @@ def registers(bench: Bench) -> dict[str, Any]:
 
 def _scenes() -> Any:
     """The random scenes of the rasterizer's tests."""
-    sys.path.insert(0, str(ROOT / "tests" / "render"))
+    sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     import render_scenes
 
     return render_scenes
@@ -167,7 +168,7 @@ def _all_losses(bench: Bench) -> None:
 
 def _three_stages(bench: Bench) -> None:
     """Three short stages: normals, Adam, densification, ranking, clones, frozen rows."""
-    sys.path.insert(0, str(ROOT / "tests" / "train"))
+    sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     import train_toys
 
     recipe = train_toys.short()
@@ -241,7 +242,7 @@ def gpu_tests(bench: Bench) -> dict[str, Any]:
     # Warnings of other versions of packages than the pinned ones are no failures here; -v names each test as it ends.
     command = [sys.executable, "-m", "pytest", "-W", "default", "-m", "gpu", "-q" if bench.dry else "-v"]
     if importlib.util.find_spec("pytest_timeout") is None:
-        command += ["-o", "addopts=-ra"]  # the project's name an option of it
+        command += ["-o", "addopts=-ra --import-mode=importlib"]  # the project's name an option of it
     command += ["--collect-only"] if bench.dry else []
     # where they are: other folders need other packages
     command += ["tests/gpu", *([] if bench.dry else ["tests/render"])]

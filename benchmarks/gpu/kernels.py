@@ -16,16 +16,16 @@ from benchmarks.gpu.bench import Bench, TimingLauncher
 from benchmarks.gpu.peers import PEERS, PeerIteration
 from benchmarks.gpu.scenes import SIZES, TOY, GpuScene, gpu_scene, scene_name
 from benchmarks.iteration import steady
+from gs2d.config.presets import two_dgs_r
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Recipe
-from gs2d.recipes import two_dgs_r
 from gs2d.render import cuda, cuda_passes
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
-from gs2d.train.loop import Trainer
-from gs2d.train.state import TrainState
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
 
 SETTINGS = RasterSettings()
 Parts = Iterator[tuple[str, Callable[[], dict[str, Any]]]]  # to be done in turn

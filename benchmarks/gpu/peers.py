@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gs2d import losses_reference
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError
-from gs2d.splats import ATTRIBUTES, Splats
+from gs2d.losses import reference as losses_reference
 
 NEAR, FAR = 0.2, 100.0
 

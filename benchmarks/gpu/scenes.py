@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from benchmarks.workload import PLACES, camera, room
-from gs2d.camera import Camera
-from gs2d.splats import Splats
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 
 SIZES = ((100_000, 800, 800), (1_000_000, 1600, 1060), (3_000_000, 1600, 1060))
 TOY = ((60, 32, 16),)

@@ -37,7 +37,7 @@ def toy_capture(folder: Path) -> Path:
     """The tests' ball, 24 x 24 px."""
     import sys
 
-    sys.path.insert(0, str(ROOT / "tests"))
+    sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     import tiny
 
     return Path(tiny.write_capture(folder / "ball"))

@@ -1,6 +1,6 @@
 """gs2d: posed photographs to a surface mesh and a scene of 2D Gaussian splats (2DGS and 2DGS-R).
 
-The names below are imported on first use (PEP 562), so that ``import gs2d.recipe`` does not load torch.
+The names below are imported on first use (PEP 562), so that ``import gs2d.config.recipe`` does not load torch.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gs2d.camera import Camera, look_at
+    from gs2d.config.recipe import Recipe, Stage
+    from gs2d.core.camera import Camera, look_at
+    from gs2d.core.mesh import Mesh
+    from gs2d.core.splats import Splats
     from gs2d.errors import Gs2dError
-    from gs2d.recipe import Recipe, Stage
     from gs2d.render.api import rasterize, splat_errors
-    from gs2d.render.backend import backend_report, get_backend
+    from gs2d.render.backends import backend_report, get_backend
     from gs2d.render.types import RasterSettings, RenderOutput
-    from gs2d.splats import Splats
-    from gs2d.triangles import Mesh
 
 __version__ = "0.1.0"
 
@@ -38,17 +38,17 @@ __all__ = [
 ]
 
 _HOME = {
-    "Camera": "gs2d.camera",
+    "Camera": "gs2d.core.camera",
     "Gs2dError": "gs2d.errors",
-    "Mesh": "gs2d.triangles",
+    "Mesh": "gs2d.core.mesh",
     "RasterSettings": "gs2d.render.types",
-    "Recipe": "gs2d.recipe",
+    "Recipe": "gs2d.config.recipe",
     "RenderOutput": "gs2d.render.types",
-    "Splats": "gs2d.splats",
-    "Stage": "gs2d.recipe",
-    "backend_report": "gs2d.render.backend",
-    "get_backend": "gs2d.render.backend",
-    "look_at": "gs2d.camera",
+    "Splats": "gs2d.core.splats",
+    "Stage": "gs2d.config.recipe",
+    "backend_report": "gs2d.render.backends",
+    "get_backend": "gs2d.render.backends",
+    "look_at": "gs2d.core.camera",
     "rasterize": "gs2d.render.api",
     "splat_errors": "gs2d.render.api",
 }

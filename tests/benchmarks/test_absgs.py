@@ -6,11 +6,11 @@ from pathlib import Path
 
 from benchmarks.absgs import CANDIDATES, Candidate, choose, make_jobs, markdown
 
-from gs2d.pipeline.paper_plan import PaperOptions
-from gs2d.pipeline.paper_rows import FIGURES, Cell
-from gs2d.pipeline.paper_scenes import find_scenes
-from gs2d.recipe_json import apply_overrides
-from gs2d.recipes import ABSGS_ADJUSTED, ABSGS_DEFAULT, get_recipe
+from gs2d.config.presets import ABSGS_ADJUSTED, ABSGS_DEFAULT, get_recipe
+from gs2d.config.serialize import apply_overrides
+from gs2d.experiments.aggregate import FIGURES, Cell
+from gs2d.experiments.plan import PaperOptions
+from gs2d.experiments.scenes import find_scenes
 from tiny import write_capture
 
 

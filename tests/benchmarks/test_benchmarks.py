@@ -4,22 +4,11 @@ from __future__ import annotations
 
 import copy
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-
-from gs2d.camera import Camera
-from gs2d.kernels.library import available_variants, load
-from gs2d.render.cpu import IMAGES, rasterize_with
-from gs2d.render.reference import rasterize as rasterize_reference
-from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import __main__ as suite_command
 from benchmarks.compare import NotComparable, compare
 from benchmarks.flops import EXECUTED, USEFUL, fraction
@@ -27,6 +16,13 @@ from benchmarks.memory import view_bytes
 from benchmarks.stages import Passes, count_work, frame_bytes, stage_times, trim
 from benchmarks.timing import summary
 from benchmarks.workload import Workload, room_workload
+
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.kernels.library import available_variants, load
+from gs2d.render.cpu import IMAGES, rasterize_with
+from gs2d.render.reference import rasterize as rasterize_reference
+from gs2d.render.types import RasterSettings, RenderOutput
 
 needs_native = pytest.mark.skipif(not available_variants(), reason="the native library was not built")
 STEPS = {

@@ -10,7 +10,7 @@ from benchmarks.duel import main
 
 from gs2d.kernels.library import FOLDER
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.usefixtures("native")

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-from gs2d.data.scene import Scene
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Recipe
-from gs2d.recipes import two_dgs
-from gs2d.schedule import scale_schedule
-from gs2d.train.loop import Trainer
-from wall_scene import WALL, wall
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import fog
+
+from gs2d.config.presets import two_dgs
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe
+from gs2d.config.schedule import scale_schedule
+from gs2d.data.scene import Scene
+from gs2d.training.trainer import Trainer
+from wall_scene import WALL, wall
 
 
 def split() -> Scene:

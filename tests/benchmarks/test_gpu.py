@@ -13,9 +13,6 @@ from typing import Any
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks.gpu import __main__ as command
 from benchmarks.gpu import bench as bench_module
 from benchmarks.gpu import correctness, kernels
@@ -25,7 +22,7 @@ from benchmarks.gpu.scenes import gpu_scene
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import KERNEL, compile_text
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
 pytestmark = [
     pytest.mark.timeout(280),

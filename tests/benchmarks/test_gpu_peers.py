@@ -7,30 +7,24 @@ fails, and a wrong convention gives another image than the reference's own.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parent / "render"))
-
 from benchmarks.gpu import peers
 from benchmarks.gpu.peers import FAR, NEAR, PEERS, Peer, PeerIteration, activated
-from render_scenes import random_camera, random_splats
+from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
-from gs2d.losses_reference import normals_from_depth
+from gs2d.losses.reference import normals_from_depth
 from gs2d.render import reference
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
+from render_scenes import random_camera, random_splats
 
 SETTINGS = RasterSettings(near=NEAR)
 

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-
-from gs2d.camera import Camera
-from gs2d.kernels.library import available_variants, load
-from gs2d.render.cpu import rasterize_with
-from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import peers
 from benchmarks.peer_adapters import accumulate_along_rays, in_front, weights_along_rays
 from benchmarks.workload import room_workload
+
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.kernels.library import available_variants, load
+from gs2d.render.cpu import rasterize_with
+from gs2d.render.types import RasterSettings
 
 
 def test_weights_along_rays_are_alpha_times_what_the_samples_before_let_through() -> None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from gs2d.camera import look_at
-from gs2d.triangles import Mesh
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import points
+
+from gs2d.core.camera import look_at
+from gs2d.core.mesh import Mesh
 
 
 def test_distances_are_in_pixels_of_the_nearest_view_and_points_out_of_sight_do_not_count(

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from benchmarks.prior_captures import of_room, relative_map, room_mesh, room_picture, sensor_map, write_maps
 
-from gs2d.camera import look_at
-from gs2d.data.prior_maps import read_depth, read_normals
-from gs2d.data.toy_rays import cast_camera
+from gs2d.core.camera import look_at
+from gs2d.data.priors import read_depth, read_normals
+from gs2d.meshing.raycast import cast_camera
 
 
 def test_maps_are_those_of_the_room_spoilt_as_their_sources_spoil_them(tmp_path: Path) -> None:

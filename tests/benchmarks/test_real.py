@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
-
-from gs2d.io.ply import write_splats
-from gs2d.kernels.library import available_variants
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import real
 from benchmarks.__main__ import runs_there
 from benchmarks.room_capture import room_splats, write_room_capture
 from benchmarks.workload import AbsentError, run_workload
+
+from gs2d.io.splat_ply import write_splats
+from gs2d.kernels.library import available_variants
 
 pytestmark = pytest.mark.skipif(not available_variants(), reason="the native library was not built")
 

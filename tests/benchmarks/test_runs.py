@@ -9,14 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from gs2d.kernels.library import available_variants
-from gs2d.splats import Splats
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import growth, profile_run
 from benchmarks.sampler import Rule, Sampler, Seconds, classify
+
+from gs2d.core.splats import Splats
+from gs2d.kernels.library import available_variants
 
 needs_native = pytest.mark.skipif(not available_variants(), reason="the native library was not built")
 
@@ -25,9 +22,9 @@ def test_the_innermost_place_decides_whose_time_a_stack_is() -> None:
     # the PSNR curve is drawn from inside a training iteration, and renders: curve, not iteration; rasterizer, not score
     stack = [
         ("/x/gs2d/render/cpu.py", "forward"),
-        ("/x/gs2d/evaluate/images.py", "image_metrics"),
-        ("/x/gs2d/pipeline/recorder.py", "_probe_psnr"),
-        ("/x/gs2d/train/loop.py", "step"),
+        ("/x/gs2d/evaluation/images.py", "image_metrics"),
+        ("/x/gs2d/pipeline/run_logger.py", "_probe_psnr"),
+        ("/x/gs2d/training/trainer.py", "step"),
     ]
     assert classify(stack, profile_run.PHASES) == "PSNR curve"
     assert classify(stack, profile_run.PARTS) == "rasterizer"
@@ -36,7 +33,7 @@ def test_the_innermost_place_decides_whose_time_a_stack_is() -> None:
 
 
 def test_every_place_of_the_tables_exists() -> None:
-    package = Path(__file__).resolve().parents[1] / "src" / "gs2d"
+    package = Path(__file__).resolve().parents[2] / "src" / "gs2d"
     files = {str(path): path.read_text() for path in package.rglob("*.py")}
     for rule in (*profile_run.PHASES, *profile_run.PARTS):
         for end, function in rule.places:
@@ -49,9 +46,9 @@ def test_every_place_of_the_tables_exists() -> None:
 
 def test_samples_add_up_to_phases_parts_and_the_share_of_the_rasterizer() -> None:
     sampler = Sampler(profile_run.PHASES, profile_run.PARTS)
-    step = ("/x/train/loop.py", "step")
+    step = ("/x/training/trainer.py", "step")
     sampler.add([("/x/render/cpu.py", "backward"), step], 3.0)
-    sampler.add([("/x/train/optimizer.py", "adam_step"), step], 0.5)
+    sampler.add([("/x/training/adam.py", "adam_step"), step], 0.5)
     sampler.add([("/x/unknown.py", "work")], 0.5)
     result = profile_run.table(sampler.seconds)
     assert result["seconds"] == 4.0

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from benchmarks import sheets
 
 from ball_runs import options
-from gs2d.io.ply import read_splats, write_splats
+from gs2d.core.splats import Splats
+from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.train import train
-from gs2d.splats import Splats
 from tiny import write_capture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks import sheets
 
 
 def planted(splats: Splats, mean: tuple[float, float, float], scale: float) -> Splats:

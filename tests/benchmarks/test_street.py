@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-
-from gs2d.camera import Camera
-from gs2d.evaluate.images import ImageMetrics, Metric
-from gs2d.images import write_image
-from gs2d.io.ply import write_mesh
-from gs2d.triangles import Mesh
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import street, street_gallery, street_runs
 from benchmarks.street_runs import Process, estimate_error, reconstruct_command, told_estimate, watch_process
+from PIL import Image
+
+from gs2d.core.camera import Camera
+from gs2d.core.images import write_image
+from gs2d.core.mesh import Mesh
+from gs2d.evaluation.images import ImageMetrics, Metric
+from gs2d.io.splat_ply import write_mesh
 
 
 def process(command: list[str], exit_code: int = 0) -> Process:

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from gs2d.camera import Camera, look_at
-from gs2d.data import View, load_scene
-from gs2d.data.scene import PointCloud, Scene
-from gs2d.errors import DataError
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks import street_peer
 from benchmarks.street_peer import Window, canvas, draw_command, schedule, seen_window, train_within, whole_steps
 
 from fake_peer import calls, fake_peer
+from gs2d.core.camera import Camera, look_at
+from gs2d.data import View, load_scene
+from gs2d.data.scene import PointCloud, Scene
+from gs2d.errors import DataError
 
 UP = np.array([0.0, 0.0, 1.0])
 

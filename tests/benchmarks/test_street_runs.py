@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
+from benchmarks.street_gallery import gallery_row
+from benchmarks.street_runs import measure_mesh, score_run
 
 from ball_runs import options
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.train import train
 from tiny import write_capture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.street_gallery import gallery_row
-from benchmarks.street_runs import measure_mesh, score_run
 
 
 @pytest.fixture(scope="module")

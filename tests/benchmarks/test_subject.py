@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks import subject
 from PIL import Image
 
 from ball_runs import options
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
 from gs2d.pipeline.train import train
-from gs2d.triangles import Mesh
 from tiny import ball_picture, write_ball_mesh, write_capture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks import subject
 
 ON_X, ON_Y = [(3, 0, 0), (-3, 0, 0)], [(0, 3, 0), (0, -3, 0), (0.5, 3, 0)]
 

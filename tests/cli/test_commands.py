@@ -11,9 +11,9 @@ import pytest
 
 from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
+from gs2d.config.presets import RECIPES
+from gs2d.pipeline.job import prepare
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.prepare import prepare
-from gs2d.recipes import RECIPES
 from tiny import write_ball_mesh, write_capture
 
 

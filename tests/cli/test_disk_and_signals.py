@@ -73,7 +73,7 @@ def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
 def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import recorder
+    from gs2d.pipeline import run_logger as recorder
 
     put = recorder.Recorder._score_stage
 
@@ -139,8 +139,8 @@ def test_an_interrupt_that_somebody_swallowed_is_heard_at_the_next_event(
 def test_a_second_ctrl_c_right_after_the_first_does_not_stop_the_cleaning_up(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.io.run import RunFolder
-    from gs2d.train.loop import Trainer
+    from gs2d.io.run_dir import RunFolder
+    from gs2d.training.trainer import Trainer
 
     discard = RunFolder.discard
 
@@ -187,7 +187,7 @@ def test_a_stdout_that_takes_nothing_is_no_fault_of_ours(
 def test_ctrl_c_before_the_first_iteration_leaves_nothing_and_says_so(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.train.loop import Trainer
+    from gs2d.training.trainer import Trainer
 
     def interrupted(_self: Trainer) -> None:
         raise KeyboardInterrupt
@@ -241,7 +241,7 @@ def test_what_could_not_be_made_is_exit_code_3_and_names_the_command_that_makes_
         raise ValueError("broken data stream")
 
     copy = Path(shutil.copytree(trained, tmp_path / "run"))
-    monkeypatch.setattr("gs2d.report.curve_section", broken)
+    monkeypatch.setattr("gs2d.report.write.curve_section", broken)
     assert run(["report", str(copy), "--json", *["--quiet"] * quiet]) == app_module.INCOMPLETE == 3
     out, err = capsys.readouterr()
     said = "fault in gs2d: ValueError: broken data stream"

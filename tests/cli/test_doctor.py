@@ -13,8 +13,8 @@ import torch
 
 import gs2d
 from gs2d.cli import run
-from gs2d.cli.extras import CPU_TORCH
-from gs2d.extras import EXTRAS, install
+from gs2d.cli.doctor_extras import CPU_TORCH
+from gs2d.core.extras import EXTRAS, install
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,7 +37,9 @@ def test_the_doctor_looks_for_all_that_single_commands_need(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PATH", "")
-    monkeypatch.setattr("gs2d.cli.extras._version", lambda name: None if name in ("viser", "pi-heif") else "1.2.3")
+    monkeypatch.setattr(
+        "gs2d.cli.doctor_extras._version", lambda name: None if name in ("viser", "pi-heif") else "1.2.3"
+    )
     assert run(["doctor", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["extras"] == {

@@ -11,9 +11,9 @@ import torch
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.io.ply import write_splats
-from gs2d.io.splat_formats import LAYOUTS, write_layout
-from gs2d.splats import Splats
+from gs2d.core.splats import Splats
+from gs2d.io.formats.registry import LAYOUTS, write_layout
+from gs2d.io.splat_ply import write_splats
 
 
 def some_splats(count: int) -> Splats:

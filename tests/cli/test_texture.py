@@ -12,9 +12,9 @@ from benchmarks import texture
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.geometry import up_direction
-from gs2d.io.ply import read_mesh, write_mesh
-from gs2d.triangles import Mesh
+from gs2d.core.mesh import Mesh
+from gs2d.core.transforms import up_direction
+from gs2d.io.splat_ply import read_mesh, write_mesh
 from tiny import RADIUS, ball_cameras, write_ball_mesh
 
 pytest.importorskip("xatlas", reason="xatlas is not installed (extra `texture`)")

@@ -6,11 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from gs2d.errors import RecipeError
-from gs2d.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
-from gs2d.recipe_multiview import MultiView
-from gs2d.recipe_priors import DepthPrior, NormalPrior
-from gs2d.recipes import (
+from gs2d.config.multiview import MultiView
+from gs2d.config.presets import (
     DEPTH_WEIGHT,
     MULTIVIEW_WEIGHT,
     RECIPES,
@@ -20,6 +17,9 @@ from gs2d.recipes import (
     with_multiview,
     with_normal_prior,
 )
+from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.recipe import ALL, CloneInPlace, Exposure, GradDensify, LossTerm, RankByError, Recipe, Stage, validate
+from gs2d.errors import RecipeError
 
 
 def weights(stage: Stage) -> dict[str, tuple[float | None, int]]:

@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 
-from gs2d.errors import ProtocolError
-from gs2d.protocols import DTU, GENERIC, NERF_SYNTHETIC, PROTOCOLS, TNT, TNT_LARGE, get_protocol, protocol_for
-from gs2d.protocols_datasets import (
+from gs2d.config.datasets import (
     DATASETS,
     DTU_SCENES,
     MIP_NERF_360_SCENES,
@@ -18,10 +16,19 @@ from gs2d.protocols_datasets import (
     SceneFacts,
     get_dataset,
 )
-from gs2d.protocols_sources import SOURCES, source, stated
-from gs2d.protocols_surface import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE, DtuSurface, TntSurface, VisibleSurface
-from gs2d.recipe import LossTerm
-from gs2d.recipes import get_recipe
+from gs2d.config.presets import get_recipe
+from gs2d.config.protocol_sources import SOURCES, source, stated
+from gs2d.config.protocols import DTU, GENERIC, NERF_SYNTHETIC, PROTOCOLS, TNT, TNT_LARGE, get_protocol, protocol_for
+from gs2d.config.recipe import LossTerm
+from gs2d.config.surface_protocols import (
+    DTU_SURFACE,
+    TNT_SURFACE,
+    VISIBLE_SURFACE,
+    DtuSurface,
+    TntSurface,
+    VisibleSurface,
+)
+from gs2d.errors import ProtocolError
 
 
 def test_the_depth_that_is_fused_is_that_of_the_losses_unless_the_protocol_names_another() -> None:

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from gs2d.errors import RecipeError
-from gs2d.recipe import (
+from gs2d.config.multiview import MultiView
+from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.recipe import (
     ALPHA,
     CloneInPlace,
     Exposure,
@@ -22,8 +23,7 @@ from gs2d.recipe import (
     Stage,
     validate,
 )
-from gs2d.recipe_multiview import MultiView
-from gs2d.recipe_priors import DepthPrior, NormalPrior
+from gs2d.errors import RecipeError
 
 L1 = (LossTerm("l1", 1.0),)
 
@@ -35,7 +35,8 @@ def one(**fields: object) -> Recipe:
 
 def test_recipe_modules_never_import_torch() -> None:
     code = (
-        "import sys, gs2d.recipe, gs2d.recipe_json, gs2d.schedule, gs2d.recipes, gs2d.protocols;"
+        "import sys, gs2d.config.recipe, gs2d.config.serialize, gs2d.config.schedule, gs2d.config.presets;"
+        "import gs2d.config.protocols;"
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -257,7 +258,7 @@ def test_densification_without_resets_may_freeze_opacity() -> None:
 
 
 def test_loss_kinds_are_those_of_the_losses_module() -> None:
-    from gs2d.losses import LOSSES
-    from gs2d.recipe import LOSS_KINDS
+    from gs2d.config.recipe import LOSS_KINDS
+    from gs2d.losses.api import LOSSES
 
     assert set(LOSS_KINDS) == set(LOSSES)

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
+from gs2d.config.presets import RECIPES, get_recipe
+from gs2d.config.recipe import ALL, GradDensify
+from gs2d.config.schedule import count_densifications, longer_steps, scale_schedule
 from gs2d.errors import RecipeError
-from gs2d.recipe import ALL, GradDensify
-from gs2d.recipes import RECIPES, get_recipe
-from gs2d.schedule import count_densifications, longer_steps, scale_schedule
 
 
 def test_factor_1_is_the_recipe_itself() -> None:
@@ -78,7 +78,7 @@ def test_the_random_start_shrinks_with_the_square_root() -> None:
 @pytest.mark.parametrize("name", RECIPES)
 @pytest.mark.parametrize("factor", [0.1, 0.03, 0.01, 1e-4])
 def test_every_recipe_scales_to_something_valid_with_the_same_stages(name: str, factor: float) -> None:
-    from gs2d.recipe import validate
+    from gs2d.config.recipe import validate
 
     recipe = get_recipe(name)
     short = validate(scale_schedule(recipe, factor))

@@ -6,11 +6,11 @@ import json
 
 import pytest
 
+from gs2d.config.presets import RECIPES, get_recipe
+from gs2d.config.recipe import CloneInPlace, Exposure, GradDensify, Recipe
+from gs2d.config.schedule import scale_schedule
+from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.errors import RecipeError
-from gs2d.recipe import CloneInPlace, Exposure, GradDensify, Recipe
-from gs2d.recipe_json import apply_overrides, from_json, to_json
-from gs2d.recipes import RECIPES, get_recipe
-from gs2d.schedule import scale_schedule
 
 
 @pytest.mark.parametrize("name", RECIPES)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.errors import ShapeError
 
 EYE4 = np.eye(4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 from gs2d.errors import Gs2dError, ShapeError
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from gs2d.core.json_files import atomic_write, read_json, write_json
 from gs2d.errors import DataError, DiskError
-from gs2d.io.files import atomic_write, read_json, write_json
 
 
 def names(folder: Path) -> list[str]:
@@ -105,7 +105,7 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Pa
         """
         import resource, sys
         from gs2d.errors import DiskError
-        from gs2d.io.files import atomic_write, write_json
+        from gs2d.core.json_files import atomic_write, write_json
         path = sys.argv[1]
         if "torch" in sys.argv[2]: import torch
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
@@ -131,7 +131,7 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Pa
 def test_a_kill_in_the_middle_leaves_the_old_file(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("old")
     code = (
-        "import os, sys, signal\nfrom gs2d.io.files import atomic_write\n"
+        "import os, sys, signal\nfrom gs2d.core.json_files import atomic_write\n"
         "with atomic_write(sys.argv[1]) as f:\n    f.write(b'new'); f.flush(); os.kill(os.getpid(), signal.SIGKILL)"
     )
     source = Path(__file__).resolve().parents[2] / "src"

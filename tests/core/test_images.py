@@ -1,4 +1,4 @@
-"""Reading, writing, compositing and filtering of pictures (gs2d.images)."""
+"""Reading, writing, compositing and filtering of pictures (gs2d.core.images)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from gs2d.errors import DataError, DiskError, ShapeError
-from gs2d.images import (
+from gs2d.core.images import (
     area_downscale,
     composite,
     image_size,
@@ -22,6 +21,7 @@ from gs2d.images import (
     to_uint8,
     write_image,
 )
+from gs2d.errors import DataError, DiskError, ShapeError
 
 
 def test_every_kind_of_file_becomes_8_bit_rgb_or_rgba(tmp_path: Path) -> None:

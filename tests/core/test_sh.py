@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
+from gs2d.core.sh import num_coefficients, rgb_to_sh0, sh_basis, sh_degree_of, sh_to_rgb
 from gs2d.errors import ShapeError
-from gs2d.sh import num_coefficients, rgb_to_sh0, sh_basis, sh_degree_of, sh_to_rgb
 
 
 def directions(count: int = 50) -> torch.Tensor:

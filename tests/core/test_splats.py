@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import ShapeError
-from gs2d.splats import ATTRIBUTES, Splats
 
 
 def make(count: int = 3, K: int = 16) -> Splats:

@@ -9,9 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
+from gs2d.core.transforms import camera_extent, focus_point, moved, nearest_distances, quats_to_matrices, rigid_motion
 from gs2d.errors import ShapeError
-from gs2d.geometry import camera_extent, focus_point, moved, nearest_distances, quats_to_matrices, rigid_motion
 
 UP = np.array([0.0, 0.0, 1.0])
 

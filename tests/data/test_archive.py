@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from capture_writers import small_colmap, small_nerfstudio
 
+from capture_writers import small_colmap, small_nerfstudio
 from gs2d.data import archive as module
 from gs2d.data import load_scene
 from gs2d.data.archive import capture_root, is_archive, read_archive, unpack

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_writers import ColmapModel, ring, small_blender, small_colmap, small_dtu, write_picture
 from scipy.io import savemat
 
+from capture_writers import ColmapModel, ring, small_blender, small_colmap, small_dtu, write_picture
+from gs2d.config.datasets import DATASETS, get_dataset
 from gs2d.data import detect_format, load_scene
-from gs2d.data.layouts import describe, find_scenes, find_truth, missing_lines, protocol_of, recognise
+from gs2d.data.benchmarks import describe, find_scenes, find_truth, missing_lines, protocol_of, recognise
 from gs2d.errors import DataError, ProtocolError
-from gs2d.pipeline.paper_scenes import find_scenes as find_captures
-from gs2d.protocols_datasets import DATASETS, get_dataset
+from gs2d.experiments.scenes import find_scenes as find_captures
 
 
 def write_dtu_2dgs(data: Path) -> Path:

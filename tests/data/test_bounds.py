@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from capture_writers import ring
 
-from gs2d.camera import Camera, look_at
+from capture_writers import ring
+from gs2d.core.camera import Camera, look_at
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.scene import PointCloud
 

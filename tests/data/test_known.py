@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from capture_writers import ring, small_colmap
 from PIL import Image
 
+from capture_writers import ring, small_colmap
+from gs2d.core.splats import Splats
 from gs2d.data import View, load_scene
 from gs2d.data.cache import Picture
-from gs2d.data.lens import colmap_intrinsics, source_positions
-from gs2d.pipeline import surface
+from gs2d.data.undistort import colmap_intrinsics, source_positions
+from gs2d.pipeline import mesh as surface
 from gs2d.pipeline.events import ignore
-from gs2d.render.backend import get_backend
+from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.report_images import HATCHED, IGNORED, known_picture
-from gs2d.splats import Splats
-from gs2d.train.targets import DeviceTargets, Targets
+from gs2d.report.images import HATCHED, IGNORED, known_picture
+from gs2d.training.targets import DeviceTargets, Targets
 
 WIDTH, HEIGHT = 160, 120
 PINCUSHION = (110.0, 80.0, 60.0, 0.3)  # the corners of the pinhole picture lie beyond the photograph

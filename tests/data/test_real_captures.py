@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_writers import tree_hash
 from skimage.feature import SIFT, match_descriptors
 
-from gs2d.camera import Camera
+from capture_writers import tree_hash
+from gs2d.core.camera import Camera
+from gs2d.core.images import read_image
 from gs2d.data import Scene, load_scene
-from gs2d.data.colmap import model_folder
-from gs2d.data.colmap_model import ColmapImage, read_images, read_points
-from gs2d.data.lens import colmap_intrinsics
-from gs2d.images import read_image
+from gs2d.data.readers.colmap import model_folder
+from gs2d.data.readers.colmap_model import ColmapImage, read_images, read_points
+from gs2d.data.undistort import colmap_intrinsics
 
 Shared = Callable[[str], Path]
 

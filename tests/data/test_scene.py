@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from capture_writers import ring, small_blender, small_colmap, small_dtu, small_nerfstudio, tree_hash
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
-
 from gs2d.data import ImageCache, Picture, PointCloud, View, detect_format, load_scene
 from gs2d.errors import DataError, ShapeError
 

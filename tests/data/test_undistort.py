@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_writers import small_colmap
 from PIL import Image
 
+from capture_writers import small_colmap
 from gs2d.data import load_scene
-from gs2d.data.lens import Intrinsics, Lens, colmap_intrinsics, source_positions, undistort_image
+from gs2d.data.undistort import Intrinsics, Lens, colmap_intrinsics, source_positions, undistort_image
 from gs2d.errors import DataError
 
 WIDTH, HEIGHT, F, CX, CY = 160, 120, 110.0, 77.0, 63.5

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from oracle_scenes import moved, rotation, similarity
 
 from gs2d.errors import DataError
-from gs2d.evaluate.align import apply, ransac_similarity, rotation_degrees, similarity_scale, umeyama
-from gs2d.evaluate.icp import icp, uniform_downsample, voxel_downsample
-from gs2d.evaluate.neighbours import Cloud
+from gs2d.evaluation.alignment import apply, ransac_similarity, rotation_degrees, similarity_scale, umeyama
+from gs2d.evaluation.icp import icp, uniform_downsample, voxel_downsample
+from gs2d.evaluation.nearest import Cloud
+from oracle_scenes import moved, rotation, similarity
 
 KNOWN = similarity(2.5, rotation((1, -2, 0.5), 130), (4, -7, 0.3))
 
@@ -106,7 +106,7 @@ def test_voxels_hold_the_mean_of_their_points_and_start_half_a_voxel_before_the_
 def test_voxels_do_not_depend_on_how_the_points_are_chunked(monkeypatch: pytest.MonkeyPatch) -> None:
     points = cube(5000)
     whole = voxel_downsample(points, 0.3)
-    monkeypatch.setattr("gs2d.evaluate.icp.CHUNK", 100)
+    monkeypatch.setattr("gs2d.evaluation.icp.CHUNK", 100)
     np.testing.assert_allclose(voxel_downsample(points, 0.3), whole, atol=1e-12)
     distances, index = Cloud(whole).nearest(points)
     np.testing.assert_allclose(np.linalg.norm(points - whole[index[:, 0]], axis=1), distances[:, 0])

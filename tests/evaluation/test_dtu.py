@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from oracle_scenes import grid_mesh, similarity
 from scipy.io import savemat
 from scipy.spatial import cKDTree
 
-from gs2d.camera import look_at
-from gs2d.data.layouts import dtu_truth_files
+from gs2d.config.surface_protocols import DTU_SURFACE
+from gs2d.core.camera import look_at
+from gs2d.core.mesh import Mesh
+from gs2d.data.benchmarks import dtu_truth_files
 from gs2d.errors import DataError
-from gs2d.evaluate.dtu import Silhouette, evaluate_dtu, inside_silhouettes, mesh_points, thin
-from gs2d.evaluate.dtu_files import DtuTruth, read_dtu_truth
+from gs2d.evaluation.dtu import Silhouette, evaluate_dtu, inside_silhouettes, mesh_points, thin
+from gs2d.evaluation.dtu_files import DtuTruth, read_dtu_truth
 from gs2d.io.ply_format import write_ply
-from gs2d.protocols_surface import DTU_SURFACE
-from gs2d.triangles import Mesh
+from oracle_scenes import grid_mesh, similarity
 
 T_MM = similarity(10.0, np.eye(3), (100, 0, 0))  # the scene's unit is 10 mm
 

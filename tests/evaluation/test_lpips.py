@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 import torch
-from test_images import head_state, vgg_state
 from torch import Tensor, nn
 
 from gs2d.errors import DataError
-from gs2d.evaluate.images import image_metrics
-from gs2d.evaluate.lpips import load_lpips
+from gs2d.evaluation.images import image_metrics
+from gs2d.evaluation.lpips import load_lpips
+from lpips_states import head_state, vgg_state
 
 package = pytest.importorskip("torchmetrics.functional.image.lpips")
 HEADS = Path(inspect.getfile(package)).parent / "lpips_models"

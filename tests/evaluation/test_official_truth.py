@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from official_captures import T_MM, write_dtu_capture, write_log, write_points, write_tnt_capture
-from oracle_scenes import grid_mesh, moved
 from scipy.io import savemat
 
+from gs2d.core.mesh import Mesh
 from gs2d.data import load_scene
 from gs2d.errors import DataError
-from gs2d.evaluate.surface import evaluate_surface
-from gs2d.io.ply import read_points, write_mesh
+from gs2d.evaluation.surface import evaluate_surface
+from gs2d.io.splat_ply import read_points, write_mesh
 from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.options import EvaluateOptions
 from gs2d.pipeline.truth import OfficialTruth, Truth, choose_truth, score_surface
-from gs2d.triangles import Mesh
+from official_captures import T_MM, write_dtu_capture, write_log, write_points, write_tnt_capture
+from oracle_scenes import grid_mesh, moved
 
-FIGURES = json.loads((Path(__file__).parent / "oracle_open3d.json").read_text())
+FIGURES = json.loads((Path(__file__).resolve().parents[1] / "helpers" / "oracle_open3d.json").read_text())
 HEADLINE = {"evaluator", "unit", "f_score", "chamfer", "accuracy", "completeness", "mesh_points", "truth_points",
             "reason", "thresholds", "self_check", "protocol", "ground_truth", "files"}  # fmt: skip
 CPU = SimpleNamespace(device="cpu")

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from gs2d.core.mesh import Mesh
+from gs2d.evaluation.alignment import ransac_similarity, umeyama
+from gs2d.evaluation.crop import CropVolume
+from gs2d.evaluation.dtu import evaluate_dtu, mesh_points
+from gs2d.evaluation.dtu_files import DtuTruth
+from gs2d.evaluation.tanks_and_temples import evaluate_tnt
+from gs2d.evaluation.tanks_and_temples_files import TntTruth
 from oracle_scenes import OBSERVED_RESOLUTION, TAU, dtu_scene, moved, tnt_scene
 
-from gs2d.evaluate.align import ransac_similarity, umeyama
-from gs2d.evaluate.crop import CropVolume
-from gs2d.evaluate.dtu import evaluate_dtu, mesh_points
-from gs2d.evaluate.dtu_files import DtuTruth
-from gs2d.evaluate.tnt import evaluate_tnt
-from gs2d.evaluate.tnt_files import TntTruth
-from gs2d.triangles import Mesh
-
-FIGURES = json.loads((Path(__file__).parent / "oracle_open3d.json").read_text())
+FIGURES = json.loads((Path(__file__).resolve().parents[1] / "helpers" / "oracle_open3d.json").read_text())
 NAMES = [f"{i + 1:06d}.jpg" for i in range(60)]
 
 

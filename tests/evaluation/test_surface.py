@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluate.distance import distances_to_mesh, face_areas, point_triangle_distances, sample_surface
-from gs2d.evaluate.surface import evaluate_surface
-from gs2d.evaluate.visibility import depth_buffer, frustum_counts, visible_counts
-from gs2d.io.ply import read_mesh
-from gs2d.triangles import Mesh
+from gs2d.evaluation.distance import distances_to_mesh, face_areas, point_triangle_distances, sample_surface
+from gs2d.evaluation.surface import evaluate_surface
+from gs2d.evaluation.visibility import depth_buffer, frustum_counts, visible_counts
+from gs2d.io.splat_ply import read_mesh
 
 
 def square(height: float, half: float = 1.0, cells: int = 1) -> Mesh:

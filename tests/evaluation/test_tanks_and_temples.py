@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from oracle_scenes import TAU, TntScene, grid_mesh, hills, moved, similarity, tnt_scene
 
+from gs2d.config.surface_protocols import TNT_SURFACE
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluate.crop import CropVolume, box
-from gs2d.evaluate.surface_clouds import FAR, GOOD, OUT, ScoredClouds, distance_colors, picture, write_clouds
-from gs2d.evaluate.tnt import TntScore, evaluate_tnt, f_score, point_set
-from gs2d.evaluate.tnt_files import TntTruth
-from gs2d.io.ply import read_points
-from gs2d.protocols_surface import TNT_SURFACE
-from gs2d.triangles import Mesh
+from gs2d.evaluation.crop import CropVolume, box
+from gs2d.evaluation.surface_clouds import FAR, GOOD, OUT, ScoredClouds, distance_colors, picture, write_clouds
+from gs2d.evaluation.tanks_and_temples import TntScore, evaluate_tnt, f_score, point_set
+from gs2d.evaluation.tanks_and_temples_files import TntTruth
+from gs2d.io.splat_ply import read_points
+from oracle_scenes import TAU, TntScene, grid_mesh, hills, moved, similarity, tnt_scene
 
 NAMES = [f"{i + 1:06d}.jpg" for i in range(60)]
 NO_ICP = replace(TNT_SURFACE, stages=(replace(TNT_SURFACE.stages[0], iterations=0),))

@@ -10,19 +10,19 @@ from typing import Any
 
 import pytest
 
-from gs2d.cli.actions import train_options
 from gs2d.cli.app import parse
 from gs2d.cli.commands import Train
+from gs2d.cli.handlers import train_options
 from gs2d.cli.paper import parse_seeds
+from gs2d.config.protocols import MetricConventions
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.paper_tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Order
-from gs2d.pipeline.paper import check_folder, paper
-from gs2d.pipeline.paper_commands import commands_of, paper_command
-from gs2d.pipeline.paper_deviations import deviations_of, opacity_resets
-from gs2d.pipeline.paper_plan import PaperOptions, make_plan
-from gs2d.pipeline.paper_rows import Cell, Results, judge_order, read_cell
-from gs2d.pipeline.paper_scenes import find_scenes
-from gs2d.protocols import MetricConventions
+from gs2d.experiments.aggregate import Cell, Results, judge_order, read_cell
+from gs2d.experiments.commands import commands_of, paper_command
+from gs2d.experiments.deviations import deviations_of, opacity_resets
+from gs2d.experiments.paper import check_folder, paper
+from gs2d.experiments.plan import PaperOptions, make_plan
+from gs2d.experiments.scenes import find_scenes
+from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Order
 from paper_cells import make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 

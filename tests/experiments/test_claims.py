@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from gs2d.pipeline import sweep_claims
-from gs2d.pipeline.sweep import StageClaims, stage_keys
-from gs2d.pipeline.sweep_claims import is_stale, take_claim
+from gs2d.experiments import claims as sweep_claims
+from gs2d.experiments.claims import is_stale, take_claim
+from gs2d.experiments.execute import StageClaims, stage_keys
 from sweep_jobs import dead_pid, write_claim
 
 

@@ -16,11 +16,11 @@ from typing import Any
 import pytest
 
 from gs2d.errors import BackendError, DataError, RunError
-from gs2d.pipeline import sweep as sweep_module
+from gs2d.experiments import execute as sweep_module
+from gs2d.experiments.execute import MAX_DEATHS, Sweep, SweepJob, work
+from gs2d.experiments.slots import revive, run_sweep
+from gs2d.experiments.slurm import run_on_slurm
 from gs2d.pipeline.events import OnEvent, StageDone
-from gs2d.pipeline.sweep import MAX_DEATHS, Sweep, SweepJob, work
-from gs2d.pipeline.sweep_slots import revive, run_sweep
-from gs2d.pipeline.sweep_slurm import run_on_slurm
 from sweep_jobs import dead_pid, make_sweep, write_claim
 
 
@@ -158,7 +158,7 @@ def test_who_waits_for_another_machine_says_for_whom(tmp_path: Path, monkeypatch
 KILLED = """
 import sys, time
 from pathlib import Path
-from gs2d.pipeline import sweep as module
+from gs2d.experiments import execute as module
 sys.path.insert(0, sys.argv[2])
 from sweep_jobs import make_sweep
 def train(job, on_event):
@@ -174,7 +174,7 @@ module.work(make_sweep(Path(sys.argv[1]), {"a": ("s",), "b": ("s", "t"), "c": ("
 def test_a_sweep_goes_on_after_sigkill_without_doing_anything_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = [sys.executable, "-c", KILLED, str(tmp_path), str(Path(__file__).parent)]
+    words = [sys.executable, "-c", KILLED, str(tmp_path), str(Path(__file__).resolve().parents[1] / "helpers")]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "at b\n"

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 import torch
 
+from gs2d.core.images import read_image
+from gs2d.core.splats import Splats
 from gs2d.errors import RunError
-from gs2d.images import read_image
-from gs2d.io.run import RunFolder, load_tensors
+from gs2d.experiments.figures import coverage, error_positions, map_limits, rank_run, write_figures
+from gs2d.experiments.render_page import coverage_table
+from gs2d.io.run_dir import RunFolder, load_tensors
 from gs2d.pipeline.changes import SAMPLE, mean_changes, take_snapshot
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.figures import coverage, error_positions, map_limits, rank_run, write_figures
+from gs2d.pipeline.job import reload_job
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.paper_page import coverage_table
-from gs2d.pipeline.prepare import reload_job
 from gs2d.pipeline.train import train
-from gs2d.report_curves import Panel, compared, read_history
-from gs2d.splats import Splats
+from gs2d.report.plots import Panel, compared, read_history
 from tiny import write_capture
 
 

@@ -19,13 +19,13 @@ import pytest
 from gs2d.cli import run
 from gs2d.cli.paper import parse_parameters, parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.paper_tables import DTU, PAPER_TABLES, TNT, Order
-from gs2d.pipeline import sweep as sweep_module
-from gs2d.pipeline.paper import paper
-from gs2d.pipeline.paper_plan import PaperOptions, canonical_recipe, make_plan
-from gs2d.pipeline.paper_rows import FIGURES, Results, Row, judge_order, read_cell
-from gs2d.pipeline.paper_scenes import find_scenes, missing_scenes
-from gs2d.pipeline.paper_text import measured, shown, to_csv, to_latex, to_markdown
+from gs2d.experiments import execute as sweep_module
+from gs2d.experiments.aggregate import FIGURES, Results, Row, judge_order, read_cell
+from gs2d.experiments.paper import paper
+from gs2d.experiments.plan import PaperOptions, canonical_recipe, make_plan
+from gs2d.experiments.render_text import measured, shown, to_csv, to_latex, to_markdown
+from gs2d.experiments.scenes import find_scenes, missing_scenes
+from gs2d.experiments.tables import DTU, PAPER_TABLES, TNT, Order
 from paper_cells import TINY, draw_nothing, make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 

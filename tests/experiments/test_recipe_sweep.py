@@ -14,13 +14,13 @@ from gs2d.cli import run
 from gs2d.cli.app import parse
 from gs2d.cli.commands import Sweep
 from gs2d.cli.paper import paper_options
-from gs2d.paper_tables import SWEEP
-from gs2d.pipeline import sweep as sweep_module
-from gs2d.pipeline.paper import paper
-from gs2d.pipeline.paper_commands import paper_command
-from gs2d.pipeline.paper_deviations import deviations_of
-from gs2d.pipeline.paper_plan import PaperOptions, make_plan
-from gs2d.pipeline.paper_rows import Results
+from gs2d.experiments import execute as sweep_module
+from gs2d.experiments.aggregate import Results
+from gs2d.experiments.commands import paper_command
+from gs2d.experiments.deviations import deviations_of
+from gs2d.experiments.paper import paper
+from gs2d.experiments.plan import PaperOptions, make_plan
+from gs2d.experiments.tables import SWEEP
 from paper_cells import TINY, draw_nothing
 from tiny import write_capture
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gs2d.paper_tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, PaperTable, printed
-from gs2d.pipeline.paper_rows import FIGURES, Cell, Results, Row, judge
-from gs2d.recipes import RECIPES, TABLES
+from gs2d.config.presets import RECIPES, TABLES
+from gs2d.experiments.aggregate import FIGURES, Cell, Results, Row, judge
+from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, PaperTable, printed
 
 # How the paper writes the labels of our rows, where it is not the same.
 TEX_LABELS = {
@@ -31,7 +31,7 @@ TEX_LABELS = {
 def tex() -> str:
     """The paper's source: $GS2D_PAPER_TEX, or beside the repository; else skip."""
     named = os.environ.get("GS2D_PAPER_TEX")
-    path = Path(named) if named else Path(__file__).resolve().parents[2] / "shared" / "paper" / "2dgs-r.tex"
+    path = Path(named) if named else Path(__file__).resolve().parents[3] / "shared" / "paper" / "2dgs-r.tex"
     if not path.is_file():
         pytest.skip(f"no source of the paper at {path}; set GS2D_PAPER_TEX to it")
     return path.read_text()

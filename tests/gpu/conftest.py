@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
 from gs2d.errors import BackendError
-from gs2d.render.backend import Backend, get_backend
-
-for folder in ("render", "train", "cuda"):  # render_scenes, train_toys, emulate
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / folder))
+from gs2d.render.backends import Backend, get_backend
 
 
 @pytest.fixture(scope="session")

@@ -10,22 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import train_toys
-from emulate import Emulator
-from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats
 from torch import Tensor
 
-from gs2d.camera import Camera
+import train_toys
+from emulate import Emulator
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.compile import compile_source, cubin, source_names
 from gs2d.render import cuda
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.backend import Backend, backend_report, get_backend
+from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
-from gs2d.train import events
-from gs2d.train.targets import DeviceTargets
+from gs2d.training import events
+from gs2d.training.targets import DeviceTargets
+from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
@@ -195,8 +195,8 @@ def no_waiting(allowed: int) -> Iterator[None]:
 def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(gpu: Backend, stage: int) -> None:
     from dataclasses import replace
 
-    from gs2d.protocols import GENERIC
-    from gs2d.train.loop import Trainer
+    from gs2d.config.protocols import GENERIC
+    from gs2d.training.trainer import Trainer
 
     recipe = train_toys.short()
     quiet = tuple(replace(s, densify=None, iterations=100) for s in recipe.stages)
@@ -224,9 +224,9 @@ def test_three_stages_train_on_the_gpu_like_on_the_cpu(gpu: Backend) -> None:
 
 
 def test_what_was_trained_on_the_gpu_goes_on_on_the_cpu_and_back(gpu: Backend) -> None:
-    from gs2d.protocols import GENERIC
-    from gs2d.train.loop import Trainer
-    from gs2d.train.state import TrainState
+    from gs2d.config.protocols import GENERIC
+    from gs2d.training.state import TrainState
+    from gs2d.training.trainer import Trainer
 
     toy, recipe = train_toys.make_scene(), train_toys.short()
     state, devices = None, []

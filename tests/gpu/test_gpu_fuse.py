@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_cuda_fuse import waves
 
-from gs2d.mesh.fuse import fuse
-from gs2d.mesh.limits import derive_limits, sample_depths
-from gs2d.render.backend import Backend
+from depth_waves import waves
+from gs2d.meshing.bounds import derive_limits, sample_depths
+from gs2d.meshing.tsdf import fuse
+from gs2d.render.backends import Backend
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
 

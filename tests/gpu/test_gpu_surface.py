@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "evaluate"))  # oracle_scenes
-
+from gs2d.core.camera import look_at
+from gs2d.core.mesh import Mesh
+from gs2d.evaluation.dtu import thin
+from gs2d.evaluation.nearest import Cloud
+from gs2d.evaluation.surface import evaluate_surface
+from gs2d.evaluation.visibility import depth_buffer, visible_counts
+from gs2d.render.backends import Backend
 from oracle_scenes import grid_mesh, hills
-
-from gs2d.camera import look_at
-from gs2d.evaluate.dtu import thin
-from gs2d.evaluate.neighbours import Cloud
-from gs2d.evaluate.surface import evaluate_surface
-from gs2d.evaluate.visibility import depth_buffer, visible_counts
-from gs2d.render.backend import Backend
-from gs2d.triangles import Mesh
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(300)]
 POINTS = 300_000

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.options import TrainOptions
 
 SMALL = ("init_points=150", "surface.densify.max_splats=250")

@@ -8,8 +8,8 @@ from enum import IntEnum
 from typing import Any
 
 import torch
-from emulate import Emulator
 
+from emulate import Emulator
 from gs2d.kernels.cuda.launch import GpuLauncher
 
 

@@ -14,10 +14,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from emulate import Emulator
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
+
+from emulate import Emulator
 
 GPU = torch.device("cuda:0")
 CROSSES = {"aten::copy_", "aten::_to_copy"}  # what takes tensors of both
@@ -160,9 +161,8 @@ class _Event:
 def install(guard: str, emulator: Emulator) -> Counter[str]:
     """From here on this process has a GPU; returns the launches by kernel, as they happen."""
     from gs2d.kernels.cuda import launch
-    from gs2d.render import backend as backends
-    from gs2d.render import cuda
-    from gs2d.render.backend import Backend
+    from gs2d.render import backends, cuda
+    from gs2d.render.backends import Backend
 
     launched: Counter[str] = Counter()
 

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from capture_writers import ColmapModel, ring
 from PIL import Image
 from scipy.spatial.transform import Rotation
+
+from capture_writers import ColmapModel, ring
 
 WIDTH, HEIGHT = 40, 30
 

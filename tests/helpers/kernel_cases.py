@@ -6,18 +6,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import render_oracle
 import torch
-from emulate import Emulator
-from render_scenes import KINDS, contraction, random_camera, random_splats, requiring_grad
 from torch import Tensor
 
-from gs2d.camera import Camera
+import render_oracle
+from emulate import Emulator
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.render import cuda, reference_errors
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
+from render_scenes import KINDS, contraction, random_camera, random_splats, requiring_grad
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 

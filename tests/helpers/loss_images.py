@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.render.types import RenderOutput
 
 

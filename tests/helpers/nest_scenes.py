@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from surface_shapes import rays, sphere_depth
 
-from gs2d.camera import look_at
-from gs2d.mesh.frames import Frame
-from gs2d.mesh.limits import FusionLimits
-from gs2d.mesh.nest import Nest
-from gs2d.mesh.volume import BLOCK, VOXELS, Volume
+from gs2d.core.camera import look_at
+from gs2d.meshing.bounds import FusionLimits
+from gs2d.meshing.depth_maps import Frame
+from gs2d.meshing.unbounded_bounds import Nest
+from gs2d.meshing.volume import BLOCK, VOXELS, Volume
+from surface_shapes import rays, sphere_depth
 
 GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it
 

@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import numpy as np
-from oracle_scenes import DtuScene, TntScene, dtu_scene, moved, similarity, tnt_scene
 from PIL import Image
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
 from gs2d.io.ply_format import write_ply
+from oracle_scenes import DtuScene, TntScene, dtu_scene, moved, similarity, tnt_scene
 
 T_MM = similarity(12.0, np.eye(3), (5, -3, 0))  # the scene's unit is 12 mm
 

@@ -12,11 +12,11 @@ from math import exp, log
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
-from gs2d.geometry import quats_to_matrices
+from gs2d.core.camera import Camera
+from gs2d.core.sh import sh_to_rgb
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
 from gs2d.render.types import RasterSettings
-from gs2d.sh import sh_to_rgb
-from gs2d.splats import Splats
 
 
 @dataclass

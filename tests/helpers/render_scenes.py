@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.render.types import RenderOutput
-from gs2d.splats import Splats
 
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 RED, GREEN, BLUE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)

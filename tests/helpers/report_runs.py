@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import look_at
-from gs2d.data.toy_rays import cast_camera
-from gs2d.data.toy_shapes import torus_knot, tube
-from gs2d.images import write_image
-from gs2d.io.files import write_json
-from gs2d.io.ply import write_mesh
-from gs2d.report_images import depth_picture, error_picture, highlight_picture, normal_picture
-from gs2d.triangles import Mesh
+from gs2d.core.camera import look_at
+from gs2d.core.images import write_image
+from gs2d.core.json_files import write_json
+from gs2d.core.mesh import Mesh
+from gs2d.io.splat_ply import write_mesh
+from gs2d.meshing.raycast import cast_camera
+from gs2d.report.images import depth_picture, error_picture, highlight_picture, normal_picture
+from gs2d.synthetic.shapes import torus_knot, tube
 
 STAGES = (("surface", 3000), ("appearance", 1000), ("refine", 2000))
 KNOT = tube(torus_knot(0.6, 0.25, steps=120), 0.16, around=14, closed=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
 
 SIZE, FOCAL = 200, 203.0  # px
 UP = np.array([0.0, 0.0, 1.0])

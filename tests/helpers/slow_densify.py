@@ -7,12 +7,12 @@ import math
 import torch
 from torch import Tensor
 
+from gs2d.config.recipe import GradDensify
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
-from gs2d.geometry import quats_to_matrices
-from gs2d.recipe import GradDensify
-from gs2d.splats import Splats
-from gs2d.train.densify import DensifyCounts
-from gs2d.train.state import Statistics, TrainState
+from gs2d.training.densify import DensifyCounts
+from gs2d.training.state import Statistics, TrainState
 
 
 def keep_rows(state: TrainState, mask: Tensor) -> None:

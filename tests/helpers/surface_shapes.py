@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gs2d.camera import Camera, look_at
-from gs2d.mesh.frames import Frame
-from gs2d.mesh.limits import FusionLimits
-from gs2d.mesh.volume import BLOCK, VOXELS, Volume
-from gs2d.triangles import Mesh
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.bounds import FusionLimits
+from gs2d.meshing.depth_maps import Frame
+from gs2d.meshing.volume import BLOCK, VOXELS, Volume
 
 
 def limits(half: float, voxel: float, truncation: float | None = None, depth_limit: float = 100.0) -> FusionLimits:

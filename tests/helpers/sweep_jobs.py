@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from gs2d.experiments.execute import Sweep, SweepJob
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.sweep import Sweep, SweepJob
 
 
 def make_sweep(folder: Path, keys: dict[str, tuple[str, ...]]) -> Sweep:

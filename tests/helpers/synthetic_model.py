@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
 
 WIDTH, HEIGHT = 640, 480
 

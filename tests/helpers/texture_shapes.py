@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gs2d.camera import Camera, look_at
-from gs2d.data.toy_rays import cast_camera
-from gs2d.mesh.atlas import Atlas
-from gs2d.mesh.bake import Photograph
-from gs2d.triangles import Mesh
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.atlas import Atlas
+from gs2d.meshing.bake import Photograph
+from gs2d.meshing.raycast import cast_camera
 
 Paint = Callable[[np.ndarray], np.ndarray]  # places [n, 3] to colours [n, 3] in [0, 1]
 

@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gs2d.camera import look_at
+from gs2d.config.multiview import MultiView
+from gs2d.config.presets import appearance, refine, surface, with_multiview
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import GradDensify, Rates, Recipe
+from gs2d.core.camera import look_at
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import camera_extent
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import BackendError
-from gs2d.geometry import camera_extent
-from gs2d.protocols import GENERIC
-from gs2d.recipe import GradDensify, Rates, Recipe
-from gs2d.recipe_multiview import MultiView
-from gs2d.recipes import appearance, refine, surface, with_multiview
 from gs2d.render.api import rasterize
-from gs2d.render.backend import get_backend
+from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
-from gs2d.train import events
-from gs2d.train.loop import Trainer
-from gs2d.train.state import Moments, Statistics, TrainState
+from gs2d.training import events
+from gs2d.training.state import Moments, Statistics, TrainState
+from gs2d.training.trainer import Trainer
 
 VIEWS, SIZE, POINTS = 6, 24, 60
 

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from gs2d.errors import DiskError, RunError
-from gs2d.io import run as run_module
-from gs2d.io.run import CheckpointFile, EventLog, RunFolder, claim_run, load_tensors, open_run, save_tensors
+from gs2d.io import run_dir as run_module
+from gs2d.io.run_dir import CheckpointFile, EventLog, RunFolder, claim_run, load_tensors, open_run, save_tensors
 
 SCENE = {"name": "ball", "path": "ball", "format": "blender", "train": 6, "test": 2}
 DEFINITION = {"recipe": {"name": "2dgs-r"}, "scene": SCENE}
@@ -66,7 +66,7 @@ def test_a_folder_with_other_files_is_never_taken(tmp_path: Path, overwrite: boo
 
 
 def test_a_run_whose_process_was_killed_while_it_wrote_run_json_is_started_again(tmp_path: Path) -> None:
-    kill = "import os; from gs2d.disk import atomic_write\nwith atomic_write('run.json'): os.kill(os.getpid(), 9)"
+    kill = "import os; from gs2d.core.files import atomic_write\nwith atomic_write('run.json'): os.kill(os.getpid(), 9)"
     subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, check=False)
     (left,) = names(tmp_path)
     assert left != "run.json"

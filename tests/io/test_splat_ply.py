@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError, DiskError
-from gs2d.io.ply import ply_kind, read_mesh, read_points, read_splats, triangulate, write_mesh, write_splats
 from gs2d.io.ply_format import PlyList, read_ply, write_ply
-from gs2d.splats import Splats
-from gs2d.triangles import Mesh
+from gs2d.io.splat_ply import ply_kind, read_mesh, read_points, read_splats, triangulate, write_mesh, write_splats
 
 
 def random_splats(n: int, degree: int, seed: int = 0) -> Splats:

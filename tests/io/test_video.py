@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
+from gs2d.core.images import write_image
 from gs2d.errors import BackendError, DataError
-from gs2d.images import write_image
 from gs2d.io import video
 from gs2d.io.mp4 import Film, film_header, read_sequence
 from gs2d.io.video import check_video, write_video

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
 from gs2d.errors import BackendError
 from gs2d.kernels.library import Library, available_variants, load
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "render"))  # render_scenes
 
 
 @pytest.fixture(params=["v4", "v3", "portable"])

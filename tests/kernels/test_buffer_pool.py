@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import copy
-import sys
-from pathlib import Path
 
 import torch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from benchmarks.workload import room_workload
 
+from gs2d.core.splats import Splats
+from gs2d.kernels.buffer_pool import LINE, Recycler
 from gs2d.kernels.library import Library
-from gs2d.kernels.recycle import LINE, Recycler
 from gs2d.render.cpu import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 FLOAT = torch.float32
 

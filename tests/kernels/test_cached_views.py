@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, load
 from gs2d.render.cpu import rasterize_with
 from gs2d.render.cpu_cached import CachedView, cache_view
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 COUNT, ROOM = 300, 1 << 30
 

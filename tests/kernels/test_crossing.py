@@ -11,14 +11,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.kernels.library import Library
 from gs2d.render import cpu
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
+from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.7))
 KINDS = ("crossing", "crossing", "near_plane", "huge", "edge_on", "plain")

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gs2d.errors import ShapeError
+from gs2d.kernels.densify_stats import accumulate
 from gs2d.kernels.library import Library
-from gs2d.kernels.screen_signal import accumulate
 
 
 @pytest.mark.parametrize("columns", [2, 4])

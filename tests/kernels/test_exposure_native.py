@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from gs2d.errors import ShapeError
-from gs2d.exposure import _exposed, _gradients
-from gs2d.kernels.exposure import exposed, gradients
 from gs2d.kernels.library import Library
+from gs2d.render.exposure import _exposed, _gradients
+from gs2d.render.exposure_native import exposed, gradients
 
 
 @pytest.mark.parametrize("cut_out", [False, True])

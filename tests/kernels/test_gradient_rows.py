@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from render_scenes import IMAGES, front_camera, requiring_grad, splat
-from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from benchmarks.stages import Passes, count_work
 from benchmarks.workload import Workload, room_workload
+from torch import Tensor
 
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library
 from gs2d.render import cpu
 from gs2d.render.api import rasterize
-from gs2d.render.backend import get_backend
+from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
+from render_scenes import IMAGES, front_camera, requiring_grad, splat
 
 
 @pytest.fixture(scope="module")

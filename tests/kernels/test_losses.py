@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d import losses_reference as reference
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels import ops
+from gs2d.kernels import losses as ops
 from gs2d.kernels.library import Library, available_variants, load
+from gs2d.losses import reference
 
 SIZES = [(1, 1), (2, 9), (5, 3), (11, 16), (37, 53), (70, 21)]
 
@@ -269,7 +269,6 @@ def test_a_target_changed_before_backward_is_an_error_not_a_wrong_gradient(libra
 
 
 def test_the_benchmark_runs(double: Library, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
     from benchmarks.losses import main
 
     main(

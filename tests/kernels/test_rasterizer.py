@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 from torch import Tensor
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import Library, available_variants, load
 from gs2d.render import cpu, reference, reference_errors
 from gs2d.render.types import RasterSettings
-from gs2d.splats import ATTRIBUTES, Splats
+from render_scenes import IMAGES, random_camera, random_splats, requiring_grad
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.7))
 

@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera, look_at
-from gs2d.geometry import moved
-from gs2d.losses_multiview import (
+from gs2d.config.multiview import MultiView
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.transforms import moved
+from gs2d.losses.multiview import (
     Neighbour,
     TwoViews,
     _sample,
@@ -21,7 +22,6 @@ from gs2d.losses_multiview import (
     photometric,
     prepare,
 )
-from gs2d.recipe_multiview import MultiView
 
 SETTINGS = MultiView(patches=40, radius=2, texture=0.01, occluded=4.0)
 PLANE_NORMAL = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])

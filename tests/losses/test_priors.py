@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from gs2d.config.recipe import LossTerm
 from gs2d.errors import RecipeError
-from gs2d.losses import compute_losses
-from gs2d.losses_priors import (
+from gs2d.losses.api import compute_losses
+from gs2d.losses.priors import (
     LEAST_POINTS,
     Depths,
     KnownDepths,
@@ -21,7 +22,6 @@ from gs2d.losses_priors import (
     fit_line,
     normal_prior,
 )
-from gs2d.recipe import LossTerm
 from loss_images import make_camera, make_output
 
 HIT = torch.ones(4, 5, dtype=torch.float64)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from gs2d import losses_reference as reference
-from gs2d.losses import normals_from_depth
+from gs2d.losses import reference
+from gs2d.losses.api import normals_from_depth
 from loss_images import make_camera, make_output, plane_depth
 
 

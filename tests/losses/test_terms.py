@@ -9,15 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d import losses_reference as reference
-from gs2d.camera import Camera
+from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView
+from gs2d.config.priors import PRIOR_KINDS
+from gs2d.config.recipe import LossTerm
+from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
-from gs2d.losses import FUSED_LOSSES, LOSSES, compute_losses, target_maps
-from gs2d.losses_multiview import Neighbour, prepare
-from gs2d.losses_priors import KnownDepths, KnownNormals, Prior
-from gs2d.recipe import LossTerm
-from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView
-from gs2d.recipe_priors import PRIOR_KINDS
+from gs2d.losses import reference
+from gs2d.losses.api import FUSED_LOSSES, LOSSES, compute_losses, target_maps
+from gs2d.losses.multiview import Neighbour, prepare
+from gs2d.losses.priors import KnownDepths, KnownNormals, Prior
 from gs2d.render.types import RenderOutput
 from loss_images import make_camera, make_output
 
@@ -124,7 +124,7 @@ def test_a_view_without_valid_pixels_has_loss_zero_except_for_the_constant_of_ss
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("kind", [kind for kind in LOSSES if kind not in MULTIVIEW_KINDS])  # test_losses_multiview.py
+@pytest.mark.parametrize("kind", [kind for kind in LOSSES if kind not in MULTIVIEW_KINDS])  # test_multiview.py
 def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked: bool) -> None:
     height, width = 6, 7
     output, camera = make_output(height, width, seed=1), make_camera(width, height)

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gs2d.camera import Camera
-from gs2d.evaluate.surface import evaluate_surface
-from gs2d.io.ply import read_mesh
-from gs2d.mesh.extract import extract
-from gs2d.mesh.frames import Frame
-from gs2d.triangles import Mesh
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh
+from gs2d.evaluation.surface import evaluate_surface
+from gs2d.io.splat_ply import read_mesh
+from gs2d.meshing.depth_maps import Frame
+from gs2d.meshing.extract import extract
 
 SIZE = 200
 

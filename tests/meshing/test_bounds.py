@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_shapes import box_depth, orbit, sphere_depth
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.errors import ProtocolError
-from gs2d.mesh.consistency import depth_noise
-from gs2d.mesh.extract import extract
-from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.limits import DepthSample, FusionLimits, backproject, derive_limits, sample_depths, widen_truncation
+from gs2d.meshing.bounds import DepthSample, FusionLimits, backproject, derive_limits, sample_depths, widen_truncation
+from gs2d.meshing.consistency import depth_noise
+from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.extract import extract
+from surface_shapes import box_depth, orbit, sphere_depth
 
 UP = np.array([0, 0, 1.0])
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_shapes import orbit, sphere_depth
 
-from gs2d.mesh.evidence import FACES_A_PIXEL, areas, clean, gather, least_views, simplified_to
-from gs2d.mesh.extract import extract
-from gs2d.mesh.frames import Frame, depth_map
-from gs2d.triangles import Mesh
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.depth_maps import Frame, depth_map
+from gs2d.meshing.evidence import FACES_A_PIXEL, areas, clean, gather, least_views, simplified_to
+from gs2d.meshing.extract import extract
+from surface_shapes import orbit, sphere_depth
 
 BOX = np.array([[-2.0, -2, -2], [2, 2, 2]])
 
@@ -90,7 +90,7 @@ def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch:
     made = [depth_map(frame) for frame in frames(5, sheets=2)]
     mesh = extract(frames(5), bbox=BOX, voxel=0.1, threads=1).mesh
     whole = gather(mesh, made, 0.1)
-    monkeypatch.setattr("gs2d.mesh.evidence.VERTICES_AT_ONCE", 37)
+    monkeypatch.setattr("gs2d.meshing.evidence.VERTICES_AT_ONCE", 37)
     parts = gather(mesh, made, 0.1)
     for name in ("support", "against", "density"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))

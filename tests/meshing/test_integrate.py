@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from surface_shapes import limits, orbit, sphere_depth
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels.fusion import arguments_of
 from gs2d.kernels.library import available_variants, load
-from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.fuse import block_finder, fuse, touched_blocks
-from gs2d.mesh.integrate import add_natively, fusion_backend, integrator
-from gs2d.mesh.limits import sample_depths
-from gs2d.mesh.nest import derive_nest
-from gs2d.mesh.nested import fuse_nested
-from gs2d.mesh.sampling import prepare
-from gs2d.mesh.volume import Volume, block_grid, unknown_volume
+from gs2d.kernels.tsdf import arguments_of
+from gs2d.meshing.bounds import sample_depths
+from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.integrate import add_natively, fusion_backend, integrator
+from gs2d.meshing.sampling import prepare
+from gs2d.meshing.tsdf import block_finder, fuse, touched_blocks
+from gs2d.meshing.unbounded import fuse_nested
+from gs2d.meshing.unbounded_bounds import derive_nest
+from gs2d.meshing.volume import Volume, block_grid, unknown_volume
+from surface_shapes import limits, orbit, sphere_depth
 
 ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")
 LIMITS = limits(1.3, 0.05)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
 
-from gs2d.mesh.cases import CORNERS, EDGES, case_table
-from gs2d.mesh.surface import _numbered, components, keep_components, marching_cubes, select_faces
-from gs2d.mesh.volume import BLOCK, Volume
-from gs2d.triangles import Mesh
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.marching_cubes import _numbered, components, keep_components, marching_cubes, select_faces
+from gs2d.meshing.marching_cubes_cases import CORNERS, EDGES, case_table
+from gs2d.meshing.volume import BLOCK, Volume
+from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
 
 
 def sphere(radius: float) -> object:

@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 
 from gs2d.cli import main
+from gs2d.core.json_files import write_json
 from gs2d.errors import ProtocolError, RunError
-from gs2d.io.files import write_json
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
+from gs2d.io.splat_ply import read_mesh
 from gs2d.kernels.library import available_variants
-from gs2d.mesh.integrate import Add, integrator
-from gs2d.mesh.volume import Volume
+from gs2d.meshing.integrate import Add, integrator
+from gs2d.meshing.volume import Volume
 from gs2d.pipeline.finished import finished_splats
+from gs2d.pipeline.job import check_same_run, reload_job
 from gs2d.pipeline.jobs import mesh_run
+from gs2d.pipeline.mesh import extract_mesh
 from gs2d.pipeline.options import MeshOptions, TrainOptions
-from gs2d.pipeline.prepare import check_same_run, reload_job
-from gs2d.pipeline.surface import extract_mesh
 from gs2d.pipeline.train import train
-from gs2d.render.backend import get_backend
+from gs2d.render.backends import get_backend
 from tiny import RADIUS, write_capture
 
 
@@ -105,8 +105,8 @@ def test_a_run_is_fused_by_its_own_backend_and_says_so(
         return integrator(volumes, backend, threads)
 
     job, splats = reload_job(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))
-    monkeypatch.setattr("gs2d.mesh.fuse.integrator", recorded)
-    monkeypatch.setattr("gs2d.mesh.nested.integrator", recorded)
+    monkeypatch.setattr("gs2d.meshing.tsdf.integrator", recorded)
+    monkeypatch.setattr("gs2d.meshing.unbounded.integrator", recorded)
     for backend in ("reference", *(["cpu"] if available_variants() else [])):
         options = MeshOptions(unbounded=unbounded, voxel=0.05)
         result = extract_mesh(

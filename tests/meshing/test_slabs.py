@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from surface_shapes import orbit, sphere_depth
 
-from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.fuse import find_blocks, fuse, fuse_blocks
-from gs2d.mesh.limits import derive_limits, sample_depths
-from gs2d.mesh.slabs import fused_surface, slabs
-from gs2d.mesh.surface import marching_cubes
-from gs2d.mesh.volume import block_bytes
+from gs2d.meshing.bounds import derive_limits, sample_depths
+from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.marching_cubes import marching_cubes
+from gs2d.meshing.slabs import fused_surface, slabs
+from gs2d.meshing.tsdf import find_blocks, fuse, fuse_blocks
+from gs2d.meshing.volume import block_bytes
+from surface_shapes import orbit, sphere_depth
 
 
 def maps(*, colored: bool) -> list[DepthMap]:
@@ -55,7 +55,7 @@ def test_no_slab_takes_more_memory_than_it_may_unless_it_is_one_layer(monkeypatc
         held.append(volume.nbytes)
         return volume
 
-    monkeypatch.setattr("gs2d.mesh.slabs.fuse_blocks", recorded)
+    monkeypatch.setattr("gs2d.meshing.slabs.fuse_blocks", recorded)
     fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)
     assert len(held) > 1
     assert max(held) <= most

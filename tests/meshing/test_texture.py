@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.texture import picture, psnr
-from texture_shapes import above, box, checkers, flat_atlas, grid_plane, join, photograph, ring
 
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import BackendError, DataError, DiskError, ProtocolError
 from gs2d.io.obj import read_obj
 from gs2d.io.textured import turn_to_y, write_textured
-from gs2d.mesh import atlas as atlas_module
-from gs2d.mesh.atlas import simplified, texels_of, unwrap, vertex_normals
-from gs2d.mesh.bake import (
+from gs2d.meshing import atlas as atlas_module
+from gs2d.meshing.atlas import simplified, texels_of, unwrap, vertex_normals
+from gs2d.meshing.bake import (
     FEATHER,
     LEAST_FEATHER,
     Photograph,
@@ -28,7 +28,7 @@ from gs2d.mesh.bake import (
     spread,
     texture_size,
 )
-from gs2d.triangles import Mesh, TexturedMesh
+from texture_shapes import above, box, checkers, flat_atlas, grid_plane, join, photograph, ring
 
 RED, GREEN, BLUE = (np.array(c, float) for c in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
 
@@ -84,7 +84,7 @@ def test_two_photographs_of_one_place_count_the_same() -> None:
 def test_a_slanted_view_counts_by_its_cosine() -> None:
     # From 60 degrees aside at the same distance d: |n . r| = d / 2 and z = d, so half of f^2 / d^2. With room for both
     # the least score is 0 and the weights are 2 to 1.
-    from gs2d.camera import look_at
+    from gs2d.core.camera import look_at
 
     eye = 2 * np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
     slanted = look_at(eye, np.zeros(3), np.array([0, 1.0, 0]), width=256, height=256, fx=64.0)

@@ -7,6 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+
+from gs2d.core.camera import Camera, look_at
+from gs2d.errors import DiskError, ProtocolError, ShapeError
+from gs2d.meshing.bounds import derive_limits, sample_depths
+from gs2d.meshing.depth_maps import DepthMap, Frame, Spool, depth_map
+from gs2d.meshing.extract import extract
+from gs2d.meshing.integrate import FULL_WEIGHT_BEHIND
+from gs2d.meshing.marching_cubes import components, marching_cubes
+from gs2d.meshing.tsdf import fuse, least_blocks, touched_blocks
+from gs2d.meshing.volume import BLOCK, block_bytes, block_grid
 from surface_shapes import (
     box_depth,
     edge_uses,
@@ -18,16 +28,6 @@ from surface_shapes import (
     sphere_depth,
     sphere_frames,
 )
-
-from gs2d.camera import Camera, look_at
-from gs2d.errors import DiskError, ProtocolError, ShapeError
-from gs2d.mesh.extract import extract
-from gs2d.mesh.frames import DepthMap, Frame, Spool, depth_map
-from gs2d.mesh.fuse import fuse, least_blocks, touched_blocks
-from gs2d.mesh.integrate import FULL_WEIGHT_BEHIND
-from gs2d.mesh.limits import derive_limits, sample_depths
-from gs2d.mesh.surface import components, marching_cubes
-from gs2d.mesh.volume import BLOCK, block_bytes, block_grid
 
 LIMITS = limits(1.3, 0.03)
 
@@ -175,7 +175,7 @@ def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: 
     frames = maps([Frame(c, box_depth(c, np.array([-0.9, -0.5, -0.2]), np.array([0.3, 0.8, 0.9]))) for c in cameras])
     fast = fuse(frames, LIMITS, threads=1)
     monkeypatch.setattr(
-        "gs2d.mesh.integrate.block_visibility",
+        "gs2d.meshing.integrate.block_visibility",
         lambda view, centers, radius, truncation: np.flatnonzero(
             centers @ view.projection[2, :3] + view.projection[2, 3] > 1.01 * radius
         ),
@@ -189,7 +189,7 @@ def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: 
 def test_the_blocks_near_a_depth_map_are_those_of_a_plain_loop(marked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples every half block from -0.15 to 0.15 of each pixel's depth; each takes the two nearest blocks by axis."""
     if not marked:
-        monkeypatch.setattr("gs2d.mesh.fuse._MOST_MARKS", 0)  # as for a grid that is too large to mark
+        monkeypatch.setattr("gs2d.meshing.tsdf._MOST_MARKS", 0)  # as for a grid that is too large to mark
     camera = look_at(np.array([0.4, -2.5, 0.3]), np.zeros(3), np.array([0, 0, 1.0]), width=24, height=20, fx=40)
     item = depth_map(Frame(camera, sphere_depth(camera, 1.0)))
     dims = block_grid(LIMITS)
@@ -260,7 +260,7 @@ def test_a_voxel_that_is_far_too_small_is_refused_at_once(voxel: float) -> None:
 
 @pytest.mark.parametrize("truncation", [0.05, 0.3, 2.0])
 def test_the_least_number_of_blocks_is_not_above_the_number(truncation: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gs2d.mesh.fuse._FEW_SAMPLES", 0)
+    monkeypatch.setattr("gs2d.meshing.tsdf._FEW_SAMPLES", 0)
     for half in (1.3, 0.9):  # the second box cuts the sphere
         lim = limits(half, 0.02, truncation)
         for item in maps(sphere_frames(orbit(3, 3.0))):

@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from gs2d.core.camera import look_at
+from gs2d.errors import ProtocolError
+from gs2d.meshing.bounds import sample_depths
+from gs2d.meshing.depth_maps import Frame, depth_map
+from gs2d.meshing.extract import Extraction, extract, extract_unbounded
+from gs2d.meshing.marching_cubes import components
+from gs2d.meshing.unbounded import fuse_nested, nested_marching_cubes
+from gs2d.meshing.unbounded_bounds import STEP, derive_nest, known_depth
+from gs2d.meshing.volume import BLOCK, VOXELS, block_bytes
 from nest_scenes import BALL, GROUND, nest_of, outdoor_frames, volumes_of
 from surface_shapes import edge_uses, is_closed_manifold, orbit, rays, signed_volume, sphere_depth
-
-from gs2d.camera import look_at
-from gs2d.errors import ProtocolError
-from gs2d.mesh.extract import Extraction, extract, extract_unbounded
-from gs2d.mesh.frames import Frame, depth_map
-from gs2d.mesh.limits import sample_depths
-from gs2d.mesh.nest import STEP, derive_nest, known_depth
-from gs2d.mesh.nested import fuse_nested, nested_marching_cubes
-from gs2d.mesh.surface import components
-from gs2d.mesh.volume import BLOCK, VOXELS, block_bytes
 
 
 # -- joins -------------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ball_runs import options
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.train import train
 from tiny import write_capture
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
+from gs2d.core.splats import Splats
 from gs2d.data.scene import View
-from gs2d.pipeline.scoring import mean_psnr, score_views
-from gs2d.render.backend import get_backend
+from gs2d.pipeline.evaluate import mean_psnr, score_views
+from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 
 def test_the_mean_psnr_of_the_curve_is_that_of_the_full_scores_masks_and_equal_images_included() -> None:

@@ -12,26 +12,27 @@ import pytest
 import torch
 
 from ball_runs import SMALL, Stop, comparable, options
-from gs2d.data import View, toy
+from gs2d.config.presets import get_recipe
+from gs2d.core.images import read_image, write_image
+from gs2d.data import View
 from gs2d.data.subject import OBJECT, read_subject
-from gs2d.data.toy_exposure import GAINS, random_gains, with_gains
 from gs2d.errors import RunError
-from gs2d.images import read_image, write_image
-from gs2d.io.run import EXPOSURE, RunFolder
+from gs2d.experiments.figures import rank_run
+from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.evaluate import score_views
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.exposure import matched_by_halves, read_exposures
-from gs2d.pipeline.figures import rank_run
 from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.job import build_recipe, prepare
 from gs2d.pipeline.jobs import evaluate_run, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.paths import orbit_cameras
-from gs2d.pipeline.pictures import render_view
-from gs2d.pipeline.prepare import build_recipe, prepare
-from gs2d.pipeline.scoring import score_views
+from gs2d.pipeline.render import render_view
 from gs2d.pipeline.texture import TextureOptions, _photographs
 from gs2d.pipeline.train import train
-from gs2d.recipes import get_recipe
+from gs2d.synthetic import capture as toy
+from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
 from tiny import ball_cameras
 
 EARLY = (*SMALL, "exposure.start=5", "exposure.rate=0.2")  # so that 60 iterations show something

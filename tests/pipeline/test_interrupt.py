@@ -13,11 +13,11 @@ import pytest
 
 from ball_runs import Stop, comparable, options
 from gs2d.errors import DiskError
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.interruption import SAME, HeldSignals
 from gs2d.pipeline.train import train
-from gs2d.train.loop import Trainer
+from gs2d.training.trainer import Trainer
 
 
 @pytest.fixture(autouse=True)

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from ball_runs import Stop, options
+from gs2d.core.images import read_image
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import DataError, DiskError, ProtocolError, RecipeError, RunError
-from gs2d.images import read_image
-from gs2d.io.ply import read_mesh, read_splats, write_mesh, write_splats
-from gs2d.io.run import RunFolder, open_run
+from gs2d.io.run_dir import RunFolder, open_run
+from gs2d.io.splat_ply import read_mesh, read_splats, write_mesh, write_splats
 from gs2d.pipeline.events import Event, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
-from gs2d.pipeline.pictures import file_name, file_names
+from gs2d.pipeline.render import file_name, file_names
 from gs2d.pipeline.train import train
-from gs2d.splats import Splats
-from gs2d.triangles import Mesh
 from tiny import ball_cameras, write_ball_mesh
 
 

@@ -18,17 +18,17 @@ import torch
 from ball_runs import comparable, options
 from cli_runs import TINY, one_line
 from gs2d.cli import run
-from gs2d.io.run import RunFolder
+from gs2d.core.splats import Splats
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline import live as module
 from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
+from gs2d.pipeline.job import Job, prepare
 from gs2d.pipeline.live import Live
-from gs2d.pipeline.prepare import Job, prepare
 from gs2d.pipeline.train import train
-from gs2d.splats import Splats
-from gs2d.train.events import Progress, StageEntering
-from gs2d.train.state import TrainState
-from gs2d.view import Stage
-from gs2d.view_exact import Drawn
+from gs2d.training.events import Progress, StageEntering
+from gs2d.training.state import TrainState
+from gs2d.viewer.exact import Drawn
+from gs2d.viewer.server import Stage
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
@@ -123,7 +123,7 @@ def job(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
 
 @pytest.fixture
 def splats(undisturbed: RunFolder) -> Splats:
-    from gs2d.io.ply import read_splats
+    from gs2d.io.splat_ply import read_splats
 
     return read_splats(undisturbed.file("splats.ply"))
 

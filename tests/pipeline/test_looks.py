@@ -10,17 +10,18 @@ import pytest
 import torch
 
 from ball_runs import comparable, options
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
+from gs2d.core.splats import Splats
 from gs2d.data.scene import View
-from gs2d.evaluate.images import ImageMetrics
-from gs2d.io.run import RunFolder
-from gs2d.pipeline import recorder, surface
+from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline import mesh as surface
+from gs2d.pipeline import run_logger as recorder
+from gs2d.pipeline.evaluate import SeenView, score_views
 from gs2d.pipeline.jobs import mesh_run
-from gs2d.pipeline.scoring import SeenView, score_views
 from gs2d.pipeline.train import train
-from gs2d.render.backend import get_backend
+from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 
 def test_whoever_visits_sees_each_view_once_with_its_photograph_and_its_scores() -> None:

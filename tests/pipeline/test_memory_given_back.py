@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
 from gs2d.data import Scene, View
 from gs2d.data.cache import TRIM_EVERY, ImageCache, Picture
-from gs2d.kernels.recycle import Recycler
+from gs2d.kernels.buffer_pool import Recycler
 from gs2d.pipeline.memory import release
 
 HOLES = """
 import os, sys
-from gs2d.memory import trim
+from gs2d.core.memory import trim
 
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -35,7 +35,7 @@ print(done, before - resident())
 
 KEPT = """
 import resource, sys
-from gs2d.memory import hold, trim
+from gs2d.core.memory import hold, trim
 
 def faults_of_a_round():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

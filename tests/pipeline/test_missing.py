@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from ball_runs import options
-from gs2d.disk import disk_error
+from gs2d.core.files import disk_error
 from gs2d.errors import DiskError, ProtocolError
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline import train as train_module
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Event, Missing
@@ -57,7 +57,7 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
             "fault in gs2d: ZeroDivisionError: no message",
             "gs2d page {run}",
         ),
-        ("recorder.draw_stage", ValueError("x"), "pictures of stage refine", "fault in gs2d: ValueError: x", None),
+        ("run_logger.draw_stage", ValueError("x"), "pictures of stage refine", "fault in gs2d: ValueError: x", None),
     ],
 )
 def test_what_cannot_be_made_is_said_and_leaves_the_others(
@@ -119,7 +119,7 @@ def test_a_section_that_fails_loses_no_other_section(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = Path(shutil.copytree(undisturbed.path, tmp_path / "run"))
-    monkeypatch.setattr("gs2d.report.curve_section", failing(RuntimeError("no curve today")))
+    monkeypatch.setattr("gs2d.report.write.curve_section", failing(RuntimeError("no curve today")))
     (copy / "renders" / "index.json").write_text("{")
     heard: list[Event] = []
     report_run(copy, heard.append)

@@ -11,8 +11,8 @@ import pytest
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Step, ignore
+from gs2d.pipeline.job import prepare
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.prepare import prepare
 from gs2d.pipeline.train import train
 
 WIDE = (  # for few cameras, far apart, and pictures of a few pixels

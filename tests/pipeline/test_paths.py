@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras, photographed_arc, stops, tour
 from tiny import ball_cameras
 

@@ -14,10 +14,10 @@ from PIL import Image
 
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.errors import DataError, RecipeError
-from gs2d.io.run import REPORT, RunFolder
+from gs2d.io.run_dir import REPORT, RunFolder
 from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.job import build_recipe, prepare
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.prepare import build_recipe, prepare
 from gs2d.pipeline.train import train
 from tiny import RADIUS, SIZE, ball_cameras
 

@@ -12,26 +12,27 @@ import pytest
 import torch
 
 from ball_runs import SMALL, Stop, comparable, options
-from gs2d.camera import Camera
-from gs2d.data import load_scene, toy
-from gs2d.data.toy_poses import TRUTH, disturbed
+from gs2d.config.presets import get_recipe
+from gs2d.core.camera import Camera
+from gs2d.core.transforms import camera_extent, common_motion, moved, similarity_motions
+from gs2d.data import load_scene
 from gs2d.errors import RecipeError, RunError
-from gs2d.evaluate.images import mean_metrics
-from gs2d.geometry import camera_extent, common_motion, moved, similarity_motions
-from gs2d.io.run import POSES, RunFolder
+from gs2d.evaluation.images import mean_metrics
+from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.evaluate import score_views
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.job import build_recipe, prepare, reload_job
 from gs2d.pipeline.jobs import evaluate_run, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TextureOptions, TrainOptions
-from gs2d.pipeline.pictures import render_view, shown_cameras
-from gs2d.pipeline.prepare import build_recipe, prepare, reload_job
-from gs2d.pipeline.refined import aligned, how_far
-from gs2d.pipeline.scoring import score_views
+from gs2d.pipeline.refined_poses import aligned, how_far
+from gs2d.pipeline.render import render_view, shown_cameras
 from gs2d.pipeline.texture import _views
 from gs2d.pipeline.train import train
-from gs2d.recipes import get_recipe
-from gs2d.report_poses import poses_section
+from gs2d.report.sections.poses import poses_section
+from gs2d.synthetic import capture as toy
+from gs2d.synthetic.perturb_poses import TRUTH, disturbed
 from tiny import ball_cameras
 
 EARLY = (*SMALL, "poses.start=5", "poses.rate=0.01")  # so that 60 iterations show something

@@ -13,9 +13,9 @@ import pytest
 
 from ball_runs import SMALL, Stop, comparable, options, spawn
 from gs2d.errors import DiskError, RunError
-from gs2d.io.run import RunFolder, open_run
+from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
-from gs2d.pipeline.prepare import prepare
+from gs2d.pipeline.job import prepare
 from gs2d.pipeline.train import train
 
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.camera import look_at
-from gs2d.data.prior_maps import ObservedPoints
+from gs2d.config.protocols import DTU, GENERIC
+from gs2d.config.recipe import Rates
+from gs2d.core.camera import look_at
+from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RecipeError
 from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.job import fit_recipe
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prepare import fit_recipe
-from gs2d.protocols import DTU, GENERIC
-from gs2d.recipe import Rates
 
 COUNT = 12
 
@@ -107,7 +107,7 @@ def test_a_part_can_be_left_out_or_changed_by_its_name() -> None:
 
 
 def test_an_unknown_word_is_refused() -> None:
-    from gs2d.pipeline.prepare import check_train_options
+    from gs2d.pipeline.job import check_train_options
 
     with pytest.raises(RecipeError, match="--robust must be one of auto, on, off, got maybe"):
         check_train_options(options(robust="maybe"))

@@ -13,12 +13,12 @@ import torch
 
 from ball_runs import Stop, comparable, options
 from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
-from gs2d.io.ply import read_splats
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
+from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.estimate import duration
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.prepare import prepare
+from gs2d.pipeline.job import prepare
 from gs2d.pipeline.train import train
 from tiny import write_capture
 
@@ -89,7 +89,7 @@ def test_pictures_of_every_stage_lie_beside_the_photographs(undisturbed: RunFold
 def test_nan_stops_the_run_and_names_iteration_attribute_and_checkpoint(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gs2d.train import loop
+    from gs2d.training import trainer as loop
 
     def poisoned(step: Any) -> Any:
         def changed(state: Any, *args: Any, **kwargs: Any) -> None:
@@ -112,7 +112,7 @@ def test_nan_stops_the_run_and_names_iteration_attribute_and_checkpoint(
 def test_a_full_disk_before_the_first_checkpoint_leaves_nothing(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gs2d.io import run as run_module
+    from gs2d.io import run_dir as run_module
 
     def full(path: Path, _payload: Any) -> None:
         raise DiskError(f"cannot write {path}: No space left on device; free some space or choose another folder")

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 import torch
 
+from gs2d.config.protocols import PROTOCOLS
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, ProtocolError, RunError
-from gs2d.io.ply import read_mesh, read_splats
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
+from gs2d.io.splat_ply import read_mesh, read_splats
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finished import finished_splats
+from gs2d.pipeline.job import protocol_from_json, reload_job
 from gs2d.pipeline.jobs import export_run
+from gs2d.pipeline.mesh import extract_mesh
 from gs2d.pipeline.options import MeshOptions
-from gs2d.pipeline.prepare import protocol_from_json, reload_job
 from gs2d.pipeline.subject import meshed_subject, subject_line, within
-from gs2d.pipeline.surface import extract_mesh
-from gs2d.protocols import PROTOCOLS
-from gs2d.report_subject import subject_section
+from gs2d.report.sections.subject import subject_section
 
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d import grades
-from gs2d.camera import look_at
 from gs2d.cli.verdict import WIDTH, verdict_lines
+from gs2d.config import grades
+from gs2d.core.camera import look_at
+from gs2d.core.json_files import write_json
 from gs2d.data import View
 from gs2d.errors import DataError, RunError
-from gs2d.io.files import write_json
-from gs2d.io.run import RunFolder
-from gs2d.pipeline.verdict import Finding, judge
-from gs2d.pipeline.verdict_measures import (
+from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline.verdict.judge import Finding, judge
+from gs2d.pipeline.verdict.measures import (
     Measures,
     Neighbour,
     ViewMeasures,
@@ -26,7 +26,7 @@ from gs2d.pipeline.verdict_measures import (
     neighbours_of,
     placed_photographs,
 )
-from gs2d.report_verdict import graded, verdict_section
+from gs2d.report.sections.verdict import graded, verdict_section
 
 
 def views(train: float = 29.0, test: float = 27.0, **changes: float) -> tuple[ViewMeasures, ...]:

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "cuda"))  # emulate
-
 import emulate
-
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render import cuda
-from gs2d.render.backend import Backend, get_backend
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
 
 
 @pytest.fixture(params=["reference", "cpu", "emulated", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from render_scenes import front_camera, splat
 
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels import library
-from gs2d.render import backend
+from gs2d.render import backends as backend
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.backend import Backend, backend_report, get_backend
+from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
+from render_scenes import front_camera, splat
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,12 @@ from math import cos, radians, sin, sqrt
 import numpy as np
 import pytest
 import torch
-from render_scenes import BLUE, C0, GREEN, IMAGES, Y_AXIS, equal, front_camera, requiring_grad, splat, stack
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
+from render_scenes import BLUE, C0, GREEN, IMAGES, Y_AXIS, equal, front_camera, requiring_grad, splat, stack
 
 
 # 7 ---------------------------------------------------------------------------------------------------------------

@@ -13,21 +13,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad, splat
 from torch import Tensor
 from torch.testing import assert_close
 
-from gs2d.camera import Camera
+from gs2d.config.recipe import LossTerm
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import moved
 from gs2d.errors import ShapeError
-from gs2d.geometry import moved
-from gs2d.losses import compute_losses
-from gs2d.losses_reference import normal_consistency, normal_consistency_per_splat
-from gs2d.recipe import LossTerm
-from gs2d.render import camera_gradient, reference
+from gs2d.losses.api import compute_losses
+from gs2d.losses.reference import normal_consistency, normal_consistency_per_splat
+from gs2d.render import pose_gradient as camera_gradient
+from gs2d.render import reference
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.backend import Backend, get_backend
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
+from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad, splat
 
 SMOOTH = ("plain", "opaque", "huge")  # kinds of splats without decisions near by
 

@@ -12,14 +12,14 @@ from math import exp, log, radians, sin, sqrt
 
 import pytest
 import torch
-from render_scenes import IMAGES, Y_AXIS, equal, front_camera, requiring_grad, splat, stack
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
+from render_scenes import IMAGES, Y_AXIS, equal, front_camera, requiring_grad, splat, stack
 
 
 # 13 --------------------------------------------------------------------------------------------------------------

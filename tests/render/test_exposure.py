@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gs2d.errors import ShapeError
-from gs2d.exposure import (
+from gs2d.render.exposure import (
     expose,
     fit_exposure,
     identity,

@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-import render_oracle
 import torch
-from render_scenes import IMAGES, KINDS, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 from torch import Tensor
 
-from gs2d.camera import Camera
+import render_oracle
+from gs2d.core.camera import Camera
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.render import reference, reference_errors
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.splats import ATTRIBUTES, Splats
+from render_scenes import IMAGES, KINDS, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 

@@ -7,15 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import render_oracle
 import torch
-from render_scenes import IMAGES, KINDS, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.render import projection_reference, reference
+import render_oracle
+from gs2d.core.camera import Camera
+from gs2d.core.splats import ATTRIBUTES, Splats
+from gs2d.render import reference
+from gs2d.render import reference_projection as projection_reference
 from gs2d.render.types import RasterSettings
-from gs2d.splats import ATTRIBUTES, Splats
+from render_scenes import IMAGES, KINDS, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from browser import Page, browser, require_browser
-from gs2d.io.run import PAGE, SPLATS
-from gs2d.report import write_report
-from gs2d.report_links import links, size_text
-from gs2d.report_terms import TERMS, glossary, titles_of
+from gs2d.io.run_dir import PAGE, SPLATS
+from gs2d.report.links import links, size_text
+from gs2d.report.terms import TERMS, glossary, titles_of
+from gs2d.report.write import write_report
 from report_runs import fabricate
 
 AT = "parseFloat(document.querySelector('.wipe .both').style.getPropertyValue('--at'))"

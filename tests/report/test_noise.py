@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from gs2d.core.images import read_image, write_image
 from gs2d.errors import BackendError
-from gs2d.images import read_image, write_image
 from gs2d.io.video import write_video
-from gs2d.report_html import picture
-from gs2d.sfm.photos import find_photos, read_photos
-from gs2d.sfm.stage import stage_photos
+from gs2d.report.html import picture
+from gs2d.sfm.image_copies import stage_photos
+from gs2d.sfm.images import find_photos, read_photos
 
 SIDES = (1, 7, 64, 256, 257, 300, 360, 361, 520, 700)
 

@@ -16,14 +16,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d import report, report_images, report_mesh, report_surface
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.json_files import write_json
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError, RunError, ShapeError
-from gs2d.io.files import write_json
-from gs2d.report import RunRecord, stage_table, story, verdict, write_report
-from gs2d.report_curves import curves, read_history, smoothed
-from gs2d.report_surface import surface_scores
-from gs2d.triangles import Mesh
+from gs2d.report import images as report_images
+from gs2d.report import mesh_images as report_mesh
+from gs2d.report import write as report
+from gs2d.report.plots import curves, read_history, smoothed
+from gs2d.report.sections import surface as report_surface
+from gs2d.report.sections.surface import surface_scores
+from gs2d.report.write import RunRecord, stage_table, story, verdict, write_report
 from report_runs import KNOT, definition, events, fabricate, scores, stage_entry
 
 VOID = {"meta", "img", "br", "input"}
@@ -235,7 +238,7 @@ def test_the_picture_of_a_score_and_the_doubts_about_it_are_in_the_report(tmp_pa
 def test_every_figure_of_a_surface_score_is_explained_in_the_report() -> None:
     from dataclasses import fields
 
-    from gs2d.evaluate.surface import SurfaceScore
+    from gs2d.evaluation.surface import SurfaceScore
 
     known = {field.name for field in fields(SurfaceScore)} - {
         "scores",

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
 
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
+from gs2d.core.images import image_size, read_image
 from gs2d.errors import DataError
-from gs2d.images import image_size, read_image
-from gs2d.sfm.photos import AVIF, HEIF, Photo, camera_groups, find_photos, read_photos, turn
-from gs2d.sfm.similar import neighbour_pairs, similar_pairs
-from gs2d.sfm.stage import stage_photos
+from gs2d.sfm.image_copies import stage_photos
+from gs2d.sfm.images import AVIF, HEIF, Photo, camera_groups, find_photos, read_photos, turn
+from gs2d.sfm.pairs import neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import rotation_to_z, up_direction
 
 DETAILS = ExifTags.IFD.Exif
@@ -282,7 +282,7 @@ def test_a_package_that_reads_heic_is_used_where_there_is_one(tmp_path: Path) ->
         picture(tmp_path / f"photos/{i}.bmp", size=(24, 16))
         os.rename(tmp_path / f"photos/{i}.bmp", tmp_path / f"photos/{i}.HEIC")
     program = (
-        "import sys; from pathlib import Path; from gs2d.sfm.photos import find_photos, read_photos\n"
+        "import sys; from pathlib import Path; from gs2d.sfm.images import find_photos, read_photos\n"
         "root = Path(sys.argv[1]); paths, notes = find_photos(root)\n"
         "print([photo.name for photo in read_photos(paths, root, threads=1)], notes)"
     )

@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from synthetic_model import HEIGHT, WIDTH, synthetic_model
 
 from gs2d.sfm.lens import MODELS, Trial, apply, choose, doubts, lens_line, models_to_try, try_lenses
+from synthetic_model import HEIGHT, WIDTH, synthetic_model
 
 F, CX, CY = 520.0, 320.0, 240.0
 

@@ -14,13 +14,13 @@ import pytest
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.data.colmap_model import ColmapCamera, ColmapImage, ColmapPoints
+from gs2d.data.readers.colmap_model import ColmapCamera, ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
-from gs2d.io.run import RunFolder
-from gs2d.pipeline.poses import PosesOptions, find_poses
-from gs2d.sfm.outcome import Piece, camera_line, check_any, why_not_placed
-from gs2d.sfm.solve import Facts, Group, Request, Solved, check_installed, solve
-from gs2d.sfm.workplace import check_out, put_in_place, workplace
+from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline.sfm import PosesOptions, find_poses
+from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, solve
+from gs2d.sfm.model import Piece, camera_line, check_any, why_not_placed
+from gs2d.sfm.workspace import check_out, put_in_place, workplace
 
 
 def piece(*names: str) -> Piece:
@@ -170,7 +170,7 @@ def test_without_pycolmap_the_extra_is_named_before_anything_is_read(
 def test_the_worker_does_not_load_torch() -> None:
     import subprocess
 
-    code = "import sys, gs2d.sfm.worker; assert 'torch' not in sys.modules; assert 'pycolmap' not in sys.modules"
+    code = "import sys, gs2d.sfm.colmap_worker; assert 'torch' not in sys.modules; assert 'pycolmap' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

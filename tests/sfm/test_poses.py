@@ -18,16 +18,16 @@ import pytest
 from PIL import Image
 
 from cli_runs import TINY, one_line
-from gs2d.camera import look_at
 from gs2d.cli import run
+from gs2d.core.camera import look_at
+from gs2d.core.images import read_image
 from gs2d.data import load_scene
-from gs2d.data.colmap_model import read_images
+from gs2d.data.readers.colmap_model import read_images
 from gs2d.errors import RunError
-from gs2d.images import read_image
 from gs2d.pipeline.events import Event, Phase
-from gs2d.pipeline.poses import PosesOptions, find_poses
+from gs2d.pipeline.sfm import PosesOptions, find_poses
 from gs2d.sfm.lens import MODELS
-from gs2d.sfm.workplace import workplace
+from gs2d.sfm.workspace import workplace
 from room_photos import FOCAL, SIZE, UP, Room, room_picture, textures, write_room
 
 

@@ -19,7 +19,7 @@ from cli_runs import TINY, one_line
 from gs2d.cli import commands, run
 from gs2d.cli.app import parse
 from gs2d.cli.options import Training
-from gs2d.io.run import open_run
+from gs2d.io.run_dir import open_run
 from gs2d.pipeline import reconstruct as module
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.reconstruct import FEW, QUALITIES, ReconstructOptions, reconstruct
@@ -193,7 +193,7 @@ def test_an_extra_that_is_missing_is_one_line_before_anything_is_made(
     write_room(tmp_path / "photos", 3)
     monkeypatch.setitem(sys.modules, package, None)
     if package == "pycolmap":
-        monkeypatch.setattr("gs2d.sfm.solve.importlib.util.find_spec", lambda _name: None)
+        monkeypatch.setattr("gs2d.sfm.colmap.importlib.util.find_spec", lambda _name: None)
     assert run(words_for(tmp_path / "photos", tmp_path / "run", "--quiet", *words)) == 2
     assert message in one_line(capsys.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]

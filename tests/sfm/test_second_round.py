@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_model import synthetic_model
 
-from gs2d.sfm.second import LEAST_SEEN, NEXT, PARTNERS, partners, refuse_unsupported
+from gs2d.sfm.second_round import LEAST_SEEN, NEXT, PARTNERS, partners, refuse_unsupported
+from synthetic_model import synthetic_model
 
 NAMES = [f"{i:03}.jpg" for i in range(40)]
 LENS = (520.0, 320.0, 240.0)

@@ -12,12 +12,12 @@ from PIL import Image, ImageFilter
 
 from cli_runs import one_line
 from gs2d.cli import run
+from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.io.files import read_json
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.poses import PosesOptions, find_poses
 from gs2d.pipeline.reconstruct import ReconstructOptions
-from gs2d.sfm.frames import Video, choose, is_video, look_into, sharpness_of, take
+from gs2d.pipeline.sfm import PosesOptions, find_poses
+from gs2d.sfm.video_frames import Video, choose, is_video, look_into, sharpness_of, take
 from room_photos import write_room
 
 real = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ffmpeg on this machine")
@@ -149,6 +149,6 @@ def test_hdr_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     answer = subprocess.CompletedProcess(
         [], 0, '{"streams": [{"nb_read_packets": "7", "color_transfer": "arib-std-b67"}]}', ""
     )
-    monkeypatch.setattr("gs2d.sfm.frames.shutil.which", lambda name: name)
-    monkeypatch.setattr("gs2d.sfm.frames.subprocess.run", lambda *_, **__: answer)
+    monkeypatch.setattr("gs2d.sfm.video_frames.shutil.which", lambda name: name)
+    monkeypatch.setattr("gs2d.sfm.video_frames.subprocess.run", lambda *_, **__: answer)
     assert look_into(path) == Video(path, 7, "HLG")

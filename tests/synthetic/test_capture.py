@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from gs2d.camera import Camera, look_at
-from gs2d.data import load_scene, toy
-from gs2d.data import toy_shapes as shapes
-from gs2d.data.toy import demo_cameras, demo_mesh, write_demo_capture
-from gs2d.data.toy_rays import _sample_boxes, cast_camera, occluded
-from gs2d.data.toy_scene import FLOOR, RADIUS, ToyScene, build_scene
+from gs2d.core.camera import Camera, look_at
+from gs2d.data import load_scene
 from gs2d.errors import DataError, DiskError
-from gs2d.io.ply import read_mesh
+from gs2d.io.splat_ply import read_mesh
+from gs2d.meshing.raycast import _sample_boxes, cast_camera, occluded
+from gs2d.synthetic import capture as toy
+from gs2d.synthetic import shapes
+from gs2d.synthetic.capture import demo_cameras, demo_mesh, write_demo_capture
+from gs2d.synthetic.scene import FLOOR, RADIUS, ToyScene, build_scene
 
 TRAIN, TEST, SIZE = 3, 2, 48
 

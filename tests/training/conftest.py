@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from train_toys import backends, make_scene
 
 from gs2d.data.scene import Scene
+from train_toys import backends, make_scene
 
 
 @pytest.fixture(scope="session")

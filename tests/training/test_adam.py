@@ -6,12 +6,12 @@ import math
 
 import pytest
 import torch
-from train_toys import full_state, random_splats
 
-from gs2d.recipe import Rates, Stage
-from gs2d.splats import ATTRIBUTES
-from gs2d.train.optimizer import adam_step, begin_stage, rates_at
-from gs2d.train.state import TrainState
+from gs2d.config.recipe import Rates, Stage
+from gs2d.core.splats import ATTRIBUTES
+from gs2d.training.adam import adam_step, begin_stage, rates_at
+from gs2d.training.state import TrainState
+from train_toys import full_state, random_splats
 
 RATES = dict(zip(ATTRIBUTES, (1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3), strict=True))
 

@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from train_toys import SIZE, VIEWS, backends, random_splats, same
 
+from gs2d.config.presets import appearance, refine
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe, Stage
 from gs2d.data.scene import Scene, View
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Recipe, Stage
-from gs2d.recipes import appearance, refine
-from gs2d.train import events
-from gs2d.train.cached_views import CachedViews, choose_evaluator, is_cacheable
-from gs2d.train.loop import Trainer
-from gs2d.train.state import TrainState
-from gs2d.train.views import WholeViews
+from gs2d.training import events
+from gs2d.training.cached_objective import CachedViews, choose_evaluator, is_cacheable
+from gs2d.training.objective import WholeViews
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from train_toys import SIZE, VIEWS, backends, random_splats, same
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 ROOM = 1 << 30

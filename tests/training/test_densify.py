@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 import torch
-from slow_densify import densify_step_by_step
 from torch.utils._python_dispatch import TorchDispatchMode
-from train_toys import full_state, random_splats
 
+from gs2d.config.recipe import GradDensify
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
-from gs2d.geometry import quats_to_matrices
-from gs2d.recipe import GradDensify
-from gs2d.splats import Splats
-from gs2d.train.densify import DensifyCounts, accumulate, densify_and_prune, limit_opacity
-from gs2d.train.state import Moments, Statistics, TrainState
+from gs2d.training.densify import DensifyCounts, accumulate, densify_and_prune, limit_opacity
+from gs2d.training.state import Moments, Statistics, TrainState
+from slow_densify import densify_step_by_step
+from train_toys import full_state, random_splats
 
 
 def logit(opacity: float) -> float:

@@ -7,20 +7,20 @@ from dataclasses import replace
 
 import pytest
 import torch
-from train_toys import random_splats, short, train
 
-from gs2d.camera import Camera
+from gs2d.config.presets import surface
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import ALL, Rates, Recipe
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RecipeError
-from gs2d.protocols import GENERIC
-from gs2d.recipe import ALL, Rates, Recipe
-from gs2d.recipes import surface
 from gs2d.render import reference, reference_errors
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
-from gs2d.train.loop import Trainer
-from gs2d.train.state import TrainState
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from train_toys import random_splats, short, train
 
 
 def test_bad_recipes_and_empty_scenes_stop_before_anything_is_trained(scene: Scene) -> None:

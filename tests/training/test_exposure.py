@@ -11,27 +11,27 @@ import numpy as np
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
-from train_toys import SIZE, VIEWS, backends, random_splats, same, short
 
-from gs2d.camera import Camera, look_at
+from gs2d.config.presets import appearance, refine, surface, with_exposure
+from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC
+from gs2d.config.recipe import Exposure, Rates, Recipe
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import camera_extent
 from gs2d.data.scene import PointCloud, Scene, View
-from gs2d.data.toy_exposure import random_gains
 from gs2d.errors import RunError
-from gs2d.exposure import _exposed, _gradients
-from gs2d.geometry import camera_extent
-from gs2d.protocols import GENERIC, NERF_SYNTHETIC
-from gs2d.recipe import Exposure, Rates, Recipe
-from gs2d.recipes import appearance, refine, surface, with_exposure
 from gs2d.render.api import rasterize, splat_errors
+from gs2d.render.exposure import _exposed, _gradients
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
-from gs2d.train import events
-from gs2d.train.cached_views import CachedViews
-from gs2d.train.exposure import Exposures, as_photographed, exposure_step, uncount
-from gs2d.train.loop import Trainer
-from gs2d.train.state import TrainState
-from gs2d.train.targets import Target
-from gs2d.train.views import clipped_pixels
+from gs2d.synthetic.perturb_exposure import random_gains
+from gs2d.training import events
+from gs2d.training.cached_objective import CachedViews
+from gs2d.training.exposure import Exposures, as_photographed, exposure_step, uncount
+from gs2d.training.objective import clipped_pixels
+from gs2d.training.state import TrainState
+from gs2d.training.targets import Target
+from gs2d.training.trainer import Trainer
+from train_toys import SIZE, VIEWS, backends, random_splats, same, short
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 

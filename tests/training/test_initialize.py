@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.scene import PointCloud, Scene
 from gs2d.errors import DataError, ProtocolError
-from gs2d.geometry import quats_to_matrices
-from gs2d.train.initialise import Initial, initial_splats, random_rotations, usable_points
+from gs2d.training.initialize import Initial, initial_splats, random_rotations, usable_points
 
 
 def start(scene: Scene, *, near: float = 0.1, degree: int = 3, count: int = 500, seed: int = 0) -> Initial:

@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_train_resume import reload, saved
-from train_toys import VIEWS, WIDE, compared, same, short
 
-from gs2d.camera import look_at
+from gs2d.config.multiview import MultiView
+from gs2d.config.presets import with_multiview
+from gs2d.config.protocols import GENERIC
+from gs2d.core.camera import look_at
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
-from gs2d.protocols import GENERIC
-from gs2d.recipe_multiview import MultiView
-from gs2d.recipes import with_multiview
 from gs2d.render.api import rasterize
-from gs2d.train.loop import Trainer
-from gs2d.train.multiview import Photographs, draw_turn, find_neighbours
-from gs2d.train.targets import Targets
+from gs2d.training.multiview import Photographs, draw_turn, find_neighbours
+from gs2d.training.targets import Targets
+from gs2d.training.trainer import Trainer
+from saved_states import reload, saved
+from train_toys import VIEWS, WIDE, compared, same, short
 
 
 def ring(angles: list[float], distance: float = 3.0) -> Scene:

@@ -8,23 +8,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from train_toys import SIZE, VIEWS, backends, make_scene, random_splats, same, short
 
-from gs2d.camera import look_at
+from gs2d.config.presets import appearance, surface
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import PoseRefinement, Rates, Recipe
+from gs2d.core.camera import look_at
+from gs2d.core.transforms import common_motion, moved, rigid_motion, similarity_motions
 from gs2d.data.scene import Scene
-from gs2d.data.toy_poses import disturbed
 from gs2d.errors import DivergedError, RunError
-from gs2d.geometry import common_motion, moved, rigid_motion, similarity_motions
-from gs2d.protocols import GENERIC
-from gs2d.recipe import PoseRefinement, Rates, Recipe
-from gs2d.recipes import appearance, surface
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.train import per_view
-from gs2d.train.cached_views import CachedViews
-from gs2d.train.loop import Trainer
-from gs2d.train.poses import Poses, pose_rate, pose_step
-from gs2d.train.state import TrainState
+from gs2d.synthetic.perturb_poses import disturbed
+from gs2d.training import per_image as per_view
+from gs2d.training.cached_objective import CachedViews
+from gs2d.training.poses import Poses, pose_rate, pose_step
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from train_toys import SIZE, VIEWS, backends, make_scene, random_splats, same, short
 
 needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
 

@@ -8,23 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from test_train_resume import reload, saved
-from train_toys import SIZE, random_splats, same, short
 
-from gs2d.data.prior_maps import DepthMap, MapFiles, ObservedPoints
+from gs2d.config.presets import with_depth_prior, with_normal_prior
+from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Rates, Recipe
+from gs2d.core.transforms import quats_to_matrices
+from gs2d.data.priors import DepthMap, MapFiles, ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
-from gs2d.geometry import quats_to_matrices
-from gs2d.losses_priors import KnownDepths, PointDepths, RelativeDepths
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Rates, Recipe
-from gs2d.recipe_priors import DepthPrior, NormalPrior
-from gs2d.recipes import with_depth_prior, with_normal_prior
+from gs2d.losses.priors import KnownDepths, PointDepths, RelativeDepths
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.train.initialise import initial_splats, turned_to
-from gs2d.train.loop import Trainer
-from gs2d.train.priors import (
+from gs2d.training.initialize import initial_splats, turned_to
+from gs2d.training.priors import (
     known_depths,
     line_of,
     plan_depths,
@@ -34,6 +31,9 @@ from gs2d.train.priors import (
     with_known_points,
     world_normals,
 )
+from gs2d.training.trainer import Trainer
+from saved_states import reload, saved
+from train_toys import SIZE, random_splats, same, short
 
 
 @dataclass(frozen=True)
@@ -361,7 +361,7 @@ def test_a_view_of_which_nothing_is_known_trains_without(scene: Scene) -> None:
 
 
 def test_what_is_known_beyond_the_room_is_made_anew(scene: Scene) -> None:
-    from gs2d.train.priors import Priors
+    from gs2d.training.priors import Priors
 
     made, recipe = cases(scene)["sensor"]
     kept, none = Priors(made, recipe), Priors(made, recipe, limit_bytes=0)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from train_toys import full_state, make_scene, random_splats
 
+from gs2d.config.recipe import CloneInPlace, RankByError
 from gs2d.errors import DivergedError
-from gs2d.recipe import CloneInPlace, RankByError
 from gs2d.render.api import rasterize
-from gs2d.train.actions import clone_in_place, halved_opacity, rank_by_error, worst
-from gs2d.train.state import TrainState
+from gs2d.training.rank_clone import clone_in_place, halved_opacity, rank_by_error, worst
+from gs2d.training.state import TrainState
+from train_toys import full_state, make_scene, random_splats
 
 
 def test_the_worst_are_the_largest_and_ties_go_by_index() -> None:

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 
 import pytest
 import torch
-from train_toys import backends, random_splats, same, short, train
 
+from gs2d.config.presets import proceed
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene
 from gs2d.errors import RunError
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Recipe
-from gs2d.recipes import proceed
-from gs2d.train import events
-from gs2d.train.loop import Trainer
-from gs2d.train.state import TrainState
-
-
-def reload(data: bytes) -> TrainState:
-    return TrainState.from_state_dict(torch.load(io.BytesIO(data), weights_only=True))
-
-
-def saved(trainer: Trainer) -> bytes:
-    file = io.BytesIO()
-    torch.save(trainer.state.state_dict(), file)
-    return file.getvalue()
+from gs2d.training import events
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from saved_states import reload, saved
+from train_toys import backends, random_splats, same, short, train
 
 
 @pytest.mark.parametrize("absgs", [False, True])

@@ -8,23 +8,23 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from train_toys import full_state, make_scene, random_splats
 
+from gs2d.config.presets import refine, surface, two_dgs, with_exposure, with_robustness
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay
+from gs2d.config.schedule import scale_schedule
+from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
 from gs2d.errors import DataError, RecipeError
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Recipe, validate
-from gs2d.recipe_robust import DenseStart, FreeSpace, OpacityDecay
-from gs2d.recipes import refine, surface, two_dgs, with_exposure, with_robustness
-from gs2d.schedule import scale_schedule
-from gs2d.splats import Splats
-from gs2d.train import events
-from gs2d.train.backdrop import backdrop_color
-from gs2d.train.free_space import FreeSpaceMaps
-from gs2d.train.loop import Trainer
-from gs2d.train.plane_sweep import start_points, sweep_views
-from gs2d.train.point_gains import point_gains
-from gs2d.train.robust import Robustness
+from gs2d.training import events
+from gs2d.training.backdrop import backdrop_color
+from gs2d.training.free_space import FreeSpaceMaps
+from gs2d.training.plane_sweep import start_points, sweep_views
+from gs2d.training.point_gains import point_gains
+from gs2d.training.robust import Robustness
+from gs2d.training.trainer import Trainer
+from train_toys import full_state, make_scene, random_splats
 from wall_scene import HEIGHT, WALL, WIDTH, wall
 
 SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
@@ -56,15 +56,15 @@ def test_a_sweep_finds_the_depth_of_a_textured_wall_and_says_nothing_of_a_bare_o
 
 
 def test_a_sweep_is_the_same_whatever_is_compared_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gs2d.train.plane_sweep.PLANES_AT_ONCE", 5)
+    monkeypatch.setattr("gs2d.training.plane_sweep.PLANES_AT_ONCE", 5)
     for one, other in zip(sweep_views(wall(), SMALL).depths, swept_wall().depths, strict=True):  # type: ignore[attr-defined]
         np.testing.assert_array_equal(one, other)
 
 
 def test_what_a_sweep_frees_is_given_back_while_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     given_back: list[int] = []
-    monkeypatch.setattr("gs2d.train.plane_sweep.trim", lambda: given_back.append(1))
-    monkeypatch.setattr("gs2d.train.plane_sweep.TRIM_EVERY", 2)
+    monkeypatch.setattr("gs2d.training.plane_sweep.trim", lambda: given_back.append(1))
+    monkeypatch.setattr("gs2d.training.plane_sweep.TRIM_EVERY", 2)
     views = len(sweep_views(wall(), SMALL).views)
     assert len(given_back) == 2 * (views // 2 + 1)  # photographs shrunk, and depths found
 

@@ -6,11 +6,11 @@ import io
 
 import pytest
 import torch
-from train_toys import full_state, random_splats
 
 from gs2d.errors import RunError, ShapeError
-from gs2d.train.rows import append_rows, keep_rows
-from gs2d.train.state import TrainState
+from gs2d.training.rows import append_rows, keep_rows
+from gs2d.training.state import TrainState
+from train_toys import full_state, random_splats
 
 
 def row_tensors(state: TrainState) -> dict[str, torch.Tensor]:

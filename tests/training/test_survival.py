@@ -7,18 +7,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gs2d.camera import Camera
+from gs2d.config.presets import get_recipe, surface
+from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC, Protocol
+from gs2d.config.recipe import GradDensify, LossTerm, Rates, Recipe
+from gs2d.config.schedule import scale_schedule
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import BackendError, DivergedError
-from gs2d.protocols import GENERIC, NERF_SYNTHETIC, Protocol
-from gs2d.recipe import GradDensify, LossTerm, Rates, Recipe
-from gs2d.recipes import get_recipe, surface
-from gs2d.render.backend import Backend, get_backend
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.schedule import scale_schedule
-from gs2d.splats import Splats
-from gs2d.train import events
-from gs2d.train.loop import Trainer
+from gs2d.training import events
+from gs2d.training.trainer import Trainer
 
 BLACK = GENERIC
 WHITE = replace(GENERIC, background=NERF_SYNTHETIC.background)

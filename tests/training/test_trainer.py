@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from train_toys import random_splats, same, short, train
 
+from gs2d.config.presets import PHOTOMETRIC, get_recipe, refine, surface
+from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC
+from gs2d.config.recipe import GradDensify, LossTerm, Recipe, Stage
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
-from gs2d.protocols import GENERIC, NERF_SYNTHETIC
-from gs2d.recipe import GradDensify, LossTerm, Recipe, Stage
-from gs2d.recipes import PHOTOMETRIC, get_recipe, refine, surface
 from gs2d.render.api import rasterize
-from gs2d.render.backend import get_backend
-from gs2d.splats import Splats
-from gs2d.train import events
-from gs2d.train.loop import raster_settings
-from gs2d.train.state import TrainState
+from gs2d.render.backends import get_backend
+from gs2d.training import events
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import raster_settings
+from train_toys import random_splats, same, short, train
 
 
 def test_the_stages_run_in_order_and_tell_what_they_do(scene: Scene) -> None:

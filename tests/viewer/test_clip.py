@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.view_clip import ClipBox, clip_commands
-from gs2d.view_exact import Frame
-from gs2d.view_splats import Preview
+from gs2d.viewer.clip import ClipBox, clip_commands
+from gs2d.viewer.exact import Frame
+from gs2d.viewer.splats import Preview
 
 
 class Control(SimpleNamespace):

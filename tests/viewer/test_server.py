@@ -18,17 +18,17 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh, TexturedMesh
+from gs2d.core.sh import rgb_to_sh0
+from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
-from gs2d.io.splat_formats import LAYOUTS, write_layout
+from gs2d.io.formats.registry import LAYOUTS, write_layout
 from gs2d.io.textured import glb_bytes, glb_turn, write_textured
 from gs2d.pipeline.view import ViewOptions, open_viewer
-from gs2d.sh import rgb_to_sh0
-from gs2d.splats import Splats
-from gs2d.triangles import Mesh, TexturedMesh
-from gs2d.view import free_port, quaternion, thumbnail
-from gs2d.view_exact import Drawn, ExactPictures, Frame, camera_of
-from gs2d.view_splats import preview
+from gs2d.viewer.exact import Drawn, ExactPictures, Frame, camera_of
+from gs2d.viewer.server import free_port, quaternion, thumbnail
+from gs2d.viewer.splats import preview
 
 WORLD = Frame(np.zeros(3), 1.0)
 

@@ -20,13 +20,13 @@ import pytest
 import torch
 from PIL import Image
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.page import MOST_SPLATS, Seen, pack, texels_of, write_page
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.report_images import depth_picture, normal_picture
-from gs2d.splats import Splats
+from gs2d.report.images import depth_picture, normal_picture
+from gs2d.viewer.web import MOST_SPLATS, Seen, pack, texels_of, write_page
 
 ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
 CAMERA = look_at(ORIGIN + np.array([0.3, -4.0, 0.8]), ORIGIN, np.array([0.0, 0.0, 1.0]), width=120, height=80, fx=100.0)
@@ -118,7 +118,7 @@ def test_a_few_outliers_do_not_coarsen_the_colours_of_all() -> None:
 
 def test_more_splats_than_a_texture_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert MOST_SPLATS * 3 <= 2048 * 8192
-    monkeypatch.setattr("gs2d.page.MOST_SPLATS", 10)
+    monkeypatch.setattr("gs2d.viewer.web.MOST_SPLATS", 10)
     splats = some_splats(11)
     splats.opacity_logits[:] = 0
     with pytest.raises(DataError, match="a page holds at most 10 splats, got 11"):

@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from browser import Page, browser, require_browser
-from gs2d.camera import look_at
+from gs2d.core.camera import look_at
+from gs2d.core.splats import Splats
 from gs2d.data.subject import Subject
-from gs2d.page import Seen, write_page
-from gs2d.page_start import guessed_subject, home_camera, photographed_arc
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
+from gs2d.viewer.web import Seen, write_page
+from gs2d.viewer.web_start import guessed_subject, home_camera, photographed_arc
 
 ORIGIN = np.array([100.0, -200.0, 50.0])
 UP = np.array([0.0, 0.0, 1.0])

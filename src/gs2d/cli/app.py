@@ -66,7 +66,7 @@ def run(argv: Sequence[str]) -> int:
     interruptible = Interruptible()
     console = Console(quiet=command.quiet, as_json=command.json, before_each=interruptible.check)
     try:
-        actions = importlib.import_module("gs2d.cli.actions")
+        actions = importlib.import_module("gs2d.cli.handlers")
         if isinstance(command, _HEAVY):
             importlib.import_module("gs2d.pipeline.jobs")  # torch and all: see `interrupts`
         with interruptible:

@@ -6,13 +6,13 @@ from typing import Any
 
 from gs2d.cli import commands as c
 from gs2d.cli.console import Console
-from gs2d.cli.extras import OPTIONAL, torch_advice
+from gs2d.cli.doctor_extras import OPTIONAL, torch_advice
 
 
 def doctor(_command: c.Doctor, console: Console) -> None:
     """Look at everything and say what is there."""
-    from gs2d.io.run import machine, versions
-    from gs2d.render.backend import backend_report
+    from gs2d.io.run_dir import machine, versions
+    from gs2d.render.backends import backend_report
 
     host, installed, backends = machine(), versions(), backend_report()
     chosen = next((status.name for status in backends if status.available), "none")

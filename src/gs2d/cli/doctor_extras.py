@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gs2d.extras import install
+from gs2d.core.extras import install
 
 CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"  # as pytorch.org has it
 _FFMPEG = "apt install ffmpeg, brew install ffmpeg, or ffmpeg.org"

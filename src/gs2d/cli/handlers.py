@@ -233,10 +233,10 @@ def report(command: c.Report, console: Console) -> None:
 
 def recipes(command: c.Recipes, console: Console) -> None:
     """``gs2d recipes``."""
-    from gs2d.pipeline.recipe_text import describe_recipe
-    from gs2d.recipe_json import apply_overrides, to_json
-    from gs2d.recipes import RECIPES, get_recipe
-    from gs2d.schedule import scale_schedule
+    from gs2d.config.describe import describe_recipe
+    from gs2d.config.presets import RECIPES, get_recipe
+    from gs2d.config.schedule import scale_schedule
+    from gs2d.config.serialize import apply_overrides, to_json
 
     if command.action == "list":
         if command.name:
@@ -279,8 +279,8 @@ def doctor(command: c.Doctor, console: Console) -> None:
 def info(command: c.Info, console: Console) -> None:
     """``gs2d info``."""
     from gs2d.data.archive import is_archive
-    from gs2d.io.run import is_run, open_run
-    from gs2d.pipeline.describe import describe_capture, describe_file
+    from gs2d.io.run_dir import is_run, open_run
+    from gs2d.pipeline.info import describe_capture, describe_file
 
     path: Path = command.path
     if is_run(path):

@@ -7,11 +7,11 @@ import json
 from gs2d.cli.commands import Paper, Sweep, TableCommon
 from gs2d.cli.console import Console
 from gs2d.errors import RecipeError, RunError
-from gs2d.paper_tables import SWEEP
-from gs2d.pipeline.paper import PaperResult
-from gs2d.pipeline.paper import paper as run_paper
-from gs2d.pipeline.paper_plan import PaperOptions
-from gs2d.pipeline.paper_text import TITLES, columns_of, measured, verdict_text
+from gs2d.experiments.paper import PaperResult
+from gs2d.experiments.paper import paper as run_paper
+from gs2d.experiments.plan import PaperOptions
+from gs2d.experiments.render_text import TITLES, columns_of, measured, verdict_text
+from gs2d.experiments.tables import SWEEP
 
 
 def show_table(command: TableCommon, console: Console) -> None:

@@ -14,7 +14,7 @@ _MOST_LINES = 12  # of photographs without a place; poses.json has them all
 
 def poses(command: c.Poses, console: Console) -> None:
     """``gs2d poses``."""
-    from gs2d.pipeline.poses import PosesOptions, find_poses
+    from gs2d.pipeline.sfm import PosesOptions, find_poses
 
     options = PosesOptions(**values(PosesOptions, command))
     result = find_poses(options, console.on_event)
@@ -26,7 +26,7 @@ def poses(command: c.Poses, console: Console) -> None:
 
 def poses_lines(result: dict[str, Any]) -> list[str]:
     """The outcome in lines for people."""
-    from gs2d.pipeline.poses import placed_line
+    from gs2d.pipeline.sfm import placed_line
 
     lines = [
         placed_line(result),

@@ -9,11 +9,11 @@ from gs2d.cli import commands as c
 from gs2d.cli.console import Console
 from gs2d.cli.options import Finding, training_values, values
 from gs2d.cli.tables import show_run
-from gs2d.io.files import read_json
-from gs2d.io.run import PAGE
+from gs2d.core.json_files import read_json
+from gs2d.io.run_dir import PAGE
 from gs2d.pipeline.reconstruct import CAPTURE, ReconstructOptions
 from gs2d.pipeline.reconstruct import reconstruct as run_all
-from gs2d.sfm.workplace import POSES_JSON
+from gs2d.sfm.workspace import POSES_JSON
 
 
 def reconstruct(command: c.Reconstruct, console: Console) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from gs2d.recipe import ALL, CloneInPlace, RankByError, Recipe, Stage
+from gs2d.config.recipe import ALL, CloneInPlace, RankByError, Recipe, Stage
 
 
 def describe_recipe(recipe: Recipe) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gs2d.recipe_checks import integer, number, require
+from gs2d.config.validate import integer, number, require
 
 MULTIVIEW_KINDS = ("multiview_photometric", "multiview_geometric")
 """Losses that need a second view."""
@@ -14,7 +14,7 @@ LARGEST = {"patches": 1_000_000, "radius": 50}  # more is a slip, and ends out o
 
 @dataclass(frozen=True)
 class MultiView:
-    """How training views are compared with a neighbour of theirs (``losses_multiview.py``, ``train/multiview.py``).
+    """How training views are compared with a neighbour of theirs (``losses.multiview.py``, ``training/multiview.py``).
 
     Attributes
     ----------

@@ -12,8 +12,9 @@ from difflib import get_close_matches
 from functools import partial
 from types import MappingProxyType
 
-from gs2d.errors import RecipeError
-from gs2d.recipe import (
+from gs2d.config.multiview import MultiView
+from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.recipe import (
     ALL,
     ALPHA,
     SH,
@@ -27,9 +28,8 @@ from gs2d.recipe import (
     Recipe,
     Stage,
 )
-from gs2d.recipe_multiview import MultiView
-from gs2d.recipe_priors import DepthPrior, NormalPrior
-from gs2d.recipe_robust import DenseStart, FreeSpace, OpacityDecay
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay
+from gs2d.errors import RecipeError
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
 SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gs2d.recipe_checks import integer, number, one_of, require
+from gs2d.config.validate import integer, number, one_of, require
 
 PRIOR_KINDS = ("depth_prior", "normal_prior")
 """Losses that need something known beforehand of a view."""
@@ -18,7 +18,7 @@ AXES = ("auto", "opencv", "opengl")
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """Where known depths come from and how far they are trusted (``train/priors.py``, ``losses_priors.py``).
+    """Where known depths come from and how far they are trusted (``training/priors.py``, ``losses.priors.py``).
 
     Attributes
     ----------

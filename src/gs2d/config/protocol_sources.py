@@ -12,9 +12,9 @@ from dataclasses import dataclass, fields, is_dataclass
 from types import MappingProxyType
 from typing import Any
 
+from gs2d.config.protocols import Protocol
+from gs2d.config.surface_protocols import DtuSurface, TntSurface, VisibleSurface
 from gs2d.errors import ProtocolError
-from gs2d.protocols import Protocol
-from gs2d.protocols_surface import DtuSurface, TntSurface, VisibleSurface
 
 _CODE, _2DGS = "the official 2DGS code", "the 2DGS paper"
 _PAPER, _OURS = "the 2DGS-R paper", "gs2d (docs/decisions.md)"
@@ -78,7 +78,7 @@ _OWN: dict[str, dict[str, str]] = {
     "mip-nerf-360": {
         "depth": f"{_360_SCRIPT}: depth_ratio stays 0",
         "distortion_weight": f"{_2DGS}: 100 in unbounded scenes; {_360_SCRIPT} uses none",
-        "downscale": f"{_360_SCRIPT}: images_4 outdoors, images_2 indoors (of each scene: protocols_datasets)",
+        "downscale": f"{_360_SCRIPT}: images_4 outdoors, images_2 indoors (of each scene: config/datasets)",
     },
     "generic": {
         "depth": f"{_OURS}: as 2DGS advises for scenes that are not around one object",

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+from gs2d.config.recipe import LossTerm
 from gs2d.errors import ProtocolError
-from gs2d.recipe import LossTerm
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 RELATIVE_NEAR = 0.01  # [d] of the extent, where a protocol names no near

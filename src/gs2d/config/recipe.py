@@ -1,8 +1,8 @@
 """What is trained, as data: losses, rates, densification, entry actions, stages, recipes.
 
-A variant is a value, never an ``if``: every ablation of the paper is another :class:`Recipe` (see ``recipes.py``).
+A variant is a value, never an ``if``: every ablation of the paper is another :class:`Recipe` (``config/presets.py``).
 Iterations are counted from 1 within a stage; ``start`` fields mean "active when iteration > start", as in the
-official 2DGS code. ``recipe_json`` writes and reads recipes and applies ``--set``; ``schedule`` scales them.
+official 2DGS code. ``config.serialize`` writes and reads recipes and applies ``--set``; ``schedule`` scales them.
 This module never imports torch.
 """
 
@@ -13,13 +13,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 
-from gs2d.recipe_checks import group, integer, number, one_of, require
-from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView, check_multiview
-from gs2d.recipe_priors import PRIOR_KINDS, DepthPrior, NormalPrior, check_priors
-from gs2d.recipe_robust import DenseStart, FreeSpace, OpacityDecay, check_robust
-from gs2d.recipe_views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
-from gs2d.recipe_views import PoseRefinement as PoseRefinement
-from gs2d.recipe_views import check_exposure, check_poses
+from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
+from gs2d.config.priors import PRIOR_KINDS, DepthPrior, NormalPrior, check_priors
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, check_robust
+from gs2d.config.validate import group, integer, number, one_of, require
+from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
+from gs2d.config.views import PoseRefinement as PoseRefinement
+from gs2d.config.views import check_exposure, check_poses
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH

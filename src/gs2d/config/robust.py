@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gs2d.recipe_checks import integer, number, require
+from gs2d.config.validate import integer, number, require
 
 
 @dataclass(frozen=True)
 class DenseStart:
-    """Splats to start from where a plane sweep over neighbouring photographs agrees (``train/plane_sweep.py``).
+    """Splats to start from where a plane sweep over neighbouring photographs agrees (``training/plane_sweep.py``).
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class DenseStart:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Prune splats from space that photographs show to be empty (``train/free_space.py``).
+    """Prune splats from space that photographs show to be empty (``training/free_space.py``).
 
     What a photograph shows at a depth, it sees through all that lies before it. Depths are those of sparse points and
     of the plane sweep, as far as a neighbour agrees.

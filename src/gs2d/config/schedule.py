@@ -14,9 +14,9 @@ import math
 from dataclasses import fields, replace
 from typing import TypeVar
 
+from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.recipe import Exposure, GradDensify, PoseRefinement, Rates, Recipe, Stage
 from gs2d.errors import RecipeError
-from gs2d.recipe import Exposure, GradDensify, PoseRefinement, Rates, Recipe, Stage
-from gs2d.recipe_priors import DepthPrior, NormalPrior
 
 MIN_DENSIFICATIONS = 10
 PRUNE_GRACE = 100  # iterations after a reset in which nothing is pruned for opacity

@@ -12,8 +12,8 @@ from dataclasses import MISSING, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from gs2d.config.recipe import CloneInPlace, RankByError, Recipe, validate
 from gs2d.errors import RecipeError
-from gs2d.recipe import CloneInPlace, RankByError, Recipe, validate
 
 ACTIONS: Mapping[str, type] = {"rank_by_error": RankByError, "clone_in_place": CloneInPlace}
 ACTION_KEY = "action"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gs2d.recipe_checks import integer, number, one_of, require
+from gs2d.config.validate import integer, number, one_of, require
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """One affine colour transform for each training photograph, learned with the splats (``train/exposure.py``).
+    """One affine colour transform for each training photograph, learned with the splats (``training/exposure.py``).
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class Exposure:
         Adam's.
     initial : "identity" or "points"
         What transforms begin as: all the same, or the gains by which the colours of sparse points differ between
-        photographs (``train/point_gains.py``), so that no splat ever explains an exposure.
+        photographs (``training/point_gains.py``), so that no splat ever explains an exposure.
     """
 
     rate: float = 0.05
@@ -45,7 +45,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """One rigid motion for each training camera, learned with the splats (``train/poses.py``).
+    """One rigid motion for each training camera, learned with the splats (``training/poses.py``).
 
     It learns in stages that train the means of all splats: elsewhere nothing could follow.
 

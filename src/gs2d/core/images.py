@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
-from gs2d.check import check_shapes
-from gs2d.disk import atomic_write
+from gs2d.core.checks import check_shapes
+from gs2d.core.files import atomic_write
 from gs2d.errors import DataError, ShapeError
 
 _BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 
 
 @dataclass(frozen=True, eq=False)

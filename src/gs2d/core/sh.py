@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 
 __all__ = ["MAX_DEGREE", "harmonics", "num_coefficients", "rgb_to_sh0", "sh_basis", "sh_degree_of", "sh_to_rgb"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 

@@ -11,8 +11,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 
 __all__ = [

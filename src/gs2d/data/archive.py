@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from gs2d.core.files import disk_error
 from gs2d.data.load import detect_format
-from gs2d.disk import disk_error
 from gs2d.errors import DataError, DiskError
 
 _JUNK = {"__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini"}  # what file managers add

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gs2d.data.colmap_model import read_images
-from gs2d.data.dtu import CAMERA_FILES
+from gs2d.core.json_files import read_json
+from gs2d.data.readers.colmap_model import read_images
+from gs2d.data.readers.dtu import CAMERA_FILES
 from gs2d.errors import DataError
-from gs2d.io.files import read_json
 
 TRAINING, TESTING, NOTHING = "for training", "for testing", "distributed, but not read by gs2d"
 FULL_SIZE = "for its folder, full size"  # photographs that are trained from a folder of smaller ones

@@ -12,7 +12,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gs2d.data.layout_pieces import (
+from gs2d.config.datasets import (
+    DATASETS,
+    DTU_SCENES,
+    MIP_NERF_360_SCENES,
+    NERF_SYNTHETIC_SCENES,
+    TNT_SCENES,
+    DataSet,
+    SceneFacts,
+    get_dataset,
+)
+from gs2d.config.protocols import Protocol, get_protocol, protocol_for
+from gs2d.data.benchmark_pieces import (
     FULL_SIZE,
     NOTHING,
     TESTING,
@@ -25,17 +36,6 @@ from gs2d.data.layout_pieces import (
     whole_folders,
 )
 from gs2d.errors import DataError
-from gs2d.protocols import Protocol, get_protocol, protocol_for
-from gs2d.protocols_datasets import (
-    DATASETS,
-    DTU_SCENES,
-    MIP_NERF_360_SCENES,
-    NERF_SYNTHETIC_SCENES,
-    TNT_SCENES,
-    DataSet,
-    SceneFacts,
-    get_dataset,
-)
 
 DEPTH = 3  # folders below the data folder in which scenes are looked for (TNT_GOF/TrainingSet/Barn)
 MESH_TRUTHS = ("mesh_gt.ply", "mesh_gt.obj", "points_gt.ply")  # beside a capture's photographs

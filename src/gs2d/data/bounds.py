@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.transforms import camera_extent, focus_point
 from gs2d.data.scene import PointCloud
-from gs2d.geometry import camera_extent, focus_point
 
 _GRID = 40  # samples along each side of the search box
 _CAMERAS = 48  # at most so many, evenly chosen, vote: loading stays fast with thousands of views

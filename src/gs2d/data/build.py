@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.images import area_downscale, image_size, mask_downscale, read_image, read_mask
+from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import ImageCache, Picture
-from gs2d.data.lens import Intrinsics, source_positions, undistort_image, undistort_mask
-from gs2d.data.prior_maps import (
+from gs2d.data.priors import (
     DEPTH_SUFFIXES,
     DEPTHS,
     NORMAL_SUFFIXES,
@@ -27,9 +28,8 @@ from gs2d.data.prior_maps import (
     find_map,
 )
 from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.data.undistort import Intrinsics, source_positions, undistort_image, undistort_mask
 from gs2d.errors import DataError, ShapeError
-from gs2d.geometry import camera_extent
-from gs2d.images import area_downscale, image_size, mask_downscale, read_image, read_mask
 
 # An image may differ from its camera's size by a factor; each axis may then be off by rounding.
 _ASPECT_TOLERANCE = 0.01

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.memory import trim
+from gs2d.core.memory import trim
 
 TRIM_EVERY = 16  # pictures that are decoded between giving back what decoding left: a few ms each time
 

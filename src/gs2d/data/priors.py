@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gs2d.camera import Camera
-from gs2d.data.lens import Intrinsics
+from gs2d.core.camera import Camera
+from gs2d.core.images import image_size, read_image
+from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
-from gs2d.images import image_size, read_image
 
 DEPTHS, NORMALS = "depths", "normals"
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff")

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.core.images import composite
+from gs2d.core.memory import trim
 from gs2d.data.cache import ImageCache, Picture
-from gs2d.data.prior_maps import ObservedPoints, PriorMaps
+from gs2d.data.priors import ObservedPoints, PriorMaps
 from gs2d.errors import DataError
-from gs2d.images import composite
-from gs2d.memory import trim
 
 
 @dataclass(frozen=True, eq=False)

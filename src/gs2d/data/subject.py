@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.json_files import read_json
+from gs2d.core.transforms import focus_point, up_direction
 from gs2d.errors import DataError, ProtocolError
-from gs2d.geometry import focus_point, up_direction
-from gs2d.io.files import read_json
-from gs2d.io.run import SUBJECT
+from gs2d.io.run_dir import SUBJECT
 
 OBJECT, SCENE = "object", "scene"
 SPREAD = 0.5  # standard deviation of a camera's votes, in halves of the picture's shorter side

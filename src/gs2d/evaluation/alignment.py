@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 from gs2d.errors import DataError
 
 _BATCH = 256  # samples fitted at a time

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
+from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.io.files import read_json
 
 _PLANES = {0: (1, 2), 1: (0, 2), 2: (0, 1)}  # the two axes of the polygon, by the axis it is drawn out along
 _CHUNK = 1 << 21

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.evaluate.neighbours import Cloud, tensor_on
-from gs2d.triangles import Mesh
+from gs2d.core.mesh import Mesh
+from gs2d.evaluation.nearest import Cloud, tensor_on
 
 _CANDIDATES = 8  # triangles tried for each point
 _CHUNK = 1 << 16  # points and triangles at a time

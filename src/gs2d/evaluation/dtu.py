@@ -17,13 +17,13 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from gs2d.camera import Camera
-from gs2d.evaluate.align import apply, similarity_scale
-from gs2d.evaluate.dtu_files import DtuTruth
-from gs2d.evaluate.neighbours import Cloud, first_of_neighbours, on_gpu
-from gs2d.evaluate.surface_clouds import ScoredClouds
-from gs2d.protocols_surface import DTU_SURFACE, DtuSurface
-from gs2d.triangles import Mesh
+from gs2d.config.surface_protocols import DTU_SURFACE, DtuSurface
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh
+from gs2d.evaluation.alignment import apply, similarity_scale
+from gs2d.evaluation.dtu_files import DtuTruth
+from gs2d.evaluation.nearest import Cloud, first_of_neighbours, on_gpu
+from gs2d.evaluation.surface_clouds import ScoredClouds
 
 GREEN_WITHIN = 1.0  # mm, in the coloured clouds only: DTU has no threshold
 _SLAB = 400_000  # points thinned at a time

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from gs2d.errors import DataError
-from gs2d.io.ply import read_points
+from gs2d.io.splat_ply import read_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class DtuTruth:
 
 
 def read_dtu_truth(scan: int, files: Mapping[str, Path]) -> DtuTruth:
-    """Read the ground truth of a scan from its three ``files`` (keys as ``data.layouts.dtu_truth_files``).
+    """Read the ground truth of a scan from its three ``files`` (keys as ``data.benchmarks.dtu_truth_files``).
 
     Raises
     ------

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.evaluate.align import apply, umeyama
-from gs2d.evaluate.neighbours import Cloud
+from gs2d.evaluation.alignment import apply, umeyama
+from gs2d.evaluation.nearest import Cloud
 
 CHUNK = 1 << 22  # points thinned at a time: bounds memory beside the clouds themselves
 

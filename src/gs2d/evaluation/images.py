@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, fields
 import torch
 from torch import Tensor
 
-from gs2d import losses
-from gs2d.check import check_shapes
-from gs2d.evaluate.lpips import MIN_SIZE, REMEDY, Lpips
+from gs2d.core.checks import check_shapes
+from gs2d.evaluation.lpips import MIN_SIZE, REMEDY, Lpips
+from gs2d.losses import api as losses
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def image_metrics(
         False = ignore this pixel. LPIPS sees the target there and still averages over the whole image.
     backend_name : "cpu", "cuda" or "reference"
     lpips : Lpips, optional
-        From ``evaluate.lpips.load_lpips``; without it LPIPS is null with the remedy as reason.
+        From ``evaluation.lpips.load_lpips``; without it LPIPS is null with the remedy as reason.
     """
     return ImageMetrics(
         psnr=_metric(psnr_8bit(image, target, mask)),

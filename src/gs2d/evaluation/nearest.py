@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 from gs2d.errors import DataError
 
 if TYPE_CHECKING:

@@ -20,14 +20,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.config.surface_protocols import VISIBLE_SURFACE
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluate.align import similarity_scale
-from gs2d.evaluate.distance import distances_to_mesh, distances_to_points, sample_surface
-from gs2d.evaluate.surface_clouds import ScoredClouds
-from gs2d.evaluate.visibility import frustum_counts, visible_counts
-from gs2d.protocols_surface import VISIBLE_SURFACE
-from gs2d.triangles import Mesh
+from gs2d.evaluation.alignment import similarity_scale
+from gs2d.evaluation.distance import distances_to_mesh, distances_to_points, sample_surface
+from gs2d.evaluation.surface_clouds import ScoredClouds
+from gs2d.evaluation.visibility import frustum_counts, visible_counts
 
 _T = TypeVar("_T")
 _Counts = Callable[[np.ndarray, Mesh], np.ndarray]  # in how many views points [P, 3] of a mesh are visible

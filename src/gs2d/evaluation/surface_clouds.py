@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from gs2d.images import write_image
+from gs2d.core.images import write_image
 from gs2d.io.ply_format import write_ply
 
 GOOD, NEAR, FAR, OUT = (40, 150, 80), (235, 200, 60), (200, 40, 40), (150, 150, 160)

@@ -17,15 +17,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.config.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
+from gs2d.core.images import natural_key
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluate.align import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
-from gs2d.evaluate.icp import IcpResult, icp, uniform_downsample, voxel_downsample
-from gs2d.evaluate.neighbours import Cloud
-from gs2d.evaluate.surface_clouds import ScoredClouds
-from gs2d.evaluate.tnt_files import TntTruth, match_cameras
-from gs2d.images import natural_key
-from gs2d.protocols_surface import TNT_SURFACE, IcpStage, TntSurface
-from gs2d.triangles import Mesh
+from gs2d.evaluation.alignment import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
+from gs2d.evaluation.icp import IcpResult, icp, uniform_downsample, voxel_downsample
+from gs2d.evaluation.nearest import Cloud
+from gs2d.evaluation.surface_clouds import ScoredClouds
+from gs2d.evaluation.tanks_and_temples_files import TntTruth, match_cameras
 
 
 @dataclass(frozen=True)

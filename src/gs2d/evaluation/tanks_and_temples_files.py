@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gs2d.core.images import natural_key
 from gs2d.errors import DataError
-from gs2d.evaluate.crop import CropVolume, read_crop
-from gs2d.images import natural_key
-from gs2d.io.ply import read_points
+from gs2d.evaluation.crop import CropVolume, read_crop
+from gs2d.io.splat_ply import read_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class TntTruth:
 
 
 def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
-    """Read the ground truth of a scene from its four ``files`` (keys as ``data.layouts.tnt_truth_files``).
+    """Read the ground truth of a scene from its four ``files`` (keys as ``data.benchmarks.tnt_truth_files``).
 
     Raises
     ------

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.evaluate.neighbours import on_gpu, tensor_on
-from gs2d.triangles import Mesh
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh
+from gs2d.evaluation.nearest import on_gpu, tensor_on
 
 _PAIRS = 1 << 21  # pairs of face and pixel at a time
 

@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gs2d.config.protocols import MetricConventions
 from gs2d.errors import Gs2dError
-from gs2d.io.run import open_run
-from gs2d.paper_tables import DTU, LOWER_IS_BETTER, METRICS, NERF_SYNTHETIC, TNT, Order, PaperTable
-from gs2d.protocols import MetricConventions
+from gs2d.experiments.tables import DTU, LOWER_IS_BETTER, METRICS, NERF_SYNTHETIC, TNT, Order, PaperTable
+from gs2d.io.run_dir import open_run
 
 FIGURES = (*METRICS, "bytes", "seconds")
 IMAGES = ("psnr", "ssim", "lpips")

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gs2d.disk import disk_error
+from gs2d.core.files import disk_error
 from gs2d.errors import RunError
-from gs2d.io.run import RunFolder
+from gs2d.io.run_dir import RunFolder
 
 FOREIGN_SECONDS = 1800.0
 UNWRITTEN_SECONDS = 10.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shlex
 
-from gs2d.paper_tables import SWEEP
+from gs2d.experiments.execute import SweepJob
+from gs2d.experiments.plan import PaperOptions
+from gs2d.experiments.tables import SWEEP
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.paper_plan import PaperOptions
-from gs2d.pipeline.sweep import SweepJob
 
 
 def paper_command(options: PaperOptions) -> str:

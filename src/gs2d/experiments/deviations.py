@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from gs2d.config.presets import get_recipe
+from gs2d.config.schedule import scale_schedule
+from gs2d.core.images import image_size
 from gs2d.errors import Gs2dError
-from gs2d.images import image_size
-from gs2d.io.run import machine, versions
-from gs2d.paper_tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
-from gs2d.pipeline.paper_plan import PaperOptions
-from gs2d.pipeline.paper_rows import NOT_YET, Results, surface_metric
-from gs2d.pipeline.paper_scenes import FoundScene, missing_scenes, unreadable
-from gs2d.recipes import get_recipe
-from gs2d.schedule import scale_schedule
+from gs2d.experiments.aggregate import NOT_YET, Results, surface_metric
+from gs2d.experiments.plan import PaperOptions
+from gs2d.experiments.scenes import FoundScene, missing_scenes, unreadable
+from gs2d.experiments.tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
+from gs2d.io.run_dir import machine, versions
 
 NERF_SYNTHETIC_SIZE = (800, 800)  # px
 SHOWN_PIECES = 5  # that a capture lacks

@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import Gs2dError
-from gs2d.io.files import read_json, write_json
-from gs2d.io.run import MESH, SPLATS, RunFolder, make_folder, now
+from gs2d.experiments.claims import FOREIGN_SECONDS, Claim, holder, take_claim
+from gs2d.io.run_dir import MESH, SPLATS, RunFolder, make_folder, now
 from gs2d.pipeline.events import Event, Missing, Notice, OnEvent, Phase, StageDone, Step, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
-from gs2d.pipeline.sweep_claims import FOREIGN_SECONDS, Claim, holder, take_claim
 
 MAX_DEATHS = 3  # so often may the process of a job die before the job counts as failed
 POLL_SECONDS = 0.5

@@ -12,25 +12,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.config.recipe import RankByError, Recipe
+from gs2d.config.serialize import from_json
+from gs2d.core.files import atomic_write
+from gs2d.core.splats import Splats
 from gs2d.data import View
-from gs2d.disk import atomic_write
 from gs2d.errors import Gs2dError
-from gs2d.io.run import RunFolder, load_tensors, make_folder, open_run
+from gs2d.io.run_dir import RunFolder, load_tensors, make_folder, open_run
 from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.exposure import photographed, read_exposures
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.pictures import choose_views, render_view, share_of_group, splatted
-from gs2d.pipeline.prepare import Job, reload_job
-from gs2d.pipeline.restart import stage_end
-from gs2d.recipe import RankByError, Recipe
-from gs2d.recipe_json import from_json
+from gs2d.pipeline.job import Job, reload_job
+from gs2d.pipeline.render import choose_views, render_view, share_of_group, splatted
+from gs2d.pipeline.resume import stage_end
 from gs2d.render.api import splat_errors
-from gs2d.report_curves import Panel, compared, read_history
-from gs2d.report_images import ERROR_TOP, error_picture, error_scale, highlight_picture, known_picture
-from gs2d.splats import Splats
-from gs2d.train.actions import worst
-from gs2d.train.exposure import as_photographed
-from gs2d.train.state import TrainState
+from gs2d.report.images import ERROR_TOP, error_picture, error_scale, highlight_picture, known_picture
+from gs2d.report.plots import Panel, compared, read_history
+from gs2d.training.exposure import as_photographed
+from gs2d.training.rank_clone import worst
+from gs2d.training.state import TrainState
 
 TRACES = (
     Panel("mean_area", r"Mean $K_a = s_u s_v$, square world units", log=True),

@@ -9,23 +9,30 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.disk import atomic_write
+from gs2d.config.protocol_sources import stated
+from gs2d.config.protocols import Protocol
+from gs2d.config.surface_protocols import (
+    DTU_SURFACE,
+    TNT_SURFACE,
+    VISIBLE_SURFACE,
+    DtuSurface,
+    TntSurface,
+    VisibleSurface,
+)
+from gs2d.core.files import atomic_write
+from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
-from gs2d.io.files import read_json, write_json
-from gs2d.io.run import machine, make_folder, versions
-from gs2d.paper_tables import DTU, SWEEP, TNT, PaperTable
+from gs2d.experiments.aggregate import FIGURES, Results, Row, Verdict, judge, read_cell
+from gs2d.experiments.commands import commands_of, paper_command
+from gs2d.experiments.deviations import deviations_of
+from gs2d.experiments.plan import PaperOptions, Plan, make_plan
+from gs2d.experiments.render_page import write_page
+from gs2d.experiments.render_text import to_csv, to_latex, to_markdown
+from gs2d.experiments.scenes import FoundScene
+from gs2d.experiments.slots import run_sweep
+from gs2d.experiments.tables import DTU, SWEEP, TNT, PaperTable
+from gs2d.io.run_dir import machine, make_folder, versions
 from gs2d.pipeline.events import Notice, OnEvent, ignore
-from gs2d.pipeline.paper_commands import commands_of, paper_command
-from gs2d.pipeline.paper_deviations import deviations_of
-from gs2d.pipeline.paper_page import write_page
-from gs2d.pipeline.paper_plan import PaperOptions, Plan, make_plan
-from gs2d.pipeline.paper_rows import FIGURES, Results, Row, Verdict, judge, read_cell
-from gs2d.pipeline.paper_scenes import FoundScene
-from gs2d.pipeline.paper_text import to_csv, to_latex, to_markdown
-from gs2d.pipeline.sweep_slots import run_sweep
-from gs2d.protocols import Protocol
-from gs2d.protocols_sources import stated
-from gs2d.protocols_surface import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE, DtuSurface, TntSurface, VisibleSurface
 
 ABOUT = "about.json"
 FIXED = ("table", "protocol", "schedule_scale", "downscale", "backend", "overrides")  # of all runs in a folder
@@ -73,7 +80,7 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
         on_event(Notice(f"{options.out} has rows of earlier commands, which stay: {', '.join(others)}"))
     if options.train:
         if options.lpips_weights is not None:
-            from gs2d.evaluate.lpips import load_lpips  # loads torch
+            from gs2d.evaluation.lpips import load_lpips  # loads torch
 
             load_lpips(options.lpips_weights)  # a wrong file is said now, not after hours of training
         make_folder(options.out)

@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gs2d.config.presets import RECIPES, get_recipe
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.schedule import scale_schedule
+from gs2d.config.serialize import apply_overrides, to_json
 from gs2d.errors import RecipeError
-from gs2d.io.run import versions
-from gs2d.paper_tables import PAPER_TABLES, SWEEP, PaperTable, recipe_table
+from gs2d.experiments.execute import Sweep, SweepJob, stage_keys
+from gs2d.experiments.scenes import FoundScene, find_scenes
+from gs2d.experiments.tables import PAPER_TABLES, SWEEP, PaperTable, recipe_table
+from gs2d.io.run_dir import versions
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
-from gs2d.pipeline.paper_scenes import FoundScene, find_scenes
-from gs2d.pipeline.sweep import Sweep, SweepJob, stage_keys
-from gs2d.recipe import Recipe, validate
-from gs2d.recipe_json import apply_overrides, to_json
-from gs2d.recipes import RECIPES, get_recipe
-from gs2d.schedule import scale_schedule
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,15 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gs2d.disk import atomic_write
+from gs2d.config.presets import RECIPES, get_recipe
+from gs2d.core.files import atomic_write
+from gs2d.core.images import read_image
+from gs2d.core.json_files import read_json
 from gs2d.errors import Gs2dError
-from gs2d.images import read_image
-from gs2d.io.files import read_json
-from gs2d.io.run import RENDERS
-from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
-from gs2d.pipeline.events import OnEvent, ignore
-from gs2d.pipeline.paper_rows import Cell, Results, Row, Verdict
-from gs2d.pipeline.paper_text import (
+from gs2d.experiments.aggregate import Cell, Results, Row, Verdict
+from gs2d.experiments.render_text import (
     TITLES,
     best_rows,
     columns_of,
@@ -25,8 +23,10 @@ from gs2d.pipeline.paper_text import (
     untrained,
     verdict_text,
 )
-from gs2d.recipes import RECIPES, get_recipe
-from gs2d.report_html import drawing, escape, facts, missing, page, picture, table
+from gs2d.experiments.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
+from gs2d.io.run_dir import RENDERS
+from gs2d.pipeline.events import OnEvent, ignore
+from gs2d.report.html import drawing, escape, facts, missing, page, picture, table
 
 PICTURE_WIDTH = 300
 FIGURE_TITLES = {
@@ -239,7 +239,7 @@ def _picture(path: Path, alt: str) -> str:
 
 def own_figures(paper_table: PaperTable, results: Results, out: Path, on_event: OnEvent) -> list[str]:
     """The paper's figures (K_a and opacity, traces of the attributes, a map of E_i), a set for each scene."""
-    from gs2d.pipeline.figures import coverage, write_figures  # loads torch
+    from gs2d.experiments.figures import coverage, write_figures  # loads torch
 
     rows = [row for row in results.rows if row.recipe is not None]
     sections: list[str] = []

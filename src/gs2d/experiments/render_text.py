@@ -6,8 +6,8 @@ import csv
 import io
 from collections.abc import Sequence
 
-from gs2d.paper_tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
-from gs2d.pipeline.paper_rows import FIGURES, Results, Row, Verdict
+from gs2d.experiments.aggregate import FIGURES, Results, Row, Verdict
+from gs2d.experiments.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 
 DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 2, "seconds": 0}
 TITLES = {**METRICS, "bytes": "MB", "seconds": "s"}

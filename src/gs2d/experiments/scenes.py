@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gs2d.config.datasets import DATASETS, DataSet, SceneFacts
+from gs2d.config.protocols import Protocol, get_protocol
 from gs2d.data import detect_format
-from gs2d.data.layouts import DEPTH, MESH_TRUTHS, find_truth, missing_lines, protocol_of, recognise, subfolders
+from gs2d.data.benchmarks import DEPTH, MESH_TRUTHS, find_truth, missing_lines, protocol_of, recognise, subfolders
 from gs2d.errors import DataError
-from gs2d.paper_tables import DTU, NERF_SYNTHETIC, TNT
-from gs2d.protocols import Protocol, get_protocol
-from gs2d.protocols_datasets import DATASETS, DataSet, SceneFacts
+from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, TNT
 
 PAPER_NAMES = {"dtu": DTU, "tnt": TNT, "nerf-synthetic": NERF_SYNTHETIC, "mip-nerf-360": "Mip-NeRF 360"}
 OFFICIAL = ("dtu", "tnt")  # evaluators that need several files

@@ -10,9 +10,9 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from gs2d.errors import BackendError, RunError
+from gs2d.experiments.execute import MAX_DEATHS, Sweep, SweepJob, watch, work
+from gs2d.experiments.slurm import run_on_slurm
 from gs2d.pipeline.events import OnEvent
-from gs2d.pipeline.sweep import MAX_DEATHS, Sweep, SweepJob, watch, work
-from gs2d.pipeline.sweep_slurm import run_on_slurm
 
 
 def run_sweep(
@@ -70,7 +70,7 @@ def gpu_count(backend: str) -> int:
     """GPUs to spread jobs over; 0 where the backend does not use any."""
     if backend not in ("auto", "cuda"):
         return 0
-    from gs2d.render.backend import backend_report
+    from gs2d.render.backends import backend_report
 
     status = {entry.name: entry for entry in backend_report()}
     if not (status.get("cuda") and status["cuda"].available):

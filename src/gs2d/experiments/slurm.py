@@ -6,10 +6,10 @@ import shutil
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from gs2d.core.extras import install
 from gs2d.errors import BackendError, RunError
-from gs2d.extras import install
+from gs2d.experiments.execute import Sweep, SweepJob, watch, work
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.sweep import Sweep, SweepJob, watch, work
 
 
 def run_on_slurm(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from gs2d.recipes import TABLES
+from gs2d.config.presets import TABLES
 
 SWEEP = "sweep"  # the name of a table of chosen recipes
 TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result

@@ -9,8 +9,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.splats import Splats
 
 FLAT_LOG_SCALE = math.log(1e-6)  # wu, the thickness that files of three scales are told
 _THIN = 0.25  # third scale / larger of the others: of disks that a file of few bits made thicker

@@ -7,8 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.triangles import Mesh
 
 
 def read_obj(path: str | os.PathLike[str]) -> Mesh:

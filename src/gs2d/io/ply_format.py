@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gs2d.core.json_files import atomic_write
 from gs2d.errors import DataError
-from gs2d.io.files import atomic_write
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",

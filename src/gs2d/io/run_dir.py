@@ -33,10 +33,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gs2d.disk import atomic_write, disk_error
+from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
 from gs2d.io.event_log import EventLog
-from gs2d.io.files import read_json, write_json
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians
 from gs2d.io.obj import read_obj
 from gs2d.io.ply_format import PlyElement, PlyFile, PlyList, read_ply, write_ply
-from gs2d.splats import Splats
-from gs2d.triangles import Mesh
 
 _ROT = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", *_ROT)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gs2d.disk import atomic_write
+from gs2d.core.files import atomic_write
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DataError
-from gs2d.triangles import Mesh, TexturedMesh
 
 SUFFIXES = (".glb", ".obj")
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON", "BIN\0"

@@ -9,7 +9,7 @@ from typing import Any
 
 from PIL import Image, features
 
-from gs2d.disk import atomic_write
+from gs2d.core.files import atomic_write
 from gs2d.errors import BackendError, DataError
 from gs2d.io.mp4 import film_header, read_sequence
 

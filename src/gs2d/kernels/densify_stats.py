@@ -1,4 +1,4 @@
-"""The densification signal of a view, added to what was gathered: ``train.densify.accumulate`` in one native call."""
+"""The densification signal of a view, added to what was gathered: ``training.densify.accumulate`` natively."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ctypes
 
 from torch import Tensor
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, prepare
 

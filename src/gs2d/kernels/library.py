@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from gs2d.errors import BackendError
-from gs2d.kernels.recycle import Recycler
+from gs2d.kernels.buffer_pool import Recycler
 
 ABI_VERSION = 6
 VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first

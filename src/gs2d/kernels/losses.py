@@ -2,7 +2,7 @@
 
 Each function computes the gradient in its forward pass, for the cotangent that the caller expects (the weights of the
 loss terms), and hands it out in the backward pass. Another cotangent gives the right gradient too, at the price of a
-second pass. The formulas are in ``kernels/core/losses.h``; ``losses_reference`` has the same in torch.
+second pass. The formulas are in ``kernels/core/losses.h``; ``losses.reference`` has the same in torch.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, prepare
 
@@ -220,7 +220,7 @@ def normal_consistency(
     expected: float = 0.05,
     library: Library | None = None,
 ) -> Tensor:
-    """Normal consistency [], the native form of the functions of the same name in ``losses_reference``.
+    """Normal consistency [], the native form of the functions of the same name in ``losses.reference``.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """The terms of the training loss: kind -> function, and the weighted values of the terms of a stage.
 
 The total of official 2DGS is 0.8 L1 + 0.2 (1 - SSIM) + lambda_n mean(1 - alpha <n, N>) + lambda_d mean(distortion): the
-weights are the :class:`~gs2d.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math.md``.
+weights are the :class:`~gs2d.config.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math.md``.
 
-There are two implementations of each kind: plain torch (``losses_reference``), used by the reference backend, and
-fused operations, native (``kernels.ops``) for the cpu backend and on the GPU (``kernels.cuda.ops``) for the cuda
+There are two implementations of each kind: plain torch (``losses.reference``), used by the reference backend, and
+fused operations, native (``kernels.losses``) for the cpu backend and on the GPU (``kernels.cuda.ops``) for the cuda
 backend. The backend's name chooses; nothing falls back.
 """
 
@@ -18,22 +18,20 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from gs2d import losses_multiview as multiview
-from gs2d import losses_priors as priors
-from gs2d import losses_reference as reference
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.config.multiview import MULTIVIEW_KINDS
+from gs2d.config.priors import PRIOR_KINDS
+from gs2d.config.recipe import LossTerm
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
 from gs2d.errors import BackendError, RecipeError, ShapeError
-from gs2d.kernels import ops
+from gs2d.kernels import losses as ops
 from gs2d.kernels.cuda import launch
-from gs2d.kernels.cuda import ops as cuda_ops
-from gs2d.losses_multiview import Neighbour, TwoViews
-from gs2d.losses_priors import Prior
-from gs2d.losses_reference import normals_from_depth
-from gs2d.recipe import LossTerm
-from gs2d.recipe_multiview import MULTIVIEW_KINDS
-from gs2d.recipe_priors import PRIOR_KINDS
-from gs2d.render.camera_gradient import turning_normals
+from gs2d.kernels.cuda import losses as cuda_ops
+from gs2d.losses import multiview, priors, reference
+from gs2d.losses.multiview import Neighbour, TwoViews
+from gs2d.losses.priors import Prior
+from gs2d.losses.reference import normals_from_depth
+from gs2d.render.pose_gradient import turning_normals
 from gs2d.render.types import RenderOutput
 
 __all__ = ["LOSSES", "LossInputs", "TargetMaps", "compute_losses", "normals_from_depth", "target_maps"]
@@ -77,7 +75,7 @@ def target_maps(target: Tensor) -> TargetMaps:
 
 @dataclass(frozen=True)
 class FusedOperations:
-    """The fused operations of a backend, with the signatures of ``kernels.ops``."""
+    """The fused operations of a backend, with the signatures of ``kernels.losses``."""
 
     photometric: Callable[..., tuple[Tensor, Tensor]]
     normal_consistency: Callable[..., Tensor]

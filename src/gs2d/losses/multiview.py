@@ -21,8 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.camera import Camera
-from gs2d.recipe_multiview import MultiView
+from gs2d.config.multiview import MultiView
+from gs2d.core.camera import Camera
 
 LEAST_COSINE = 0.1  # between normal and ray: a plane seen more edge-on than this is no plane to warp by
 LEAST_SCALE = 0.1  # depth in the neighbour in that here: below, the patch comes too close to the neighbour's camera

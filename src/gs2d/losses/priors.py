@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gs2d.losses_reference import fill_ignored, masked_mean
+from gs2d.losses.reference import fill_ignored, masked_mean
 
 LEAST_POINTS = 100  # fewer points than these do not weigh as much as a whole picture
 FIT_PIXELS = 4_000  # of a relative map, about, that its scale and shift are fitted by

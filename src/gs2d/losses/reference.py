@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 
 WINDOW_RADIUS = 5  # px: 11 taps
 WINDOW_SIGMA = 1.5  # px

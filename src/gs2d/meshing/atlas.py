@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import Camera
-from gs2d.data.toy_rays import cast_camera
+from gs2d.core.camera import Camera
+from gs2d.core.extras import install
+from gs2d.core.mesh import Mesh
 from gs2d.errors import BackendError, ProtocolError
-from gs2d.extras import install
-from gs2d.triangles import Mesh
+from gs2d.meshing.raycast import cast_camera
 
 PADDING = 4  # texels between charts: two smaller copies of the texture do not mix them
 _BAND = 1 << 20  # texels that are drawn at a time

@@ -22,11 +22,11 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 
-from gs2d.camera import Camera
-from gs2d.data.toy_rays import cast_camera
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import ProtocolError
-from gs2d.mesh.atlas import Atlas, Texels, texels_of, vertex_normals
-from gs2d.triangles import Mesh, TexturedMesh
+from gs2d.meshing.atlas import Atlas, Texels, texels_of, vertex_normals
+from gs2d.meshing.raycast import cast_camera
 
 BEST = 4  # photographs in the mean
 FEATHER = 4.0  # px

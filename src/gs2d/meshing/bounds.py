@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 from gs2d.errors import ProtocolError
-from gs2d.mesh.frames import DepthMap
+from gs2d.meshing.depth_maps import DepthMap
 
 FAR_FACTOR = 4.0  # times the median depth; beyond it a pixel is wider than four voxels made for the median depth
 BOX_PERCENTILES = (1.0, 99.0)

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.limits import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionLimits
-from gs2d.mesh.sampling import UNSEEN, prepare
+from gs2d.meshing.bounds import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionLimits
+from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.sampling import UNSEEN, prepare
 
 NEIGHBOURS = 8  # views compared with each
 PERCENTILE = 75.0  # of the positive residuals

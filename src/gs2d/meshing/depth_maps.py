@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
 from gs2d.errors import DiskError, ShapeError
 
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gs2d.camera import Camera
-from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.surface import components, select_faces
-from gs2d.triangles import Mesh
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.marching_cubes import components, select_faces
 
 VIEWS = 3.0  # that support a vertex
 FEW_VIEWS = 12  # in a capture, of which two are enough

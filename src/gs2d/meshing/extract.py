@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gs2d.mesh.consistency import depth_noise
-from gs2d.mesh.evidence import Cleaned, clean
-from gs2d.mesh.frames import Frame, Spool
-from gs2d.mesh.fuse import find_blocks
-from gs2d.mesh.integrate import fusion_backend
-from gs2d.mesh.limits import FusionLimits, derive_limits, sample_depths, widen_truncation
-from gs2d.mesh.nest import derive_nest
-from gs2d.mesh.nested import FAR_VIEWS, fuse_nested, nested_marching_cubes
-from gs2d.mesh.slabs import fused_surface
-from gs2d.mesh.surface import components, inside_box, keep_components
-from gs2d.mesh.volume import Volume
-from gs2d.triangles import Mesh
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.bounds import FusionLimits, derive_limits, sample_depths, widen_truncation
+from gs2d.meshing.consistency import depth_noise
+from gs2d.meshing.depth_maps import Frame, Spool
+from gs2d.meshing.evidence import Cleaned, clean
+from gs2d.meshing.integrate import fusion_backend
+from gs2d.meshing.marching_cubes import components, inside_box, keep_components
+from gs2d.meshing.slabs import fused_surface
+from gs2d.meshing.tsdf import find_blocks
+from gs2d.meshing.unbounded import FAR_VIEWS, fuse_nested, nested_marching_cubes
+from gs2d.meshing.unbounded_bounds import derive_nest
+from gs2d.meshing.volume import Volume
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.errors import BackendError
-from gs2d.mesh.sampling import View, block_visibility
-from gs2d.mesh.volume import BLOCK, VOXELS, Volume
+from gs2d.meshing.sampling import View, block_visibility
+from gs2d.meshing.volume import BLOCK, VOXELS, Volume
 
 if TYPE_CHECKING:
     import torch
@@ -197,7 +197,7 @@ def _blend_colors(
 @contextmanager
 def add_natively(volumes: Sequence[Volume], library: Library, threads: int) -> Iterator[Add]:
     """By the native library, on so many threads."""
-    from gs2d.kernels.fusion import arguments_of, fuse_on_cpu
+    from gs2d.kernels.tsdf import arguments_of, fuse_on_cpu
 
     grids = _grids(volumes)
 
@@ -218,7 +218,7 @@ def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.devi
     """On a device: the volumes lie there until the end; each view and its list of blocks go there."""
     import torch
 
-    from gs2d.kernels.fusion import arguments_of, fuse_on_gpu
+    from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
 
     def to_device(arrays: dict[str, np.ndarray | None]) -> dict[str, torch.Tensor | None]:
         return {name: None if a is None else torch.from_numpy(a).to(device) for name, a in arrays.items()}

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gs2d.mesh.cases import CORNERS, EDGES, case_table
-from gs2d.mesh.volume import BLOCK, VOXELS, Volume
-from gs2d.triangles import Mesh
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.marching_cubes_cases import CORNERS, EDGES, case_table
+from gs2d.meshing.volume import BLOCK, VOXELS, Volume
 
 _CHUNK = 512  # blocks at a time
 EDGES_OF_BLOCK = 3 * VOXELS  # of a block: those that go up from its voxels

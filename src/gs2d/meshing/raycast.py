@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 
 _PAIRS_PER_CHUNK = 60_000  # a step of one chunk stays in the cache of a core
 _CLOSEST = 1e-3  # wu, hits nearer than this to the camera are ignored

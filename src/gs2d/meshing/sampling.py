@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.limits import FusionLimits
+from gs2d.meshing.bounds import FusionLimits
+from gs2d.meshing.depth_maps import DepthMap
 
 UNSEEN = np.float32(-1e30)  # a depth so near that nothing lies before it: the weight comes out as 0, without NaN
 

@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.fuse import Blocks, fuse_blocks
-from gs2d.mesh.limits import FusionLimits
-from gs2d.mesh.surface import EDGES_OF_BLOCK, cell_surface, edge_vertices
-from gs2d.mesh.volume import block_bytes
-from gs2d.triangles import Mesh
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.bounds import FusionLimits
+from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.marching_cubes import EDGES_OF_BLOCK, cell_surface, edge_vertices
+from gs2d.meshing.tsdf import Blocks, fuse_blocks
+from gs2d.meshing.volume import block_bytes
 
 SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared too often, much more and it is the peak
 

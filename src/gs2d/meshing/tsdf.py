@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.errors import ProtocolError
-from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.integrate import fusion_backend, integrator
-from gs2d.mesh.limits import FusionLimits, backproject
-from gs2d.mesh.sampling import prepare
-from gs2d.mesh.volume import BLOCK, Budget, Volume, block_bytes, block_grid, check_truncation, unknown_volume
+from gs2d.meshing.bounds import FusionLimits, backproject
+from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.integrate import fusion_backend, integrator
+from gs2d.meshing.sampling import prepare
+from gs2d.meshing.volume import BLOCK, Budget, Volume, block_bytes, block_grid, check_truncation, unknown_volume
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
@@ -195,7 +195,7 @@ def touched_blocks(
         for dy in shifts
     )
     if library is not None and padded[0] * padded[1] * padded[2] <= _MOST_MARKS:
-        from gs2d.kernels.fusion import mark_on_cpu
+        from gs2d.kernels.tsdf import mark_on_cpu
 
         marks = np.zeros(padded, bool)
         for ray in rays:

@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gs2d.core.mesh import Mesh
 from gs2d.errors import ProtocolError
-from gs2d.mesh.cases import CORNERS, EDGES, case_table
-from gs2d.mesh.frames import DepthMap
-from gs2d.mesh.fuse import block_finder, least_blocks, merged, touched_blocks
-from gs2d.mesh.integrate import integrator
-from gs2d.mesh.limits import backproject
-from gs2d.mesh.nest import STEP, Nest
-from gs2d.mesh.sampling import prepare
-from gs2d.mesh.surface import cell_surface, crossing, mixed_colors
-from gs2d.mesh.volume import BLOCK, VOXELS, Budget, Volume, check_truncation, unknown_volume
-from gs2d.triangles import Mesh
+from gs2d.meshing.bounds import backproject
+from gs2d.meshing.depth_maps import DepthMap
+from gs2d.meshing.integrate import integrator
+from gs2d.meshing.marching_cubes import cell_surface, crossing, mixed_colors
+from gs2d.meshing.marching_cubes_cases import CORNERS, EDGES, case_table
+from gs2d.meshing.sampling import prepare
+from gs2d.meshing.tsdf import block_finder, least_blocks, merged, touched_blocks
+from gs2d.meshing.unbounded_bounds import STEP, Nest
+from gs2d.meshing.volume import BLOCK, VOXELS, Budget, Volume, check_truncation, unknown_volume
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library

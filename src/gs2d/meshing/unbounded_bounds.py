@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 from gs2d.errors import ProtocolError
-from gs2d.mesh.limits import (
+from gs2d.meshing.bounds import (
     BOX_PERCENTILES,
     DEPTH_PERCENTILE,
     FAR_FACTOR,
@@ -24,7 +24,7 @@ from gs2d.mesh.limits import (
     check_positive,
     checked_box,
 )
-from gs2d.mesh.volume import BLOCK
+from gs2d.meshing.volume import BLOCK
 
 STEP = 4 * BLOCK  # voxels along a side are a multiple: the middle half of a level is made of whole blocks
 MAX_LEVELS = 24

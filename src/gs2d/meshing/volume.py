@@ -8,7 +8,7 @@ from typing import NoReturn
 import numpy as np
 
 from gs2d.errors import ProtocolError
-from gs2d.mesh.limits import FusionLimits
+from gs2d.meshing.bounds import FusionLimits
 
 BLOCK = 8  # voxels along the side of a block
 VOXELS = BLOCK**3

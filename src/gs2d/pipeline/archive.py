@@ -11,10 +11,10 @@ from pathlib import Path
 
 from gs2d.data.archive import Archive, capture_root, read_archive, unpack
 from gs2d.errors import RunError
-from gs2d.io.run import LOCK, RunFolder, check_claim, is_run, make_folder, remove_made
+from gs2d.io.run_dir import LOCK, RunFolder, check_claim, is_run, make_folder, remove_made
 from gs2d.pipeline.events import OnEvent, Phase, Step
+from gs2d.pipeline.job import check_train_options
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.prepare import check_train_options
 
 UNPACKED = "unpacked"  # in the run folder: a folder for each archive, named by its contents
 

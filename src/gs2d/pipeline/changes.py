@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gs2d.geometry import quats_to_matrices
-from gs2d.splats import Splats
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
 
 SAMPLE = 2_000  # splats: enough for a curve of a mean, at a tenth of the time of 20,000
 CHANGES = ("mean", "covariance", "opacity", "sh")  # mu, Sigma, alpha and SHs in the paper

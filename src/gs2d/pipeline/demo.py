@@ -5,19 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from gs2d.data.toy import write_demo_capture
-from gs2d.data.toy_exposure import GAINS
-from gs2d.data.toy_poses import TRUTH as TRUE_POSES
 from gs2d.errors import RunError
-from gs2d.io.run import RunFolder, check_claim, is_run, open_run
+from gs2d.io.run_dir import RunFolder, check_claim, is_run, open_run
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import OnEvent, Phase, Plan, Step, ignore
+from gs2d.pipeline.job import check_train_options
 from gs2d.pipeline.jobs import evaluate_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.plan import DEMO
-from gs2d.pipeline.prepare import check_train_options
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.train import check_viewer, train
+from gs2d.synthetic.capture import write_demo_capture
+from gs2d.synthetic.perturb_exposure import GAINS
+from gs2d.synthetic.perturb_poses import TRUTH as TRUE_POSES
 
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
@@ -30,8 +30,8 @@ SCHEDULE_SCALE = 0.1
 class DemoOptions:
     """Where and how; see ``TrainOptions``. ``size`` is the width and height of the photographs, px.
 
-    With ``vary_exposure`` the training photographs get random gains (``data.toy_exposure``), with ``vary_poses`` their
-    cameras are said to be a little off where they were (``data.toy_poses``).
+    With ``vary_exposure`` the training photographs get random gains (``synthetic.perturb_exposure``), with
+    ``vary_poses`` their cameras are said to be a little off where they were (``synthetic.perturb_poses``).
     """
 
     out: Path = Path("runs/demo")

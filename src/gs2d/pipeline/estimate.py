@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import duration
-from gs2d.pipeline.prepare import Job
-from gs2d.train.events import Initialised
-from gs2d.train.loop import Trainer
+from gs2d.pipeline.job import Job
+from gs2d.training.events import Initialised
+from gs2d.training.trainer import Trainer
 
 WARM_UP, FEWEST, MOST = 2, 3, 30  # iterations
 MEASURED_SECONDS = 3.0

@@ -12,15 +12,15 @@ from typing import Any
 
 import torch
 
+from gs2d.core.splats import Splats
 from gs2d.data import View
-from gs2d.evaluate.images import ImageMetrics, image_metrics, mean_metrics, psnr_float
-from gs2d.evaluate.lpips import Lpips
+from gs2d.evaluation.images import ImageMetrics, image_metrics, mean_metrics, psnr_float
+from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import OnEvent, Phase, Step
 from gs2d.pipeline.exposure import NONE, Transforms, matched_by_halves, photographed
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,16 +9,16 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
+from gs2d.config.recipe import Recipe
+from gs2d.core.json_files import read_json, write_json
 from gs2d.data import View
 from gs2d.errors import DataError, RunError
-from gs2d.exposure import expose, fit_exposure
-from gs2d.io.files import read_json, write_json
-from gs2d.io.run import EXPOSURE, RunFolder
+from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.prepare import Job
-from gs2d.recipe import Recipe
+from gs2d.pipeline.job import Job
+from gs2d.render.exposure import expose, fit_exposure
 from gs2d.render.types import RenderOutput
-from gs2d.train.exposure import Exposures
+from gs2d.training.exposure import Exposures
 
 Transforms = Mapping[str, Tensor]
 """Transform [3, 4] by the name of the training view; empty where a run learns none."""

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import torch
 
+from gs2d.core.splats import Splats
 from gs2d.errors import RunError
-from gs2d.io.ply import read_splats
-from gs2d.io.run import SPLATS, RunFolder, open_run
+from gs2d.io.run_dir import SPLATS, RunFolder, open_run
+from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import OnEvent
-from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.job import Job, reload_job
 from gs2d.pipeline.threads import use_threads
-from gs2d.splats import Splats
 
 
 def finished_splats(run: RunFolder) -> Splats:

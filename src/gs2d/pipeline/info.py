@@ -7,10 +7,10 @@ from typing import Any
 
 from gs2d.data import detect_format, load_scene
 from gs2d.data.archive import is_archive
-from gs2d.data.layouts import missing_lines
+from gs2d.data.benchmarks import missing_lines
 from gs2d.errors import DataError
-from gs2d.io.ply import ply_kind, read_mesh, read_points
-from gs2d.io.splat_formats import is_splat_file, read_splat_file
+from gs2d.io.formats.registry import is_splat_file, read_splat_file
+from gs2d.io.splat_ply import ply_kind, read_mesh, read_points
 from gs2d.pipeline.archive import unpacked_for_a_look
 
 _OF_CAPTURES = (".json", ".xml", ".sfm", ".npz", ".bin", ".txt")

@@ -12,27 +12,34 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.config.presets import (
+    get_recipe,
+    with_depth_prior,
+    with_exposure,
+    with_normal_prior,
+    with_poses,
+    with_robustness,
+)
+from gs2d.config.protocols import BLACK, GENERIC, FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.schedule import longer_steps, scale_schedule
+from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
-from gs2d.data.layouts import missing_lines, protocol_of
+from gs2d.data.benchmarks import missing_lines, protocol_of
 from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
-from gs2d.io.run import RUN_JSON, RunFolder, versions
+from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
 from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.priors import with_priors
-from gs2d.pipeline.refined import with_found_poses
-from gs2d.protocols import BLACK, GENERIC, FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
-from gs2d.recipe import Recipe, validate
-from gs2d.recipe_json import apply_overrides, from_json, to_json
-from gs2d.recipes import get_recipe, with_depth_prior, with_exposure, with_normal_prior, with_poses, with_robustness
-from gs2d.render.backend import Backend, backend_report, get_backend
+from gs2d.pipeline.refined_poses import with_found_poses
+from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.schedule import longer_steps, scale_schedule
-from gs2d.train.backdrop import backdrop_color
-from gs2d.train.cached_views import is_cacheable
-from gs2d.train.loop import raster_settings
-from gs2d.train.point_gains import point_gains
+from gs2d.training.backdrop import backdrop_color
+from gs2d.training.cached_objective import is_cacheable
+from gs2d.training.point_gains import point_gains
+from gs2d.training.trainer import raster_settings
 
 DECODE_THREADS = 2
 SHOWN_SKIPS = 3

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.files import check_writable
+from gs2d.core.images import write_image
 from gs2d.data import View
 from gs2d.data.subject import OBJECT, read_subject
-from gs2d.disk import check_writable
 from gs2d.errors import DataError, RunError
-from gs2d.evaluate.lpips import load_lpips
-from gs2d.images import write_image
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import (
+from gs2d.evaluation.lpips import load_lpips
+from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout
+from gs2d.io.run_dir import (
     LOCK,
     MESH,
     RENDERS,
@@ -33,22 +33,22 @@ from gs2d.io.run import (
     open_run,
     remove_made,
 )
-from gs2d.io.splat_formats import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout
+from gs2d.io.splat_ply import read_mesh
 from gs2d.pipeline.attempts import again, attempted, reason_of
+from gs2d.pipeline.evaluate import score_views, split_metrics
 from gs2d.pipeline.events import Missing, Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.finished import finished_splats, open_job
+from gs2d.pipeline.job import Job
+from gs2d.pipeline.mesh import extract_mesh
 from gs2d.pipeline.options import Box, EvaluateOptions, MeshOptions
 from gs2d.pipeline.paths import flight_cameras, orbit_cameras
-from gs2d.pipeline.pictures import file_names, render_view, shown_cameras
 from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prepare import Job
-from gs2d.pipeline.refined import aligned
-from gs2d.pipeline.scoring import score_views, split_metrics
+from gs2d.pipeline.refined_poses import aligned
+from gs2d.pipeline.render import file_names, render_view, shown_cameras
 from gs2d.pipeline.subject import meshed_subject, within
-from gs2d.pipeline.surface import extract_mesh
-from gs2d.pipeline.verdict_file import write_verdict
-from gs2d.pipeline.verdict_measures import Collector
+from gs2d.pipeline.verdict.file import write_verdict
+from gs2d.pipeline.verdict.measures import Collector
 
 MOST_FRAMES = 100_000  # of an orbit or a flight
 FPS = 30.0
@@ -297,7 +297,7 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
     Parameters
     ----------
     layout : str or None
-        A name of ``io.splat_formats.LAYOUTS``; None: by the ending of ``out``.
+        A name of ``io.formats.registry.LAYOUTS``; None: by the ending of ``out``.
     bbox : six floats, optional
         Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, wu.
 
@@ -329,7 +329,7 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
     ------
     RunError, DataError, DiskError
     """
-    from gs2d.report import write_report
+    from gs2d.report.write import write_report
 
     run = open_run(Path(path))
     command = again("report", run.path)

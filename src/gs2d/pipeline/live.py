@@ -16,19 +16,19 @@ from concurrent.futures import Future
 
 import numpy as np
 
-from gs2d.camera import Camera
-from gs2d.geometry import up_direction
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import up_direction
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
+from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.view import drawn, frame_around, shots
 from gs2d.pipeline.watch import Watch
-from gs2d.splats import Splats
-from gs2d.train import events as train_events
-from gs2d.train.state import TrainState
-from gs2d.view import Stage, Viewer
-from gs2d.view_exact import Drawn, Render
-from gs2d.view_splats import Preview, preview
+from gs2d.training import events as train_events
+from gs2d.training.state import TrainState
+from gs2d.viewer.exact import Drawn, Render
+from gs2d.viewer.server import Stage, Viewer
+from gs2d.viewer.splats import Preview, preview
 
 HOST = "127.0.0.1"  # from another machine: ssh -L
 NOW = "now"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import gc
 
+from gs2d.core.memory import trim
 from gs2d.data import Scene
 from gs2d.kernels.library import available_variants, load
-from gs2d.memory import trim
 
 
 def release(scene: Scene) -> None:

@@ -13,23 +13,23 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.core.files import disk_error
+from gs2d.core.memory import trim
+from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.data.subject import LARGEST, Subject, checked_box
-from gs2d.disk import disk_error
 from gs2d.errors import ProtocolError
-from gs2d.evaluate.images import ImageMetrics
-from gs2d.io.ply import write_mesh
-from gs2d.memory import trim
-from gs2d.mesh.extract import Extraction, extract, extract_unbounded
-from gs2d.mesh.frames import Frame, Spool, depth_map
+from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.splat_ply import write_mesh
+from gs2d.meshing.depth_maps import Frame, Spool, depth_map
+from gs2d.meshing.extract import Extraction, extract, extract_unbounded
+from gs2d.pipeline.evaluate import SeenView
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
+from gs2d.pipeline.job import Job
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions
-from gs2d.pipeline.prepare import Job
-from gs2d.pipeline.scoring import SeenView
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
-from gs2d.splats import Splats
 
 OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
 ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
@@ -39,7 +39,7 @@ MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 class MeshFrames:
     """Depth maps of the training views, kept in a temporary file while others look at the same renderings.
 
-    Its :meth:`visit` is for :func:`~gs2d.pipeline.scoring.score_views`.
+    Its :meth:`visit` is for :func:`~gs2d.pipeline.evaluate.score_views`.
     """
 
     def __init__(self, job: Job) -> None:

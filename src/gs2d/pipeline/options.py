@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gs2d.protocols import Protocol
-from gs2d.recipe import Recipe
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import Recipe
 
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, wu
 

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.subject import Subject, read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.geometry import up_direction
-from gs2d.io.run import PAGE, is_run, open_run
-from gs2d.io.splat_formats import read_disks
-from gs2d.page import Seen, write_page
+from gs2d.io.formats.registry import read_disks
+from gs2d.io.run_dir import PAGE, is_run, open_run
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.prepare import Job, reload_job
+from gs2d.pipeline.job import Job, reload_job
 from gs2d.pipeline.view import frame_around, from_aside, settings_without_run
+from gs2d.viewer.web import Seen, write_page
 
 MOST_VIEWS = 100  # photographs that one can step through
 SUFFIXES = (".html", ".htm")

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
-from gs2d.camera import Camera, look_at
-from gs2d.geometry import focus_point, up_direction
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.transforms import focus_point, up_direction
 
 _UNSEEN_ARC = np.radians(100.0)  # without a camera: nobody photographed that side; orbits have gaps of up to 60
 _FADE = 0.15  # of the arc: over so much of it distances and heights of photographs are averaged

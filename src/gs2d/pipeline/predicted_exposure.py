@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 from gs2d.data import Scene
-from gs2d.exposure import identity
 from gs2d.pipeline.exposure import Transforms
+from gs2d.render.exposure import identity
 
 NEIGHBOURS = 5  # training photographs that a prediction is made of
 CLOSE = 0.02  # added to distances, in extents: poses are never quite the same, and one photograph is no mean

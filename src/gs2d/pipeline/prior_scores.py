@@ -9,17 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.core.images import write_image
+from gs2d.core.splats import Splats
 from gs2d.data import View
-from gs2d.images import write_image
-from gs2d.io.run import PRIORS, RENDERS, RunFolder, make_folder
-from gs2d.losses_priors import Depths, KnownNormals, PointDepths, RelativeDepths, aligned
-from gs2d.pipeline.pictures import file_names
-from gs2d.pipeline.prepare import Job
+from gs2d.io.run_dir import PRIORS, RENDERS, RunFolder, make_folder
+from gs2d.losses.priors import Depths, KnownNormals, PointDepths, RelativeDepths, aligned
+from gs2d.pipeline.job import Job
+from gs2d.pipeline.render import file_names
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
-from gs2d.report_images import depth_limits, depth_picture, normal_picture
-from gs2d.splats import Splats
-from gs2d.train.priors import Priors, has_priors
+from gs2d.report.images import depth_limits, depth_picture, normal_picture
+from gs2d.training.priors import Priors, has_priors
 
 SHOWN = 3  # views whose known depths are drawn
 POINT_RADIUS = 0.004  # of a drawn point, as a share of the picture's width

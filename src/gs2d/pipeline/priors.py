@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from gs2d.config.recipe import Recipe
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
-from gs2d.losses_priors import Depths, KnownDepths, KnownNormals, PointDepths
+from gs2d.losses.priors import Depths, KnownDepths, KnownNormals, PointDepths
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
-from gs2d.recipe import Recipe
-from gs2d.train.priors import DepthPlan, Priors, has_priors
+from gs2d.training.priors import DepthPlan, Priors, has_priors
 
 
 def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) -> str:

@@ -11,26 +11,26 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from gs2d.core.json_files import read_json
 from gs2d.data import detect_format, load_scene
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
-from gs2d.io.files import read_json
-from gs2d.io.run import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
-from gs2d.mesh.atlas import required
+from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
+from gs2d.meshing.atlas import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Plan, ignore
+from gs2d.pipeline.job import check_train_options
 from gs2d.pipeline.jobs import report_again
 from gs2d.pipeline.options import TrainOptions, paths_of
 from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
-from gs2d.pipeline.poses import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
-from gs2d.pipeline.prepare import check_train_options
+from gs2d.pipeline.sfm import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run
 from gs2d.pipeline.train import check_viewer, train
-from gs2d.render.backend import get_backend
-from gs2d.sfm.frames import is_video, look_into
-from gs2d.sfm.photos import find_photos
-from gs2d.sfm.solve import check_installed
-from gs2d.sfm.workplace import POSES_JSON, POSES_PNG, hidden_workplace
+from gs2d.render.backends import get_backend
+from gs2d.sfm.colmap import check_installed
+from gs2d.sfm.images import find_photos
+from gs2d.sfm.video_frames import is_video, look_into
+from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workplace
 
 CAPTURE = "capture"
 FEW = 24  # photographs, below which each is needed for the surface and none is held out

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
+from gs2d.config.recipe import LossTerm, Recipe
+from gs2d.core.camera import Camera
+from gs2d.core.json_files import read_json, write_json
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import focus_point, moved
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
-from gs2d.geometry import focus_point, moved
-from gs2d.io.files import read_json, write_json
-from gs2d.io.run import POSES, SPLATS, RunFolder
-from gs2d.losses import compute_losses
+from gs2d.io.run_dir import POSES, SPLATS, RunFolder
+from gs2d.losses.api import compute_losses
 from gs2d.pipeline.events import Notice, OnEvent, counted
-from gs2d.recipe import LossTerm, Recipe
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 FoundPoses = Mapping[str, np.ndarray]
 """T_cam_world [4, 4] by the name of the training view; empty where a run learns none."""

@@ -14,19 +14,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.images import write_image
+from gs2d.core.json_files import write_json
+from gs2d.core.sh import rgb_to_sh0
+from gs2d.core.splats import Splats
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
-from gs2d.images import write_image
-from gs2d.io.files import write_json
-from gs2d.io.run import RENDERS, RunFolder, make_folder
+from gs2d.io.run_dir import RENDERS, RunFolder, make_folder
+from gs2d.pipeline.evaluate import evenly
 from gs2d.pipeline.exposure import NONE, Transforms, photographed
-from gs2d.pipeline.prepare import Job
-from gs2d.pipeline.scoring import evenly
+from gs2d.pipeline.job import Job
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.report_images import (
+from gs2d.report.images import (
     depth_limits,
     depth_picture,
     error_picture,
@@ -34,9 +36,7 @@ from gs2d.report_images import (
     known_picture,
     normal_picture,
 )
-from gs2d.report_pictures import read_index
-from gs2d.sh import rgb_to_sh0
-from gs2d.splats import Splats
+from gs2d.report.sections.pictures import read_index
 
 INDEX = "index.json"
 LONGEST_NAME = 180  # bytes; file systems take 255, and a picture's kind and a temporary suffix come after it

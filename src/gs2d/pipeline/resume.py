@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
-from gs2d.io.run import RunFolder, is_run, load_tensors, make_folder, open_run, remove_made, save_tensors
+from gs2d.io.run_dir import RunFolder, is_run, load_tensors, make_folder, open_run, remove_made, save_tensors
 from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.prepare import Job
-from gs2d.train.state import TrainState
+from gs2d.training.state import TrainState
 
 
 @dataclass(frozen=True, eq=False)

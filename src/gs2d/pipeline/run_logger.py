@@ -11,23 +11,16 @@ from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
+from gs2d.config.recipe import CloneInPlace, Stage
+from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import DivergedError, Gs2dError
-from gs2d.evaluate.images import ImageMetrics
-from gs2d.io.run import RunFolder, load_tensors
+from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.run_dir import RunFolder, load_tensors
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.estimate import start_text
-from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
-from gs2d.pipeline.exposure import Transforms, named
-from gs2d.pipeline.interruption import HeldSignals
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.pictures import choose_views, draw_stage
-from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prepare import Job
-from gs2d.pipeline.prior_scores import score_priors
-from gs2d.pipeline.restart import Start, put_in_cache
-from gs2d.pipeline.scoring import (
+from gs2d.pipeline.evaluate import (
     PeakGpuMemory,
     PeakMemory,
     SeenView,
@@ -38,13 +31,20 @@ from gs2d.pipeline.scoring import (
     score_views,
     split_metrics,
 )
-from gs2d.recipe import CloneInPlace, Stage
+from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
+from gs2d.pipeline.exposure import Transforms, named
+from gs2d.pipeline.interruption import HeldSignals
+from gs2d.pipeline.job import Job
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.prior_scores import score_priors
+from gs2d.pipeline.render import choose_views, draw_stage
+from gs2d.pipeline.resume import Start, put_in_cache
 from gs2d.render.types import RenderOutput
-from gs2d.splats import Splats
-from gs2d.train import events as train_events
-from gs2d.train.loop import Trainer
-from gs2d.train.per_view import scene_now
-from gs2d.train.state import TrainState
+from gs2d.training import events as train_events
+from gs2d.training.per_image import scene_now
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
 
 LOG_LINES = 300  # step lines a stage
 PROBES = 30  # times a stage at which the probe views are scored for the PSNR curve

@@ -1,6 +1,6 @@
 """``gs2d poses``: a folder of photographs becomes a capture, in one step or not at all.
 
-The finished capture is read back by the loader that training uses before it gets its name (``sfm.workplace``).
+The finished capture is read back by the loader that training uses before it gets its name (``sfm.workspace``).
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gs2d.core.json_files import write_json
 from gs2d.data import load_scene
 from gs2d.errors import DataError, RunError
-from gs2d.io.files import write_json
-from gs2d.io.run import make_folder, now, remove_made
+from gs2d.io.run_dir import make_folder, now, remove_made
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Plan, Step, counted, ignore
 from gs2d.pipeline.options import paths_of
 from gs2d.pipeline.plan import PLACED
-from gs2d.sfm.frames import MOST_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
+from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, read_facts, solve
+from gs2d.sfm.image_copies import stage_photos
+from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, read_photos
 from gs2d.sfm.lens import START, lens_line
-from gs2d.sfm.outcome import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
-from gs2d.sfm.photos import FEWEST, Photo, camera_groups, find_photos, read_photos
+from gs2d.sfm.model import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
 from gs2d.sfm.picture import write_picture
-from gs2d.sfm.solve import Facts, Group, Request, Solved, check_installed, read_facts, solve
-from gs2d.sfm.stage import stage_photos
-from gs2d.sfm.workplace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workplace
+from gs2d.sfm.video_frames import MOST_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
+from gs2d.sfm.workspace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workplace
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar")

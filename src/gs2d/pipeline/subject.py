@@ -7,7 +7,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.json_files import write_json
+from gs2d.core.splats import Splats
 from gs2d.data.subject import (
     OBJECT,
     Sight,
@@ -21,14 +23,12 @@ from gs2d.data.subject import (
     shown,
 )
 from gs2d.errors import DataError, DiskError, ProtocolError, RunError
-from gs2d.io.files import write_json
-from gs2d.io.run import RENDERS, SUBJECT, RunFolder, make_folder
+from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
 from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import MeshOptions
-from gs2d.pipeline.prepare import Job
 from gs2d.render.api import rasterize
-from gs2d.report_subject import PICTURE, write_subject_picture
-from gs2d.splats import Splats
+from gs2d.report.sections.subject import PICTURE, write_subject_picture
 
 MOST_VIEWS = 64  # cameras, evenly chosen, that vote
 SIDE = 56  # px, the shorter side of the depth maps that are looked at

@@ -10,28 +10,28 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.core.files import check_writable
+from gs2d.core.images import to_uint8
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import up_direction
 from gs2d.data import View
-from gs2d.disk import check_writable
 from gs2d.errors import ProtocolError, RunError
-from gs2d.exposure import take_back
-from gs2d.geometry import up_direction
-from gs2d.images import to_uint8
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import MESH, TEXTURED, RunFolder
+from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
+from gs2d.io.splat_ply import read_mesh
 from gs2d.io.textured import write_textured, written_files
-from gs2d.mesh.atlas import required, simplified, unwrap
-from gs2d.mesh.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
+from gs2d.meshing.atlas import required, simplified, unwrap
+from gs2d.meshing.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.job import Job, read_scene
 from gs2d.pipeline.jobs import mesh_run
+from gs2d.pipeline.mesh import OPAQUE, extract_mesh
 from gs2d.pipeline.options import MeshOptions, TextureOptions
-from gs2d.pipeline.pictures import render_view
-from gs2d.pipeline.prepare import Job, read_scene
+from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import meshed_subject
-from gs2d.pipeline.surface import OPAQUE, extract_mesh
-from gs2d.splats import Splats
-from gs2d.triangles import Mesh
+from gs2d.render.exposure import take_back
 
 PACKAGES = ("xatlas",)  # of the extra `texture`
 

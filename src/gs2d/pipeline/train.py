@@ -6,35 +6,35 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+from gs2d.core.memory import hold
+from gs2d.core.splats import Splats
 from gs2d.data.archive import is_archive
 from gs2d.errors import RecipeError, RunError
-from gs2d.io.ply import write_splats
-from gs2d.io.run import MESH, PAGE, REPORT, SPLATS, VERDICT, RunFolder, check_claim, claim_run, is_run, make_folder
-from gs2d.memory import hold
+from gs2d.io.run_dir import MESH, PAGE, REPORT, SPLATS, VERDICT, RunFolder, check_claim, claim_run, is_run, make_folder
+from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.evaluate import Visitor
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
+from gs2d.pipeline.job import Job, check_same_run, prepare
 from gs2d.pipeline.jobs import report_run
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release
+from gs2d.pipeline.mesh import MeshFrames, extract_mesh
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.plan import TRAINED
-from gs2d.pipeline.prepare import Job, check_same_run, prepare
-from gs2d.pipeline.recorder import Recorder
-from gs2d.pipeline.refined import FoundPoses, found_poses, write_poses
-from gs2d.pipeline.restart import Start, check_sources, choose_start
-from gs2d.pipeline.scoring import Visitor
+from gs2d.pipeline.refined_poses import FoundPoses, found_poses, write_poses
+from gs2d.pipeline.resume import Start, check_sources, choose_start
+from gs2d.pipeline.run_logger import Recorder
 from gs2d.pipeline.subject import meshed_subject
-from gs2d.pipeline.surface import MeshFrames, extract_mesh
 from gs2d.pipeline.threads import use_threads
-from gs2d.pipeline.verdict_file import write_verdict
-from gs2d.pipeline.verdict_measures import Collector
+from gs2d.pipeline.verdict.file import write_verdict
+from gs2d.pipeline.verdict.measures import Collector
 from gs2d.pipeline.watch import Watch
-from gs2d.splats import Splats
-from gs2d.train import events
-from gs2d.view import free_port, required_viser
+from gs2d.training import events
+from gs2d.viewer.server import free_port, required_viser
 
 
 def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
@@ -149,8 +149,8 @@ def train_stages(
 
     ``visitors`` see every view of the finished splats, unless the last stage was scored before.
     """
-    from gs2d.train.loop import Trainer
-    from gs2d.train.per_view import scene_now
+    from gs2d.training.per_image import scene_now
+    from gs2d.training.trainer import Trainer
 
     recorder = Recorder(run, job, options, start, watch.on_event, visitors)
 

@@ -10,19 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.data.layouts import MESH_TRUTHS, find_truth, recognise
+from gs2d.config.datasets import DataSet, SceneFacts
+from gs2d.config.surface_protocols import VISIBLE_SURFACE
+from gs2d.core.mesh import Mesh
+from gs2d.data.benchmarks import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
-from gs2d.evaluate.surface import SurfaceScore, evaluate_surface, headline
-from gs2d.evaluate.surface_clouds import write_clouds
-from gs2d.io.ply import ply_kind, read_mesh, read_points
-from gs2d.io.run import make_folder
+from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, headline
+from gs2d.evaluation.surface_clouds import write_clouds
+from gs2d.io.run_dir import make_folder
+from gs2d.io.splat_ply import ply_kind, read_mesh, read_points
 from gs2d.pipeline.events import Notice, OnEvent, Phase
+from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import EvaluateOptions
-from gs2d.pipeline.prepare import Job
 from gs2d.pipeline.truth_official import score_dtu, score_tnt
-from gs2d.protocols_datasets import DataSet, SceneFacts
-from gs2d.protocols_surface import VISIBLE_SURFACE
-from gs2d.triangles import Mesh
 
 APART = 0.05  # of the truth's diagonal: farther, and it is hardly the same surface in the same frame
 SEEN_SUFFIX = "_seen.npy"  # beside FILE.ply: FILE_seen.npy, how many views see each face
@@ -53,7 +53,7 @@ class OfficialTruth:
     ----------
     dataset, facts : DataSet, SceneFacts
     files : mapping of str to Path
-        Keys as ``gs2d.data.layouts`` names them.
+        Keys as ``gs2d.data.benchmarks`` names them.
     """
 
     dataset: DataSet

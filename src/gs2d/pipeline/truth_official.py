@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.data.dtu import dtu_silhouettes
-from gs2d.data.layouts import published_log
+from gs2d.config.datasets import SceneFacts
+from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE
+from gs2d.core.images import read_mask
+from gs2d.core.mesh import Mesh
+from gs2d.data.benchmarks import published_log
+from gs2d.data.readers.dtu import dtu_silhouettes
 from gs2d.errors import DataError
-from gs2d.evaluate.dtu import Silhouette, evaluate_dtu
-from gs2d.evaluate.dtu_files import read_dtu_truth
-from gs2d.evaluate.surface_clouds import write_clouds
-from gs2d.evaluate.tnt import Alignment, evaluate_tnt
-from gs2d.evaluate.tnt_files import read_tnt_truth, read_trajectory
-from gs2d.images import read_mask
-from gs2d.pipeline.prepare import Job
-from gs2d.protocols_datasets import SceneFacts
-from gs2d.protocols_surface import DTU_SURFACE, TNT_SURFACE
-from gs2d.triangles import Mesh
+from gs2d.evaluation.dtu import Silhouette, evaluate_dtu
+from gs2d.evaluation.dtu_files import read_dtu_truth
+from gs2d.evaluation.surface_clouds import write_clouds
+from gs2d.evaluation.tanks_and_temples import Alignment, evaluate_tnt
+from gs2d.evaluation.tanks_and_temples_files import read_tnt_truth, read_trajectory
+from gs2d.pipeline.job import Job
 
 
 def score_dtu(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job, folder: Path) -> dict[str, Any]:

@@ -13,30 +13,30 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.camera import Camera, look_at
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.images import to_uint8
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.subject import read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.geometry import up_direction
-from gs2d.images import to_uint8
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_run
-from gs2d.io.splat_formats import read_disks
+from gs2d.io.formats.registry import read_disks
+from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_run
+from gs2d.io.splat_ply import read_mesh
 from gs2d.io.textured import glb_bytes, glb_turn
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.prepare import Job, reload_job
-from gs2d.pipeline.surface import OPAQUE
+from gs2d.pipeline.job import Job, reload_job
+from gs2d.pipeline.mesh import OPAQUE
 from gs2d.pipeline.threads import use_threads
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend, get_backend
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.report_images import depth_picture, known_picture, normal_picture
-from gs2d.splats import Splats
-from gs2d.train.state import TrainState
-from gs2d.view import Shot, Stage, Viewer, middle_of, required_viser, thumbnail
-from gs2d.view_exact import Drawn, Frame, Render
-from gs2d.view_splats import preview
+from gs2d.report.images import depth_picture, known_picture, normal_picture
+from gs2d.training.state import TrainState
+from gs2d.viewer.exact import Drawn, Frame, Render
+from gs2d.viewer.server import Shot, Stage, Viewer, middle_of, required_viser, thumbnail
+from gs2d.viewer.splats import preview
 
 MOST_CAMERAS = 200
 FINAL = "final"

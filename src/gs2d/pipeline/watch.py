@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from gs2d.pipeline.events import Event, OnEvent
-from gs2d.train import events
-from gs2d.train.state import TrainState
+from gs2d.training import events
+from gs2d.training.state import TrainState
 
 
 class Watch:

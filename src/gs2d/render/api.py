@@ -69,14 +69,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.core.sh import MAX_DEGREE, sh_degree_of
+from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
-from gs2d.render.backend import Backend, get_backend
-from gs2d.render.camera_gradient import carried, with_world_normals
+from gs2d.render.backends import Backend, get_backend
+from gs2d.render.pose_gradient import carried, with_world_normals
 from gs2d.render.types import CROSSING, RasterSettings, RenderOutput
-from gs2d.sh import MAX_DEGREE, sh_degree_of
-from gs2d.splats import Splats
 
 __all__ = ["rasterize", "splat_errors"]
 
@@ -100,7 +100,7 @@ def rasterize(
         With a ``pose`` that requires a gradient, that of the camera is worked out too (rule 20).
     settings : RasterSettings
     backend : str or Backend
-        "auto" (by the device of the splats), "cpu", "cuda" or "reference" (``gs2d.render.backend``).
+        "auto" (by the device of the splats), "cpu", "cuda" or "reference" (``gs2d.render.backends``).
     screen_probe : Tensor [N, 2] or [N, 4], optional
         Zeros with ``requires_grad``; its gradient is the densification signal (rule 13). That it is zeros is checked
         on the CPU only.

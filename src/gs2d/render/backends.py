@@ -9,10 +9,10 @@ from typing import Protocol
 
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
 
 __all__ = ["BACKENDS", "Backend", "BackendStatus", "backend_report", "get_backend"]
 

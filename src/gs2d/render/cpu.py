@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import Library, prepare
 from gs2d.render.types import CROSSING, RasterSettings, RenderOutput
-from gs2d.splats import ATTRIBUTES, Splats
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, prepare
 from gs2d.render.cpu import _address, _check_tensors, _forward, _ParameterGradients, _parameters, _view
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 __all__ = ["CachedView", "cache_view"]
 

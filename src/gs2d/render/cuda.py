@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_budget import PairBudget
 from gs2d.render.cuda_passes import IMAGES, PARAMETERS, Frame, Wanted, backward, errors, forward
 from gs2d.render.cuda_passes import view_of as _view
+from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.arguments import (
     BlendArguments,
@@ -32,7 +32,7 @@ from gs2d.kernels.cuda.arguments import (
     View,
 )
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_budget import MOST_PAIRS, PairBudget, room_for
+from gs2d.render.pair_budget import MOST_PAIRS, PairBudget, room_for
 from gs2d.render.types import CROSSING, RasterSettings
 
 __all__ = ["IMAGES", "PARAMETERS", "Frame", "Wanted", "backward", "errors", "forward", "view_of"]

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.check import check_shapes
-from gs2d.kernels import exposure as native
+from gs2d.core.checks import check_shapes
 from gs2d.kernels.library import library_for
+from gs2d.render import exposure_native as native
 
 RIDGE = 1e-4  # of a fit, per pixel: keeps what a picture says nothing about at the identity
 

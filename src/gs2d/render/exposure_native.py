@@ -1,4 +1,4 @@
-"""The native colour transform of a photograph and its gradients; ``gs2d.exposure`` has the same in torch."""
+"""The native colour transform of a photograph and its gradients; ``gs2d.render.exposure`` has the same in torch."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def exposed(
     background: Tensor | None,
     clipped: Tensor | None,
 ) -> tuple[Tensor, Tensor | None]:
-    """The picture, and where it was cut to 1 [H, W, 3]; arguments as of ``gs2d.exposure.expose``.
+    """The picture, and where it was cut to 1 [H, W, 3]; arguments as of ``gs2d.render.exposure.expose``.
 
     Raises
     ------

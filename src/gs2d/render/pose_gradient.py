@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.kernels import camera as native
+from gs2d.core.sh import C0, num_coefficients, sh_basis
+from gs2d.core.splats import Splats
 from gs2d.kernels.library import library_for
+from gs2d.render import pose_gradient_native as native
 from gs2d.render.types import RenderOutput
-from gs2d.sh import C0, num_coefficients, sh_basis
-from gs2d.splats import Splats
 
 __all__ = ["carried", "turning_normals", "with_world_normals"]
 

@@ -1,4 +1,4 @@
-"""Sums over splats, or pixels, that a camera's gradient is made of (``render.camera_gradient``), in one native call."""
+"""Sums over splats, or pixels, that a camera's gradient is made of (``render.pose_gradient``), in one native call."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import ctypes
 import torch
 from torch import Tensor
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library
 

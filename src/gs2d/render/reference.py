@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gs2d.camera import Camera
-from gs2d.render.projection_reference import (
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
+from gs2d.render.reference_projection import (
     Block,
     ScreenSplats,
     blocks,
@@ -24,7 +25,6 @@ from gs2d.render.projection_reference import (
     visible_rows,
 )
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
 
 __all__ = ["Pairs", "blend_weights", "evaluate_pairs", "rasterize"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.render.projection_reference import blocks, cutoff_squared, project, screen_boxes, visible_rows
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.render.reference import evaluate_pairs, pair_alpha
+from gs2d.render.reference_projection import blocks, cutoff_squared, project, screen_boxes, visible_rows
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
 
 __all__ = ["splat_errors"]
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.geometry import quats_to_matrices
+from gs2d.core.camera import Camera
+from gs2d.core.sh import num_coefficients, sh_to_rgb
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
 from gs2d.render.types import RasterSettings
-from gs2d.sh import num_coefficients, sh_to_rgb
-from gs2d.splats import Splats
 
 TILE = 16  # px; side of the blocks of pixels that share a list of splats
 MAX_PAIRS = 1 << 21  # pairs of splat and pixel evaluated at once; bounds the memory

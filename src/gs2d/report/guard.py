@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from gs2d.disk import is_full
-from gs2d.report_html import missing
+from gs2d.core.files import is_full
+from gs2d.report.html import missing
 
 OnFailure = Callable[[str, Exception], None]
 """Is told the name of a part and why it is not there."""

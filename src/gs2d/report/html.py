@@ -1,6 +1,6 @@
 """The look of the report: small HTML builders, pictures and scales as data URLs.
 
-Style sheet and script lie in ``report_files``.
+Style sheet and script lie in ``assets``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from urllib.parse import quote
 import numpy as np
 from PIL import Image
 
-from gs2d.images import composite, to_uint8
+from gs2d.core.images import composite, to_uint8
 
 LARGE = """<dialog class="large" aria-label="enlarged picture">
 <nav><button class="before" type="button" aria-label="picture before">&lsaquo;</button>
@@ -38,7 +38,7 @@ def page(title: str, body: Sequence[str]) -> str:
 
 
 def _text(name: str) -> str:
-    return (files("gs2d") / "report_files" / name).read_text(encoding="utf-8")
+    return (files("gs2d.report") / "assets" / name).read_text(encoding="utf-8")
 
 
 def escape(text: object) -> str:

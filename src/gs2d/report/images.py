@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
 
 ERROR_TOP = 0.2  # mean absolute error over channels, on colours in [0, 1], that gets the last colour of its scale
 HIGHLIGHT = (0.93, 0.11, 0.62)  # of the high-error splats

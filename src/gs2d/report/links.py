@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gs2d.io.run import EVENTS, EXPOSURE, MESH, METRICS, PAGE, POSES, RUN_JSON, SPLATS, TEXTURED
-from gs2d.report_html import escape, missing
+from gs2d.io.run_dir import EVENTS, EXPOSURE, MESH, METRICS, PAGE, POSES, RUN_JSON, SPLATS, TEXTURED
+from gs2d.report.html import escape, missing
 
 FILES = {  # in the order in which people want them
     PAGE: "the scene to turn, in any browser",

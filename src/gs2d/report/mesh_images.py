@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.camera import Camera, look_at
-from gs2d.data.toy_rays import Hits, cast_camera
-from gs2d.triangles import Mesh
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.mesh import Mesh
+from gs2d.meshing.raycast import Hits, cast_camera
 
 _CLAY = np.array([0.86, 0.86, 0.88])
 _LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])  # camera axes: left, up, towards the eye

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gs2d.report_html import escape
+from gs2d.report.html import escape
 
 TERMS = {
     "PSNR": "Peak signal-to-noise ratio, in decibels: how near a rendering is to its photograph, pixel by pixel. "

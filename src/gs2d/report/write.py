@@ -15,22 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import Camera
-from gs2d.disk import atomic_write
-from gs2d.io.run import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, VERDICT, open_run
-from gs2d.report_capture import capture_section
-from gs2d.report_curves import curves, read_history
-from gs2d.report_exposure import exposure_section
-from gs2d.report_guard import Guard, OnFailure
-from gs2d.report_html import drawing, escape, facts, missing, page, table
-from gs2d.report_links import links
-from gs2d.report_pictures import hero, mesh_section, view_sections
-from gs2d.report_poses import poses_section
-from gs2d.report_priors import priors_section
-from gs2d.report_subject import subject_section
-from gs2d.report_surface import surface_scores
-from gs2d.report_terms import glossary, titles_of
-from gs2d.report_verdict import graded, scaled, verdict_section
+from gs2d.core.camera import Camera
+from gs2d.core.files import atomic_write
+from gs2d.io.run_dir import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, VERDICT, open_run
+from gs2d.report.guard import Guard, OnFailure
+from gs2d.report.html import drawing, escape, facts, missing, page, table
+from gs2d.report.links import links
+from gs2d.report.plots import curves, read_history
+from gs2d.report.sections.capture import capture_section
+from gs2d.report.sections.exposure import exposure_section
+from gs2d.report.sections.pictures import hero, mesh_section, view_sections
+from gs2d.report.sections.poses import poses_section
+from gs2d.report.sections.priors import priors_section
+from gs2d.report.sections.subject import subject_section
+from gs2d.report.sections.surface import surface_scores
+from gs2d.report.sections.verdict import graded, scaled, verdict_section
+from gs2d.report.terms import glossary, titles_of
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
 

@@ -17,16 +17,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from gs2d.disk import atomic_write
+from gs2d.core.extras import install
+from gs2d.core.files import atomic_write
 from gs2d.errors import BackendError, DataError
-from gs2d.extras import install
 
 OnProgress = Callable[[str, int, int], None]  # name of the phase, steps done, steps in all
 MISSING = f"structure from motion needs pycolmap, which is not installed: {install('sfm')}"
 POLL_SECONDS = 0.5
 _LITTLE_SPACE = 64 << 20  # bytes; what SQLite could not write is given back when it gives up
 # Modules are looked for where this process does: `-m` would first take a random.py of the folder one is in.
-_WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.worker import main; main(sys.argv[1])"
+_WORKER = "import sys; sys.path[:] = sys.argv[2:]; from gs2d.sfm.colmap_worker import main; main(sys.argv[1])"
 _COUNTED = {"features": "keypoints", "matching": "two_view_geometries", "again": "two_view_geometries"}  # a row a step
 _PHASES = {
     "features": "finding features",

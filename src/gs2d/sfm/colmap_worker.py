@@ -1,4 +1,4 @@
-"""The process in which COLMAP runs: ``python -m gs2d.sfm.worker REQUEST.json``. It never loads torch.
+"""The process in which COLMAP runs: ``python -m gs2d.sfm.colmap_worker REQUEST.json``. It never loads torch.
 
 A process of its own, because a fault in a native library must not take the command down, because Ctrl-C must not wait
 for a native call that takes minutes, and because torch and pycolmap each bring an OpenMP library. It writes one JSON
@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.sfm import second
+from gs2d.sfm import second_round as second
 from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
-from gs2d.sfm.similar import neighbour_pairs, similar_pairs
+from gs2d.sfm.pairs import neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import rotation_to_z, up_direction
 
 Say = Callable[..., None]

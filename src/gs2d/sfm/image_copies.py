@@ -11,10 +11,10 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from gs2d.disk import atomic_write, disk_error
+from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.images import read_image
 from gs2d.errors import DataError
-from gs2d.images import read_image
-from gs2d.sfm.photos import DAMAGED_EXIF, JPEG, Photo, turn
+from gs2d.sfm.images import DAMAGED_EXIF, JPEG, Photo, turn
 
 QUALITY = 95  # of JPEG files that had to be written again, without chroma subsampling
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, features
 
+from gs2d.core.images import natural_key, read_image
 from gs2d.errors import DataError
-from gs2d.images import natural_key, read_image
-from gs2d.sfm.frames import VIDEOS
+from gs2d.sfm.video_frames import VIDEOS
 
 
 def _reads_heif() -> bool:

@@ -10,9 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.data.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_cameras, read_images, read_points
+from gs2d.data.readers.colmap_model import (
+    ColmapCamera,
+    ColmapImage,
+    ColmapPoints,
+    read_cameras,
+    read_images,
+    read_points,
+)
 from gs2d.errors import DataError
-from gs2d.sfm.solve import Facts
+from gs2d.sfm.colmap import Facts
 
 _MOST_ANGLES = 2000
 FEW_FEATURES = 50  # of a photograph: fewer verify nothing

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.disk import atomic_write
-from gs2d.sfm.outcome import Piece, focal_length
+from gs2d.core.files import atomic_write
+from gs2d.sfm.model import Piece, focal_length
 
 MOST_POINTS = 20_000
 _VIEWS = (("from above", 0, 1), ("from the side", 0, 2))

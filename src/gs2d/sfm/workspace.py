@@ -12,9 +12,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from gs2d.disk import disk_error
+from gs2d.core.files import disk_error
 from gs2d.errors import RunError
-from gs2d.io.run import LOCK, RunFolder, make_folder, remove_made
+from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_made
 
 IMAGES, SPARSE, POSES_JSON, POSES_PNG = "images", "sparse", "poses.json", "poses.png"
 OLD = "old"  # an earlier capture, until the new one has its name

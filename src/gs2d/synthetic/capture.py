@@ -10,20 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.camera import Camera, look_at
-from gs2d.data.toy_exposure import GAINS, random_gains, with_gains
-from gs2d.data.toy_light import BakedLight, bake, shade
-from gs2d.data.toy_poses import TRUTH, disturbed
-from gs2d.data.toy_rays import cast_camera
-from gs2d.data.toy_scene import ToyScene, build_scene
-from gs2d.data.toy_shapes import merge_vertices
-from gs2d.data.toy_textures import linear_to_srgb
-from gs2d.disk import atomic_write, disk_error
+from gs2d.core.camera import Camera, look_at
+from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.images import write_image
+from gs2d.core.json_files import write_json
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.images import write_image
-from gs2d.io.files import write_json
-from gs2d.io.ply import write_mesh
-from gs2d.triangles import Mesh
+from gs2d.io.splat_ply import write_mesh
+from gs2d.meshing.raycast import cast_camera
+from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
+from gs2d.synthetic.perturb_poses import TRUTH, disturbed
+from gs2d.synthetic.scene import ToyScene, build_scene
+from gs2d.synthetic.shading import BakedLight, bake, shade
+from gs2d.synthetic.shapes import merge_vertices
+from gs2d.synthetic.textures import linear_to_srgb
 
 CAMERA_ANGLE_X = 0.6911112  # radians, the horizontal field of view of NeRF-Synthetic
 _SAMPLES = 4  # rays per pixel along each axis
@@ -74,11 +74,11 @@ def write_demo_capture(
     size : int
         Width and height, px.
     vary_exposure : bool
-        Training pictures get random gains (``toy_exposure``), which ``exposure_gt.json`` holds; test pictures keep the
-        gain 1, the mean of the others.
+        Training pictures get random gains (``perturb_exposure``), which ``exposure_gt.json`` holds; test pictures keep
+        the gain 1, the mean of the others.
     vary_poses : bool
-        The poses of training pictures are said to be a little off where they are (``toy_poses``); ``poses_gt.json`` has
-        the true ones.
+        The poses of training pictures are said to be a little off where they are (``perturb_poses``); ``poses_gt.json``
+        has the true ones.
     on_progress : callable, optional
         Called with (pictures done, pictures in all) after each picture, always from the calling thread.
     threads : int, optional

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
-from gs2d.geometry import camera_extent, common_motion, focus_point, moved, similarity_motions
+from gs2d.core.camera import Camera
+from gs2d.core.transforms import camera_extent, common_motion, focus_point, moved, similarity_motions
 
 TRUTH = "poses_gt.json"  # the true cameras of the training photographs, in the layout of transforms_train.json
 DEGREES, SHARE = 0.5, 0.005  # root mean square of the rotations, and of the shifts as shares of the distance

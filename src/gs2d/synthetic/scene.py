@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.data import toy_shapes as shapes
-from gs2d.data import toy_textures as textures
+from gs2d.synthetic import shapes, textures
 
 FLOOR = -0.60  # wu, height of the plinth's upper face
 RADIUS = 1.08  # wu, of the plinth

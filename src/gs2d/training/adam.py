@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from gs2d.recipe import Rates, Stage
-from gs2d.splats import ATTRIBUTES
-from gs2d.train.state import Moments, TrainState
+from gs2d.config.recipe import Rates, Stage
+from gs2d.core.splats import ATTRIBUTES
+from gs2d.training.state import Moments, TrainState
 
 
 def begin_stage(state: TrainState, stage: Stage) -> None:

@@ -6,11 +6,11 @@ from collections.abc import Collection, Mapping
 
 from torch import Tensor
 
+from gs2d.config.recipe import Stage
 from gs2d.kernels import adam as native
 from gs2d.kernels.adam import AdamUpdate
 from gs2d.kernels.cuda import adam, launch
-from gs2d.recipe import Stage
-from gs2d.train.state import TrainState
+from gs2d.training.state import TrainState
 
 
 def native_adam_step(

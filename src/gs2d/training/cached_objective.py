@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from gs2d.recipe import Recipe, Stage
+from gs2d.config.recipe import Recipe, Stage
 from gs2d.render.cpu_cached import CachedView, cache_view
 from gs2d.render.types import RenderOutput
-from gs2d.train.state import TrainState
-from gs2d.train.views import Evaluated, Evaluator, WholeViews
+from gs2d.training.objective import Evaluated, Evaluator, WholeViews
+from gs2d.training.state import TrainState
 
 COLORS = frozenset({"sh0", "shN"})
 OF_COLOR = frozenset({"l1", "ssim"})  # losses that see nothing but the colour image

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gs2d.config.recipe import GradDensify
+from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
-from gs2d.geometry import quats_to_matrices
-from gs2d.kernels import screen_signal
-from gs2d.recipe import GradDensify
-from gs2d.train.rows import append_rows
-from gs2d.train.state import Moments, Statistics, TrainState
+from gs2d.kernels import densify_stats as screen_signal
+from gs2d.training.rows import append_rows
+from gs2d.training.state import Moments, Statistics, TrainState
 
 
 @dataclass(frozen=True)

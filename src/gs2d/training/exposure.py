@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.config.recipe import Recipe
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.core.sh import rgb_to_sh0, sh_to_rgb
+from gs2d.core.splats import Splats
 from gs2d.errors import RunError
-from gs2d.exposure import expose, identity
-from gs2d.recipe import Recipe
+from gs2d.render.exposure import expose, identity
 from gs2d.render.types import RasterSettings
-from gs2d.sh import rgb_to_sh0, sh_to_rgb
-from gs2d.splats import Splats
 
 
 @dataclass(eq=False)

@@ -14,10 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.geometry import quats_to_matrices
-from gs2d.recipe_robust import FreeSpace
-from gs2d.splats import Splats
-from gs2d.train.plane_sweep import Sweep
+from gs2d.config.robust import FreeSpace
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
+from gs2d.training.plane_sweep import Sweep
 
 _UNKNOWN = float("inf")
 

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.core.sh import num_coefficients, rgb_to_sh0
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import nearest_distances
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, ProtocolError
-from gs2d.geometry import nearest_distances
-from gs2d.sh import num_coefficients, rgb_to_sh0
-from gs2d.splats import Splats
 
 INITIAL_OPACITY = 0.1
 SCALE_FLOOR = math.sqrt(1e-7)  # wu; the official floor of the squared distance is 1e-7

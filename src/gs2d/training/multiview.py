@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
+from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView
+from gs2d.config.recipe import Recipe, Stage
+from gs2d.core.camera import Camera
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
-from gs2d.losses_multiview import Photograph, prepare
-from gs2d.recipe import Recipe, Stage
-from gs2d.recipe_multiview import MULTIVIEW_KINDS, MultiView
-from gs2d.train.targets import Target
+from gs2d.losses.multiview import Photograph, prepare
+from gs2d.training.targets import Target
 
 SAMPLES = 2000  # points that say how far away is what a camera looks at
 

@@ -11,27 +11,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.config.multiview import MULTIVIEW_KINDS
+from gs2d.config.priors import PRIOR_KINDS
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import Recipe, Stage
+from gs2d.core.camera import Camera
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DivergedError
-from gs2d.exposure import expose, identity
 from gs2d.kernels import adam
-from gs2d.losses import compute_losses
-from gs2d.losses_multiview import Neighbour
-from gs2d.losses_priors import Prior
-from gs2d.protocols import Protocol
-from gs2d.recipe import Recipe, Stage
-from gs2d.recipe_multiview import MULTIVIEW_KINDS
-from gs2d.recipe_priors import PRIOR_KINDS
+from gs2d.losses.api import compute_losses
+from gs2d.losses.multiview import Neighbour
+from gs2d.losses.priors import Prior
 from gs2d.render.api import rasterize
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
+from gs2d.render.exposure import expose, identity
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.splats import Splats
-from gs2d.train.multiview import Photographs, draw_turn, find_neighbours, is_compared
-from gs2d.train.poses import pose_rate
-from gs2d.train.priors import Priors, has_priors
-from gs2d.train.state import TrainState
-from gs2d.train.targets import Target, TargetSource
+from gs2d.training.multiview import Photographs, draw_turn, find_neighbours, is_compared
+from gs2d.training.poses import pose_rate
+from gs2d.training.priors import Priors, has_priors
+from gs2d.training.state import TrainState
+from gs2d.training.targets import Target, TargetSource
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
+from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene
-from gs2d.recipe import Recipe
-from gs2d.train.exposure import Exposures, check_views, exposure_step, uncount
-from gs2d.train.point_gains import point_gains
-from gs2d.train.poses import Poses, check_poses, pose_rate, pose_step
-from gs2d.train.state import TrainState
-from gs2d.train.views import finite
+from gs2d.training.exposure import Exposures, check_views, exposure_step, uncount
+from gs2d.training.objective import finite
+from gs2d.training.point_gains import point_gains
+from gs2d.training.poses import Poses, check_poses, pose_rate, pose_step
+from gs2d.training.state import TrainState
 
 
 def start(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:

@@ -16,10 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gs2d.data.prior_maps import ObservedPoints
+from gs2d.config.robust import DenseStart
+from gs2d.core.memory import trim
+from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
-from gs2d.memory import trim
-from gs2d.recipe_robust import DenseStart
 
 MIN_POINTS = 20  # sparse points of a view, below which its depths are unknown
 NEAREST = 2  # percentile of depth that stands for the nearest: a few sparse points are wrong

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.config.recipe import Recipe
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.core.transforms import common_motion, rigid_motion, similarity_motions
 from gs2d.errors import RunError
-from gs2d.geometry import common_motion, rigid_motion, similarity_motions
-from gs2d.recipe import Recipe
 
 
 @dataclass(eq=False)

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gs2d.data.prior_maps import DepthMap, ObservedPoints, PointsInView
+from gs2d.config.priors import DepthPrior, NormalPrior
+from gs2d.config.recipe import Recipe
+from gs2d.data.priors import DepthMap, ObservedPoints, PointsInView
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
-from gs2d.losses_priors import Depths, KnownDepths, KnownNormals, PointDepths, Prior, RelativeDepths, fit_line
-from gs2d.recipe import Recipe
-from gs2d.recipe_priors import DepthPrior, NormalPrior
+from gs2d.losses.priors import Depths, KnownDepths, KnownNormals, PointDepths, Prior, RelativeDepths, fit_line
 
 FIT_POINTS = 10  # in a map, at least, for its scale and shift
 ASKED_VIEWS = 20  # that say what a capture's maps are: their unit, their space

@@ -8,10 +8,10 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from gs2d.config.recipe import CloneInPlace, RankByError
 from gs2d.errors import DivergedError
-from gs2d.recipe import CloneInPlace, RankByError
-from gs2d.train.rows import append_rows
-from gs2d.train.state import TrainState
+from gs2d.training.rows import append_rows
+from gs2d.training.state import TrainState
 
 
 @torch.no_grad()

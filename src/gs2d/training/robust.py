@@ -8,15 +8,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gs2d.config.recipe import Recipe, Stage
+from gs2d.config.robust import DenseStart
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.recipe import Recipe, Stage
-from gs2d.recipe_robust import DenseStart
-from gs2d.train import events
-from gs2d.train.free_space import FreeSpaceMaps
-from gs2d.train.plane_sweep import start_points, sweep_views
-from gs2d.train.rows import keep_rows
-from gs2d.train.state import TrainState
+from gs2d.training import events
+from gs2d.training.free_space import FreeSpaceMaps
+from gs2d.training.plane_sweep import start_points, sweep_views
+from gs2d.training.rows import keep_rows
+from gs2d.training.state import TrainState
 
 
 class Robustness:

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
+from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
-from gs2d.splats import Splats
-from gs2d.train.state import TrainState
+from gs2d.training.state import TrainState
 
 
 def keep_rows(state: TrainState, mask: Tensor) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gs2d.check import check_shapes
+from gs2d.core.checks import check_shapes
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import RunError
-from gs2d.splats import ATTRIBUTES, Splats
-from gs2d.train.exposure import Exposures
-from gs2d.train.poses import Poses
+from gs2d.training.exposure import Exposures
+from gs2d.training.poses import Poses
 
 FORMAT = 1  # of the state dict
 

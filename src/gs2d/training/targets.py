@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gs2d.data.scene import View
-from gs2d.losses import TargetMaps, target_maps
+from gs2d.losses.api import TargetMaps, target_maps
 
 # Of 292 photographs of 780x520 a fifth would stay in twice as much, for less than 1 % of an iteration's time: to make a
 # target anew from its bytes takes a few ms. Small captures stay whole.

@@ -13,31 +13,26 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import CloneInPlace, RankByError, Recipe, Stage, validate
+from gs2d.core.memory import trim
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RunError
-from gs2d.memory import trim
-from gs2d.protocols import Protocol
-from gs2d.recipe import CloneInPlace, RankByError, Recipe, Stage, validate
 from gs2d.render import cuda
 from gs2d.render.api import splat_errors
-from gs2d.render.backend import Backend, get_backend
-from gs2d.render.cuda_budget import PairBudget
+from gs2d.render.backends import Backend, get_backend
+from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import RasterSettings
-from gs2d.splats import Splats
-from gs2d.train import events, per_view
-from gs2d.train.actions import clone_in_place, rank_by_error
-from gs2d.train.cached_views import choose_evaluator
-from gs2d.train.densify import accumulate, densify_and_prune, limit_opacity
-from gs2d.train.exposure import as_photographed
-from gs2d.train.initialise import initial_splats
-from gs2d.train.optimizer import adam_step, begin_stage, rates_at
-from gs2d.train.optimizer_fused import fused_adam_step, native_adam_step
-from gs2d.train.priors import with_known_points
-from gs2d.train.robust import Robustness
-from gs2d.train.rows import keep_rows
-from gs2d.train.state import Statistics, TrainState
-from gs2d.train.targets import TARGET_BYTES, DeviceTargets, Targets, TargetSource
-from gs2d.train.views import (
+from gs2d.training import events
+from gs2d.training import per_image as per_view
+from gs2d.training.adam import adam_step, begin_stage, rates_at
+from gs2d.training.adam_fused import fused_adam_step, native_adam_step
+from gs2d.training.cached_objective import choose_evaluator
+from gs2d.training.densify import accumulate, densify_and_prune, limit_opacity
+from gs2d.training.exposure import as_photographed
+from gs2d.training.initialize import initial_splats
+from gs2d.training.objective import (
     Evaluated,
     Evaluator,
     WholeViews,
@@ -48,6 +43,12 @@ from gs2d.train.views import (
     seen_rows,
     waits,
 )
+from gs2d.training.priors import with_known_points
+from gs2d.training.rank_clone import clone_in_place, rank_by_error
+from gs2d.training.robust import Robustness
+from gs2d.training.rows import keep_rows
+from gs2d.training.state import Statistics, TrainState
+from gs2d.training.targets import TARGET_BYTES, DeviceTargets, Targets, TargetSource
 
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.view_exact import Frame
-from gs2d.view_splats import Preview
+from gs2d.viewer.exact import Frame
+from gs2d.viewer.splats import Preview
 
 AXES = "xyz"
 STEPS = 400  # of a slider, over what it spans

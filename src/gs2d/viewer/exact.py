@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 
 Render = Callable[[Camera, str], "Drawn"]
 

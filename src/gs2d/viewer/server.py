@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.extras import install
+from gs2d.core.transforms import focus_point
 from gs2d.errors import BackendError, Gs2dError
-from gs2d.extras import install
-from gs2d.geometry import focus_point
-from gs2d.view_clip import ClipBox
-from gs2d.view_exact import ExactPictures, Frame, Render
-from gs2d.view_splats import Preview
+from gs2d.viewer.clip import ClipBox
+from gs2d.viewer.exact import ExactPictures, Frame, Render
+from gs2d.viewer.splats import Preview
 
 DEFAULT_PORT = 8080
 PICTURES = ("preview", "exact", "normals", "depth")  # what is drawn of the splats

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
-from gs2d.geometry import quats_to_matrices
-from gs2d.sh import sh_to_rgb
-from gs2d.splats import Splats
+from gs2d.core.camera import Camera
+from gs2d.core.sh import sh_to_rgb
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
 
 MOST_DIRECTIONS = 8  # cameras from which a splat's colour is averaged
 _LARGEST = 6e4  # covariances are sent as 16-bit floats

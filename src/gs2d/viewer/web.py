@@ -1,7 +1,7 @@
 """A page that draws splats exactly, in one file: HTML, WebGL 2 shaders and the splats themselves, for any browser.
 
 It needs no server, no network and no library: it can be mailed, or put on any web space. The files that it is made of
-lie in ``page_files``; its shaders follow the rasterizer's contract (``render/api.py``), with the browser's float32 and
+lie in ``web_assets``; its shaders follow the rasterizer's contract (``render/api.py``), with the browser's float32 and
 with attributes that are stored as below.
 """
 
@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.files import atomic_write
+from gs2d.core.splats import Splats
 from gs2d.data.subject import OBJECT, Subject
-from gs2d.disk import atomic_write
 from gs2d.errors import DataError
-from gs2d.page_start import guessed_subject, home_camera, photographed_arc
 from gs2d.render.types import CROSSING, RasterSettings
-from gs2d.splats import Splats
+from gs2d.viewer.web_start import guessed_subject, home_camera, photographed_arc
 
 PARTS = {  # script elements: id -> file, type
     "splat-vert": ("splat.vert", "x-shader/x-vertex"),
@@ -215,7 +215,7 @@ def write_page(
 
 
 def _text(name: str) -> str:
-    return (files("gs2d") / "page_files" / name).read_text(encoding="utf-8").strip()
+    return (files("gs2d.viewer") / "web_assets" / name).read_text(encoding="utf-8").strip()
 
 
 def _part(name: str, file: str, kind: str) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
 from gs2d.data.subject import OBJECT, SCENE, Subject
 
 ROUND = math.radians(100.0)  # a gap between neighbouring directions from which a capture is one-sided

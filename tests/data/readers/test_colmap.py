@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_writers import ColmapModel, ring, small_colmap, write_picture
 from PIL import Image
 
+from capture_writers import ColmapModel, ring, small_colmap, write_picture
+from gs2d.core.images import read_image
 from gs2d.data import load_scene
-from gs2d.data.colmap_model import read_cameras, read_images, read_points
+from gs2d.data.readers.colmap_model import read_cameras, read_images, read_points
 from gs2d.errors import DataError
-from gs2d.images import read_image
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])

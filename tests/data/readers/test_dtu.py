@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_writers import SCALE_MAT, ColmapModel, ring, small_dtu, write_picture
 
+from capture_writers import SCALE_MAT, ColmapModel, ring, small_dtu, write_picture
 from gs2d.data import load_scene
-from gs2d.data.dtu import decompose_projection, dtu_silhouettes
+from gs2d.data.readers.dtu import decompose_projection, dtu_silhouettes
 from gs2d.errors import DataError
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+
 from foreign_writers import (
     BENT,
     HEIGHT,
@@ -31,10 +33,8 @@ from foreign_writers import (
     write_photographs,
     write_points,
 )
-from PIL import Image
-
 from gs2d.data import Scene, detect_format, load_scene
-from gs2d.data.lens import Lens as OurLens
+from gs2d.data.undistort import Lens as OurLens
 from gs2d.errors import DataError
 
 Writer = Callable[[Path, Lens], None]
@@ -101,7 +101,7 @@ def test_the_unit_of_opensfm_is_the_larger_side(tmp_path: Path, upright: bool) -
 
 
 def test_each_projection_of_opensfm_becomes_its_lens(tmp_path: Path) -> None:
-    from gs2d.data.opensfm import _intrinsics
+    from gs2d.data.readers.opensfm import _intrinsics
 
     def of(model: str, **keys: float) -> OurLens | None:
         camera = {"projection_type": model, "width": 40, "height": 30, "focal": 1, "focal_x": 1, "focal_y": 1, **keys}
@@ -241,7 +241,7 @@ def test_affinity_and_skew_of_metashape_by_its_formulas(tmp_path: Path) -> None:
     """u = w/2 + cx + x' (f + b1) + y' b2 of points that the lens bends, in numbers of the manual."""
     from xml.etree import ElementTree
 
-    from gs2d.data.metashape import _intrinsics
+    from gs2d.data.readers.metashape import _intrinsics
 
     for kind in ("frame", "fisheye"):
         sensor = ElementTree.fromstring(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from foreign_writers import (
     CHUNK,
     metashape_similarity,
@@ -18,7 +19,6 @@ from foreign_writers import (
     small_opensfm,
     write_photographs,
 )
-
 from gs2d.data import load_scene
 from gs2d.errors import DataError
 

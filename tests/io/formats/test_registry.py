@@ -13,17 +13,17 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from gs2d.core.sh import sh_basis
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError, DiskError
-from gs2d.io import compressed_ply
-from gs2d.io.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.io.formats import compressed_ply
+from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.io.formats.registry import LAYOUTS, layout_of, read_splat_file, write_layout
+from gs2d.io.formats.splat import read_splat, write_splat
+from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid, unit_quats
-from gs2d.io.ply import read_gaussians, write_splats
 from gs2d.io.ply_format import read_ply, write_ply
-from gs2d.io.splat_file import read_splat, write_splat
-from gs2d.io.splat_formats import LAYOUTS, layout_of, read_splat_file, write_layout
-from gs2d.io.spz import read_spz, write_spz
-from gs2d.sh import sh_basis
-from gs2d.splats import Splats
+from gs2d.io.splat_ply import read_gaussians, write_splats
 
 C0 = 0.28209479177387814
 

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import astuple, replace
-from pathlib import Path
 from types import SimpleNamespace
 
-import emulate
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "evaluate"))  # oracle_scenes
-
 import torch
-from oracle_scenes import grid_mesh, hills, tnt_scene
 
-from gs2d.camera import look_at
+import emulate
+from gs2d.core.camera import look_at
+from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluate import dtu, neighbours, visibility
-from gs2d.evaluate.dtu import thin
-from gs2d.evaluate.icp import icp
-from gs2d.evaluate.neighbours import Cloud
-from gs2d.evaluate.surface import evaluate_surface
-from gs2d.triangles import Mesh
+from gs2d.evaluation import dtu, visibility
+from gs2d.evaluation import nearest as neighbours
+from gs2d.evaluation.dtu import thin
+from gs2d.evaluation.icp import icp
+from gs2d.evaluation.nearest import Cloud
+from gs2d.evaluation.surface import evaluate_surface
+from oracle_scenes import grid_mesh, hills, tnt_scene
 
 pytestmark = pytest.mark.timeout(120)
 GPU = "cpu"  # where torch's part runs here
@@ -31,7 +27,7 @@ GPU = "cpu"  # where torch's part runs here
 
 @pytest.fixture
 def launched(emulator: emulate.Emulator, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Everything in ``gs2d.evaluate`` takes the CPU for a GPU; the names of the kernels that were launched."""
+    """Everything in ``gs2d.evaluation`` takes the CPU for a GPU; the names of the kernels that were launched."""
     names: list[str] = []
 
     def launch(name: str, *rest: object) -> None:

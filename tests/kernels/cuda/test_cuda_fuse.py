@@ -4,34 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import emulate
 import numpy as np
 import pytest
 import torch
 
-from gs2d.camera import look_at
-from gs2d.mesh.frames import DepthMap, Frame, depth_map
-from gs2d.mesh.fuse import touched_blocks
-from gs2d.mesh.integrate import add_in_numpy, add_on_gpu
-from gs2d.mesh.limits import derive_limits, sample_depths
-from gs2d.mesh.sampling import prepare
-from gs2d.mesh.volume import Volume, block_grid, unknown_volume
+import emulate
+from depth_waves import waves
+from gs2d.meshing.bounds import derive_limits, sample_depths
+from gs2d.meshing.integrate import add_in_numpy, add_on_gpu
+from gs2d.meshing.sampling import prepare
+from gs2d.meshing.tsdf import touched_blocks
+from gs2d.meshing.volume import Volume, block_grid, unknown_volume
 
 pytestmark = pytest.mark.timeout(120)
-
-
-def waves(count: int, *, colored: bool) -> list[DepthMap]:
-    """A wavy wall with holes from several places: weights in every other view, no colours in the third."""
-    rng = np.random.default_rng(0)
-    found = []
-    for k in range(count):
-        eye = np.array([0.3 * k - 0.4, -2.0, 0.1 * k])
-        camera = look_at(eye, np.zeros(3), np.array([0.0, 0.1, 1.0]), width=20, height=16, fx=24.0)
-        depth = 2.0 + 0.1 * np.sin(np.arange(20.0)) + 0.02 * rng.standard_normal((16, 20))
-        valid = rng.random((16, 20)) > 0.1
-        color = rng.random((16, 20, 3)) if colored and k != 2 else None
-        found.append(depth_map(Frame(camera, depth, color, valid * rng.random((16, 20)) if k % 2 else valid)))
-    return found
 
 
 @pytest.mark.parametrize("colored", [True, False])

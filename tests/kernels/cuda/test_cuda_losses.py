@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import emulate
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from gs2d import losses_reference as reference
-from gs2d.camera import Camera, look_at
+import emulate
+from gs2d.core.camera import Camera, look_at
 from gs2d.errors import ShapeError
-from gs2d.kernels.cuda import ops
+from gs2d.kernels.cuda import losses as ops
+from gs2d.losses import reference
 
 pytestmark = pytest.mark.timeout(120)
 # Smaller than the window; a row and a strip of 128 reals (43 pixels) and of 32 rows begun and passed.

@@ -6,37 +6,35 @@ value, looking up which rows are True, or making a tensor from Python numbers.
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from emulate import Emulator
-from render_scenes import front_camera, splat, stack
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "train"))  # train_toys
-
 import train_toys
-
+from emulate import Emulator
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
-from gs2d.protocols import GENERIC
-from gs2d.recipe import Exposure, PoseRefinement, Recipe
-from gs2d.render import cuda, cuda_budget, cuda_passes
-from gs2d.render.backend import Backend, get_backend
+from gs2d.render import cuda, cuda_passes
+from gs2d.render import pair_budget as cuda_budget
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.train import events, loop, views
-from gs2d.train.loop import Trainer
-from gs2d.train.targets import DeviceTargets, Targets
+from gs2d.training import events
+from gs2d.training import objective as views
+from gs2d.training import trainer as loop
+from gs2d.training.targets import DeviceTargets, Targets
+from gs2d.training.trainer import Trainer
+from render_scenes import front_camera, splat, stack
 
 pytestmark = pytest.mark.timeout(170)
 

@@ -25,12 +25,11 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 ctypes.CDLL(sys.argv[1])
-for folder in ("train", "render", "cuda"):
-    sys.path.insert(0, sys.argv[2] + "/" + folder)
+sys.path.insert(0, sys.argv[2])
 
-from gs2d.kernels.cuda import adam, arguments, launch, nearest, ops
-from gs2d.render import cuda, cuda_budget, cuda_passes
-from gs2d.render.backend import Backend
+from gs2d.kernels.cuda import adam, arguments, launch, nearest, losses as ops
+from gs2d.render import cuda, pair_budget as cuda_budget, cuda_passes
+from gs2d.render.backends import Backend
 
 launched, pointers = set(), [0]
 
@@ -57,10 +56,10 @@ budget = cuda_budget.PairBudget()
 
 ITERATIONS = """
 import train_toys
-from gs2d.protocols import GENERIC
-from gs2d.train import loop
-from gs2d.train.initialise import initial_splats
-from gs2d.train.state import TrainState
+from gs2d.config.protocols import GENERIC
+from gs2d.training import trainer as loop
+from gs2d.training.initialize import initial_splats
+from gs2d.training.state import TrainState
 
 backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize, device="cuda:0")
 recipe, scene, generator = train_toys.compared(), train_toys.make_scene(), torch.Generator()
@@ -93,7 +92,7 @@ print(sorted(devices), sorted(launched), pointers[0])
 GRADIENTS = """
 import numpy as np
 from render_scenes import front_camera
-from gs2d.evaluate import distance, visibility
+from gs2d.evaluation import distance, visibility
 from gs2d.render.types import RasterSettings
 
 class Context:
@@ -146,7 +145,7 @@ with FakeTensorMode():
 @pytest.fixture(scope="module")
 def said(guard: Path) -> list[str]:
     """What both scripts print: a line each, and the refusal; in a process of their own, because the stand-in stays."""
-    given = [str(guard), str(Path(__file__).resolve().parents[1])]
+    given = [str(guard), str(Path(__file__).resolve().parents[2] / "helpers")]
     command = [sys.executable, "-c", COMMON + ITERATIONS + "launched.clear()\n" + GRADIENTS, *given]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False, env=dict(os.environ))
     assert done.returncode == 0, done.stderr[-3000:]

@@ -13,7 +13,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda import diagnose
 from gs2d.kernels.cuda.diagnose import Facts, describe, missing
-from gs2d.render.backend import backend_report, get_backend
+from gs2d.render.backends import backend_report, get_backend
 
 H200 = ("NVIDIA H200", (9, 0))
 WORKS = Facts("2.15.0", (13, 0), nvrtc=(13, 0), driver=(13, 2), devices=(H200,))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
-import emulate
 import pytest
 import torch
 from torch import Tensor
+
+import emulate
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -19,7 +20,7 @@ class _Arrays(ctypes.Structure):
 
 @pytest.fixture(scope="module")
 def cases(tmp_path_factory: pytest.TempPathFactory) -> emulate.EmulatedKernels:
-    here = Path(__file__).parent
+    here = Path(__file__).resolve().parents[2] / "helpers"
     return emulate.build([here / "emulator_cases.cu"], here, tmp_path_factory.mktemp("emulator"), "cases")
 
 

@@ -11,8 +11,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import emulate
 import pytest
+
+import emulate
 
 pytestmark = pytest.mark.timeout(280)
 
@@ -20,8 +21,8 @@ COMMON = """
 import sys
 from pathlib import Path
 
-guard, kernels, tests, folder = sys.argv[1], *map(Path, sys.argv[2:])
-sys.path[:0] = [str(tests / name) for name in ("cuda", "render", "train", ".")]
+guard, kernels, helpers, folder = sys.argv[1], *map(Path, sys.argv[2:])
+sys.path.insert(0, str(helpers))
 import fake_gpu
 import torch
 from emulate import Emulator
@@ -53,7 +54,7 @@ print(leaf.grad.tolist())
 TRAINING = """
 import train_toys
 from gs2d.render import cuda
-from gs2d.render.backend import Backend, get_backend
+from gs2d.render.backends import Backend, get_backend
 from gs2d.kernels.cuda import launch
 
 def trained(backend):
@@ -74,7 +75,7 @@ assert {"adam_step", "splat_errors", "blend_vjp_learning"} <= set(launched)
 
 WHOLE_PATH = """
 from functools import partial
-from gs2d.evaluate.surface import evaluate_surface
+from gs2d.evaluation.surface import evaluate_surface
 from gs2d.pipeline import truth
 from gs2d.pipeline.jobs import evaluate_run, mesh_run, render_run
 from gs2d.pipeline.options import TrainOptions
@@ -98,7 +99,7 @@ print(render_run(folder / "run", orbit=1)["images"])
 
 def said(script: str, guard: Path, emulator: emulate.Emulator, folder: Path) -> list[str]:
     """What a script prints in a process of its own; kernels that these tests have compiled already are taken."""
-    given = [str(guard), str(emulator.folder), str(Path(__file__).resolve().parents[1]), str(folder)]
+    given = [str(guard), str(emulator.folder), str(Path(__file__).resolve().parents[2] / "helpers"), str(folder)]
     command = [sys.executable, "-c", COMMON + script, *given]
     done = subprocess.run(command, capture_output=True, text=True, timeout=270, check=False, env=dict(os.environ))
     assert done.returncode == 0, done.stderr[-3000:]

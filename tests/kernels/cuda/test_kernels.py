@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from emulate import Emulator
-from kernel_cases import SETTINGS, Case, cases, double, gradients, many_tiles, quantile, render
-from render_scenes import IMAGES, front_camera, random_cotangents, requiring_grad, splat, stack
 from torch import Tensor
 
+from emulate import Emulator
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import ShapeError
 from gs2d.render import cuda, reference, reference_errors
 from gs2d.render.api import rasterize
-from gs2d.splats import ATTRIBUTES, Splats
+from kernel_cases import SETTINGS, Case, cases, double, gradients, many_tiles, quantile, render
+from render_scenes import IMAGES, front_camera, random_cotangents, requiring_grad, splat, stack
 
 pytestmark = pytest.mark.timeout(120)  # a kernel that does not end
 

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from emulate import Emulator
-from kernel_cases import SETTINGS, Case, cases, crossing_tiles, double, many_tiles
-from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 from torch import Tensor
 
-from gs2d.camera import Camera
+from emulate import Emulator
+from gs2d.core.camera import Camera
+from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.arguments import SlotArguments, fill
 from gs2d.render import cuda, cuda_passes, reference
-from gs2d.splats import ATTRIBUTES, Splats
+from kernel_cases import SETTINGS, Case, cases, crossing_tiles, double, many_tiles
+from render_scenes import IMAGES, contraction, front_camera, random_cotangents, requiring_grad, splat, stack
 
 pytestmark = pytest.mark.timeout(120)
 COLORS = ("sh0", "shN")

@@ -11,19 +11,19 @@ import sys
 import threading
 from pathlib import Path
 
-import fake_driver
 import numpy as np
 import pytest
 import torch
+
+import fake_driver
 from emulate import Emulator
 from fake_driver import FakeDriver, Result
-from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
-
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import arguments, launch
 from gs2d.kernels.cuda.compile import kernel_sources
 from gs2d.render import cuda
 from gs2d.render.types import RasterSettings
+from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -198,7 +198,7 @@ def with_fake_libcuda(folder: Path, **environment: str) -> tuple[str, list[dict[
     pytest.importorskip("cuda.bindings", reason="cuda-bindings is not here")
     if shutil.which("g++") is None or sys.platform != "linux":
         pytest.skip("no g++ on Linux here to build a fake libcuda")
-    source = Path(__file__).with_name("fake_libcuda.cpp")
+    source = Path(__file__).resolve().parents[2] / "helpers" / "fake_libcuda.cpp"
     library, log = folder / "libcuda.so.1", folder / "log"
     command = ["g++", "-std=c++17", "-O1", "-fPIC", "-shared", "-Wall", f"-Wl,-soname,{library.name}"]
     subprocess.run([*command, "-o", str(library), str(source)], check=True, timeout=60)

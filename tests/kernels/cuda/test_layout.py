@@ -12,7 +12,7 @@ import re
 import pytest
 
 from gs2d.errors import BackendError
-from gs2d.kernels import fusion
+from gs2d.kernels import tsdf as fusion
 from gs2d.kernels.cuda import arguments, compile, nearest
 
 pytestmark = pytest.mark.timeout(120)

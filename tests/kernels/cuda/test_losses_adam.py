@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import emulate
 import pytest
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+import emulate
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
 

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from emulate import Emulator
-from kernel_cases import SETTINGS, many_tiles
-from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "train"))  # train_toys
-
 import train_toys
-
+from emulate import Emulator
 from gs2d.kernels.cuda import launch
 from gs2d.render import cuda
-from gs2d.render.backend import Backend
+from gs2d.render.backends import Backend
+from kernel_cases import SETTINGS, many_tiles
+from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import emulate
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
 
+import emulate
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.nearest import LEAF, build_tree, choose_spread, find_nearest
 

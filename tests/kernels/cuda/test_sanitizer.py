@@ -13,14 +13,14 @@ from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).parent
+HELPERS = Path(__file__).resolve().parents[2] / "helpers"
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(200)]
 
 COMMON = """
 import sys
 from pathlib import Path
 
-sys.path[:0] = [sys.argv[1], sys.argv[1] + "/../render"]
+sys.path.insert(0, sys.argv[1])
 import numpy as np
 import torch
 from emulate import Emulator
@@ -41,11 +41,11 @@ EVERYTHING = """
 from kernel_cases import SETTINGS, many_tiles
 from render_scenes import contraction, random_cotangents
 
-from gs2d.kernels.cuda import ops
+from gs2d.kernels.cuda import losses as ops
 from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
 from gs2d.kernels.cuda.nearest import NEIGHBOURS, build_tree, choose_spread, find_nearest
 from gs2d.render import cuda
-from gs2d.splats import Splats
+from gs2d.core.splats import Splats
 
 case = many_tiles()  # 70 x 45 px, no multiple of anything
 cotangents = random_cotangents(np.random.default_rng(1), case.camera)
@@ -106,7 +106,7 @@ def run(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
     # Fibers have stacks of their own, which it does not follow; the rest is about other libraries.
     options = "detect_leaks=0:detect_stack_use_after_return=0:alloc_dealloc_mismatch=0:detect_odr_violation=0"
     settings = {**os.environ, "LD_PRELOAD": str(library), "ASAN_OPTIONS": options, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", COMMON + script, str(HERE), str(folder)]
+    command = [sys.executable, "-c", COMMON + script, str(HELPERS), str(folder)]
     return subprocess.run(command, env=settings, capture_output=True, text=True, timeout=180, check=False)
 
 

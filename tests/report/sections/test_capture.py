@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gs2d.core.images import write_image
 from gs2d.errors import DataError
-from gs2d.images import write_image
-from gs2d.report_capture import capture_section
+from gs2d.report.sections.capture import capture_section
 
 FOUND: dict[str, Any] = {
     "count": 3,

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.data.capture import Capture, Frame
-from gs2d.data.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images, read_points
-from gs2d.data.lens import Intrinsics, colmap_intrinsics
-from gs2d.data.prior_maps import ObservedPoints
+from gs2d.core.images import image_size
+from gs2d.data.build import Capture, Frame
+from gs2d.data.priors import ObservedPoints
+from gs2d.data.readers.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images, read_points
 from gs2d.data.scene import PointCloud
+from gs2d.data.undistort import Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError
-from gs2d.images import image_size
 
 MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 

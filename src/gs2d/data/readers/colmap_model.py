@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DataError
-from gs2d.geometry import quats_to_matrices
 
 #: model id -> (name, number of parameters)
 CAMERA_MODELS = {

@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
-from gs2d.data.colmap import find_mask
-from gs2d.data.fields import entries, head, real, reals, required, whole
-from gs2d.data.foreign_points import points_beside
-from gs2d.data.lens import Intrinsics, Lens
-from gs2d.data.photographs import Photographs
+from gs2d.core.json_files import read_json
+from gs2d.data.build import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.readers.colmap import find_mask
+from gs2d.data.readers.fields import entries, head, real, reals, required, whole
+from gs2d.data.readers.foreign_points import points_beside
+from gs2d.data.readers.photographs import Photographs
 from gs2d.data.scene import PointCloud
+from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
-from gs2d.io.files import read_json
 
 #: distortion -> (kind of lens, number of its parameters); in older files it is in the name of the type
 _LENSES: Mapping[str, tuple[str, int]] = {

@@ -20,12 +20,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
-from gs2d.data.colmap import find_mask
-from gs2d.data.fields import head, real, reals, whole
-from gs2d.data.foreign_points import points_beside
-from gs2d.data.lens import Intrinsics, Lens
-from gs2d.data.photographs import Photographs
+from gs2d.data.build import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.readers.colmap import find_mask
+from gs2d.data.readers.fields import head, real, reals, whole
+from gs2d.data.readers.foreign_points import points_beside
+from gs2d.data.readers.photographs import Photographs
+from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 
 _KINDS = {"frame": "perspective", "fisheye": "fisheye"}

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gs2d.data.capture import Capture, Frame
-from gs2d.data.colmap import find_mask
-from gs2d.data.fields import entries, real, reals, required, whole
-from gs2d.data.lens import Intrinsics, Lens
-from gs2d.data.photographs import Photographs
+from gs2d.core.images import image_size
+from gs2d.core.json_files import read_json
+from gs2d.data.build import Capture, Frame
+from gs2d.data.readers.colmap import find_mask
+from gs2d.data.readers.fields import entries, real, reals, required, whole
+from gs2d.data.readers.photographs import Photographs
 from gs2d.data.scene import PointCloud
+from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
-from gs2d.images import image_size
-from gs2d.io.files import read_json
 
 #: OpenSfM's projection type -> (kind of lens, radial coefficients, has c_x and c_y, has p1 and p2)
 _MODELS: Mapping[str, tuple[str, int, bool, bool]] = {

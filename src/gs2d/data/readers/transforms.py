@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.data.capture import Capture, Frame, pose_from_camera_to_world
-from gs2d.data.lens import Intrinsics, Lens
-from gs2d.data.prior_maps import MapFiles
+from gs2d.core.images import image_size
+from gs2d.core.json_files import read_json
+from gs2d.data.build import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.priors import MapFiles
 from gs2d.data.scene import PointCloud
+from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
-from gs2d.images import image_size
-from gs2d.io.files import read_json
-from gs2d.io.ply import read_points
+from gs2d.io.splat_ply import read_points
 
 _LARGEST = 1e300  # JSON has whole numbers of any size
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")

@@ -12,10 +12,10 @@ import os
 
 import numpy as np
 
+from gs2d.core.sh import C0
 from gs2d.errors import DataError
 from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
 from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
-from gs2d.sh import C0
 
 _CHUNK = 256
 _BITS = (11, 10, 11)

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from gs2d.core.splats import Splats
 from gs2d.errors import DataError
-from gs2d.io.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.io.formats.splat import read_splat, write_splat
+from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import Gaussians
-from gs2d.io.ply import ply_kind, read_gaussians, read_splats, write_splats
-from gs2d.io.splat_file import read_splat, write_splat
-from gs2d.io.spz import read_spz, write_spz
-from gs2d.splats import Splats
+from gs2d.io.splat_ply import ply_kind, read_gaussians, read_splats, write_splats
 
 Writer = Callable[[Path, Splats], tuple[str, ...] | None]
 

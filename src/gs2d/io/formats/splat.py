@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gs2d.core.json_files import atomic_write
+from gs2d.core.sh import C0
 from gs2d.errors import DataError
-from gs2d.io.files import atomic_write
 from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
-from gs2d.sh import C0
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.json_files import atomic_write
 from gs2d.errors import DataError
-from gs2d.io.files import atomic_write
 from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
 
 _MAGIC = 0x5053474E  # "NGSP"

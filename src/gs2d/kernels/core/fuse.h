@@ -1,5 +1,5 @@
-// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; mesh/integrate.py
-// and mesh/sampling.py have the same in numpy, operation for operation: single precision gives the same bits, so
+// What one depth map changes in one voxel of a truncated signed distance field (docs/math.md; meshing/integrate.py
+// and meshing/sampling.py have the same in numpy, operation for operation: single precision gives the same bits, so
 // nothing here is a fused multiply-add).
 #pragma once
 
@@ -8,10 +8,10 @@
 namespace gs2d {
 
 constexpr int FUSE_VOXELS = 512;           // of a block of 8^3, z fastest
-constexpr double FUSE_WEIGHT_SLOPE = 4.0;  // 1 / (1 - FULL_WEIGHT_BEHIND) of mesh/integrate.py
+constexpr double FUSE_WEIGHT_SLOPE = 4.0;  // 1 / (1 - FULL_WEIGHT_BEHIND) of meshing/integrate.py
 constexpr double FUSE_NO_WEIGHT = 1e-20;   // a sum of weights below this is taken as this
 
-// One view over some blocks of a volume, for kernels/fusion.py. R is the type of the arrays.
+// One view over some blocks of a volume, for kernels/tsdf.py. R is the type of the arrays.
 template <class R> struct FuseArguments {
     long long blocks;      // that the view may change
     const long long* rows; // [blocks] of the volume
@@ -24,7 +24,7 @@ template <class R> struct FuseArguments {
     R *tsdf, *weight, *color, *color_weight;  // [M, 512], [M, 512, 3]; the colours null where there are none
 };
 
-// Rays of one depth map through a grid of blocks, for kernels/fusion.py: where a depth lies on each, sampled before and
+// Rays of one depth map through a grid of blocks, for kernels/tsdf.py: where a depth lies on each, sampled before and
 // behind it, in halves of a block from the grid's corner.
 struct MarkArguments {
     long long count, steps;   // rays; samples along each

@@ -15,7 +15,7 @@ namespace {
 constexpr int64_t PIECE = 2048;  // pixels
 constexpr int SUMS = 12;
 
-// kernels/exposure.py has the same.
+// render/exposure_native.py has the same.
 struct Picture {
     const real* color;        // [pixels, 3]
     const real* coverage;     // [pixels], or null: 1

@@ -12,7 +12,7 @@ from torch import Tensor
 from gs2d.errors import ShapeError
 from gs2d.kernels.adam import AdamUpdate, bias_corrections, check_update
 from gs2d.kernels.cuda.arguments import AdamArguments, fill
-from gs2d.kernels.cuda.ops import ready
+from gs2d.kernels.cuda.losses import ready
 
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher

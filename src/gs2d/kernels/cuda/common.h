@@ -1,6 +1,6 @@
 // What the CUDA kernels share. Every kernel takes one struct by value (a ctypes structure on the Python side) and uses
 // only what the compiler has built in: no headers of the toolkit. Warp collectives stand in convergent code, with the
-// full mask: the tests run these sources on the CPU, where anything else is an error (tests/cuda/emulator.h).
+// full mask: the tests run these sources on the CPU, where anything else is an error (tests/helpers/emulator.h).
 #pragma once
 
 #include "core/blend.h"

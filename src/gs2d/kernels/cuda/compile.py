@@ -17,7 +17,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from gs2d.disk import atomic_write
+from gs2d.core.files import atomic_write
 from gs2d.errors import BackendError, DiskError
 
 __all__ = [

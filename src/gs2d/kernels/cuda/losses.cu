@@ -8,8 +8,8 @@
 
 namespace gs2d {
 
-constexpr int MEAN_PIXELS = 1024;             // of a block; ops.py has the same
-constexpr int NORMAL_W = 32, NORMAL_H = 8;    // tile of a block in the backward pass; ops.py has the same
+constexpr int MEAN_PIXELS = 1024;             // of a block; losses.py has the same
+constexpr int NORMAL_W = 32, NORMAL_H = 8;    // tile of a block in the backward pass; losses.py has the same
 constexpr int HALO = 2;                       // depths that a depth's gradient depends on, on each side
 
 struct NormalArguments {

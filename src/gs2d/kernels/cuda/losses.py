@@ -1,8 +1,8 @@
-"""The image losses on a GPU: the functions of ``kernels/ops.py`` over a launcher; nothing waits for the host.
+"""The image losses on a GPU: the functions of ``kernels/losses.py`` over a launcher; nothing waits for the host.
 
 Values are reduced in a fixed order, so they are the same from run to run. Unlike the native ones, gradients wait for
 the backward pass: their cotangents are read on the device, and nothing has to be guessed (``expected`` is accepted and
-not needed). The formulas are in ``kernels/core/losses.h``; ``losses_reference`` has the same in torch.
+not needed). The formulas are in ``kernels/core/losses.h``; ``losses.reference`` has the same in torch.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gs2d.camera import Camera
-from gs2d.check import check_shapes
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.cuda.arguments import (
     BlurArguments,
@@ -252,7 +252,7 @@ def normal_consistency(
     expected: float = 0.05,
     launcher: Launcher,
 ) -> Tensor:
-    """Normal consistency [], the form on a GPU of the functions of the same name in ``losses_reference``.
+    """Normal consistency [], the form on a GPU of the functions of the same name in ``losses.reference``.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@
 
 namespace gs2d {
 
-constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;            // reals and rows of a block; ops.py has the same
+constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;            // reals and rows of a block; losses.py has the same
 constexpr int SIDE = 3 * SSIM_RADIUS, STAGED = STRIP + 2 * SIDE;  // reals of a row that a block reads
 
 struct PhotometricArguments {

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.json_files import read_json, write_json
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
-from gs2d.io.files import read_json, write_json
-from gs2d.io.run import VERDICT, RunFolder
-from gs2d.pipeline.prepare import Job
-from gs2d.pipeline.verdict import FORMAT, judge
-from gs2d.pipeline.verdict_measures import Collector, Measures, measure, measures_from_json
+from gs2d.io.run_dir import VERDICT, RunFolder
+from gs2d.pipeline.job import Job
+from gs2d.pipeline.verdict.judge import FORMAT, judge
+from gs2d.pipeline.verdict.measures import Collector, Measures, measure, measures_from_json
 
 
 def write_verdict(run: RunFolder, job: Job, collected: Collector) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-from gs2d import grades
-from gs2d.grades import GOOD, USABLE
-from gs2d.pipeline.verdict_measures import Measures, Neighbour
+from gs2d.config import grades
+from gs2d.config.grades import GOOD, USABLE
+from gs2d.pipeline.verdict.measures import Measures, Neighbour
 
 FORMAT = 1
 NAMED = 3  # views that a sentence names; verdict.json has all

@@ -12,18 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.json_files import read_json
+from gs2d.core.transforms import focus_point, up_direction
 from gs2d.data import Scene, View
-from gs2d.data.prior_maps import ObservedPoints
+from gs2d.data.priors import ObservedPoints
 from gs2d.errors import DataError, RunError
-from gs2d.evaluate.hidden_points import hidden_points
-from gs2d.evaluate.images import ImageMetrics, psnr_float
-from gs2d.exposure import fit_exposure
-from gs2d.geometry import focus_point, up_direction
-from gs2d.io.files import read_json
+from gs2d.evaluation.hidden_points import hidden_points
+from gs2d.evaluation.images import ImageMetrics, psnr_float
+from gs2d.pipeline.evaluate import SeenView
 from gs2d.pipeline.exposure import GREY, matched_by_halves, over
-from gs2d.pipeline.scoring import SeenView
-from gs2d.sfm.workplace import POSES_JSON
+from gs2d.render.exposure import fit_exposure
+from gs2d.sfm.workspace import POSES_JSON
 
 FACING = math.cos(math.radians(60.0))  # a camera looks at the subject where it is within this of its axis
 
@@ -116,7 +116,7 @@ def measures_from_json(data: Mapping[str, Any]) -> Measures:
 
 
 class Collector:
-    """Measures each view while it is scored; its :meth:`visit` is for :func:`~gs2d.pipeline.scoring.score_views`."""
+    """Measures each view while it is scored; its :meth:`visit` is for :func:`~gs2d.pipeline.evaluate.score_views`."""
 
     def __init__(self, scene: Scene, background: tuple[float, float, float]) -> None:
         self._background = background

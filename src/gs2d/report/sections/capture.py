@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gs2d.core.images import read_image
+from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.images import read_image
-from gs2d.io.files import read_json
-from gs2d.report_html import escape, missing, picture, table
+from gs2d.report.html import escape, missing, picture, table
 
 CAPTURE = "capture"  # in a run of `gs2d reconstruct`
 POSES_JSON, POSES_PNG = "poses.json", "poses.png"  # of a capture that `gs2d poses` made

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.images import composite, read_image
+from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.images import composite, read_image
-from gs2d.io.files import read_json
-from gs2d.io.ply import read_mesh
-from gs2d.io.run import RENDERS
-from gs2d.report_html import color_bar, escape, missing, picture, wipe
-from gs2d.report_images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
-from gs2d.report_mesh import mesh_pictures, orbit_cameras
+from gs2d.io.run_dir import RENDERS
+from gs2d.io.splat_ply import read_mesh
+from gs2d.report.html import color_bar, escape, missing, picture, wipe
+from gs2d.report.images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
+from gs2d.report.mesh_images import mesh_pictures, orbit_cameras
 
 MOST_VIEWS = 4
 MOST_FACES = 4_000_000  # a picture of more would take gigabytes

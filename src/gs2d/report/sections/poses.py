@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.io.files import read_json
-from gs2d.report_curves import INK, plot_by_photograph, svg_text
-from gs2d.report_html import drawing, escape, missing
+from gs2d.report.html import drawing, escape, missing
+from gs2d.report.plots import INK, plot_by_photograph, svg_text
 
 MEASURES = ("pixels", "degrees", "shift")
 

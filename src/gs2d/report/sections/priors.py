@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.images import read_image
-from gs2d.report_curves import INK, plot_by_photograph, svg_text
-from gs2d.report_html import drawing, escape, missing, picture
+from gs2d.core.images import read_image
+from gs2d.report.html import drawing, escape, missing, picture
+from gs2d.report.plots import INK, plot_by_photograph, svg_text
 
 TITLES = {
     "known-depth": "known depth",

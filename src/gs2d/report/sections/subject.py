@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.camera import Camera
+from gs2d.core.camera import Camera
+from gs2d.core.files import atomic_write
+from gs2d.core.images import read_image
 from gs2d.data.subject import OBJECT, Subject, read_subject
-from gs2d.disk import atomic_write
-from gs2d.images import read_image
-from gs2d.io.run import RENDERS
-from gs2d.report_html import escape, picture
+from gs2d.io.run_dir import RENDERS
+from gs2d.report.html import escape, picture
 
 PICTURE = "subject.png"
 MOST_POINTS = 8000

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gs2d.images import read_image
-from gs2d.report_html import escape, missing, picture, table
-from gs2d.report_terms import titles_of
+from gs2d.core.images import read_image
+from gs2d.report.html import escape, missing, picture, table
+from gs2d.report.terms import titles_of
 
 SCORES = (
     "Precision: the share of the mesh that is nearer to the true surface than the distance in the first column. "

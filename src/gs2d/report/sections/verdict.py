@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gs2d.config.grades import GRADES, TEST_PSNR, TRAIN_PSNR
+from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.grades import GRADES, TEST_PSNR, TRAIN_PSNR
-from gs2d.io.files import read_json
-from gs2d.report_html import escape, table
+from gs2d.report.html import escape, table
 
 
 def verdict_section(path: Path) -> str:

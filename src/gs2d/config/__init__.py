@@ -1,0 +1,1 @@
+"""What is trained and how it is scored, as values: recipes, schedules, protocols. Never imports torch."""

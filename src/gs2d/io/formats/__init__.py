@@ -1,0 +1,1 @@
+"""Splats in the files of other tools, one file a format."""

@@ -1,0 +1,1 @@
+"""``report.html``: sections, plots and images of a run in one file."""
