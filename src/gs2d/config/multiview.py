@@ -14,7 +14,7 @@ LARGEST = {"patches": 1_000_000, "radius": 50}  # more is a slip, and ends out o
 
 @dataclass(frozen=True)
 class MultiView:
-    """How training views are compared with a neighbour of theirs (``losses.multiview.py``, ``training/multiview.py``).
+    """How training views are compared with a neighbour of theirs (``losses/multiview.py``, ``training/multiview.py``).
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ AXES = ("auto", "opencv", "opengl")
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """Where known depths come from and how far they are trusted (``training/priors.py``, ``losses.priors.py``).
+    """Where known depths come from and how far they are trusted (``training/priors.py``, ``losses/priors.py``).
 
     Attributes
     ----------
