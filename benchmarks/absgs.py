@@ -28,10 +28,9 @@ from gs2d.core.files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
 from gs2d.experiments.aggregate import Cell, read_cell
-from gs2d.experiments.execute import Sweep, SweepJob
+from gs2d.experiments.execute import Job, execute
 from gs2d.experiments.plan import PaperOptions, make_job, trained_recipe
 from gs2d.experiments.scenes import FoundScene, find_scenes
-from gs2d.experiments.slots import run_sweep
 from gs2d.io.run_dir import machine, versions
 from gs2d.pipeline.events import Event, Notice
 
@@ -70,17 +69,16 @@ class Candidate:
 CANDIDATES = tuple(Candidate(g, s) for g, s in itertools.product(FACTORS, FACTORS))
 
 
-def make_jobs(
-    options: PaperOptions, scenes: Sequence[FoundScene], cache: Path
-) -> dict[tuple[Candidate, str, int], SweepJob]:
+def make_jobs(options: PaperOptions, scenes: Sequence[FoundScene]) -> dict[tuple[Candidate, str, int], Job]:
     """The run of every candidate, scene and seed."""
     jobs = {}
     for candidate, scene, seed in itertools.product(CANDIDATES, scenes, options.seeds):
         changed = replace(options, overrides=(*options.overrides, *candidate.overrides))
-        job = make_job(changed, scene, RECIPE, trained_recipe(RECIPE, changed), seed, cache)
+        job = make_job(changed, scene, RECIPE, trained_recipe(RECIPE, changed), seed)
         name = f"{scene.name}-{candidate.name}-s{seed}"
         run = replace(job.train, out=options.out / "runs" / name)
-        jobs[candidate, scene.name, seed] = replace(job, name=name, train=run)
+        record = job.record.with_name(f"{name}.json")
+        jobs[candidate, scene.name, seed] = replace(job, name=name, record=record, train=run)
     return jobs
 
 
@@ -141,10 +139,9 @@ def lost(cell: Cell) -> bool:
 def sweep(options: PaperOptions) -> Candidate | None:
     """Train all candidates, and write ``absgs.json`` and ``absgs.md``."""
     scenes = find_scenes(options.data, options.scenes, truths=options.truth)
-    cache = options.cache or options.out / "cache"
-    jobs = make_jobs(options, scenes, cache)
-    work = Sweep(folder=options.out, jobs=tuple(jobs.values()), cache=cache)
-    run_sweep(work, say, slots=options.slots, threads=options.threads, backend=options.backend)
+    jobs = make_jobs(options, scenes)
+    todo = tuple(jobs.values())
+    execute(todo, options.out, say, slots=options.slots, threads=options.threads, backend=options.backend)
     cells: dict[Candidate, list[Cell]] = {candidate: [] for candidate in CANDIDATES}
     for (candidate, name, seed), job in jobs.items():
         scene = next(scene for scene in scenes if scene.name == name)
@@ -154,7 +151,7 @@ def sweep(options: PaperOptions) -> Candidate | None:
             "seed": seed,
             "test_on": scene.protocol.test_on,
         }
-        cells[candidate].append(read_cell(job.train.out, record=work.record(job), **place))
+        cells[candidate].append(read_cell(job.train.out, record=job.outcome(), **place))
     chosen = choose(cells)
     command = shlex.join(["python", "-m", "benchmarks.absgs", *sys.argv[1:]])
     found = [{**c.thresholds, "runs": [cell.to_json() for cell in cells[c]]} for c in CANDIDATES]

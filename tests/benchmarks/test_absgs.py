@@ -40,7 +40,7 @@ def test_the_thresholds_of_the_named_recipe_are_among_the_candidates() -> None:
 def test_candidates_share_all_but_the_last_stage(tmp_path: Path) -> None:
     write_capture(tmp_path / "ball", train=2, test=1, size=8)
     options = PaperOptions(table="absgs", data=tmp_path, out=tmp_path / "out", schedule_scale=0.01)
-    jobs = make_jobs(options, find_scenes(tmp_path), tmp_path / "cache")
+    jobs = make_jobs(options, find_scenes(tmp_path))
     assert len({job.name for job in jobs.values()}) == len({job.train.out for job in jobs.values()}) == 9
     keys = [job.stage_keys for job in jobs.values()]
     assert len({key[:2] for key in keys}) == 1

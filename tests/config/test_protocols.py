@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
-from typing import Any
-
 import pytest
 
 from gs2d.config.datasets import (
@@ -13,21 +10,12 @@ from gs2d.config.datasets import (
     MIP_NERF_360_SCENES,
     NERF_SYNTHETIC_SCENES,
     TNT_SCENES,
-    SceneFacts,
     get_dataset,
 )
 from gs2d.config.presets import get_recipe
-from gs2d.config.protocol_sources import SOURCES, source, stated
 from gs2d.config.protocols import DTU, GENERIC, NERF_SYNTHETIC, PROTOCOLS, TNT, TNT_LARGE, get_protocol, protocol_for
 from gs2d.config.recipe import LossTerm
-from gs2d.config.surface_protocols import (
-    DTU_SURFACE,
-    TNT_SURFACE,
-    VISIBLE_SURFACE,
-    DtuSurface,
-    TntSurface,
-    VisibleSurface,
-)
+from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
 from gs2d.errors import ProtocolError
 
 
@@ -159,58 +147,3 @@ def test_the_three_stages_of_tanks_and_temples_are_in_units_of_tau() -> None:
     assert (TNT_SURFACE.score_voxel, TNT_SURFACE.max_points) == (0.5, 4_000_000)
     assert (DTU_SURFACE.density, DTU_SURFACE.max_distance, DTU_SURFACE.dilation) == (0.2, 20, 24)
     assert (VISIBLE_SURFACE.samples, VISIBLE_SURFACE.fractions) == (200_000, (0.0025, 0.005, 0.01))
-
-
-# sources
-
-
-def names(value: Any, where: str = "") -> list[str]:
-    """Fields of a dataclass, those of its parts with a dot."""
-    out = []
-    for field in fields(value):
-        inner = getattr(value, field.name, None)
-        if is_dataclass(inner):
-            out += names(inner, f"{where}{field.name}.")
-        else:
-            out.append(where + field.name)
-    return out
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_every_number_of_a_protocol_has_a_source(name: str) -> None:
-    assert sorted(SOURCES[name]) == sorted(names(PROTOCOLS[name]))
-    assert all(text.strip() for text in SOURCES[name].values())
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("surface: tnt", TntSurface),
-        ("surface: dtu", DtuSurface),
-        ("surface: visible", VisibleSurface),
-        ("scenes", SceneFacts),
-    ],
-)
-def test_every_number_of_an_evaluator_and_of_a_scene_has_a_source(name: str, kind: type) -> None:
-    assert sorted(SOURCES[name]) == sorted(field.name for field in fields(kind))
-
-
-def test_sources_that_do_not_exist_say_which_do() -> None:
-    assert source("dtu", "fusion.voxel") == "2DGS scripts/dtu_eval.py"
-    with pytest.raises(ProtocolError, match="no protocol 'x'; there is dtu"):
-        source("x", "near")
-    with pytest.raises(ProtocolError, match="no field 'far' in protocol dtu"):
-        source("dtu", "far")
-
-
-def test_every_number_is_stated_with_its_source() -> None:
-    rows = {number.field: number for number in stated(PROTOCOLS["dtu"])}
-    assert sorted(rows) == sorted(set(SOURCES["dtu"]) - {"name"})
-    assert (rows["fusion.voxel"].value, rows["fusion.voxel"].source) == ("0.004", "2DGS scripts/dtu_eval.py")
-    generic = {number.field: number.value for number in stated(PROTOCOLS["generic"])}
-    assert (generic["near"], generic["fusion.depth"]) == ("from the scene", "that of the losses")
-    stages = next(number for number in stated(TNT_SURFACE) if number.field == "stages")
-    assert stages.value.startswith("voxel 1.0, threshold 80.0, iterations 30; voxel 0.5, ")
-    assert stages.value.endswith("voxel none, threshold 2.0, iterations 30")
-    assert len(stated(DTU_SURFACE)) == len(fields(DtuSurface))
-    assert len(stated(VISIBLE_SURFACE)) == len(fields(VisibleSurface))

@@ -17,10 +17,9 @@ from gs2d.cli.paper import parse_seeds
 from gs2d.config.protocols import MetricConventions
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.experiments.aggregate import Cell, Results, judge_order, read_cell
-from gs2d.experiments.commands import commands_of, paper_command
 from gs2d.experiments.deviations import deviations_of, opacity_resets
 from gs2d.experiments.paper import check_folder, paper
-from gs2d.experiments.plan import PaperOptions, make_plan
+from gs2d.experiments.plan import PaperOptions, commands_of, make_plan, paper_command
 from gs2d.experiments.scenes import find_scenes
 from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Order
 from paper_cells import make_cell, make_row
@@ -201,7 +200,7 @@ def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None
         threads=1,
         overrides=("surface.densify.max_splats=7",),
     )
-    jobs = make_plan(options).sweep.jobs
+    jobs = make_plan(options).jobs
     assert len(jobs) == 5
     for job in jobs:
         words = shlex.split(commands_of(job)[0])
@@ -229,11 +228,11 @@ def test_zero_is_not_taken_for_the_default(name: str) -> None:
 def test_what_is_scored_is_part_of_the_job_and_a_strange_folder_is_refused(tmp_path: Path) -> None:
     write_capture(tmp_path / "ball", train=2, test=1, size=8)
     options = PaperOptions(table="modules", data=tmp_path / "ball", out=tmp_path / "out")
-    assert make_plan(options).sweep.jobs[0].wanted == ()
+    assert make_plan(options).jobs[0].wanted == ()
     write_ball_mesh(tmp_path / "ball" / "mesh_gt.ply", rings=4)
     plan = make_plan(replace(options, lpips_weights=tmp_path / "vgg.pth"))
     truth, weights = (tmp_path / "ball" / "mesh_gt.ply").resolve(), (tmp_path / "vgg.pth").resolve()
-    assert plan.sweep.jobs[0].wanted == (f"surface: {truth}", f"lpips: {weights}")
+    assert plan.jobs[0].wanted == (f"surface: {truth}", f"lpips: {weights}")
     (tmp_path / "out").mkdir()
     with pytest.raises(DataError, match="LPIPS weights not found"):  # before anything is trained
         paper(replace(options, lpips_weights=tmp_path / "vgg.pth"))

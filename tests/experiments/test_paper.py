@@ -17,15 +17,15 @@ from typing import Any
 import pytest
 
 from gs2d.cli import run
-from gs2d.cli.paper import parse_parameters, parse_seeds
+from gs2d.cli.paper import parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.experiments import execute as sweep_module
+from gs2d.experiments import execute as execute_module
 from gs2d.experiments.aggregate import FIGURES, Results, Row, judge_order, read_cell
 from gs2d.experiments.paper import paper
 from gs2d.experiments.plan import PaperOptions, canonical_recipe, make_plan
-from gs2d.experiments.render_text import measured, shown, to_csv, to_latex, to_markdown
+from gs2d.experiments.render import parts_of, shown, to_csv, to_latex, to_markdown
 from gs2d.experiments.scenes import find_scenes, missing_scenes
-from gs2d.experiments.tables import DTU, PAPER_TABLES, TNT, Order
+from gs2d.experiments.tables import DTU, PAPER_TABLES, TNT, Order, recipe_table
 from paper_cells import TINY, draw_nothing, make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 
@@ -77,7 +77,7 @@ def test_rows_that_train_the_same_share_a_recipe_and_its_stages(captures: Path) 
     assert canonical_recipe("2dgs-r-k1") == canonical_recipe("2dgs-r-module-iv") == "2dgs-r"
     assert canonical_recipe("2dgs-r-module-i") == "2dgs"
     plan = make_plan(PaperOptions(table="modules", data=captures, out=captures / "out", scenes=("ball",), seeds=(0, 1)))
-    by_name = {job.name: job for job in plan.sweep.jobs}
+    by_name = {job.name: job for job in plan.jobs}
     assert list(by_name)[:4] == [
         "ball-2dgs-s0",
         "ball-2dgs-r-module-ii-s0",
@@ -93,7 +93,7 @@ def test_rows_that_train_the_same_share_a_recipe_and_its_stages(captures: Path) 
 
 def test_an_override_must_fit_a_recipe_of_the_table(captures: Path) -> None:
     options = PaperOptions(table="modules", data=captures, out=captures / "out", overrides=("refine.iterations=5",))
-    jobs = make_plan(options).sweep.jobs
+    jobs = make_plan(options).jobs
     assert {job.train.recipe: job.train.overrides for job in jobs}["2dgs"] == ()
     assert {job.train.recipe: job.train.overrides for job in jobs}["2dgs-r"] == ("refine.iterations=5",)
     with pytest.raises(RecipeError, match="--set paint.iterations=5 fits no recipe of the table"):
@@ -102,7 +102,7 @@ def test_an_override_must_fit_a_recipe_of_the_table(captures: Path) -> None:
 
 def test_the_protocol_says_how_much_photographs_are_shrunk(captures: Path) -> None:
     plan = make_plan(PaperOptions(table="k", data=captures, out=captures / "out", protocol="tnt"))
-    assert {job.train.downscale for job in plan.sweep.jobs} == {2}
+    assert {job.train.downscale for job in plan.jobs} == {2}
     assert {scene.data_set for scene in plan.scenes} == {"other (tnt)"}
 
 
@@ -112,7 +112,6 @@ def test_seeds_are_a_list_or_a_count() -> None:
     assert parse_seeds(("0",)) == parse_seeds(("1",)) == (0,)
     with pytest.raises(RecipeError, match="--seeds must be whole numbers"):
         parse_seeds(("one",))
-    assert parse_parameters("slurm_partition=gpu,timeout_min=600") == {"slurm_partition": "gpu", "timeout_min": 600}
 
 
 # -- rows ----------------------------------------------------------------------------------------------------------
@@ -135,7 +134,8 @@ def test_the_spread_is_over_seeds_of_the_mean_over_scenes() -> None:
     # Means 25 and 27: their standard deviation is sqrt(((25 - 26)^2 + (27 - 26)^2) / 1) = 1.41421.
     assert results.mean(row)["psnr"] == 26.0
     assert results.spread(row)["psnr"] == pytest.approx(2**0.5)
-    assert measured("psnr", results, row, TNT) == "26.00 ± 1.41"
+    (part,) = parts_of(recipe_table(["row"]), results)
+    assert part.rows[0].figures[part.columns.index("psnr")].measured == "26.00 ± 1.41"
     assert Results((make_row("one", make_cell(psnr=1.0)),)).spread(make_row("one", make_cell(psnr=1.0)))["psnr"] is None
 
 
@@ -318,7 +318,6 @@ def test_the_page_shows_figures_pictures_and_orders_and_needs_nothing_else(finis
     assert "PSNR I &lt; IV &lt; II &lt; III" in page
     assert "24.89" in page  # the paper's
     assert "<summary>Protocol nerf-synthetic</summary>" in page
-    assert "2DGS scripts/nerf_eval.py: --white_background" in page
     assert "r_1.png" in page
     assert "http" not in page
     labels = base64.b64encode(b"['(I)', '(II)', '(III)', '(IV)'] ['(IV)']").decode()
@@ -331,11 +330,11 @@ def test_what_is_done_is_not_done_again(
     out, words = finished
     tried: list[str] = []
 
-    def train(job: sweep_module.SweepJob, _on_event: object) -> dict[str, str]:
+    def train(job: execute_module.Job, _on_event: object) -> dict[str, str]:
         tried.append(job.name)
         raise DataError("still broken")
 
-    monkeypatch.setattr(sweep_module, "train_and_evaluate", train)
+    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
     before = (out / "runs" / "ball-2dgs-s0" / "splats.ply").stat().st_mtime_ns
     assert run([*words, "--json"]) == 2
     assert len(tried) == 4
@@ -355,7 +354,7 @@ def test_a_command_killed_at_any_moment_goes_on_to_the_same_bytes(tmp_path: Path
     killed, undisturbed = tmp_path / "killed", tmp_path / "undisturbed"
     records = killed / "jobs"
     with subprocess.Popen([sys.executable, "-m", "gs2d", *words, str(killed)]) as process:
-        while process.poll() is None and not (records / "ball-2dgs-r-module-ii-s0.claim").exists():
+        while process.poll() is None and not (records / "ball-2dgs-r-module-ii-s0.json").exists():
             time.sleep(0.01)
         time.sleep(0.3)  # somewhere in the second job
         process.send_signal(signal.SIGKILL)

@@ -6,6 +6,7 @@ import csv
 import json
 import shlex
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,12 +15,11 @@ from gs2d.cli import run
 from gs2d.cli.app import parse
 from gs2d.cli.commands import Sweep
 from gs2d.cli.paper import paper_options
-from gs2d.experiments import execute as sweep_module
+from gs2d.experiments import execute as execute_module
 from gs2d.experiments.aggregate import Results
-from gs2d.experiments.commands import paper_command
 from gs2d.experiments.deviations import deviations_of
 from gs2d.experiments.paper import paper
-from gs2d.experiments.plan import PaperOptions, make_plan
+from gs2d.experiments.plan import PaperOptions, make_plan, paper_command
 from gs2d.experiments.tables import SWEEP
 from paper_cells import TINY, draw_nothing
 from tiny import write_capture
@@ -58,10 +58,10 @@ def test_nothing_of_the_paper_stands_in_it(swept: tuple[Path, list[str], int]) -
         text = (out / name).read_text()
         assert "What to know about these figures" in text
         assert "the schedule is 0.0005 of the paper" in text  # what a recipe is defined by
-        phrases = ("orders", "In brackets", "In small print", "differs from", "paper&#x27;s figure", "RTX 4090")
+        phrases = ("orders", "In brackets", "In small print", "differs from", "paper&#39;s figure", "RTX 4090")
         for phrase in (*phrases, "gs2d paper"):
             assert phrase not in text
-    assert "2DGS with normal consistency 0.05: the paper&#x27;s baseline" in (out / "index.html").read_text()
+    assert "2DGS with normal consistency 0.05: the paper&#39;s baseline" in (out / "index.html").read_text()
     assert '<p class="lead">2 recipes on 1 scene. Trained at 0.0005 of the schedule' in (out / "index.html").read_text()
     assert json.loads((out / "about.json").read_text())["orders"] == []
 
@@ -80,7 +80,7 @@ def test_the_rows_that_were_there_are_named_and_the_same_command_does_nothing_ag
     swept: tuple[Path, list[str], int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     draw_nothing(monkeypatch)
-    monkeypatch.setattr(sweep_module, "train_and_evaluate", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(execute_module, "train_and_evaluate", lambda *_: pytest.fail("trained again"))
     words = [word for word in swept[1] if word != "--quiet"]
     assert run([*words, "--json"]) == 0
     said = capsys.readouterr()
@@ -88,21 +88,20 @@ def test_the_rows_that_were_there_are_named_and_the_same_command_does_nothing_ag
     assert f"{swept[0]} has rows of earlier commands, which stay: 2dgs" in said.err
 
 
-def test_commands_that_share_a_folder_do_not_take_each_others_rows(
+def test_the_table_of_what_is_there_can_be_written_while_a_command_trains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_capture(tmp_path / "ball", train=2, test=1, size=8)
     mine = PaperOptions(table=SWEEP, recipes=("2dgs",), data=tmp_path / "ball", out=tmp_path / "out")
-    others = PaperOptions(table=SWEEP, recipes=("2dgs-r",), data=mine.data, out=mine.out, train=False)
+    found: list[int] = []
 
     def train(*_: object) -> dict[str, str]:
-        paper(others)  # another command, while this one trains
+        found.append(paper(replace(mine, train=False)).unfinished)
         return {}
 
-    monkeypatch.setattr(sweep_module, "train_and_evaluate", train)
-    result = paper(mine)
-    assert [row.name for row in result.results.rows] == ["2dgs", "2dgs-r"]
-    assert result.unfinished == 1  # the other's
+    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
+    assert paper(mine).unfinished == 0
+    assert found == [1]
 
 
 def test_recipes_that_train_the_same_are_trained_once_and_named_twice(tmp_path: Path) -> None:
@@ -110,7 +109,7 @@ def test_recipes_that_train_the_same_are_trained_once_and_named_twice(tmp_path: 
     recipes = ("2dgs-r-k1", "2dgs-r", "2dgs-r-k1")
     plan = make_plan(PaperOptions(table=SWEEP, recipes=recipes, data=tmp_path, out=tmp_path / "out", seeds=(0, 4)))
     assert [row.name for row in plan.table.rows] == ["2dgs-r-k1", "2dgs-r"]
-    assert [job.name for job in plan.sweep.jobs] == ["ball-2dgs-r-s0", "ball-2dgs-r-s4"]
+    assert [job.name for job in plan.jobs] == ["ball-2dgs-r-s0", "ball-2dgs-r-s4"]
 
 
 @pytest.mark.parametrize(

@@ -1,34 +1,30 @@
-"""Sweeps of jobs that train nothing, and claims of processes that are gone."""
+"""Jobs that train nothing."""
 
 from __future__ import annotations
 
-import json
 import os
-import socket
-import subprocess
-import sys
+import signal
 from pathlib import Path
-from typing import Any
 
-from gs2d.experiments.execute import Sweep, SweepJob
+from gs2d.experiments.execute import Job
 from gs2d.pipeline.options import TrainOptions
 
 
-def make_sweep(folder: Path, keys: dict[str, tuple[str, ...]]) -> Sweep:
-    """Jobs by name with the keys of their stages."""
-    jobs = tuple(
-        SweepJob(name=name, train=TrainOptions(scene=folder, out=folder / "runs" / name), stage_keys=stages)
+def make_jobs(folder: Path, keys: dict[str, tuple[str, ...]]) -> tuple[Job, ...]:
+    """Jobs by name with the keys of their stages; their capture is an empty folder, so that training fails at once."""
+    return tuple(
+        Job(
+            name=name,
+            record=folder / "jobs" / f"{name}.json",
+            train=TrainOptions(scene=folder, out=folder / "runs" / name),
+            stage_keys=stages,
+        )
         for name, stages in keys.items()
     )
-    return Sweep(folder=folder, jobs=jobs, cache=folder / "cache")
 
 
-def dead_pid() -> int:
-    """The number of a process that has ended."""
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
-
-
-def write_claim(path: Path, **facts: Any) -> None:
-    path.write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "began": None, **facts}))
+def fail_or_die(job: Job, _device: str | None) -> None:
+    """What a process of its own does in place of training: that of "b" is killed, the others fail."""
+    if job.name == "b":
+        os.kill(os.getpid(), signal.SIGKILL)
+    job.write("failed", reason="no photographs")

@@ -251,7 +251,7 @@ class TableCommon(Common):
     data: Annotated[Path, arg(metavar="DIR")]
     """A capture, or a folder of captures."""
     out: Annotated[Path, arg(metavar="DIR")]
-    """Folder for runs, table and page. The command can be stopped and started again; several may share it."""
+    """Folder for runs, table and page. The command can be stopped and started again."""
     scenes: tuple[str, ...] = ()
     """Only these captures, by the names of their folders."""
     protocol: str = "auto"
@@ -267,7 +267,7 @@ class TableCommon(Common):
     slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
     """Runs at the same time (default: one a GPU, else one)."""
     threads: int | None = None
-    """CPU threads of each slot (default: the cores divided among the slots)."""
+    """CPU threads of each of several runs (default: the cores divided among them)."""
     cache: Annotated[Path | None, arg(metavar="DIR")] = None
     """Stage cache (default: in --out). Tables that share it train their common stages once."""
     truth: Annotated[Path | None, arg(metavar="DIR")] = None
@@ -276,8 +276,6 @@ class TableCommon(Common):
     """VGG-16 and LPIPS weights for the LPIPS metric."""
     overrides: Overrides = ()
     """Change the recipes, as in `gs2d train`; reaches those that have the stage."""
-    slurm: Annotated[str | None, arg(metavar="KEY=VALUE,...")] = None
-    """Run the slots as Slurm jobs with these parameters, e.g. slurm_partition=gpu,timeout_min=600."""
     no_train: bool = False
     """Only write the table of what is there."""
 

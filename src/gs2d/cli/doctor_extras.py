@@ -79,7 +79,6 @@ OPTIONAL = (
     Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas")),
     Wanted("view", "viewer in the browser (gs2d view, --viewer)", _packages("view", "viser")),
     Wanted("films", "films (gs2d render --video x.mp4)", _films),
-    Wanted("slurm", "runs as Slurm jobs (--slurm)", _packages("slurm", "submitit")),
 )
 
 

@@ -10,7 +10,7 @@ from gs2d.errors import RecipeError, RunError
 from gs2d.experiments.paper import PaperResult
 from gs2d.experiments.paper import paper as run_paper
 from gs2d.experiments.plan import PaperOptions
-from gs2d.experiments.render_text import TITLES, columns_of, measured, verdict_text
+from gs2d.experiments.render import TITLES, parts_of, verdict_text
 from gs2d.experiments.tables import SWEEP
 
 
@@ -68,7 +68,6 @@ def paper_options(command: TableCommon) -> PaperOptions:
         lpips_weights=command.lpips_weights,
         threads=command.threads,
         train=not command.no_train,
-        slurm=None if command.slurm is None else parse_parameters(command.slurm),
     )
 
 
@@ -94,29 +93,12 @@ def parse_seeds(words: tuple[str, ...]) -> tuple[int, ...]:
     return numbers if listed else tuple(range(numbers[0]))
 
 
-def parse_parameters(text: str) -> dict[str, str | int]:
-    """``slurm_partition=gpu,timeout_min=600`` as a mapping.
-
-    Raises
-    ------
-    RecipeError
-    """
-    found: dict[str, str | int] = {}
-    for part in filter(None, text.split(",")):
-        name, equals, value = part.partition("=")
-        if not equals:
-            raise RecipeError(f"--slurm must be name=value,name=value, got {part!r}")
-        found[name.strip()] = int(value) if value.strip().isdecimal() else value.strip()
-    return found
-
-
 def _tables(result: PaperResult, console: Console) -> None:
-    results = result.results
-    for data_set in results.data_sets:
-        columns = columns_of(result.table, results, data_set)
-        trained = [row for row in results.rows if row.recipe is not None]
-        rows = [[row.name, *(measured(metric, results, row, data_set) for metric in columns)] for row in trained]
-        console.table(f"{result.table.title}: {data_set}", ["", *(TITLES[metric] for metric in columns)], rows)
+    for part in parts_of(result.table, result.results):
+        if part.trained:
+            heads = ["", *(TITLES[metric] for metric in part.columns)]
+            rows = [[row.name, *(figure.measured for figure in row.figures)] for row in part.rows if not row.quoted]
+            console.table(f"{result.table.title}: {part.data_set}", heads, rows)
     for verdict in result.verdicts:
         console.say(f"{verdict.holds:>7}  {verdict.text} ({verdict.data_set}): {verdict_text(verdict)}")
     if result.unfinished:

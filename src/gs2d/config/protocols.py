@@ -37,12 +37,12 @@ class FusionLimits:
         inside the limits, as the scripts of the data sets do.
     """
 
-    voxel: float | None = None
+    voxel: float | None = None  # [d] from the depth maps, and the next two
     truncation: float | None = None
     depth_limit: float | None = None
-    clusters: int = 50
-    depth: str | None = None
-    subject: bool = False
+    clusters: int = 50  # [c] render.py
+    depth: str | None = None  # [c] render.py fuses the depth that was trained
+    subject: bool = False  # [c] render.py meshes all that is inside the limits
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class MetricConventions:
         "chamfer" or "f_score": the headline figure against ground truth.
     """
 
-    from_8bit: bool = True
-    lpips_unit_range: bool = True
-    surface: str = "f_score"
+    from_8bit: bool = True  # [c] metrics.py reads PNG files
+    lpips_unit_range: bool = True  # [c] metrics.py
+    surface: str = "f_score"  # [r]
 
 
 @dataclass(frozen=True)
@@ -98,15 +98,15 @@ class Protocol:
     name: str
     depth: str
     distortion_weight: float
-    background: tuple[float, float, float] = BLACK
+    background: tuple[float, float, float] = BLACK  # [c] unless asked for white
     near: float | None = None
     crossing: str = "draw"
-    downscale: int = 1
-    test_every: int = 8
-    test_on: str = "test"
+    downscale: int = 1  # [d] full size
+    test_every: int = 8  # [c] --eval
+    test_on: str = "test"  # [r] novel views
     robust: bool = False
     use_mask_in_training: bool = True
-    use_mask_in_fusion: bool = True
+    use_mask_in_fusion: bool = True  # [c] depth is cleared outside the alpha mask
     fusion: FusionLimits = FusionLimits()
     metrics: MetricConventions = MetricConventions()
 

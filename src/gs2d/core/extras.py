@@ -11,7 +11,6 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "sfm": ("pycolmap>=4.2",),
         "texture": ("xatlas>=0.0.9",),
         "view": ("viser>=1.1,<2",),
-        "slurm": ("submitit>=1.5",),
     }
 )
 

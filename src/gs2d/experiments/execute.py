@@ -1,42 +1,47 @@
-"""Many training runs from one list, worked off by any number of processes, and restarted at any point.
+"""Many training runs from one list: here, one after another or several at once, and restarted at any point.
 
-Everything is on disk, under the sweep's folder: ``jobs/NAME.json`` (what became of a job) and ``jobs/NAME.claim``
-(who works on it). Jobs whose recipes begin with the same stages share them through the stage cache; a stage that one
-process trains is claimed in ``CACHE/claims``, and jobs that need it wait for it instead of training it again.
-Never imports torch at the top: a slot chooses its GPU before torch loads.
+What became of a job is in ``jobs/NAME.json`` under the folder of the list; a job that is done is not done again. The
+folder is locked while somebody works in it. Jobs whose recipes begin with the same stages share them through the stage
+cache: of several at once those wait whose next stage another one is training.
+Never imports torch at the top: a process of its own chooses its GPU before torch loads.
 """
 
 from __future__ import annotations
 
 import hashlib
+import multiprocessing
+import os
+import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 from gs2d.core.json_files import read_json, write_json
-from gs2d.errors import Gs2dError
-from gs2d.experiments.claims import FOREIGN_SECONDS, Claim, holder, take_claim
+from gs2d.errors import BackendError, Gs2dError
 from gs2d.io.run_dir import MESH, SPLATS, RunFolder, make_folder, now
-from gs2d.pipeline.events import Event, Missing, Notice, OnEvent, Phase, StageDone, Step, ignore
+from gs2d.pipeline.events import Event, Missing, Notice, OnEvent, Phase, Step, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 
-MAX_DEATHS = 3  # so often may the process of a job die before the job counts as failed
 POLL_SECONDS = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepJob:
-    """One run: trained, then scored.
+class Job:
+    """One run of a list: trained, then scored.
 
     Attributes
     ----------
     name : str
-        Unique in the sweep; a file name.
+        Unique in the list; a file name.
+    record : Path
+        The file that says what became of it.
     train : TrainOptions
-        With ``resume``, and with the sweep's cache.
+        With ``resume``, and with the stage cache of the list.
     evaluate : EvaluateOptions or None
         What is scored beyond what training scores.
     stage_keys : tuple of str
@@ -46,253 +51,216 @@ class SweepJob:
     """
 
     name: str
+    record: Path
     train: TrainOptions
     evaluate: EvaluateOptions | None = None
     stage_keys: tuple[str, ...] = ()
     wanted: tuple[str, ...] = ()
 
+    def outcome(self) -> dict[str, Any]:
+        """Return what became of it: ``state`` (new, running, done, failed), ``reason``, ``trained``, ``wanted``."""
+        return dict(read_json(self.record)) if self.record.exists() else {"state": "new"}
 
-@dataclass(frozen=True, kw_only=True)
-class Sweep:
-    """A list of jobs and where it is worked off.
+    def is_trained(self) -> bool:
+        """Return whether its run has splats."""
+        return RunFolder(self.train.out).file(SPLATS).exists()
 
-    Attributes
-    ----------
-    folder : Path
-    jobs : tuple of SweepJob
-    cache : Path
-        The stage cache of all jobs.
-    started : float
-        Time (seconds since 1970) of this command: what failed before it is tried again.
-    """
+    def is_done(self) -> bool:
+        """Return whether nothing is left to do: trained, scored with all that is wanted, and not deleted since."""
+        outcome = self.outcome()
+        is_scored = set(self.wanted) <= set(outcome.get("wanted", self.wanted))
+        return outcome["state"] == "done" and is_scored and (self.is_trained() or not outcome.get("trained", False))
 
-    folder: Path
-    jobs: tuple[SweepJob, ...]
-    cache: Path
-    started: float = field(default_factory=time.time)
+    def write(self, state: str, **facts: Any) -> None:
+        """Write what became of it."""
+        write_json(self.record, {"state": state, **facts, "time": time.time(), "at": now()})
 
-    def record_file(self, job: SweepJob) -> Path:
-        """Where it is written what became of a job."""
-        return self.folder / "jobs" / f"{job.name}.json"
-
-    def claim_file(self, job: SweepJob) -> Path:
-        """Where a process says that it works on a job."""
-        return self.folder / "jobs" / f"{job.name}.claim"
-
-    def record(self, job: SweepJob) -> dict[str, Any]:
-        """What became of a job: ``state`` (new, running, done, failed), ``reason``, ``trained``, ``deaths``."""
-        path = self.record_file(job)
-        return dict(read_json(path)) if path.exists() else {"state": "new"}
-
-    def settled(self, job: SweepJob) -> bool:
-        """Whether nothing is left to do for a job in this command."""
-        record = self.record(job)
-        if record["state"] == "done":
-            gone = record.get("trained", False) and not is_trained(job)
-            scored = set(job.wanted) <= set(record.get("wanted", job.wanted))
-            return not gone and (scored or record["time"] >= self.started)
-        return record["state"] == "failed" and record["time"] >= self.started
-
-    def unsettled(self) -> list[SweepJob]:
-        """Jobs that are not settled, in order."""
-        return [job for job in self.jobs if not self.settled(job)]
-
-    def failures(self) -> dict[str, str]:
-        """Reason by job, of those that failed."""
-        records = {job.name: self.record(job) for job in self.jobs}
-        return {name: record["reason"] for name, record in records.items() if record["state"] == "failed"}
+    def stages_ahead(self) -> set[str]:
+        """Return the keys of the stages that its run has not finished."""
+        return set(self.stage_keys[len(RunFolder(self.train.out).metrics()["stages"]) :])
 
 
-def is_trained(job: SweepJob) -> bool:
-    """Whether the run of a job has its splats."""
-    return RunFolder(job.train.out).file(SPLATS).exists()
+def failures(jobs: Sequence[Job]) -> dict[str, str]:
+    """Return the reason by job, of those that failed."""
+    outcomes = {job.name: job.outcome() for job in jobs}
+    return {name: outcome["reason"] for name, outcome in outcomes.items() if outcome["state"] == "failed"}
 
 
 def stage_keys(facts: Sequence[Any], stages: Sequence[Any]) -> tuple[str, ...]:
-    """A key of each stage: a hash of what the runs have in common and of the stages so far (as JSON values).
+    """Return a key of each stage: a hash of what the runs have in common and of the stages so far (as JSON values).
 
-    Cheaper than ``Job.stage_key``, which reads the photographs, and only used to decide who waits for whom: a wrong
-    one costs time, never a wrong result.
+    Cheaper than ``Job.stage_key`` of the pipeline, which reads the photographs, and only used to decide who waits for
+    whom: a wrong one costs time, never a wrong result.
     """
-    return tuple(
-        hashlib.sha256(repr((list(facts), list(stages[: i + 1]))).encode()).hexdigest()[:32] for i in range(len(stages))
-    )
+    texts = (repr((list(facts), list(stages[: i + 1]))) for i in range(len(stages)))
+    return tuple(hashlib.sha256(text.encode()).hexdigest()[:32] for text in texts)
 
 
-# -- stages that jobs share ----------------------------------------------------------------------------------------
-class StageClaims:
-    """The claims of one job on the stages it is going to train."""
-
-    def __init__(self, folder: Path, keys: Sequence[str]) -> None:
-        self._folder, self._keys = folder, keys
-        self._held: dict[int, Claim] = {}
-
-    def _done(self, index: int) -> Path:
-        return self._folder / f"{self._keys[index]}.done"
-
-    def take(self) -> bool:
-        """Claim every stage that is not trained yet; False (and nothing held) if another process has one of them."""
-        make_folder(self._folder)
-        for index, key in enumerate(self._keys):
-            if self._done(index).exists():
-                continue
-            claim = take_claim(self._folder / f"{key}.claim")
-            if claim is None:
-                self.release()
-                return False
-            if self._done(index).exists():  # finished between the two looks
-                claim.release()
-                continue
-            self._held[index] = claim
-        return True
-
-    def finished(self, stages: int) -> None:
-        """So many stages are in the cache: whoever waits for them may go on."""
-        for index in [i for i in self._held if i < stages]:
-            self._done(index).touch()
-            self._held.pop(index).release()
-
-    def touch(self) -> None:
-        """Say that the holder lives."""
-        for claim in self._held.values():
-            claim.touch()
-
-    def release(self) -> None:
-        """Give all back."""
-        for index in list(self._held):
-            self._held.pop(index).release()
-
-
-# -- working ---------------------------------------------------------------------------------------------------------
-def work(
-    sweep: Sweep,
+# -- the list ----------------------------------------------------------------------------------------------------------
+def execute(
+    jobs: Sequence[Job],
+    folder: Path,
     on_event: OnEvent = ignore,
     *,
-    after_job: Callable[[SweepJob], None] = lambda _job: None,
-    wait: bool = True,
+    slots: int | None = None,
+    threads: int | None = None,
+    backend: str = "auto",
+    before: Callable[[], None] = lambda: None,
+    after_job: Callable[[Job], object] = lambda _job: None,
 ) -> None:
-    """Do jobs until all are settled, whoever does them.
+    """Do the jobs of a list that are not done; one that fails is written down, and the others go on.
 
     Parameters
     ----------
-    sweep : Sweep
+    jobs : sequence of Job
+    folder : Path
+        Of the list; locked meanwhile. The system gives the lock of a killed process back.
     on_event : callable
-        Gets what training says, and a notice about each job.
+        Gets what training says (one at a time), or how many jobs are done (several).
+    slots : int or None
+        Runs at the same time; None = one a GPU where the backend is CUDA, else one, in this process.
+    threads : int or None
+        CPU threads of each of several runs; None = the cores divided among them.
+    before : callable
+        Called when the folder is locked.
     after_job : callable
-        Called after each job of this process.
-    wait : bool
-        Whether to stay until the jobs of other processes are settled too (and take them over if those die).
+        Called whenever a job has ended.
+
+    Raises
+    ------
+    BackendError
+        ``slots`` is no number of runs.
+    RunError
+        Another process works in the folder.
     """
-    make_folder(sweep.folder / "jobs")
-    said = ""
-    while True:
-        left = sweep.unsettled()
-        if not left:
+    if slots is not None and slots < 1:
+        raise BackendError(f"--slots must be a whole number >= 1, got {slots}")
+    make_folder(folder / "jobs")
+    with RunFolder(folder).locked():
+        before()
+        todo = [job for job in jobs if not job.is_done()]
+        gpus = gpu_count(backend)
+        slots = min(slots or max(1, gpus), max(1, len(todo)))
+        if slots > 1:
+            share = threads or max(1, available_cores() // slots)
+            todo = [replace(job, train=replace(job.train, threads=share)) for job in todo]
+            _several_at_once(todo, on_event, slots, gpus, after_job)
             return
-        taken = _take_one(sweep, left)
-        if taken is None:
-            if not wait:
-                return
-            others = _waiting_for(sweep, left)
-            if others and others != said:
-                on_event(Notice(others))
-                said = others
-            time.sleep(POLL_SECONDS)
-            continue
-        job, claim, stages = taken
-        try:
-            number = 1 + sweep.jobs.index(job)
-            on_event(Notice(f"job {number} of {len(sweep.jobs)}: {job.name}"))
-            _do(sweep, job, claim, stages, on_event)
-        finally:
-            stages.release()
-            claim.release()
-        after_job(job)
-
-
-def watch(
-    sweep: Sweep, on_event: OnEvent, after_job: Callable[[SweepJob], None], each_round: Callable[[], None]
-) -> None:
-    """Tell the user how far other processes are, until all jobs are settled."""
-    settled: set[str] = set()
-    on_event(Phase("jobs", len(sweep.jobs)))
-    while True:
-        fresh = [job for job in sweep.jobs if job.name not in settled and sweep.settled(job)]
-        for job in fresh:
-            settled.add(job.name)
-            record = sweep.record(job)
-            if record["state"] == "failed":
-                on_event(Notice(f"{job.name} failed: {record['reason']}"))
+        for number, job in enumerate(todo, 1):
+            on_event(Notice(f"job {number} of {len(todo)}: {job.name}"))
+            do(job, on_event)
             after_job(job)
-        left = [job for job in sweep.jobs if job.name not in settled]
-        running = [job.name for job in left if sweep.record(job)["state"] == "running"]
-        on_event(Step(len(settled), ", ".join(running)))
-        if not left:
-            return
-        each_round()
-        time.sleep(POLL_SECONDS)
 
 
-def _take_one(sweep: Sweep, jobs: Sequence[SweepJob]) -> tuple[SweepJob, Claim, StageClaims] | None:
-    """The first job that is free and whose stages nobody else is training."""
-    for job in jobs:
-        claim = take_claim(sweep.claim_file(job))
-        if claim is None:
-            continue
-        stages = StageClaims(sweep.cache / "claims", job.stage_keys)
-        if not sweep.settled(job) and stages.take():
-            return job, claim, stages
-        claim.release()
-    return None
+def available_cores() -> int:
+    """Return the CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _waiting_for(sweep: Sweep, jobs: Sequence[SweepJob]) -> str:
-    """Who has what is left: a claim of a machine that died looks like a hang to whoever waits for it."""
-    held = {job.name: found for job in jobs if (found := holder(sweep.claim_file(job)))}
-    names = [f"{name} (process {found.get('pid')} on {found.get('host')})" for name, found in held.items()]
-    if not names:
-        return ""
-    return (
-        f"waiting for {', '.join(names)}; should that machine be gone, its work is taken over after "
-        f"{FOREIGN_SECONDS / 60:.0f} minutes"
-    )
+def gpu_count(backend: str) -> int:
+    """Return the GPUs to spread jobs over; 0 where the backend does not use any."""
+    if backend not in ("auto", "cuda"):
+        return 0
+    from gs2d.render.backends import backend_report  # loads torch
+
+    status = {entry.name: entry for entry in backend_report()}
+    if not (status.get("cuda") and status["cuda"].available):
+        return 0
+    import torch
+
+    return torch.cuda.device_count()
 
 
-def _do(sweep: Sweep, job: SweepJob, claim: Claim, stages: StageClaims, on_event: OnEvent) -> None:
-    """One job; what goes wrong is written down, and the sweep goes on."""
-    path, record = sweep.record_file(job), sweep.record(job)
-    died = record["state"] == "running" and record.get("time", 0.0) >= sweep.started
-    deaths = record.get("deaths", 0) + 1 if died else 0
-    if deaths >= MAX_DEATHS:
-        reason = f"its process died {deaths} times (out of memory?)"
-        write_json(path, {"state": "failed", "reason": reason, "time": time.time()})
-        on_event(Notice(f"{job.name} failed: {reason}"))
-        return
-    write_json(path, {"state": "running", "deaths": deaths, "time": time.time(), "at": now()})
-
-    def listen(event: Event) -> None:
-        claim.touch()
-        stages.touch()
-        if isinstance(event, Phase | StageDone):
-            stages.finished(len(RunFolder(job.train.out).metrics()["stages"]))
-        on_event(event)
-
+def _several_at_once(
+    jobs: Sequence[Job], on_event: OnEvent, slots: int, gpus: int, after_job: Callable[[Job], object]
+) -> None:
+    """Do jobs in a process each, ``slots`` at a time: what one leaves in memory, or dies of, is its own matter."""
+    context = multiprocessing.get_context("spawn")
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    devices = visible or [str(i) for i in range(gpus)]
+    waiting, running = list(jobs), dict[int, tuple[Job, BaseProcess]]()
+    on_event(Phase("jobs", len(jobs)))
     try:
-        notes = train_and_evaluate(job, listen)
+        while waiting or running:
+            for slot in set(range(slots)) - running.keys():
+                if (job := _startable(waiting, running)) is None:
+                    break
+                waiting.remove(job)
+                device = devices[slot % len(devices)] if gpus else None
+                process: BaseProcess = context.Process(target=_do_here, args=(job, device), daemon=True)
+                process.start()
+                running[slot] = job, process
+            wait([process.sentinel for _, process in running.values()], POLL_SECONDS)
+            for slot, (job, process) in list(running.items()):
+                if process.exitcode is not None:
+                    del running[slot]
+                    _end(job, process.exitcode, on_event)
+                    after_job(job)
+            names = ", ".join(job.name for job, _ in running.values())
+            on_event(Step(len(jobs) - len(waiting) - len(running), names))
+    finally:
+        left = [process for _, process in running.values()]
+        for process in left:
+            process.terminate()
+        for process in left:
+            process.join(timeout=10)
+
+
+def _startable(waiting: Sequence[Job], running: Mapping[int, tuple[Job, BaseProcess]]) -> Job | None:
+    """Return the first job that would train no stage which another one is training."""
+    taken = {key for job, _ in running.values() for key in job.stages_ahead()}
+    return next((job for job in waiting if not taken & set(job.stage_keys)), None)
+
+
+def _end(job: Job, code: int, on_event: OnEvent) -> None:
+    """Say of a job whose process has ended that it failed, if it did."""
+    outcome = job.outcome()
+    if outcome["state"] not in ("done", "failed"):
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        outcome = {"reason": f"its process died ({how}; out of memory?)", "trained": job.is_trained()}
+        job.write("failed", **outcome)
+    if "reason" in outcome:
+        on_event(Notice(f"{job.name} failed: {outcome['reason']}"))
+
+
+def _do_here(job: Job, device: str | None) -> None:
+    """Do a job in a process made for it."""
+    if device is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = device  # before torch loads
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    try:
+        do(job)
+    except KeyboardInterrupt:  # Ctrl-C reaches every process of the terminal; the parent says so
+        os._exit(130)
+
+
+def _leave_with_parent() -> None:
+    """End this process when the one that started it is gone: nobody else would, and its lock is free again."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+# -- one job -----------------------------------------------------------------------------------------------------------
+def do(job: Job, on_event: OnEvent = ignore) -> None:
+    """Train and score one run; what goes wrong is written down."""
+    job.write("running")
+    try:
+        notes = train_and_evaluate(job, on_event)
     except Exception as error:
-        mended = isinstance(error, Gs2dError)
-        reason = " ".join(str(error).split()) if mended else f"{type(error).__name__}: {error}"
-        failed: dict[str, Any] = {"state": "failed", "reason": reason or type(error).__name__}
-        failed |= {"time": time.time(), "at": now()}
-        failed["trained"] = is_trained(job)  # then its pictures were scored, and those scores stand
-        write_json(path, failed if mended else {**failed, "traceback": traceback.format_exc()})
+        is_ours = not isinstance(error, Gs2dError)
+        text = " ".join(str(error).split())
+        reason = f"{type(error).__name__}: {error}" if is_ours else text or type(error).__name__
+        more = {"traceback": traceback.format_exc()} if is_ours else {}
+        # Where it was trained, its pictures were scored, and those scores stand.
+        job.write("failed", reason=reason, trained=job.is_trained(), **more)
         on_event(Notice(f"{job.name} failed: {reason}"))
         return
-    facts = {"notes": notes, "wanted": list(job.wanted), "trained": is_trained(job)}
-    write_json(path, {"state": "done", **facts, "time": time.time(), "at": now()})
+    job.write("done", notes=notes, wanted=list(job.wanted), trained=job.is_trained())
 
 
-def train_and_evaluate(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
+def train_and_evaluate(job: Job, on_event: OnEvent) -> dict[str, str]:
     """Train and score one run; returns what could not be had, with reasons (``surface``).
 
     Raises
@@ -303,7 +271,6 @@ def train_and_evaluate(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
     from gs2d.pipeline.jobs import evaluate_run
     from gs2d.pipeline.train import train
 
-    run = RunFolder(job.train.out)
     missing: list[Missing] = []
 
     def listen(event: Event) -> None:
@@ -312,11 +279,10 @@ def train_and_evaluate(job: SweepJob, on_event: OnEvent) -> dict[str, str]:
 
     train(job.train, listen)
     no_mesh = [event.reason for event in missing if event.what == MESH]
-    if no_mesh:
-        if job.evaluate is not None and job.evaluate.lpips_weights is not None:
-            images = EvaluateOptions(lpips_weights=job.evaluate.lpips_weights)
-            evaluate_run(run.path, images, on_event, threads=job.train.threads)
-        return {"surface": f"no mesh: {no_mesh[0]}"}
-    if job.evaluate is not None:
-        evaluate_run(run.path, job.evaluate, on_event, threads=job.train.threads)
-    return {}
+    evaluate = job.evaluate
+    if evaluate is not None and no_mesh:  # nothing to compare with a true surface
+        weights = evaluate.lpips_weights
+        evaluate = None if weights is None else EvaluateOptions(lpips_weights=weights)
+    if evaluate is not None:
+        evaluate_run(job.train.out, evaluate, on_event, threads=job.train.threads)
+    return {"surface": f"no mesh: {no_mesh[0]}"} if no_mesh else {}

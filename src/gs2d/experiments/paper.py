@@ -1,36 +1,25 @@
-"""One of the paper's tables, or a table of chosen recipes: train what the rows need, score it, write table and page."""
+"""One of the paper's tables, or a table of chosen recipes: plan, train and score, aggregate, write table and page."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gs2d.config.protocol_sources import stated
-from gs2d.config.protocols import Protocol
-from gs2d.config.surface_protocols import (
-    DTU_SURFACE,
-    TNT_SURFACE,
-    VISIBLE_SURFACE,
-    DtuSurface,
-    TntSurface,
-    VisibleSurface,
-)
+from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURFACE
 from gs2d.core.files import atomic_write
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
 from gs2d.experiments.aggregate import FIGURES, Results, Row, Verdict, judge, read_cell
-from gs2d.experiments.commands import commands_of, paper_command
 from gs2d.experiments.deviations import deviations_of
-from gs2d.experiments.plan import PaperOptions, Plan, make_plan
-from gs2d.experiments.render_page import write_page
-from gs2d.experiments.render_text import to_csv, to_latex, to_markdown
+from gs2d.experiments.execute import execute, failures
+from gs2d.experiments.plan import PaperOptions, Plan, commands_of, make_plan, paper_command
+from gs2d.experiments.render import to_csv, to_latex, to_markdown, write_page
 from gs2d.experiments.scenes import FoundScene
-from gs2d.experiments.slots import run_sweep
-from gs2d.experiments.tables import DTU, SWEEP, TNT, PaperTable
+from gs2d.experiments.tables import DTU, SWEEP, TNT, PaperRow, PaperTable
 from gs2d.io.run_dir import machine, make_folder, versions
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 
@@ -70,7 +59,7 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
     Raises
     ------
     Gs2dError
-        The options or the data folder are wrong; nothing is trained then.
+        The options or the data folder are wrong, or another process works in the folder; nothing is trained then.
     """
     asked = make_plan(options)
     check_folder(asked)
@@ -83,26 +72,21 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
             from gs2d.evaluation.lpips import load_lpips  # loads torch
 
             load_lpips(options.lpips_weights)  # a wrong file is said now, not after hours of training
-        make_folder(options.out)
-        write_json(options.out / ABOUT, about(plan, None, ()))
-        run_sweep(
-            plan.sweep,
+        execute(
+            plan.jobs,
+            options.out,
             on_event,
             slots=options.slots,
             threads=options.threads,
             backend=options.backend,
-            slurm=options.slurm,
-            after_job=lambda _job: _tabulate_so_far(plan),
+            before=lambda: write_json(options.out / ABOUT, about(plan, None, ())),
+            after_job=lambda _job: tabulate(plan, pictures=False),
         )
-    return tabulate(with_other_rows(plan), on_event)
-
-
-def _tabulate_so_far(plan: Plan) -> None:
-    tabulate(with_other_rows(plan), pictures=False)
+    return tabulate(plan, on_event)
 
 
 def with_other_rows(plan: Plan) -> Plan:
-    """A sweep's plan with the rows of other commands too, earlier ones and those under way: none takes them away."""
+    """Return a sweep's plan with the rows of earlier commands too: none takes them away."""
     path = plan.options.out / ABOUT
     if plan.options.table != SWEEP or not path.exists():
         return plan
@@ -143,17 +127,17 @@ def _defining(options: PaperOptions) -> dict[str, Any]:
 # -- tabulating ------------------------------------------------------------------------------------------------------
 def tabulate(plan: Plan, on_event: OnEvent = ignore, *, pictures: bool = True) -> PaperResult:
     """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
-    unfinished = sum(plan.sweep.record(job)["state"] not in ("done", "failed") for job in plan.sweep.jobs)
+    unfinished = sum(job.outcome()["state"] not in ("done", "failed") for job in plan.jobs)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
     verdicts = judge(plan.table, results)
     deviations = deviations_of(plan.options, plan.scenes, plan.table, results)
-    out = plan.options.out
+    out, facts = plan.options.out, about(plan, results, verdicts)
     make_folder(out)
-    commands = [line for job in plan.sweep.jobs for line in commands_of(job)]
+    commands = [line for job in plan.jobs for line in commands_of(job)]
     write_json(out / "table.json", [row_json(row, results, deviations) for row in results.rows])
-    write_json(out / ABOUT, {**about(plan, results, verdicts), "deviations": deviations})
+    write_json(out / ABOUT, {**facts, "deviations": deviations})
     texts = {
-        "table.md": to_markdown(plan.table, results, verdicts, deviations, [paper_command(plan.options), *commands]),
+        "table.md": to_markdown(plan.table, results, verdicts, deviations, [facts["command"], *commands]),
         "table.csv": to_csv(results),
         "table.tex": to_latex(plan.table, results),
     }
@@ -162,16 +146,15 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, pictures: bool = True) -
             file.write(text)
     files = [out / name for name in ("table.json", *texts, ABOUT)]
     if pictures:
-        facts = about(plan, results, verdicts)
         files.append(write_page(plan.table, results, verdicts, deviations, commands, facts, out, on_event))
-    return PaperResult(plan.table, tuple(files), results, verdicts, plan.sweep.failures(), unfinished)
+    return PaperResult(plan.table, tuple(files), results, verdicts, failures(plan.jobs), unfinished)
 
 
-def _row(plan: Plan, row: Any) -> Row:
+def _row(plan: Plan, row: PaperRow) -> Row:
     cells, commands = [], []
     for scene in plan.scenes if row.recipe is not None else ():
         for seed in plan.options.seeds:
-            job = plan.jobs[row.recipe, scene.name, seed]
+            job = plan.cells[str(row.recipe), scene.name, seed]
             cells.append(
                 read_cell(
                     job.train.out,
@@ -179,7 +162,7 @@ def _row(plan: Plan, row: Any) -> Row:
                     data_set=scene.data_set,
                     seed=seed,
                     test_on=scene.protocol.test_on,
-                    record=plan.sweep.record(job),
+                    record=job.outcome(),
                     conventions=scene.protocol.metrics,
                 )
             )
@@ -189,7 +172,7 @@ def _row(plan: Plan, row: Any) -> Row:
 
 
 def row_json(row: Row, results: Results, deviations: Sequence[str]) -> dict[str, Any]:
-    """A row of table.json."""
+    """Return a row of table.json."""
     return {
         "name": row.name,
         "recipe": row.recipe,
@@ -207,7 +190,7 @@ def row_json(row: Row, results: Results, deviations: Sequence[str]) -> dict[str,
 
 
 def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """What the whole table was made with."""
+    """Return what the whole table was made with."""
     options = plan.options
     return {
         "table": plan.table.name,
@@ -216,11 +199,11 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
         "options": _defining(options),
         "data": str(options.data),
         "scenes": {scene.name: {"data_set": scene.data_set, **_scene_facts(scene)} for scene in plan.scenes},
-        "protocols": {name: [asdict(number) for number in stated(p)] for name, p in _protocols(plan).items()},
+        "protocols": {name: numbers_of(protocol) for name, protocol in _protocols(plan).items()},
         "seeds": list(options.seeds),
         "spread": "standard deviation over seeds of the mean over scenes",
         "orders": [verdict.to_json() for verdict in verdicts],
-        "failures": plan.sweep.failures() if results is not None else {},
+        "failures": failures(plan.jobs) if results is not None else {},
         "command": paper_command(options),
         "versions": versions(),
         "machine": machine(),
@@ -228,7 +211,7 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
     }
 
 
-def _protocols(plan: Plan) -> dict[str, Protocol | DtuSurface | TntSurface | VisibleSurface]:
+def _protocols(plan: Plan) -> dict[str, Any]:
     """The protocols of the scenes, and those that surfaces are scored by."""
     found: dict[str, Any] = {scene.protocol.name: scene.protocol for scene in plan.scenes}
     surfaces = {DTU: ("surface: dtu", DTU_SURFACE), TNT: ("surface: tnt", TNT_SURFACE)}
@@ -237,6 +220,26 @@ def _protocols(plan: Plan) -> dict[str, Protocol | DtuSurface | TntSurface | Vis
             name, protocol = surfaces.get(scene.data_set, ("surface: visible", VISIBLE_SURFACE))
             found[name] = protocol
     return found
+
+
+def numbers_of(protocol: Any, within: str = "") -> dict[str, str]:
+    """Return every number of a protocol in words, by the name of its field, those of its parts with a dot."""
+    found: dict[str, str] = {}
+    for field in fields(protocol):
+        value, name = getattr(protocol, field.name), within + field.name
+        if is_dataclass(value):
+            found |= numbers_of(value, f"{name}.")
+        elif name != "name":
+            found[name] = _words(value)
+    return found
+
+
+def _words(value: Any) -> str:
+    if value is None:
+        return "derived"
+    if is_dataclass(value):
+        return ", ".join(f"{name} {text}" for name, text in numbers_of(value).items())
+    return "; ".join(map(_words, value)) if isinstance(value, tuple) else str(value)
 
 
 def _scene_facts(scene: FoundScene) -> dict[str, Any]:

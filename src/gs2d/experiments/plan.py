@@ -1,9 +1,15 @@
-"""What a table needs before a photograph is read: its scenes, its recipes, and the run of each of them."""
+"""What a table needs before a photograph is read: its scenes, its recipes, and the run of each of them.
+
+`gs2d paper` and `gs2d sweep` are two plans of one machine: recipes x scenes x seeds become jobs, which differ in who
+names the recipes.
+"""
 
 from __future__ import annotations
 
+import itertools
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +18,7 @@ from gs2d.config.recipe import Recipe, validate
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
 from gs2d.errors import RecipeError
-from gs2d.experiments.execute import Sweep, SweepJob, stage_keys
+from gs2d.experiments.execute import Job, stage_keys
 from gs2d.experiments.scenes import FoundScene, find_scenes
 from gs2d.experiments.tables import PAPER_TABLES, SWEEP, PaperTable, recipe_table
 from gs2d.io.run_dir import versions
@@ -41,18 +47,16 @@ class PaperOptions:
     overrides : tuple of str
         ``stage.field=value``; those of a stage reach the recipes that have it.
     slots : int or None
-        Processes that train at the same time; None = one a GPU, or one.
+        Runs at the same time; None = one a GPU, or one.
     cache : Path or None
         Stage cache; None = ``out/cache``. Shared by several tables it trains their common stages once.
     truth : Path or None
         Folder of ground truths that do not lie beside their captures.
     lpips_weights : Path or None
     threads : int or None
-        CPU threads of each slot; None = what is there, divided among the slots.
+        CPU threads of each of several runs; None = what is there, divided among them.
     train : bool
         False: only tabulate what is there.
-    slurm : dict or None
-        Parameters of a Slurm job (partition, timeout_min ...): slots become Slurm jobs.
     """
 
     table: str
@@ -72,22 +76,25 @@ class PaperOptions:
     lpips_weights: Path | None = None
     threads: int | None = None
     train: bool = True
-    slurm: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A table's work: its scenes, and the job of every (recipe, scene, seed)."""
+    """A table's work: its scenes, and the job of every (recipe of a row, scene, seed)."""
 
     options: PaperOptions
     table: PaperTable
     scenes: tuple[FoundScene, ...]
-    sweep: Sweep
-    jobs: Mapping[tuple[str, str, int], SweepJob]  # (recipe of the row, scene, seed)
+    cells: Mapping[tuple[str, str, int], Job]
+
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """Each once: rows whose recipes train the same share theirs."""
+        return tuple({job.name: job for job in self.cells.values()}.values())
 
 
 def make_plan(options: PaperOptions) -> Plan:
-    """Everything that can be decided, and can be wrong, before a photograph is read.
+    """Decide everything that can be decided, and can be wrong, before a photograph is read.
 
     Raises
     ------
@@ -103,19 +110,14 @@ def make_plan(options: PaperOptions) -> Plan:
         if value is not None and value < 1:
             raise RecipeError(f"--{name} must be a whole number >= 1, got {value}")
     scenes = find_scenes(options.data, options.scenes, protocol=options.protocol, truths=options.truth)
-    names = {row.recipe: canonical_recipe(row.recipe) for row in table.trained if row.recipe is not None}
+    names = {row.recipe: canonical_recipe(row.recipe) for row in table.rows if row.recipe is not None}
     recipes = {name: trained_recipe(name, options) for name in dict.fromkeys(names.values())}
     _check_overrides(options.overrides, [get_recipe(name) for name in recipes])
-    cache = options.cache or options.out / "cache"
-    made: dict[str, SweepJob] = {}
-    jobs: dict[tuple[str, str, int], SweepJob] = {}
-    for scene in scenes:
-        for seed in options.seeds:
-            for row_recipe, name in names.items():
-                job = make_job(options, scene, name, recipes[name], seed, cache)
-                jobs[row_recipe, scene.name, seed] = made.setdefault(job.name, job)
-    sweep = Sweep(folder=options.out, jobs=tuple(made.values()), cache=cache)
-    return Plan(options, table, scenes, sweep, jobs)
+    cells = {
+        (row_recipe, scene.name, seed): make_job(options, scene, name, recipes[name], seed)
+        for scene, seed, (row_recipe, name) in itertools.product(scenes, options.seeds, names.items())
+    }
+    return Plan(options, table, scenes, cells)
 
 
 def _table(options: PaperOptions) -> PaperTable:
@@ -134,19 +136,19 @@ def _table(options: PaperOptions) -> PaperTable:
 
 
 def canonical_recipe(name: str) -> str:
-    """The first named recipe that trains the same: "2dgs-r" for "2dgs-r-k1"."""
+    """Return the first named recipe that trains the same: "2dgs-r" for "2dgs-r-k1"."""
     recipe = replace(get_recipe(name), name="")
     return next(other for other in RECIPES if replace(get_recipe(other), name="") == recipe)
 
 
 def trained_recipe(name: str, options: PaperOptions) -> Recipe:
-    """A named recipe at the schedule and with the changes of the options."""
+    """Return a named recipe at the schedule and with the changes of the options."""
     recipe = scale_schedule(get_recipe(name), options.schedule_scale)
     return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
 
 
 def fitting_overrides(recipe: Recipe, overrides: Sequence[str]) -> tuple[str, ...]:
-    """The overrides that speak of the recipe itself or of a stage that it has."""
+    """Return the overrides that speak of the recipe itself or of a stage that it has."""
     stages = {stage.name for stage in recipe.stages}
     heads = {text: text.partition("=")[0].split(".") for text in overrides}
     return tuple(text for text in overrides if len(heads[text]) == 1 or heads[text][0] in stages)
@@ -159,8 +161,8 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
             raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
 
 
-def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int, cache: Path) -> SweepJob:
-    """The run of a recipe (``trained_recipe`` of the name) on a scene."""
+def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> Job:
+    """Return the run of a recipe (``trained_recipe`` of the name) on a scene."""
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
         scene=scene.path,
@@ -174,7 +176,7 @@ def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe
         overrides=fitting_overrides(recipe, options.overrides),
         seed=seed,
         resume=True,
-        cache=cache,
+        cache=options.cache or options.out / "cache",
         threads=options.threads,
         page=False,  # of dozens of runs nobody looks at each, and it is as large as the splats
     )
@@ -182,8 +184,9 @@ def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe
     if scene.scored or options.lpips_weights is not None:
         evaluate = EvaluateOptions(ground_truth=scene.truth, lpips_weights=options.lpips_weights)
     facts = (str(scene.path.resolve()), scene.protocol, downscale, seed, options.backend, versions()["2dgs-r"])
-    return SweepJob(
+    return Job(
         name=train.out.name,
+        record=options.out / "jobs" / f"{train.out.name}.json",
         train=train,
         evaluate=evaluate,
         stage_keys=stage_keys((*map(repr, facts), recipe.init_points, recipe.sh_degree), to_json(recipe)["stages"]),
@@ -197,3 +200,38 @@ def _wanted(scene: FoundScene, options: PaperOptions) -> Iterator[str]:
         yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
     if options.lpips_weights is not None:
         yield f"lpips: {options.lpips_weights.resolve()}"
+
+
+# -- the commands that do it -------------------------------------------------------------------------------------------
+def paper_command(options: PaperOptions) -> str:
+    """Return the command that makes a table."""
+    words = ["sweep", *options.recipes] if options.table == SWEEP else ["paper", options.table]
+    return _command(words, options, ("table", "recipes", "slots", "threads", "train"))
+
+
+def commands_of(job: Job) -> list[str]:
+    """Return the `gs2d train` and `gs2d evaluate` lines that do what a job does."""
+    words = ["train", str(job.train.scene), "--out", str(job.train.out), "--recipe", str(job.train.recipe)]
+    lines = [_command(words, job.train, ("scene", "out", "recipe", "resume"))]
+    if job.evaluate is not None:
+        lines.append(_command(["evaluate", str(job.train.out)], job.evaluate, ()))
+    return lines
+
+
+def _command(words: Sequence[str], options: Any, said: Sequence[str]) -> str:
+    """A command line: its first words, and every option that is not as it is by default, but for those ``said``."""
+    line = ["gs2d", *words]
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if field.name in said or value == field.default:
+            continue
+        flag = "--" + field.name.replace("_", "-")
+        if field.name == "overrides":
+            line += [word for text in value for word in ("--set", text)]
+        elif field.name == "seeds":  # one number alone would be a count
+            line += [flag, ",".join(map(str, value)) + ("," if len(value) == 1 else "")]
+        elif value is False:
+            line.append(f"--no-{flag[2:]}")
+        else:
+            line += [flag, *map(str, value if isinstance(value, tuple) else (value,))]
+    return shlex.join(line)
