@@ -22,7 +22,6 @@ from gs2d.core.splats import Splats
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda import losses as ops
 from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sources, source_names
-from gs2d.kernels.cuda.nearest import NEIGHBOURS, build_tree, choose_spread, find_nearest
 from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
 from gs2d.render import cuda, reference
 from gs2d.render.api import rasterize, splat_errors
@@ -40,7 +39,6 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
         "registers": lambda: registers(bench),
         "parity": lambda: parity(bench, 2 if bench.dry else 60),
         "determinism": lambda: determinism(bench),
-        "neighbours": lambda: neighbours(bench, 500 if bench.dry else 5_000_000),
         "tests": lambda: gpu_tests(bench),
         **{tool: lambda tool=tool: sanitize(bench, tool) for tool in TOOLS},
     }
@@ -132,7 +130,6 @@ def exercise(bench: Bench) -> list[str]:
         _all_losses(bench)
         _three_stages(bench)
         _fusion(bench)
-        _neighbours(bench)
     bench.wait()
     return sorted(set(kernel_sources()) - launched)
 
@@ -193,15 +190,6 @@ def _fusion(bench: Bench) -> None:
     fuse_on_gpu(launch.launcher_for(bench.device), arguments_of((height, width), 0.5, arrays))
 
 
-def _neighbours(bench: Bench) -> None:
-    """Nearest points of a cloud, and some that keep a distance."""
-    points = torch.rand(100, 3, dtype=torch.float64, device=bench.device)
-    launcher, tree = launch.launcher_for(bench.device), build_tree(points)
-    for neighbours in NEIGHBOURS:
-        find_nearest(tree, points[::3] + 0.1, launcher=launcher, neighbours=neighbours)
-    choose_spread(points, 0.2, launcher=launcher)
-
-
 def determinism(bench: Bench) -> dict[str, Any]:
     """Two renderings: images bit for bit, gradients by relative norm."""
     scenes = _scenes()
@@ -216,23 +204,6 @@ def determinism(bench: Bench) -> dict[str, Any]:
     judge = reference.rasterize(splats.to("cpu", torch.float64), camera, SETTINGS)
     covered = float(judge.alpha.mean())
     return {"images_are_the_same_bits": same, "relative_change_of_gradients": change, "mean_alpha": covered}
-
-
-def neighbours(bench: Bench, count: int) -> dict[str, Any]:
-    """Milliseconds of what surface scores spend most on: a tree of points on a sphere, a search for as many others."""
-    generator = torch.Generator().manual_seed(0)
-    points, queries = (torch.randn(count, 3, generator=generator, dtype=torch.float64) for _ in range(2))
-    points, queries = ((x / x.norm(dim=1, keepdim=True)).to(bench.device) for x in (points, queries))
-    launcher, tree = launch.launcher_for(bench.device), build_tree(points)
-    found: dict[str, Any] = {"points": count}
-    found["build_ms"] = bench.times(lambda _: build_tree(points), repeats=3, warmup=1)
-    for k in NEIGHBOURS:
-
-        def search(_: int, k: int = k) -> object:
-            return find_nearest(tree, queries, launcher=launcher, neighbours=k)
-
-        found[f"nearest_{k}_ms"] = bench.times(search, repeats=3, warmup=1)
-    return found
 
 
 def gpu_tests(bench: Bench) -> dict[str, Any]:

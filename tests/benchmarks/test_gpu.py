@@ -77,9 +77,8 @@ def test_correctness_compares_with_the_reference_and_runs_every_kernel(tmp_path:
 
 
 def test_parts_can_be_chosen_and_each_is_in_the_file_as_soon_as_it_is_done(tmp_path: Path) -> None:
-    found = dry("correctness", tmp_path, "--only", "ceil", "register", "neighbours")
-    assert set(found) == {"ceilings", "registers", "neighbours"}
-    assert set(found["neighbours"]) == {"points", "build_ms", "nearest_1_ms", "nearest_8_ms"}
+    found = dry("correctness", tmp_path, "--only", "ceil", "register")
+    assert set(found) == {"ceilings", "registers"}
 
 
 @pytest.mark.parametrize(

@@ -43,13 +43,14 @@ def test_the_doctor_looks_for_all_that_single_commands_need(
     assert run(["doctor", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["extras"] == {
-        "sfm": True, "ffmpeg": False, "heic": True, "texture": True, "view": False, "films": True
+        "sfm": True, "ffmpeg": False, "heic": True, "texture": True, "view": False
     }  # fmt: skip
     assert report["optional"]["heic"]["details"] == "pillow-heif 1.2.3"
     assert run(["doctor"]) == 0
     text = capsys.readouterr().out
     assert "no   viewer in the browser (gs2d view, --viewer): viser missing\n       to get it: pip install 'vi" in text
-    assert "no   videos instead of photographs: no ffmpeg and no ffprobe on the PATH\n       to get it: apt" in text
+    ffmpeg = "no   videos, read and made (gs2d render --video x.mp4): no ffmpeg and no ffprobe on the PATH"
+    assert f"{ffmpeg}\n       to get it: apt" in text
 
 
 def test_a_torch_with_cuda_where_there_is_no_gpu_is_told_with_the_command_for_one_without(

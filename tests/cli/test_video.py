@@ -13,29 +13,43 @@ from cli_runs import one_line
 from gs2d.cli import run
 
 
-def test_a_flight_becomes_pictures_and_a_film(
+def test_a_flight_becomes_pictures_and_a_video(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy, film = tmp_path / "run", tmp_path / "film.webp"
+    copy, video = tmp_path / "run", tmp_path / "video.webp"
     shutil.copytree(trained, copy)
-    words = ["--flight", "5", "--video", str(film), "--fps", "10", "--threads", "1"]
+    words = ["--flight", "5", "--video", str(video), "--fps", "10", "--threads", "1"]
     assert run(["render", str(copy), *words]) == 0
     out, err = capsys.readouterr()
     assert "5 images in" in out
-    assert f"{film}: 0.5 s, 0.0 MB" in out
-    assert "compressing the film (5)" in err
+    assert f"{video}: 0.5 s, 0.0 MB" in out
+    assert "compressing the video (5)" in err
     assert len(list((copy / "renders" / "flight").glob("*.png"))) == 5
-    with Image.open(film) as pictures:
+    with Image.open(video) as pictures:
         assert (pictures.size, pictures.n_frames) == ((20, 20), 5)
-    assert run(["render", str(copy), "--orbit", "2", "--video", str(film), "--json", "--threads", "1"]) == 0
+    assert run(["render", str(copy), "--orbit", "2", "--video", str(video), "--json", "--threads", "1"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result == {
         "folder": str(copy / "renders" / "orbit"),
         "images": 2,
-        "video": str(film),
+        "video": str(video),
         "seconds": pytest.approx(2 / 30),
-        "video_bytes": film.stat().st_size,
+        "video_bytes": video.stat().st_size,
     }
+
+
+def test_a_video_without_an_ending_is_what_can_be_made_here_and_mp4_without_ffmpeg_is_refused(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    words = ["render", str(trained), "--orbit", "2", "--out", str(tmp_path / "frames"), "--threads", "1"]
+    assert run([*words, "--video", str(tmp_path / "round")]) == 0
+    out, err = capsys.readouterr()
+    assert f"the video is an animated WebP, {tmp_path / 'round.webp'}: MP4 needs ffmpeg" in err
+    assert f"{tmp_path / 'round.webp'}: 0.1 s" in out
+    assert run([*words, "--video", str(tmp_path / "round.mp4")]) == 2
+    assert "round.mp4 needs ffmpeg, and there is none on the PATH; install it (apt" in one_line(capsys.readouterr().err)
+    assert not (tmp_path / "round.mp4").exists()
 
 
 @pytest.mark.parametrize(
@@ -44,38 +58,37 @@ def test_a_flight_becomes_pictures_and_a_film(
         (["--video", "a.webp"], "--video needs frames that move, got neither --orbit N nor --flight N"),
         (["--orbit", "9", "--flight", "9"], "--orbit 9 and --flight 9 exclude each other"),
         (["--flight", "-1"], "--flight must be a number of frames from 1 to 100000, got -1"),
-        (["--orbit", "9", "--fps", "25"], "--fps 25 is of a film, and no --video was given"),
+        (["--orbit", "9", "--fps", "25"], "--fps 25 is of a video, and no --video was given"),
         (["--orbit", "9", "--video", "a.mov"], "--video must name a .mp4 or .webp file, got a.mov"),
         (["--orbit", "1", "--video", "a.webp"], "--video needs at least 2 frames, got 1"),
         (["--orbit", "9", "--video", "no/such/folder/a.webp"], "the folder does not exist"),
         (["--orbit", "9", "--video", f"{'a' * 300}.webp"], "choose a shorter name"),
     ],
 )
-def test_what_makes_no_film_is_one_line(
+def test_what_makes_no_video_is_one_line(
     trained: Path, words: list[str], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["render", str(trained), *words]) == 2
     assert named in one_line(capsys.readouterr().err)
 
 
-def test_a_film_that_cannot_be_written_is_said_before_the_pictures_are_rendered(
+def test_a_video_that_cannot_be_written_is_said_before_the_pictures_are_rendered(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "film.webp").mkdir()
+    (tmp_path / "video.webp").mkdir()
     frames = tmp_path / "frames"
-    assert (
-        run(["render", str(trained), "--orbit", "9", "--video", str(tmp_path / "film.webp"), "--out", str(frames)]) == 2
-    )
+    words = ["--orbit", "9", "--video", str(tmp_path / "video.webp"), "--out", str(frames)]
+    assert run(["render", str(trained), *words]) == 2
     assert "a folder has this name" in one_line(capsys.readouterr().err)
     assert not frames.exists()
 
 
-def test_a_film_is_not_written_over_a_photograph(
+def test_a_video_is_not_written_over_a_photograph(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capture = Path(json.loads((trained / "run.json").read_text())["scene"]["path"])
-    film = tmp_path / "film.webp"  # captures may hold pictures of this kind; the ones here are PNG
-    film.symlink_to(next(capture.glob("train/*.png")))
-    assert run(["render", str(trained), "--orbit", "2", "--video", str(film), "--out", str(tmp_path), "--quiet"]) == 2
+    video = tmp_path / "video.webp"  # captures may hold pictures of this kind; the ones here are PNG
+    video.symlink_to(next(capture.glob("train/*.png")))
+    assert run(["render", str(trained), "--orbit", "2", "--video", str(video), "--out", str(tmp_path), "--quiet"]) == 2
     assert "--video would write over the capture's photograph" in one_line(capsys.readouterr().err)
-    assert film.is_symlink()
+    assert video.is_symlink()

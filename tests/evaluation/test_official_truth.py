@@ -178,25 +178,3 @@ def test_the_visible_surface_has_its_headline_at_half_a_per_cent_of_the_true_siz
     elsewhere = score_surface(flat(0.5), truth, job, EvaluateOptions(), far.append, folder=tmp_path)
     assert not elsewhere["self_check"]["ok"]
     assert "is it in the capture's frame" in notices(far)[-1]
-
-
-@pytest.mark.parametrize("protocol", ["tnt", "dtu", "visible-surface"])
-def test_surfaces_are_compared_on_the_device_of_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: str
-) -> None:
-    class Asked(Exception):
-        pass
-
-    def asked(*_: Any, device: str, **__: Any) -> None:
-        raise Asked(device)
-
-    for name in ("truth.evaluate_surface", "truth_official.evaluate_dtu", "truth_official.evaluate_tnt"):
-        monkeypatch.setattr(f"gs2d.pipeline.{name}", asked)
-    root, *_ = write_dtu_capture(tmp_path) if protocol == "dtu" else write_tnt_capture(tmp_path)
-    truth = choose_truth(None, root, ignore)
-    if protocol == "visible-surface":
-        truth = Truth(tmp_path, flat(0.0), None)
-    assert truth is not None
-    job: Any = SimpleNamespace(scene=load_scene(root), backend=SimpleNamespace(device="the run's"))
-    with pytest.raises(Asked, match="the run's"):
-        score_surface(flat(0.01), truth, job, EvaluateOptions(), ignore, folder=tmp_path / "surface")

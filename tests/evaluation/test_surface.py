@@ -14,8 +14,9 @@ from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
 from gs2d.evaluation.distance import distances_to_mesh, face_areas, point_triangle_distances, sample_surface
 from gs2d.evaluation.surface import evaluate_surface
-from gs2d.evaluation.visibility import depth_buffer, frustum_counts, visible_counts
+from gs2d.evaluation.visibility import frustum_counts, visible_counts
 from gs2d.io.splat_ply import read_mesh
+from gs2d.meshing.raycast import cast_camera
 
 
 def square(height: float, half: float = 1.0, cells: int = 1) -> Mesh:
@@ -108,17 +109,22 @@ def test_masked_faces_get_no_samples_and_no_area_gives_none() -> None:
 # visibility
 
 
-def test_the_depth_buffer_is_the_ray_cast_of_a_real_mesh(shared: Callable[[str], Path]) -> None:
+def depths(mesh: Mesh, camera: Camera) -> np.ndarray:
+    """Depth [H, W] wu of the nearest face, 0 where there is none."""
+    return cast_camera(mesh.vertices.astype(np.float64), mesh.faces, camera).depth
+
+
+def test_depth_is_that_of_another_ray_caster_on_a_real_mesh(shared: Callable[[str], Path]) -> None:
     """Against the published depth maps of test views, float16: within 0.002."""
     folder = shared("rendered_bottle")
     mesh = read_mesh(folder / "mesh_gt.ply")
     info = json.loads((folder / "transforms_test.json").read_text())
     focal = 200 / np.tan(info["camera_angle_x"] / 2)
     T = np.linalg.inv(np.array(info["frames"][0]["transform_matrix"]) @ np.diag([1.0, -1, -1, 1]))
-    got = depth_buffer(mesh, Camera(400, 400, focal, focal, 200.0, 200.0, T))
+    got = depths(mesh, Camera(400, 400, focal, focal, 200.0, 200.0, T))
     expected = np.load(folder / "depth_test" / "r_0.npy").astype(np.float64)
-    assert (np.isfinite(got) != (expected > 0)).sum() <= 2
-    both = np.isfinite(got) & (expected > 0)
+    assert ((got > 0) != (expected > 0)).sum() <= 2
+    both = (got > 0) & (expected > 0)
     assert both.sum() > 10_000
     assert np.abs(got - expected)[both].max() < 0.003
 
@@ -127,10 +133,10 @@ def test_faces_that_cross_the_camera_plane_are_drawn() -> None:
     """A floor 1 below the camera: the ray (x', y', 1) with y' > 0 meets it at depth 1 / y'."""
     camera = Camera(20, 20, 10.0, 10.0, 10.0, 10.0, np.eye(4))
     floor = Mesh(np.array([[-1e4, 1, -50], [1e4, 1, -50], [0, 1, 1e5]], np.float64), np.array([[0, 1, 2]], np.int32))
-    got = depth_buffer(floor, camera)
+    got = depths(floor, camera)
     y = (np.arange(20) + 0.5 - 10) / 10
-    np.testing.assert_allclose(got[10:], np.broadcast_to((1 / y[10:])[:, None], (10, 20)))
-    assert np.isinf(got[:10]).all()
+    np.testing.assert_allclose(got[10:], np.broadcast_to((1 / y[10:])[:, None], (10, 20)), rtol=1e-6)
+    assert (got[:10] == 0).all()
 
 
 def test_a_closed_surface_has_no_pinholes() -> None:
@@ -138,7 +144,7 @@ def test_a_closed_surface_has_no_pinholes() -> None:
     rng = np.random.default_rng(0)
     mesh = square(0.0, half=20.0, cells=40)
     jitter = rng.uniform(-0.2, 0.2, mesh.vertices.shape) * [1, 1, 0]
-    assert np.isfinite(depth_buffer(Mesh(mesh.vertices + jitter, mesh.faces), camera)).all()
+    assert (depths(Mesh(mesh.vertices + jitter, mesh.faces), camera) > 0).all()
 
 
 def test_points_behind_a_surface_outside_the_image_or_behind_the_camera_are_not_visible() -> None:
@@ -147,6 +153,22 @@ def test_points_behind_a_surface_outside_the_image_or_behind_the_camera_are_not_
     points = np.array([[0, 0, 0.0], [0, 0, -0.5], [0, 0, 1.0], [5, 0, 0], [0, 0, 9.0], [0, 0, -0.005]])
     assert visible_counts(points, mesh, cameras, tolerance=0.01).tolist() == [3, 0, 3, 0, 0, 3]
     assert frustum_counts(points, cameras).tolist() == [3, 3, 3, 0, 0, 3]
+
+
+def test_what_hides_does_so_in_captures_of_any_unit() -> None:
+    """A capture in kilometres: all of it is nearer to the cameras than a millimetre is in metres."""
+    small = 1e-4
+    cameras = [Camera(c.width, c.height, c.fx, c.fy, c.cx, c.cy, scaled(c.T_cam_world, small)) for c in from_above(3)]
+    mesh = square(0.0)
+    points = np.array([[0, 0, 0.0], [0, 0, -0.5]])
+    tiny = Mesh(mesh.vertices * small, mesh.faces)
+    assert visible_counts(points * small, tiny, cameras, tolerance=0.01 * small).tolist() == [3, 0]
+
+
+def scaled(T_cam_world: np.ndarray, scale: float) -> np.ndarray:
+    T = T_cam_world.copy()
+    T[:3, 3] *= scale
+    return T
 
 
 def test_large_images_are_drawn_small_with_the_same_answer() -> None:

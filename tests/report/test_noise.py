@@ -59,12 +59,12 @@ def test_noisy_photographs_are_turned_and_shrunk(side: int, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("ending", [".webp", ".mp4"])
-def test_noise_makes_a_film(ending: str, tmp_path: Path) -> None:
+def test_noise_makes_a_video(ending: str, tmp_path: Path) -> None:
     frames = [tmp_path / f"{i}.png" for i in range(3)]
     for i, frame in enumerate(frames):
         write_image(frame, np.roll(noise(120, 180), i, axis=0))
     try:
-        write_video(tmp_path / f"film{ending}", frames, fps=10, quality=100)
+        write_video(tmp_path / f"film{ending}", frames, fps=10)
     except BackendError as error:
         pytest.skip(str(error))
     assert (tmp_path / f"film{ending}").stat().st_size > 0

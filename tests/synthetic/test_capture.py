@@ -13,7 +13,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.data import load_scene
 from gs2d.errors import DataError, DiskError
 from gs2d.io.splat_ply import read_mesh
-from gs2d.meshing.raycast import _sample_boxes, cast_camera, occluded
+from gs2d.meshing.raycast import NEAR, _sample_boxes, cast_camera, occluded
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic import shapes
 from gs2d.synthetic.capture import demo_cameras, demo_mesh, write_demo_capture
@@ -124,7 +124,7 @@ def test_from_within_a_room_few_faces_are_compared_with_the_whole_picture() -> N
         local = room.vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]
         behind = (local[room.faces][:, :, 2] < 0).sum(axis=1)
         assert ((behind == 1) | (behind == 2)).sum() > 200
-        _, low, high = _sample_boxes(local, room.faces, camera, 1, 40, 30)
+        _, low, high = _sample_boxes(local, room.faces, camera, 1, NEAR)
         assert (high - low).prod(axis=1).sum() < 10 * 40 * 30
         hits = cast_camera(room.vertices, room.faces, camera)
         rays = pixel_rays(camera)[::7]

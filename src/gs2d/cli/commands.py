@@ -138,7 +138,7 @@ class Mesh(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Common):
-    """Render a trained run to PNG files, or to a film."""
+    """Render a trained run to PNG files, or to a video."""
 
     run: RunPath
     """Run folder."""
@@ -152,9 +152,9 @@ class Render(Common):
     out: Path | None = None
     """Folder for the pictures (default: renders/SPLIT, renders/orbit or renders/flight in the run)."""
     video: Annotated[Path | None, arg(metavar="FILE")] = None
-    """With --orbit or --flight: also a film of the frames, .mp4 (AV1) or .webp."""
+    """With --orbit or --flight: also a video of the frames, .mp4 (H.264, by ffmpeg) or .webp; no ending: what works."""
     fps: float = 30.0
-    """Frames a second of the film."""
+    """Frames a second of the video."""
     exposure_of: Annotated[str | None, arg(metavar="PHOTOGRAPH")] = None
     """Of a run with --exposure: in the exposure of this training photograph (default: in the mean of all)."""
     threads: int | None = None

@@ -7,10 +7,9 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gs2d.core.extras import install
+from gs2d.core.extras import FFMPEG, install
 
 CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"  # as pytorch.org has it
-_FFMPEG = "apt install ffmpeg, brew install ffmpeg, or ffmpeg.org"
 
 
 @dataclass(frozen=True)
@@ -62,23 +61,16 @@ def _heic() -> Found:
     return Found(False, "pi-heif missing", "pip install pi-heif (its wheel holds LGPL code), or convert to JPEG")
 
 
-def _films() -> Found:
-    """Look for the AVIF encoder of Pillow, which compresses films."""
-    from PIL import features
-
-    here = f"pillow {_version('pillow')}"
-    if features.check("avif"):
-        return Found(True, f"{here} with AVIF")
-    return Found(False, f"{here} has no AVIF; .webp works", "pip install 'pillow>=11.3'")
-
-
 OPTIONAL = (
     Wanted("sfm", "cameras of photographs (gs2d reconstruct, poses)", _packages("sfm", "pycolmap")),
-    Wanted("ffmpeg", "videos instead of photographs", _programs(_FFMPEG, "ffmpeg", "ffprobe")),
+    Wanted(
+        "ffmpeg",
+        "videos, read and made (gs2d render --video x.mp4)",
+        _programs(FFMPEG, "ffmpeg", "ffprobe"),
+    ),
     Wanted("heic", "HEIC photographs, as of an iPhone", _heic),
     Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas")),
     Wanted("view", "viewer in the browser (gs2d view, --viewer)", _packages("view", "viser")),
-    Wanted("films", "films (gs2d render --video x.mp4)", _films),
 )
 
 

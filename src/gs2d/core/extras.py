@@ -1,4 +1,4 @@
-"""The packages that some commands need and that gs2d does not bring, and the words that install them."""
+"""The packages and programs that some commands need and gs2d does not bring, and the words that install them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "view": ("viser>=1.1,<2",),
     }
 )
+FFMPEG = "apt install ffmpeg, brew install ffmpeg, or ffmpeg.org"
 
 
 def install(extra: str) -> str:

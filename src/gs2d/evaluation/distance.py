@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gs2d.core.mesh import Mesh
-from gs2d.evaluation.nearest import Cloud, tensor_on
+from gs2d.evaluation.nearest import Cloud
 
 _CANDIDATES = 8  # triangles tried for each point
 _CHUNK = 1 << 16  # points and triangles at a time
@@ -58,11 +58,9 @@ def sample_surface(mesh: Mesh, count: int, *, seed: int = 0, mask: np.ndarray | 
     return SurfaceSamples(points, faces)
 
 
-def distances_to_points(
-    queries: np.ndarray, points: np.ndarray, *, device: str = "cpu", workers: int | None = None
-) -> np.ndarray:
-    """Distance [Q] of each query to the nearest of the points [P, 3]."""
-    return Cloud(points, device=device, workers=workers).nearest(queries)[0][:, 0]
+def distances_to_points(queries: np.ndarray, points: np.ndarray, *, workers: int | None = None) -> np.ndarray:
+    """Return the distance [Q] of each query to the nearest of the points [P, 3]."""
+    return Cloud(points, workers=workers).nearest(queries)[0][:, 0]
 
 
 def distances_to_mesh(
@@ -71,7 +69,6 @@ def distances_to_mesh(
     *,
     samples: int = 200_000,
     seed: int = 0,
-    device: str = "cpu",
     workers: int | None = None,
 ) -> np.ndarray:
     """Distance [Q] of each query [Q, 3] to the surface.
@@ -83,27 +80,31 @@ def distances_to_mesh(
     t = mesh.vertices.astype(np.float64)[mesh.faces]
     spread = sample_surface(mesh, samples, seed=seed)
     points = np.concatenate([t.mean(axis=1), spread.points])
-    _, index = Cloud(points, device=device, workers=workers).nearest(queries, neighbours=_CANDIDATES)
+    _, index = Cloud(points, workers=workers).nearest(queries, neighbours=_CANDIDATES)
     owner = np.concatenate([np.arange(len(t)), spread.faces, [0]])  # there may be fewer than eight points: any face
-    return _least_distances(queries, t, owner[index], device)
+    return _least_distances(queries, t, owner[index])
 
 
-def _least_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray, device: str) -> np.ndarray:
+def _least_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Least distance [Q] of each query to some of the triangles [F, 3, 3], ``faces`` [Q, K]."""
-    corners = tensor_on(device, t)
+    corners = _tensor(t)
     best = np.empty(len(queries))
     for start in range(0, len(queries), _CHUNK):
         part = slice(start, start + _CHUNK)
-        p = tensor_on(device, queries[part])
-        columns = tensor_on(device, faces[part], np.int64).unbind(dim=1)
+        p, columns = _tensor(queries[part]), _tensor(faces[part], np.int64).unbind(dim=1)
         found = [_triangle_distances(p, corners[column]) for column in columns]
-        best[part] = torch.stack(found).amin(dim=0).cpu().numpy()
+        best[part] = torch.stack(found).amin(dim=0).numpy()
     return best
 
 
 def point_triangle_distances(p: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Distance [n] of points [n, 3] to triangles [n, 3, 3]: to the plane where the foot lies inside, else the edges."""
-    return np.asarray(_triangle_distances(tensor_on("cpu", p), tensor_on("cpu", t)).numpy())
+    return np.asarray(_triangle_distances(_tensor(p), _tensor(t)).numpy())
+
+
+def _tensor(array: np.ndarray, dtype: type = np.float64) -> Tensor:
+    """An array as a tensor, the same memory where it has that type and may be written to (torch warns of others)."""
+    return torch.from_numpy(np.require(array, dtype, ["C", "W"]))
 
 
 def _triangle_distances(p: Tensor, t: Tensor) -> Tensor:

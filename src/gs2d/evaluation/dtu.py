@@ -22,7 +22,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.evaluation.alignment import apply, similarity_scale
 from gs2d.evaluation.dtu_files import DtuTruth
-from gs2d.evaluation.nearest import Cloud, first_of_neighbours, on_gpu
+from gs2d.evaluation.nearest import Cloud
 from gs2d.evaluation.surface_clouds import ScoredClouds
 
 GREEN_WITHIN = 1.0  # mm, in the coloured clouds only: DTU has no threshold
@@ -82,7 +82,6 @@ def evaluate_dtu(
     *,
     protocol: DtuSurface = DTU_SURFACE,
     seed: int = 0,
-    device: str = "cpu",
     workers: int | None = None,
 ) -> DtuScore:
     """Score a mesh in the scene's frame.
@@ -93,8 +92,8 @@ def evaluate_dtu(
         Of all views; empty: nothing is culled.
     T_metric_scene : ndarray [4, 4]
         scale_mat: from the scene to mm.
-    device, workers
-        Where points are thinned and nearest ones found, see ``neighbours.Cloud``.
+    workers : int, optional
+        Threads that look for nearest points; default: all.
     """
     similarity_scale(T_metric_scene, "T_metric_scene")
     keep = inside_silhouettes(mesh.vertices.astype(np.float64), silhouettes, protocol)
@@ -102,9 +101,9 @@ def evaluate_dtu(
     used = keep if len(silhouettes) else np.ones(len(keep), bool)
     low, high = truth.bounds[0] - protocol.margin_low, truth.bounds[1] + protocol.margin_high
     points = mesh_points(_touching(culled, low, high), protocol.density, vertices=culled.vertices[used])
-    points = thin(points, protocol.density, seed=seed, device=device)
+    points = thin(points, protocol.density, seed=seed)
     points = points[((points >= low) & (points < high)).all(axis=1)]
-    return _score(points, truth, float(1 - used.mean()) if len(used) else 0.0, protocol, device, workers)
+    return _score(points, truth, float(1 - used.mean()) if len(used) else 0.0, protocol, workers)
 
 
 def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
@@ -114,9 +113,7 @@ def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces[touch])
 
 
-def _score(
-    points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurface, device: str, workers: int | None
-) -> DtuScore:
+def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurface, workers: int | None) -> DtuScore:
     """Distances both ways between the thinned points inside the box, and the scan."""
     observed = points[truth.is_observed(points)]
     above = truth.above_plane()
@@ -132,8 +129,8 @@ def _score(
             message = "every corner of the mesh lies outside some silhouette: are the masks those of these views?"
         counts = (len(observed), len(above))
         return DtuScore(None, None, None, *counts, 1.0, 1.0, culled, False, (message,), clouds, why)
-    d2s = Cloud(truth.points, device=device, workers=workers).nearest(observed, limit=limit)[0][:, 0]
-    s2d = Cloud(points, device=device, workers=workers).nearest(above, limit=limit)[0][:, 0]
+    d2s = Cloud(truth.points, workers=workers).nearest(observed, limit=limit)[0][:, 0]
+    s2d = Cloud(points, workers=workers).nearest(above, limit=limit)[0][:, 0]
     clouds = ScoredClouds(observed, d2s, above, s2d, GREEN_WITHIN)
     near, back = np.isfinite(d2s), np.isfinite(s2d)
     dropped = (float(1 - near.mean()), float(1 - back.mean()))
@@ -214,25 +211,18 @@ def _half_steps(n1: int, n2: int) -> np.ndarray:
     return np.stack([u, v], axis=-1).reshape(-1, 2)[(u + v < 1).ravel()]
 
 
-def thin(
-    points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _SLAB, device: str = "cpu"
-) -> np.ndarray:
+def thin(points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _SLAB) -> np.ndarray:
     """A subset of which no two points are within ``radius``, and every point left out is within it of one that is kept.
 
     Points are taken greedily: slab by slab along the longest axis, in an order shuffled from the seed within a slab.
     Within a slab all points that come before their neighbours are taken at once, again and again: the same set as one
-    by one. On a GPU the same order decides, without slabs.
+    by one.
     """
     if not len(points):
         return points
     axis = int(np.ptp(points, axis=0).argmax())
     points = points[np.argsort(points[:, axis], kind="stable")]
     rng = np.random.default_rng(seed)
-    if on_gpu(device):
-        starts = range(0, len(points), slab_size)
-        turns = [start + rng.permutation(min(slab_size, len(points) - start)) for start in starts]
-        points = points[np.concatenate(turns)]
-        return np.asarray(points[first_of_neighbours(points, radius, device)])
     kept: list[np.ndarray] = []
     for start in range(0, len(points), slab_size):
         slab = points[start : start + slab_size]

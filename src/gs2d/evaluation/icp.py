@@ -94,7 +94,6 @@ def icp(
     with_scale: bool = True,
     share_change: float = 1e-6,
     rms_change: float = math.inf,
-    device: str = "cpu",
     workers: int | None = None,
 ) -> IcpResult:
     """Move ``source`` [P, 3] onto ``target`` [Q, 3]: pair with the nearest, fit, repeat (Besl and McKay 1992).
@@ -111,7 +110,7 @@ def icp(
         It has converged when the share of paired points and their rms change by less, both. The official Tanks and
         Temples script leaves the rms out in effect (it passes 20).
     """
-    cloud = Cloud(target, device=device, workers=workers)
+    cloud = Cloud(target, workers=workers)
     T = np.eye(4)
     moved = np.asarray(source, np.float64)
     share, rms, index, paired = _paired(cloud, moved, threshold)

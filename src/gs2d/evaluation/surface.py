@@ -102,7 +102,6 @@ def evaluate_surface(
     thresholds: Sequence[float] | None = None,
     samples: int = VISIBLE_SURFACE.samples,
     seed: int = 0,
-    device: str = "cpu",
     workers: int | None = None,
 ) -> SurfaceScore:
     """Score a reconstruction.
@@ -125,8 +124,8 @@ def evaluate_surface(
         In the truth's units; default 0.25 %, 0.5 % and 1 % of the diagonal of the truth's bounding box.
     samples : int
         Points on each surface.
-    device, workers
-        Where distances and visibility are computed: a device as torch names it; on the CPU with so many threads.
+    workers : int, optional
+        Threads; default: all.
 
     Raises
     ------
@@ -144,8 +143,8 @@ def evaluate_surface(
     # Everything below happens in the mesh's frame; distances return to the truth's units at the end.
     local = _moved(truth, np.linalg.inv(T))
     tolerance = SEEN_TOLERANCE * diagonal / scale
-    counts = partial(visible_counts, cameras=cameras, tolerance=tolerance, device=device, workers=workers)
-    to_mesh = partial(distances_to_mesh, samples=samples, seed=seed, device=device, workers=workers)
+    counts = partial(visible_counts, cameras=cameras, tolerance=tolerance, workers=workers)
+    to_mesh = partial(distances_to_mesh, samples=samples, seed=seed, workers=workers)
     theirs = _true_side(local, cameras, seen, min_views, samples, seed, counts)
     ours = _reconstructed_side(mesh, cameras, samples, seed, counts)
     if not len(mesh.faces) or not len(ours.points):
@@ -156,7 +155,7 @@ def evaluate_surface(
     if isinstance(local, Mesh):
         accuracy = scale * to_mesh(ours.points, local)
     else:
-        accuracy = scale * distances_to_points(ours.points, local, device=device, workers=workers)
+        accuracy = scale * distances_to_points(ours.points, local, workers=workers)
     completeness = scale * to_mesh(theirs.points, mesh)
     return SurfaceScore(
         accuracy=float(accuracy.mean()),

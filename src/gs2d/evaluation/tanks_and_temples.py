@@ -127,7 +127,6 @@ def evaluate_tnt(
     published: np.ndarray | None = None,
     protocol: TntSurface = TNT_SURFACE,
     seed: int = 0,
-    device: str = "cpu",
     workers: int | None = None,
 ) -> TntScore:
     """Score a mesh.
@@ -145,8 +144,8 @@ def evaluate_tnt(
         m.
     published : ndarray [m, 4, 4], optional
         The log that came with the photographs: checked against the cameras, never used.
-    device, workers
-        Where nearest points are found, see ``neighbours.Cloud``.
+    workers : int, optional
+        Threads that look for nearest points; default: all.
 
     Raises
     ------
@@ -159,12 +158,12 @@ def evaluate_tnt(
     start = T = fit.T_target_source
     reports: list[StageReport] = []
     for stage in protocol.stages:
-        step, report = _stage(source, target, T, truth, stage, tau, protocol, device, workers)
+        step, report = _stage(source, target, T, truth, stage, tau, protocol, workers)
         T = step.T_target_source @ T
         reports.append(report)
     moved = truth.crop.apply(apply(T, source))
     alignment = _check(fit, start, T, moved, truth, tau, tuple(reports), frame_notes, protocol)
-    return _score(moved, target, tau, alignment, protocol, device, workers)
+    return _score(moved, target, tau, alignment, protocol, workers)
 
 
 def point_set(mesh: Mesh) -> np.ndarray:
@@ -215,7 +214,6 @@ def _stage(
     stage: IcpStage,
     tau: float,
     protocol: TntSurface,
-    device: str,
     workers: int | None,
 ) -> tuple[IcpResult, StageReport]:
     """One stage on the cropped and thinned clouds."""
@@ -233,7 +231,6 @@ def _stage(
         iterations=stage.iterations,
         share_change=protocol.share_change,
         rms_change=protocol.rms_change,
-        device=device,
         workers=workers,
     )
     report = StageReport(
@@ -320,7 +317,6 @@ def _score(
     tau: float,
     alignment: Alignment,
     protocol: TntSurface,
-    device: str,
     workers: int | None,
 ) -> TntScore:
     """Precision, recall and F of the cropped clouds."""
@@ -332,8 +328,8 @@ def _score(
         clouds = ScoredClouds(ours, np.zeros(0), theirs, np.full(len(theirs), np.inf), tau)
         why = "no part of the mesh lies inside the crop volume"
         return TntScore(tau, None, 0.0, 0.0, None, None, None, 0, len(theirs), alignment, clouds, why)
-    accuracy, _ = Cloud(theirs, device=device, workers=workers).nearest(ours)
-    completeness, _ = Cloud(ours, device=device, workers=workers).nearest(theirs)
+    accuracy, _ = Cloud(theirs, workers=workers).nearest(ours)
+    completeness, _ = Cloud(ours, workers=workers).nearest(theirs)
     accuracy, completeness = accuracy[:, 0], completeness[:, 0]
     precision, recall = float((accuracy < tau).mean()), float((completeness < tau).mean())
     return TntScore(

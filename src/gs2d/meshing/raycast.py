@@ -1,6 +1,7 @@
-"""A small ray caster over triangles for the demo capture: beams of rays that share an origin or a direction.
+"""Cameras and distant lights that look at triangles: beams of rays that share an origin or a direction.
 
-It shares nothing with the splat rasterizers, so pictures made with it are evidence about them. Every hit is an exact
+The demo capture, textures, pictures of meshes and the visibility of surface scores are made with it. It shares nothing
+with the splat rasterizers, so that what it says is evidence about them. Every hit is an exact
 ray-triangle intersection (signed volumes, as in Pluecker tests); only the choice of candidate pairs uses that the rays
 of a camera meet on its image plane, and that the rays of a distant light meet on a plane across it.
 """
@@ -15,7 +16,7 @@ import numpy as np
 from gs2d.core.camera import Camera
 
 _PAIRS_PER_CHUNK = 60_000  # a step of one chunk stays in the cache of a core
-_CLOSEST = 1e-3  # wu, hits nearer than this to the camera are ignored
+NEAR = 1e-3  # wu
 _MARGIN = 1e-6  # samples around the box of a triangle, for rounding
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
 
@@ -39,7 +40,9 @@ class Hits:
     weights: np.ndarray  # [H, W, 3]
 
 
-def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samples: int = 1) -> Hits:
+def cast_camera(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samples: int = 1, near: float = NEAR
+) -> Hits:
     """Cast ``samples`` x ``samples`` rays through every pixel of a camera and keep the nearest triangle of each.
 
     A ray through the camera's origin with direction d meets the triangle (a, b, c), given in camera axes, where the
@@ -54,6 +57,8 @@ def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samp
     camera : Camera
     samples : int
         Rays per pixel along each axis, at the centres of equal sub-pixels.
+    near : float
+        Hits at a smaller depth, wu, do not count.
 
     Returns
     -------
@@ -62,7 +67,7 @@ def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samp
     """
     width, height = camera.width * samples, camera.height * samples
     local = vertices @ camera.rotation.T + camera.T_cam_world[:3, 3]  # [P, 3] in camera axes
-    met, low, high = _sample_boxes(local, faces, camera, samples, width, height)
+    met, low, high = _sample_boxes(local, faces, camera, samples, near)
     a, b, c = (local[faces[met, k]] for k in range(3))
     edges = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)  # [F, 3, 3]
     volume = np.einsum("fi,fi->f", a, edges[:, 0])
@@ -77,7 +82,7 @@ def cast_camera(vertices: np.ndarray, faces: np.ndarray, camera: Camera, *, samp
         total = e[0][inside] + e[1][inside] + e[2][inside]
         face = pair_face[inside]
         depth = volume[face] / np.where(total == 0, np.inf, total)
-        hit = depth > _CLOSEST
+        hit = depth > near
         # Positive floats order like their bits, so one integer minimum finds the nearest hit and settles ties by index.
         key = (depth[hit].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | face[hit].astype(
             np.uint64
@@ -96,15 +101,16 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _sample_boxes(
-    local: np.ndarray, faces: np.ndarray, camera: Camera, samples: int, width: int, height: int
+    local: np.ndarray, faces: np.ndarray, camera: Camera, samples: int, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The triangles [n] that may cover a sample, the first (x, y) [n, 2] of each and the end of its box (exclusive).
 
     Most faces of a fine mesh lie between two columns or two rows of samples. Bounds are rounded once a vertex.
     """
-    ahead = local[:, 2] > _CLOSEST
+    ahead = local[:, 2] > near
     safe = np.where(ahead, local[:, 2], 1.0)
-    size, focal, center = (width, height), (camera.fx, camera.fy), (camera.cx, camera.cy)
+    size = camera.width * samples, camera.height * samples
+    focal, center = (camera.fx, camera.fy), (camera.cx, camera.cy)
     met, crossing = np.arange(len(faces)), np.zeros(0, np.int64)
     if not ahead.all():
         corners = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
@@ -121,7 +127,7 @@ def _sample_boxes(
         some = high > low
         met, bounds = met[some], [*(bound[some] for bound in bounds), low[some], high[some]]
     for axis in range(2):
-        low, high = _reach(local[faces[crossing]], axis, focal[axis], center[axis])
+        low, high = _reach(local[faces[crossing]], axis, focal[axis], center[axis], near)
         first = np.clip(np.ceil(low * samples - 0.5 - _MARGIN), 0, size[axis]).astype(np.int32)
         end = np.clip(np.floor(high * samples - 0.5 + _MARGIN) + 1, 0, size[axis]).astype(np.int32)
         some = end > first
@@ -133,20 +139,20 @@ def _sample_boxes(
     return every[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
 
 
-def _reach(corners: np.ndarray, axis: int, focal: float, center: float) -> tuple[np.ndarray, np.ndarray]:
+def _reach(corners: np.ndarray, axis: int, focal: float, center: float, near: float) -> tuple[np.ndarray, np.ndarray]:
     """Between which pixels [n], [n] of an axis the part of triangles [n, 3, 3] lies that is ahead of the camera.
 
     A triangle that crosses the plane where hits begin is cut there; what is left is as wide as its corners. Of a room,
     which is all around, thousands cross it, and nearly all of them beside the picture.
     """
     z = corners[:, :, 2]
-    ahead = z > _CLOSEST
+    ahead = z > near
     pixels = [np.where(ahead, corners[:, :, axis] / np.where(ahead, z, 1.0), np.nan)]  # [n, 3]
     for i, j in ((0, 1), (1, 2), (2, 0)):
         cut = ahead[:, i] != ahead[:, j]
-        share = (_CLOSEST - z[:, i]) / np.where(cut, z[:, j] - z[:, i], 1.0)
+        share = (near - z[:, i]) / np.where(cut, z[:, j] - z[:, i], 1.0)
         at = corners[:, i, axis] + share * (corners[:, j, axis] - corners[:, i, axis])
-        pixels.append(np.where(cut, at / _CLOSEST, np.nan)[:, None])
+        pixels.append(np.where(cut, at / near, np.nan)[:, None])
     places = np.concatenate(pixels, axis=1) * focal + center  # [n, 6], three or four of them numbers
     return np.fmin.reduce(places, axis=1), np.fmax.reduce(places, axis=1)
 

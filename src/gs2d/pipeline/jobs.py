@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from gs2d.core.camera import Camera
+from gs2d.core.extras import FFMPEG
 from gs2d.core.files import check_writable
 from gs2d.core.images import write_image
 from gs2d.data import View
@@ -124,7 +125,7 @@ def render_run(
 ) -> dict[str, Any]:
     """Render the views of a split, ``orbit`` frames of a circle or ``flight`` frames past the photographs, as PNGs.
 
-    Frames of a circle or a flight can be made a film too: ``video`` names it, ``fps`` frames a second. All are in the
+    Frames of a circle or a flight can be made a video too: ``video`` names it, ``fps`` frames a second. All are in the
     mean exposure of the photographs, or in that of the training photograph ``exposure_of``.
 
     Raises
@@ -134,7 +135,9 @@ def render_run(
     from gs2d.io.video import write_video
 
     path, out, video = Path(path), None if out is None else Path(out), None if video is None else Path(video)
-    moving = check_frames(orbit, flight, video, fps)
+    asked, (moving, video) = video, check_frames(orbit, flight, video, fps)
+    if video is not None and video != asked and video.suffix == ".webp":
+        on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
     run, job, splats = open_job(path, threads, on_event)
     transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, job.recipe))
     views: list[tuple[str, View]]
@@ -178,7 +181,7 @@ def render_run(
         result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
         if video is None:
             return result
-        on_event(Phase("compressing the film", len(views)))
+        on_event(Phase("compressing the video", len(views)))
         frames = [folder / f"{name}.png" for name, _ in views]
         with attempted(str(video), again("render", path, f"--{moving}", len(views), "--video", video), on_event):
             threads = torch.get_num_threads()
@@ -198,8 +201,10 @@ def _alone_in(folder: Path) -> Iterator[None]:
         yield
 
 
-def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> str:
-    """What moves: "orbit", "flight" or nothing; raises for what makes no film, before anything is loaded.
+def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tuple[str, Path | None]:
+    """Return what moves ("orbit", "flight" or nothing) and the video's whole name.
+
+    Raises for what makes no video, before anything is loaded.
 
     Raises
     ------
@@ -213,13 +218,13 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> str
     if orbit and flight:
         raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; give one")
     if video is None and fps != FPS:
-        raise RunError(f"--fps {fps:g} is of a film, and no --video was given; give both")
+        raise RunError(f"--fps {fps:g} is of a video, and no --video was given; give both")
     if video is not None:
         if not (orbit or flight):
             raise RunError("--video needs frames that move, got neither --orbit N nor --flight N; give one")
-        check_video(video, fps, orbit or flight)
+        video = check_video(video, fps, orbit or flight)
         check_writable(video)
-    return "orbit" if orbit else "flight" if flight else ""
+    return "orbit" if orbit else "flight" if flight else "", video
 
 
 def _spare_photographs(files: Sequence[Path], option: str, job: Job) -> None:

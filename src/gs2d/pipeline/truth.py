@@ -169,7 +169,6 @@ def _score_visible(
         seen=truth.seen,
         T_truth_mesh=job.scene.T_metric_scene,
         thresholds=options.thresholds or None,
-        device=job.backend.device,
     )
     facts = asdict(replace(score, clouds=None))
     facts.pop("clouds")

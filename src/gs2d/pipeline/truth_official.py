@@ -33,7 +33,7 @@ def score_dtu(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job
     """
     truth = read_dtu_truth(scene.scan or 0, files)
     silhouettes, T = _silhouettes(job), job.scene.T_metric_scene
-    score = evaluate_dtu(mesh, silhouettes, T, truth, device=job.backend.device)
+    score = evaluate_dtu(mesh, silhouettes, T, truth)
     return {
         "evaluator": "dtu",
         "unit": "mm",
@@ -81,7 +81,6 @@ def score_tnt(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job
         read_tnt_truth(scene.name, files),
         scene.tau,
         published=read_trajectory(log) if log is not None and log.is_file() and log.stat().st_size else None,
-        device=job.backend.device,
     )
     row = {"threshold": score.tau, "precision": score.precision, "recall": score.recall, "f_score": score.f_score}
     return {

@@ -21,6 +21,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from gs2d.core.extras import FFMPEG
 from gs2d.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv")
@@ -59,7 +60,7 @@ def look_into(path: Path) -> Video:
         if shutil.which(program) is None:
             raise DataError(
                 f"{path} is a video, whose frames are taken by ffmpeg, and there is no {program} on the PATH; install "
-                "it (apt install ffmpeg, brew install ffmpeg, ffmpeg.org), or give a folder of photographs"
+                f"it ({FFMPEG}), or give a folder of photographs"
             )
     entries = "stream=nb_read_packets,color_transfer"
     words = ["ffprobe", "-v", "error", "-select_streams", "V:0", "-count_packets", "-show_entries", entries]

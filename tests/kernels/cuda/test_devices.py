@@ -27,7 +27,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 ctypes.CDLL(sys.argv[1])
 sys.path.insert(0, sys.argv[2])
 
-from gs2d.kernels.cuda import adam, arguments, launch, nearest, losses as ops
+from gs2d.kernels.cuda import adam, arguments, launch, losses as ops
 from gs2d.render import cuda, pair_budget as cuda_budget, cuda_passes
 from gs2d.render.backends import Backend
 
@@ -40,7 +40,7 @@ def fill(structure, **tensors):
             assert tensor.is_contiguous(), name
             pointers[0] += 1
 
-for module in (adam, arguments, nearest, ops):
+for module in (adam, arguments, ops):
     module.fill = fill
 cuda_passes._fill = lambda structure, tensors: fill(structure, **tensors)
 launcher = SimpleNamespace(launch=lambda name, *rest: launched.add(name))
@@ -92,7 +92,6 @@ print(sorted(devices), sorted(launched), pointers[0])
 GRADIENTS = """
 import numpy as np
 from render_scenes import front_camera
-from gs2d.evaluation import distance, visibility
 from gs2d.render.types import RasterSettings
 
 class Context:
@@ -129,10 +128,6 @@ with FakeTensorMode():
         there_and_back(ops._NormalConsistency, (True, True, True), image, plane, plane, mask, camera, form, launcher)
     there_and_back(ops._MaskedMean, (True,), plane, mask, launcher)
     cuda_passes.errors(launcher, view, splats, image, mask)
-    points = rand(50, 3).double()
-    near = nearest.find_nearest(nearest.build_tree(points), points, launcher=launcher, neighbours=8)
-    near += (distance._triangle_distances(points, rand(50, 3, 3).double()), *visibility._in_image(points, camera))
-    fill(None, **{str(k): tensor.contiguous() for k, tensor in enumerate(near)})
     print(sorted(launched), pointers[0])
     torch.argsort = lambda x, **_: torch.arange(len(x))  # in host memory
     try:
@@ -161,10 +156,6 @@ def test_an_iteration_of_each_stage_stays_on_the_device(said: list[str]) -> None
 def test_gradients_and_splat_errors_stay_on_the_device(said: list[str]) -> None:
     for kernel in ("blend_vjp_distortion_abs", "blend_vjp_learning", "sum_slots", "photometric_vjp", "splat_errors"):
         assert f"'{kernel}'" in said[1]
-
-
-def test_neighbours_and_visibility_stay_on_the_device(said: list[str]) -> None:
-    assert "'nearest_8'" in said[1]
 
 
 def test_a_tensor_of_the_host_is_found(said: list[str]) -> None:

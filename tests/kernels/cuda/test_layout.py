@@ -13,7 +13,7 @@ import pytest
 
 from gs2d.errors import BackendError
 from gs2d.kernels import tsdf as fusion
-from gs2d.kernels.cuda import arguments, compile, nearest
+from gs2d.kernels.cuda import arguments, compile
 
 pytestmark = pytest.mark.timeout(120)
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\((\w+)(<float>)? ')
@@ -23,7 +23,7 @@ CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "c
 def structures() -> dict[str, type[ctypes.Structure]]:
     """By name."""
     found = {}
-    for module in (arguments, nearest, fusion):
+    for module in (arguments, fusion):
         for name, value in vars(module).items():
             if isinstance(value, type) and issubclass(value, ctypes.Structure):
                 found[name.lstrip("_")] = value

@@ -43,7 +43,6 @@ from render_scenes import contraction, random_cotangents
 
 from gs2d.kernels.cuda import losses as ops
 from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
-from gs2d.kernels.cuda.nearest import NEIGHBOURS, build_tree, choose_spread, find_nearest
 from gs2d.render import cuda
 from gs2d.core.splats import Splats
 
@@ -85,12 +84,6 @@ for columns in ((3,), (15, 3), ()):
     for choice in ({}, {"trained": trained}, {"rows": index}):
         adam_step([AdamUpdate(*tensors, gradient, 0.1, 1, **choice)], **settings)
     adam_step([AdamUpdate(*tensors, gradient[index], 0.1, 1, rows=index, compact=True)], **settings)
-
-for count in (0, 1, 8, 9, 300):
-    points = torch.rand(count, 3, dtype=torch.float64)
-    for neighbours in NEIGHBOURS:
-        find_nearest(build_tree(points), torch.rand(37, 3).double(), launcher=emulator, neighbours=neighbours)
-    choose_spread(points, 0.1, launcher=emulator)
 print("all done")
 """
 

@@ -1,0 +1,35 @@
+"""Nearest neighbours: as far as asked for, and never of numbers that are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gs2d.errors import DataError
+from gs2d.evaluation.nearest import Cloud
+
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
+
+
+def test_the_nearest_come_first_and_what_is_missing_is_infinitely_far() -> None:
+    distances, index = Cloud(POINTS).nearest(np.array([[0.9, 0, 0]]), neighbours=4)
+    np.testing.assert_allclose(distances, [[0.1, 0.9, 2.1, np.inf]], atol=1e-12)
+    assert index.tolist() == [[1, 0, 2, 3]]
+    distances, index = Cloud(POINTS).nearest(np.array([[0.9, 0, 0], [9, 0, 0]]), limit=0.5)
+    assert index.tolist() == [[1], [3]]
+    assert distances[:, 0].tolist() == [pytest.approx(0.1), np.inf]
+
+
+def test_a_cloud_of_no_points_has_no_nearest() -> None:
+    distances, index = Cloud(POINTS[:0]).nearest(POINTS)
+    assert np.isinf(distances).all()
+    assert index.tolist() == [[0]] * 3
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_is_refused(bad: float) -> None:
+    broken = np.array([[0.0, bad, 0]])
+    with pytest.raises(DataError, match="finite points were expected"):
+        Cloud(broken)
+    with pytest.raises(DataError, match="finite queries were expected"):
+        Cloud(POINTS).nearest(broken)
