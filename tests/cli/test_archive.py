@@ -86,5 +86,5 @@ def test_info_looks_into_an_archive_and_leaves_nothing(
     assert (facts["capture"], facts["format"], facts["training views"]) == (str(path), "blender", 3)
     path.write_bytes(path.read_bytes()[:1000])
     assert run(["info", str(path)]) == 2
-    assert "must be a ZIP file, got" in one_line(capsys.readouterr().err)
+    assert "must be a whole ZIP file" in one_line(capsys.readouterr().err)
     assert list((tmp_path / "temporary").iterdir()) == []

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from gs2d.data import detect_format, load_scene
-from gs2d.data.archive import is_archive
+from gs2d.data.archive import is_archive, unpack
 from gs2d.data.benchmarks import missing_lines
 from gs2d.errors import DataError
 from gs2d.io.formats.registry import is_splat_file, read_splat_file
 from gs2d.io.splat_ply import ply_kind, read_mesh, read_points
-from gs2d.pipeline.archive import unpacked_for_a_look
 
 _OF_CAPTURES = (".json", ".xml", ".sfm", ".npz", ".bin", ".txt")
 
@@ -24,8 +24,8 @@ def describe_capture(path: Path) -> dict[str, Any]:
     DataError
     """
     if is_archive(path):
-        with unpacked_for_a_look(path) as root:
-            return {**describe_capture(root), "capture": str(path)}
+        with tempfile.TemporaryDirectory(prefix="gs2d-") as home:
+            return {**describe_capture(unpack(path, Path(home))), "capture": str(path)}
     scene = load_scene(path, format=detect_format(path))
     sizes = sorted({(view.camera.width, view.camera.height) for view in scene.views})
     facts: dict[str, Any] = {

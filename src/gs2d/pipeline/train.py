@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 from gs2d.core.memory import hold
 from gs2d.core.splats import Splats
-from gs2d.data.archive import is_archive
+from gs2d.data.archive import is_archive, unpack
 from gs2d.errors import RecipeError, RunError
-from gs2d.io.run_dir import MESH, PAGE, REPORT, SPLATS, VERDICT, RunFolder, check_claim, claim_run, is_run, make_folder
+from gs2d.io.run_dir import (
+    MESH,
+    PAGE,
+    REPORT,
+    SPLATS,
+    VERDICT,
+    RunFolder,
+    check_claim,
+    claim_run,
+    is_run,
+    make_folder,
+    remove_made,
+)
 from gs2d.io.splat_ply import write_splats
-from gs2d.pipeline.archive import train_archive
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.evaluate import Visitor
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
-from gs2d.pipeline.job import Job, check_same_run, prepare
+from gs2d.pipeline.job import Job, check_same_run, check_train_options, prepare
 from gs2d.pipeline.jobs import report_run
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release
@@ -35,6 +48,8 @@ from gs2d.pipeline.verdict.measures import Collector
 from gs2d.pipeline.watch import Watch
 from gs2d.training import events
 from gs2d.viewer.server import free_port, required_viser
+
+UNPACKED = "unpacked"  # in the run folder: what came as a ZIP file
 
 
 def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
@@ -60,7 +75,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         Anything that the user can mend.
     """
     if is_archive(options.scene):
-        return train_archive(options, on_event, train)
+        return _train_archive(options, on_event)
     check_viewer(options)
     claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": options.allowed}
     check_claim(options.out, **claim)  # type: ignore[arg-type]
@@ -99,6 +114,24 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
             finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
     return run
+
+
+def _train_archive(options: TrainOptions, on_event: OnEvent) -> RunFolder:
+    """Train on a capture in a ZIP file, which is unpacked into the run folder, where later commands find it."""
+    options = replace(options, allowed=(*options.allowed, UNPACKED), title=options.title or options.scene.stem)
+    check_train_options(options)
+    check_claim(options.out, resume=options.resume, overwrite=options.overwrite, allowed=options.allowed)
+    home = options.out / UNPACKED
+    made = make_folder(home)
+    try:
+        on_event(Phase(f"unpacking {options.scene.name}", 0))
+        return train(replace(options, scene=unpack(options.scene, home)), on_event)
+    finally:  # what the run is not of goes: all of it where there is no run, the older one where a run was replaced
+        used = RunFolder(options.out).definition()["scene"]["path"] if is_run(options.out) else ""
+        for folder in home.iterdir():
+            if folder.resolve() not in Path(used).resolve().parents:
+                shutil.rmtree(folder, ignore_errors=True)
+        remove_made((home, *made))
 
 
 @contextmanager
