@@ -19,8 +19,8 @@ import numpy as np
 
 from gs2d.data.scene import Scene
 from gs2d.evaluation.distance import distances_to_mesh
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.io.splat_ply import read_mesh
 from gs2d.pipeline.job import reload_job
 
 WITHIN = (0.5, 1.0, 2.0, 5.0)  # px

@@ -20,8 +20,9 @@ import torch
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import SPLATS, open_run
-from gs2d.io.splat_ply import read_mesh, read_splats
+from gs2d.io.splat_ply import read_splats
 from gs2d.meshing.raycast import cast_camera
 from gs2d.pipeline.job import Job, reload_job
 from gs2d.render.api import rasterize

@@ -29,8 +29,8 @@ from gs2d.data.subject import find_subject
 from gs2d.errors import DataError
 from gs2d.evaluation.hidden_points import hidden_points, total
 from gs2d.evaluation.images import ImageMetrics
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
-from gs2d.io.splat_ply import read_mesh
 from gs2d.meshing.depth_maps import depth_map
 from gs2d.meshing.evidence import gather, pixels
 from gs2d.pipeline.evaluate import score_views

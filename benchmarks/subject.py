@@ -28,8 +28,8 @@ from gs2d.data import View
 from gs2d.data.build import Decoder
 from gs2d.data.readers.colmap import find_mask
 from gs2d.errors import DataError, Gs2dError
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.io.splat_ply import read_mesh
 from gs2d.pipeline.job import reload_job
 
 HALF = 0.5  # of the photographs that have a face in frame, which must have it in the mask

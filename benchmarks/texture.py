@@ -23,8 +23,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.images import write_image
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.data import View
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.io.splat_ply import read_mesh
 from gs2d.meshing.bake import bilinear
 from gs2d.meshing.raycast import Hits, cast_camera
 from gs2d.pipeline.finished import finished_splats

@@ -235,18 +235,6 @@ def test_importing_a_module_has_no_side_effect_on_torch() -> None:
     run_python(code)
 
 
-FORBIDDEN = {"plyfile", "pymeshlab", "open3d", "torchvision", "numba", "cv2", "trimesh", "skimage", "torchmetrics"}
-
-
-@pytest.mark.parametrize("path", FILES, ids=module_of)
-def test_only_the_declared_dependencies_are_imported(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-        for name in names:
-            assert name.split(".")[0] not in FORBIDDEN, f"{module_of(path)} imports {name}"
-
-
 def test_tests_lie_where_their_modules_lie() -> None:
     """``helpers`` is what they share, ``benchmarks`` tests what is beside the package, ``gpu`` needs a device."""
     root = Path(__file__).parent

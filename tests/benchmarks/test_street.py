@@ -17,7 +17,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.images import write_image
 from gs2d.core.mesh import Mesh
 from gs2d.evaluation.images import ImageMetrics, Metric
-from gs2d.io.splat_ply import write_mesh
+from gs2d.io.meshes import write_mesh
 
 
 def process(command: list[str], exit_code: int = 0) -> Process:

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from benchmarks import texture
 
 from cli_runs import one_line
 from gs2d.cli import run
 from gs2d.core.mesh import Mesh
 from gs2d.core.transforms import up_direction
-from gs2d.io.splat_ply import read_mesh, write_mesh
+from gs2d.io.meshes import read_mesh, write_mesh
 from tiny import RADIUS, ball_cameras, write_ball_mesh
 
 pytest.importorskip("xatlas", reason="xatlas is not installed (extra `texture`)")
@@ -33,7 +34,6 @@ def ball(trained: Path, tmp_path: Path) -> Path:
 def test_the_runs_mesh_gets_a_texture_of_what_the_photographs_show(
     ball: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    trimesh = pytest.importorskip("trimesh")
     before = (ball / "mesh.ply").read_bytes()
     assert run(["mesh", str(ball), "--texture", "--threads", "1"]) == 0
     out, _ = capsys.readouterr()

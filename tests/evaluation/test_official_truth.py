@@ -17,7 +17,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.data import load_scene
 from gs2d.errors import DataError
 from gs2d.evaluation.surface import evaluate_surface
-from gs2d.io.splat_ply import read_points, write_mesh
+from gs2d.io.meshes import read_points, write_mesh
 from gs2d.pipeline.events import Event, Notice, ignore
 from gs2d.pipeline.options import EvaluateOptions
 from gs2d.pipeline.truth import OfficialTruth, Truth, choose_truth, score_surface

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
@@ -15,7 +16,7 @@ from gs2d.errors import DataError
 from gs2d.evaluation.distance import distances_to_mesh, face_areas, point_triangle_distances, sample_surface
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.evaluation.visibility import frustum_counts, visible_counts
-from gs2d.io.splat_ply import read_mesh
+from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import cast_camera
 
 
@@ -69,7 +70,6 @@ def test_distances_to_a_mesh_are_exact_whatever_the_size_of_its_faces(cells: int
 
 
 def test_distances_agree_with_trimesh_on_a_crumpled_mesh() -> None:
-    trimesh = pytest.importorskip("trimesh")
     rng = np.random.default_rng(1)
     mesh = square(0.0, cells=12)
     crumpled = Mesh(mesh.vertices + rng.normal(0, 0.03, mesh.vertices.shape), mesh.faces)

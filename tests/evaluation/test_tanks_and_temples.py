@@ -15,7 +15,7 @@ from gs2d.evaluation.crop import CropVolume, box
 from gs2d.evaluation.surface_clouds import FAR, GOOD, OUT, ScoredClouds, distance_colors, picture, write_clouds
 from gs2d.evaluation.tanks_and_temples import TntScore, evaluate_tnt, f_score, point_set
 from gs2d.evaluation.tanks_and_temples_files import TntTruth
-from gs2d.io.splat_ply import read_points
+from gs2d.io.meshes import read_points
 from oracle_scenes import TAU, TntScene, grid_mesh, hills, moved, similarity, tnt_scene
 
 NAMES = [f"{i + 1:06d}.jpg" for i in range(60)]

@@ -12,7 +12,7 @@ from gs2d.core.camera import look_at
 from gs2d.core.images import write_image
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
-from gs2d.io.splat_ply import write_mesh
+from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
 from gs2d.report.images import depth_picture, error_picture, highlight_picture, normal_picture
 from gs2d.synthetic.shapes import torus_knot, tube

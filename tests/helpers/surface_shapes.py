@@ -102,3 +102,10 @@ def orbit(count: int, distance: float, size: int = 96, focal: float = 120.0) -> 
 
 def sphere_frames(cameras: list[Camera], radius: float = 1.0) -> list[Frame]:
     return [Frame(camera, sphere_depth(camera, radius)) for camera in cameras]
+
+
+def tetrahedron(colors: bool = True, dtype: type = np.float32) -> Mesh:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=dtype)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
+    rgb = np.array([[0, 1, 2], [255, 4, 5], [6, 7, 8], [9, 10, 255]], np.uint8)
+    return Mesh(vertices, faces, rgb if colors else None)

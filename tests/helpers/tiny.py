@@ -56,7 +56,7 @@ def write_capture(folder: Path, *, train: int = 6, test: int = 2, size: int = SI
 def write_ball_mesh(path: Path, rings: int = 24) -> None:
     """The ball's surface as a PLY mesh."""
     from gs2d.core.mesh import Mesh
-    from gs2d.io.splat_ply import write_mesh
+    from gs2d.io.meshes import write_mesh
 
     theta, phi = np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False)
     t, p = np.meshgrid(theta, phi, indexing="ij")

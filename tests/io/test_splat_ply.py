@@ -1,4 +1,4 @@
-"""PLY and OBJ files: what is written comes back, and every other kind of file is named for what it is."""
+"""PLY files: what is written comes back, and every other kind of file is named for what it is."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
-from gs2d.errors import DataError, DiskError
+from gs2d.errors import DataError
+from gs2d.io.meshes import read_mesh, read_points, write_mesh
 from gs2d.io.ply_format import PlyList, read_ply, write_ply
-from gs2d.io.splat_ply import ply_kind, read_mesh, read_points, read_splats, triangulate, write_mesh, write_splats
+from gs2d.io.splat_ply import ply_kind, read_splats, write_splats
+from surface_shapes import tetrahedron
 
 
 def random_splats(n: int, degree: int, seed: int = 0) -> Splats:
@@ -22,13 +23,6 @@ def random_splats(n: int, degree: int, seed: int = 0) -> Splats:
     shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 2), "opacity_logits": (n,), "sh0": (n, 1, 3)}
     shapes["shN"] = (n, k - 1, 3)
     return Splats(**{a: torch.randn(s, generator=g) for a, s in shapes.items()})
-
-
-def tetrahedron(colors: bool = True, dtype: type = np.float32) -> Mesh:
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=dtype)
-    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
-    rgb = np.array([[0, 1, 2], [255, 4, 5], [6, 7, 8], [9, 10, 255]], np.uint8)
-    return Mesh(vertices, faces, rgb if colors else None)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -112,39 +106,6 @@ def test_an_odd_number_of_sh_coefficients_is_refused(tmp_path: Path) -> None:
     (tmp_path / "b.ply").write_bytes(data)
     with pytest.raises(DataError, match="got 8"):
         read_splats(tmp_path / "b.ply")
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("colors", [True, False])
-def test_a_mesh_comes_back(tmp_path: Path, dtype: type, colors: bool) -> None:
-    mesh = tetrahedron(colors, dtype)
-    write_mesh(tmp_path / "a.ply", mesh)
-    back = read_mesh(tmp_path / "a.ply")
-    assert back.vertices.dtype == dtype
-    np.testing.assert_array_equal(back.vertices, mesh.vertices)
-    np.testing.assert_array_equal(back.faces, mesh.faces)
-    assert (back.colors is None) if mesh.colors is None else np.array_equal(back.colors, mesh.colors)
-
-
-def test_a_mesh_file_has_only_the_vertex_list_on_faces_and_colours_on_vertices(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "a.ply", tetrahedron())
-    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode().splitlines()
-    assert header[1] == "format binary_little_endian 1.0"
-    assert header[-5:] == [
-        "property uchar red",
-        "property uchar green",
-        "property uchar blue",
-        "element face 4",
-        "property list uchar int vertex_indices",
-    ]
-
-
-def test_trimesh_reads_our_mesh(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    write_mesh(tmp_path / "a.ply", tetrahedron())
-    back = trimesh.load(tmp_path / "a.ply", process=False)
-    assert back.volume == pytest.approx(1 / 6)  # positive: the faces look outward
-    assert back.visual.vertex_colors[1].tolist() == [255, 4, 5, 255]
 
 
 MIXED = """ply
@@ -247,13 +208,6 @@ def test_a_count_or_number_that_cannot_be_is_a_data_error(tmp_path: Path, kind: 
         read_mesh(file)
 
 
-def test_an_empty_mesh_comes_back_empty(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "x.ply", Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))
-    mesh = read_mesh(tmp_path / "x.ply")
-    assert (len(mesh.vertices), len(mesh.faces)) == (0, 0)
-    assert ply_kind(tmp_path / "x.ply") == "mesh"
-
-
 def test_a_missing_file_is_a_data_error(tmp_path: Path) -> None:
     for read in (read_ply, read_splats, read_mesh, read_points):
         with pytest.raises(DataError, match="cannot be read"):
@@ -262,57 +216,9 @@ def test_a_missing_file_is_a_data_error(tmp_path: Path) -> None:
         read_mesh(tmp_path / "none.obj")
 
 
-def test_a_face_that_names_no_vertex_is_a_data_error(tmp_path: Path) -> None:
-    mesh = tetrahedron()
-    write_mesh(tmp_path / "a.ply", Mesh(mesh.vertices[:3], mesh.faces))
-    with pytest.raises(DataError, match="below 3 were expected, got 3"):
-        read_mesh(tmp_path / "a.ply")
-
-
-def test_points_are_no_mesh(tmp_path: Path) -> None:
-    write_splats(tmp_path / "a.ply", random_splats(3, 0))
-    with pytest.raises(DataError, match="without faces"):
-        read_mesh(tmp_path / "a.ply")
-
-
-def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(DiskError):
-        write_mesh(tmp_path / "no such folder" / "a.ply", tetrahedron())
-    write_mesh(tmp_path / "a.ply", tetrahedron())
-    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
-
-
-def test_polygons_become_fans() -> None:
-    faces = triangulate(np.array([2, 5, 3]), np.array([0, 1, 10, 11, 12, 13, 14, 20, 21, 22]))
-    assert faces.tolist() == [[10, 11, 12], [10, 12, 13], [10, 13, 14], [20, 21, 22]]
-
-
 def test_equal_lists_and_ragged_lists_read_alike(tmp_path: Path) -> None:
     write_mesh(tmp_path / "a.ply", tetrahedron())
     fast = read_ply(tmp_path / "a.ply").elements["face"].properties["vertex_indices"]
     assert isinstance(fast, PlyList)
     assert fast.counts.tolist() == [3, 3, 3, 3]
     assert fast.values.tolist() == tetrahedron().faces.reshape(-1).tolist()
-
-
-def test_obj_faces_with_texture_indices_negative_indices_and_polygons_are_read(tmp_path: Path) -> None:
-    (tmp_path / "a.obj").write_text(
-        "# a comment\nmtllib none.mtl\nv 0 0 0\nv 1 0 0 0.5 0.5 0.5\nv 1 1 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n"
-        "f 1/1/1 2//1 3/1 4 # a square\nf -4 -3 -2\n"
-    )
-    mesh = read_mesh(tmp_path / "a.obj")
-    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2]]
-
-
-@pytest.mark.parametrize("text", ["v 0 0\n", "v 0 0 0\nf 1 2 x\n", "v 0 0 0\nf 1 2 3\n", "v 0 0 0\n"])
-def test_a_broken_obj_is_a_data_error(tmp_path: Path, text: str) -> None:
-    (tmp_path / "a.obj").write_text(text)
-    with pytest.raises(DataError):
-        read_mesh(tmp_path / "a.obj")
-
-
-def test_real_meshes_are_read(shared: Callable[[str], Path]) -> None:
-    mesh = read_mesh(shared("rendered_bottle") / "mesh_gt.ply")
-    assert (len(mesh.vertices), len(mesh.faces)) == (20341, 40670)
-    assert np.allclose(mesh.vertices.min(0), [-0.9, -0.9, -0.85], atol=1e-3)

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.evaluation.surface import evaluate_surface
-from gs2d.io.splat_ply import read_mesh
+from gs2d.io.meshes import read_mesh
 from gs2d.meshing.depth_maps import Frame
 from gs2d.meshing.extract import extract
 
@@ -30,7 +31,6 @@ def cameras_of(folder: Path) -> list[Camera]:
 
 def ray_cast(mesh: Mesh, camera: Camera) -> np.ndarray:
     """z-depth [H, W] by trimesh and Embree; 0 where nothing is hit."""
-    trimesh = pytest.importorskip("trimesh")
     pyembree = pytest.importorskip("trimesh.ray.ray_pyembree")
     caster = pyembree.RayMeshIntersector(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     v, u = np.mgrid[0:SIZE, 0:SIZE] + 0.5

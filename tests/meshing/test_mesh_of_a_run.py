@@ -14,8 +14,8 @@ import pytest
 from gs2d.cli import main
 from gs2d.core.json_files import write_json
 from gs2d.errors import ProtocolError, RunError
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
-from gs2d.io.splat_ply import read_mesh
 from gs2d.kernels.library import available_variants
 from gs2d.meshing.integrate import Add, integrator
 from gs2d.meshing.volume import Volume

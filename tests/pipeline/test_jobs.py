@@ -17,8 +17,9 @@ from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import DataError, DiskError, ProtocolError, RecipeError, RunError
+from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.run_dir import RunFolder, open_run
-from gs2d.io.splat_ply import read_mesh, read_splats, write_mesh, write_splats
+from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.events import Event, StageDone, Step
 from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions

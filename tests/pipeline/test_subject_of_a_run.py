@@ -14,8 +14,9 @@ import torch
 from gs2d.config.protocols import PROTOCOLS
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, ProtocolError, RunError
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
-from gs2d.io.splat_ply import read_mesh, read_splats
+from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import protocol_from_json, reload_job

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from gs2d.core.camera import Camera, look_at
 from gs2d.data import load_scene
 from gs2d.errors import DataError, DiskError
-from gs2d.io.splat_ply import read_mesh
+from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import NEAR, _sample_boxes, cast_camera, occluded
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic import shapes

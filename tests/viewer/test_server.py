@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh, TexturedMesh
@@ -24,7 +25,7 @@ from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.registry import LAYOUTS, write_layout
-from gs2d.io.textured import glb_bytes, glb_turn, write_textured
+from gs2d.io.meshes import glb_bytes, glb_turn, write_textured
 from gs2d.pipeline.view import ViewOptions, open_viewer
 from gs2d.viewer.exact import Drawn, ExactPictures, Frame, camera_of
 from gs2d.viewer.server import free_port, quaternion, thumbnail
@@ -232,7 +233,6 @@ def test_thumbnails_are_small_and_lie_over_the_background() -> None:
 
 
 def test_a_coloured_mesh_becomes_a_glb_with_its_colours(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
     colors = np.array([[255, 0, 0], [0, 188, 0], [12, 0, 255]], np.uint8)
     mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), colors)
     (tmp_path / "a.glb").write_bytes(glb_bytes(mesh))

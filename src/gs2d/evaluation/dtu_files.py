@@ -10,7 +10,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from gs2d.errors import DataError
-from gs2d.io.splat_ply import read_points
+from gs2d.io.meshes import read_points
 
 
 @dataclass(frozen=True, eq=False)

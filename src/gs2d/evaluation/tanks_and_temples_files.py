@@ -12,7 +12,7 @@ import numpy as np
 from gs2d.core.images import natural_key
 from gs2d.errors import DataError
 from gs2d.evaluation.crop import CropVolume, read_crop
-from gs2d.io.splat_ply import read_points
+from gs2d.io.meshes import read_points
 
 
 @dataclass(frozen=True, eq=False)

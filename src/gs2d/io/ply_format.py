@@ -41,6 +41,12 @@ class PlyElement:
     count: int
     properties: Mapping[str, np.ndarray | PlyList]
 
+    def scalar(self, name: str) -> np.ndarray:
+        """Return a property [count] of scalars that is known to be there."""
+        column = self.properties[name]
+        assert isinstance(column, np.ndarray), name
+        return column
+
     def scalars(self, *names: str) -> np.ndarray | None:
         """The named scalar properties as float64 columns [count, len(names)], or None where one is missing."""
         columns = [self.properties.get(name) for name in names]

@@ -1,35 +1,23 @@
-"""Splats, meshes and point clouds as PLY files.
+"""Splats as PLY files.
 
-Splats are raw (before activation). The official 2DGS layout has two scales; common viewers know only the 3DGS layout,
+They are raw (before activation). The official 2DGS layout has two scales; common viewers know only the 3DGS layout,
 whose third scale we write as ``log 1e-6``: a disk with no thickness, its normal along the third axis in both.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians
-from gs2d.io.obj import read_obj
-from gs2d.io.ply_format import PlyElement, PlyFile, PlyList, read_ply, write_ply
+from gs2d.io.ply_format import PlyElement, PlyFile, read_ply, write_ply
 
 _ROT = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FIXED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", *_ROT)
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """A point cloud as a file holds it: ``points`` [P, 3] float64 wu, ``colors`` and ``normals`` or None."""
-
-    points: np.ndarray
-    colors: np.ndarray | None = None  # [P, 3] uint8
-    normals: np.ndarray | None = None  # [P, 3] float64
 
 
 def splat_fields(n_rest: int, *, layout: str) -> list[str]:
@@ -117,7 +105,7 @@ def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...]) -> di
     def columns(*wanted: str) -> torch.Tensor:
         table = np.empty((vertex.count, len(wanted)), np.float32)
         for i, name in enumerate(wanted):
-            table[:, i] = _scalar(vertex, name)
+            table[:, i] = vertex.scalar(name)
         return torch.from_numpy(table)
 
     return {
@@ -150,12 +138,6 @@ def ply_kind(path: str | os.PathLike[str]) -> str:
     return "mesh" if faces is not None and (faces.count > 0 or empty) else "points"
 
 
-def _scalar(vertex: PlyElement, name: str) -> np.ndarray:
-    column = vertex.properties[name]
-    assert isinstance(column, np.ndarray), name  # its callers have looked
-    return column
-
-
 def _splat_element(path: object, file: PlyFile) -> PlyElement:
     """The vertex element of a 2DGS file, or an error that says what the file is instead."""
     vertex = file.elements.get("vertex")
@@ -173,93 +155,3 @@ def _splat_element(path: object, file: PlyFile) -> PlyElement:
     if missing:
         raise DataError(f"{expected}, the properties {', '.join(missing)} are missing; export the splats again")
     return vertex
-
-
-def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
-    """Write a triangle mesh, atomically: float32 or float64 vertices as they are, uchar vertex colours.
-
-    The vertex list is the only property of a face, which is all that common readers understand.
-
-    Raises
-    ------
-    DiskError
-        If the file could not be written.
-    """
-    real = "<f8" if mesh.vertices.dtype == np.float64 else "<f4"
-    fields = [(name, real) for name in "xyz"]
-    if mesh.colors is not None:
-        fields += [(name, "u1") for name in ("red", "green", "blue")]
-    vertices = np.empty(len(mesh.vertices), dtype=fields)
-    _fill(vertices, ("x", "y", "z"), mesh.vertices)
-    if mesh.colors is not None:
-        _fill(vertices, ("red", "green", "blue"), mesh.colors)
-    faces = np.empty(len(mesh.faces), dtype=[("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = mesh.faces
-    write_ply(path, {"vertex": vertices, "face": faces})
-
-
-def read_mesh(path: str | os.PathLike[str]) -> Mesh:
-    """Read a mesh from PLY or OBJ; polygons become triangle fans, other properties are passed over.
-
-    Returns
-    -------
-    Mesh
-        Vertices float32, or float64 where the file has doubles (or is text, as OBJ is).
-
-    Raises
-    ------
-    DataError
-        If the file is broken, has vertices but no faces, or a face names a vertex that does not exist.
-    """
-    if os.fspath(path).lower().endswith(".obj"):
-        return read_obj(path)
-    file = read_ply(path)
-    vertex, face = file.elements.get("vertex"), file.elements.get("face")
-    positions = vertex.scalars("x", "y", "z") if vertex else None
-    if vertex is None or positions is None:
-        raise DataError(f"{path}: a mesh was expected, got a PLY without vertex positions; give a triangle mesh")
-    if face is None or (face.count == 0 and vertex.count > 0):  # nothing at all is an empty mesh
-        raise DataError(f"{path}: a mesh was expected, got a PLY without faces (points or splats); give a mesh")
-    lists = face.properties.get("vertex_indices", face.properties.get("vertex_index"))
-    if not isinstance(lists, PlyList):
-        raise DataError(f"{path}: faces with a list vertex_indices were expected, got {sorted(face.properties)}")
-    faces = triangulate(lists.counts, lists.values)
-    if len(faces) and (faces.min() < 0 or faces.max() >= vertex.count):
-        raise DataError(f"{path}: vertex indices below {vertex.count} were expected, got {faces.max()}")
-    dtype = np.float64 if _scalar(vertex, "x").dtype == np.float64 else np.float32
-    return Mesh(positions.astype(dtype), faces.astype(np.int32), _colors(vertex))
-
-
-def triangulate(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Triangle fans [F, 3] of polygons given as ``counts`` [n] and flat ``indices``; shorter than 3 give nothing."""
-    counts = np.asarray(counts, dtype=np.int64)
-    fans = np.maximum(counts - 2, 0)  # triangles of each polygon
-    first = np.repeat(np.cumsum(counts) - counts, fans)  # flat position of the polygon's first index
-    k = np.arange(len(first)) - np.repeat(np.cumsum(fans) - fans, fans)  # 0, 1, ... within the polygon
-    return np.stack([indices[first], indices[first + k + 1], indices[first + k + 2]], axis=1).astype(np.int64)
-
-
-def _colors(vertex: PlyElement) -> np.ndarray | None:
-    """Vertex colours as uint8: as stored, or from floats in [0, 1]."""
-    names = ("red", "green", "blue")
-    colors = vertex.scalars(*names)
-    if colors is None:
-        return None
-    if all(_scalar(vertex, name).dtype.kind == "f" for name in names):
-        colors = colors * 255.0
-    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)
-
-
-def read_points(path: str | os.PathLike[str]) -> Points:
-    """Read the vertices of any PLY file as a point cloud.
-
-    Raises
-    ------
-    DataError
-        If the file is broken or has no vertex positions.
-    """
-    vertex = read_ply(path).elements.get("vertex")
-    positions = vertex.scalars("x", "y", "z") if vertex else None
-    if vertex is None or positions is None:
-        raise DataError(f"{path}: points were expected, got a PLY without vertex positions; give a point cloud")
-    return Points(positions, _colors(vertex), vertex.scalars("nx", "ny", "nz"))

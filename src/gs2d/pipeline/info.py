@@ -11,7 +11,8 @@ from gs2d.data.archive import is_archive, unpack
 from gs2d.data.benchmarks import missing_lines
 from gs2d.errors import DataError
 from gs2d.io.formats.registry import is_splat_file, read_splat_file
-from gs2d.io.splat_ply import ply_kind, read_mesh, read_points
+from gs2d.io.meshes import FOREIGN, read_mesh, read_points
+from gs2d.io.splat_ply import ply_kind
 
 _OF_CAPTURES = (".json", ".xml", ".sfm", ".npz", ".bin", ".txt")
 
@@ -60,7 +61,7 @@ def describe_file(path: Path) -> dict[str, Any]:
             f"{path}: a file of splats, a mesh or points was expected, got a file of a capture; give its folder"
         )
     size = path.stat().st_size
-    kind = "splats" if is_splat_file(path) else ply_kind(path)
+    kind = "mesh" if path.suffix.lower() in FOREIGN else "splats" if is_splat_file(path) else ply_kind(path)
     if kind == "mesh":
         mesh = read_mesh(path)
         return {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "bytes": size}

@@ -20,6 +20,7 @@ from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.evaluation.lpips import load_lpips
 from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import (
     LOCK,
     MESH,
@@ -34,7 +35,6 @@ from gs2d.io.run_dir import (
     open_run,
     remove_made,
 )
-from gs2d.io.splat_ply import read_mesh
 from gs2d.pipeline.attempts import again, attempted, reason_of
 from gs2d.pipeline.evaluate import score_views, split_metrics
 from gs2d.pipeline.events import Missing, Notice, OnEvent, Phase, Step, counted, ignore

@@ -20,7 +20,7 @@ from gs2d.data import View
 from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError
 from gs2d.evaluation.images import ImageMetrics
-from gs2d.io.splat_ply import write_mesh
+from gs2d.io.meshes import write_mesh
 from gs2d.meshing.depth_maps import Frame, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.pipeline.evaluate import SeenView

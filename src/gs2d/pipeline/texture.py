@@ -17,9 +17,8 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.errors import ProtocolError, RunError
+from gs2d.io.meshes import read_mesh, write_textured, written_files
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
-from gs2d.io.splat_ply import read_mesh
-from gs2d.io.textured import write_textured, written_files
 from gs2d.meshing.atlas import required, simplified, unwrap
 from gs2d.meshing.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore

@@ -17,8 +17,9 @@ from gs2d.data.benchmarks import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
 from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, headline
 from gs2d.evaluation.surface_clouds import write_clouds
+from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.run_dir import make_folder
-from gs2d.io.splat_ply import ply_kind, read_mesh, read_points
+from gs2d.io.splat_ply import ply_kind
 from gs2d.pipeline.events import Notice, OnEvent, Phase
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import EvaluateOptions
@@ -62,13 +63,13 @@ class OfficialTruth:
 
 
 def read_truth(path: Path) -> Truth:
-    """Read a ground truth: a PLY or OBJ mesh (with the counts of ``NAME_seen.npy`` beside it, if any) or PLY points.
+    """Read a ground truth: a mesh (with the counts of ``NAME_seen.npy`` beside it, if any) or the points of a PLY file.
 
     Raises
     ------
     DataError
     """
-    kind = "mesh" if path.suffix.lower() == ".obj" else ply_kind(path)
+    kind = "mesh" if path.suffix.lower() in FOREIGN else ply_kind(path)
     if kind == "points":
         return Truth(path, np.asarray(read_points(path).points, np.float64), None)
     if kind != "mesh":

@@ -21,9 +21,8 @@ from gs2d.data import View
 from gs2d.data.subject import read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.registry import read_disks
+from gs2d.io.meshes import glb_bytes, glb_turn, read_mesh
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_run
-from gs2d.io.splat_ply import read_mesh
-from gs2d.io.textured import glb_bytes, glb_turn
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import Job, reload_job

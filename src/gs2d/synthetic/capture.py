@@ -16,7 +16,7 @@ from gs2d.core.images import write_image
 from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.io.splat_ply import write_mesh
+from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
 from gs2d.synthetic.perturb_poses import TRUTH, disturbed

@@ -9,7 +9,8 @@ import numpy as np
 
 from gs2d.data.build import Frame
 from gs2d.data.scene import PointCloud
-from gs2d.io.splat_ply import ply_kind, read_points
+from gs2d.io.meshes import read_points
+from gs2d.io.splat_ply import ply_kind
 
 _NAMES = ("points3D.ply", "points.ply", "sparse.ply", "sparse_points.ply", "tie_points.ply", "point_cloud.ply")
 _TRUTHS = ("mesh_gt.ply", "points_gt.ply")  # what a result is scored against is no place to start from

@@ -17,7 +17,7 @@ from gs2d.data.priors import MapFiles
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
-from gs2d.io.splat_ply import read_points
+from gs2d.io.meshes import read_points
 
 _LARGEST = 1e300  # JSON has whole numbers of any size
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")

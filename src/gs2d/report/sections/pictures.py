@@ -13,8 +13,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.images import composite, read_image
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
+from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RENDERS
-from gs2d.io.splat_ply import read_mesh
 from gs2d.report.html import color_bar, escape, missing, picture, wipe
 from gs2d.report.images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
 from gs2d.report.mesh_images import mesh_pictures, orbit_cameras

@@ -1,10 +1,13 @@
-"""Textured meshes on disk: glTF binary (.glb, one file) and Wavefront OBJ (.obj with .mtl and .png)."""
+"""Meshes on disk: PLY read and written; OBJ, STL and OFF read by trimesh; with a texture written as glTF or OBJ."""
 
 from __future__ import annotations
 
 import io
 import json
+import os
+import re
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +17,144 @@ from PIL import Image
 from gs2d.core.files import atomic_write
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import DataError
+from gs2d.io.ply_format import PlyElement, PlyList, read_ply, write_ply
 
-SUFFIXES = (".glb", ".obj")
+COLORS = ("red", "green", "blue")
+FOREIGN = (".obj", ".stl", ".off")  # read by trimesh
+SUFFIXES = (".glb", ".obj")  # of a mesh with a texture
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON", "BIN\0"
 _FLOAT, _UINT, _USHORT = 5126, 5125, 5123  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 _SRGB = np.arange(256) / 255
 _LINEAR_U16 = np.rint(65535 * np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)).astype("<u2")
 _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987  # CLAMP_TO_EDGE, LINEAR, LINEAR_MIPMAP_LINEAR
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """A point cloud as a file holds it: ``points`` [P, 3] float64 wu, ``colors`` and ``normals`` or None."""
+
+    points: np.ndarray
+    colors: np.ndarray | None = None  # [P, 3] uint8
+    normals: np.ndarray | None = None  # [P, 3] float64
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
+    """Write a triangle mesh as PLY, atomically: float32 or float64 vertices as they are, uchar vertex colours.
+
+    The vertex list is the only property of a face, which is all that common readers understand.
+
+    Raises
+    ------
+    DiskError
+        If the file could not be written.
+    """
+    real = "<f8" if mesh.vertices.dtype == np.float64 else "<f4"
+    fields = [(name, real) for name in "xyz"]
+    if mesh.colors is not None:
+        fields += [(name, "u1") for name in COLORS]
+    vertices = np.empty(len(mesh.vertices), dtype=fields)
+    for i, name in enumerate("xyz"):
+        vertices[name] = mesh.vertices[:, i]
+    if mesh.colors is not None:
+        for i, name in enumerate(COLORS):
+            vertices[name] = mesh.colors[:, i]
+    faces = np.empty(len(mesh.faces), dtype=[("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.faces
+    write_ply(path, {"vertex": vertices, "face": faces})
+
+
+def read_mesh(path: str | os.PathLike[str]) -> Mesh:
+    """Read a mesh from PLY, OBJ, STL or OFF; polygons become triangles, other properties are passed over.
+
+    Returns
+    -------
+    Mesh
+        Vertices float32, or float64 where the file has doubles (or is no PLY).
+
+    Raises
+    ------
+    DataError
+        If the file is broken, has vertices but no faces, or a face names a vertex that does not exist.
+    """
+    if Path(path).suffix.lower() in FOREIGN:
+        return _read_foreign(Path(path))
+    file = read_ply(path)
+    vertex, face = file.elements.get("vertex"), file.elements.get("face")
+    positions = vertex.scalars("x", "y", "z") if vertex else None
+    if vertex is None or positions is None:
+        raise DataError(f"{path}: a mesh was expected, got a PLY without vertex positions; give a triangle mesh")
+    if face is None or (face.count == 0 and vertex.count > 0):  # nothing at all is an empty mesh
+        raise DataError(f"{path}: a mesh was expected, got a PLY without faces (points or splats); give a mesh")
+    lists = face.properties.get("vertex_indices", face.properties.get("vertex_index"))
+    if not isinstance(lists, PlyList):
+        raise DataError(f"{path}: faces with a list vertex_indices were expected, got {sorted(face.properties)}")
+    faces = triangulate(lists.counts, lists.values)
+    if len(faces) and (faces.min() < 0 or faces.max() >= vertex.count):
+        raise DataError(f"{path}: vertex indices below {vertex.count} were expected, got {faces.max()}")
+    dtype = np.float64 if vertex.scalar("x").dtype == np.float64 else np.float32
+    return Mesh(positions.astype(dtype), faces.astype(np.int32), _colors(vertex))
+
+
+def _read_foreign(path: Path) -> Mesh:
+    """Read a mesh by trimesh, corners in the order of the file."""
+    import trimesh  # 0.6 s: for those who have such a file
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: a mesh was expected, it cannot be read: {error.strerror}") from error
+    kind = path.suffix.lower().lstrip(".")
+    if kind == "obj":  # trimesh takes a comment behind a face for one of its corners
+        data = re.sub(rb"#[^\n]*", b"", data)
+    try:
+        loaded = trimesh.load_mesh(
+            io.BytesIO(data), file_type=kind, process=False, maintain_order=True, skip_materials=True
+        )
+        vertices, faces = np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
+        visual: Any = loaded.visual
+        colors = np.array(visual.vertex_colors, np.uint8)[:, :3] if visual.kind == "vertex" else None
+    except Exception as error:  # whatever its parsers run into
+        raise DataError(f"{path}: a mesh was expected, trimesh cannot read it ({error}); export it again") from error
+    if not len(faces):
+        raise DataError(f"{path}: a mesh was expected, the file has no faces; give a triangle mesh")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise DataError(f"{path}: vertex indices below {len(vertices)} were expected, got {faces.max()}")
+    return Mesh(vertices, faces.astype(np.int32), colors)
+
+
+def triangulate(counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Triangle fans [F, 3] of polygons given as ``counts`` [n] and flat ``indices``; shorter than 3 give nothing."""
+    counts = np.asarray(counts, dtype=np.int64)
+    fans = np.maximum(counts - 2, 0)  # triangles of each polygon
+    first = np.repeat(np.cumsum(counts) - counts, fans)  # flat position of the polygon's first index
+    k = np.arange(len(first)) - np.repeat(np.cumsum(fans) - fans, fans)  # 0, 1, ... within the polygon
+    return np.stack([indices[first], indices[first + k + 1], indices[first + k + 2]], axis=1).astype(np.int64)
+
+
+def _colors(vertex: PlyElement) -> np.ndarray | None:
+    """Vertex colours as uint8: as stored, or from floats in [0, 1]."""
+    colors = vertex.scalars(*COLORS)
+    if colors is None:
+        return None
+    if all(vertex.scalar(name).dtype.kind == "f" for name in COLORS):
+        colors = colors * 255.0
+    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+
+
+def read_points(path: str | os.PathLike[str]) -> Points:
+    """Read the vertices of any PLY file as a point cloud.
+
+    Raises
+    ------
+    DataError
+        If the file is broken or has no vertex positions.
+    """
+    vertex = read_ply(path).elements.get("vertex")
+    positions = vertex.scalars("x", "y", "z") if vertex else None
+    if vertex is None or positions is None:
+        raise DataError(f"{path}: points were expected, got a PLY without vertex positions; give a point cloud")
+    return Points(positions, _colors(vertex), vertex.scalars("nx", "ny", "nz"))
 
 
 def written_files(path: Path) -> tuple[Path, ...]:

@@ -1,0 +1,123 @@
+"""Meshes in files: they come back as they were, and other programs open them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from gs2d.core.mesh import Mesh
+from gs2d.errors import DataError, DiskError
+from gs2d.io.meshes import read_mesh, triangulate, write_mesh
+from gs2d.io.ply_format import write_ply
+from gs2d.io.splat_ply import ply_kind
+from surface_shapes import tetrahedron
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("colors", [True, False])
+def test_a_mesh_comes_back(tmp_path: Path, dtype: type, colors: bool) -> None:
+    mesh = tetrahedron(colors, dtype)
+    write_mesh(tmp_path / "a.ply", mesh)
+    back = read_mesh(tmp_path / "a.ply")
+    assert back.vertices.dtype == dtype
+    np.testing.assert_array_equal(back.vertices, mesh.vertices)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    assert (back.colors is None) if mesh.colors is None else np.array_equal(back.colors, mesh.colors)
+
+
+def test_a_mesh_file_has_only_the_vertex_list_on_faces_and_colours_on_vertices(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "a.ply", tetrahedron())
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode().splitlines()
+    assert header[1] == "format binary_little_endian 1.0"
+    assert header[-5:] == [
+        "property uchar red",
+        "property uchar green",
+        "property uchar blue",
+        "element face 4",
+        "property list uchar int vertex_indices",
+    ]
+
+
+def test_trimesh_reads_our_mesh(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "a.ply", tetrahedron())
+    back = trimesh.load(tmp_path / "a.ply", process=False)
+    assert back.volume == pytest.approx(1 / 6)  # positive: the faces look outward
+    assert back.visual.vertex_colors[1].tolist() == [255, 4, 5, 255]
+
+
+def test_an_empty_mesh_comes_back_empty(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "x.ply", Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))
+    mesh = read_mesh(tmp_path / "x.ply")
+    assert (len(mesh.vertices), len(mesh.faces)) == (0, 0)
+    assert ply_kind(tmp_path / "x.ply") == "mesh"
+
+
+def test_a_face_that_names_no_vertex_is_a_data_error(tmp_path: Path) -> None:
+    mesh = tetrahedron()
+    write_mesh(tmp_path / "a.ply", Mesh(mesh.vertices[:3], mesh.faces))
+    with pytest.raises(DataError, match="below 3 were expected, got 3"):
+        read_mesh(tmp_path / "a.ply")
+
+
+def test_points_are_no_mesh(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", {"vertex": np.zeros(3, [(name, "f4") for name in "xyz"])})
+    with pytest.raises(DataError, match="without faces"):
+        read_mesh(tmp_path / "a.ply")
+
+
+def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises(DiskError):
+        write_mesh(tmp_path / "no such folder" / "a.ply", tetrahedron())
+    write_mesh(tmp_path / "a.ply", tetrahedron())
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_polygons_become_fans() -> None:
+    faces = triangulate(np.array([2, 5, 3]), np.array([0, 1, 10, 11, 12, 13, 14, 20, 21, 22]))
+    assert faces.tolist() == [[10, 11, 12], [10, 12, 13], [10, 13, 14], [20, 21, 22]]
+
+
+def test_obj_faces_with_texture_indices_negative_indices_and_polygons_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(
+        "# a comment\nmtllib none.mtl\nv 0 0 0\nv 1 0 0 0.5 0.5 0.5\nv 1 1 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\n"
+        "f 1/1/1 2//1 3/1 4 # a square\nf -4 -3 -2\n"
+    )
+    mesh = read_mesh(tmp_path / "a.obj")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 1, 2], [2, 3, 0], [0, 1, 2]]
+    assert mesh.vertices.dtype == np.float64
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.off", "a.obj", "A.OBJ"])
+def test_other_formats_come_back_as_trimesh_writes_them(tmp_path: Path, name: str) -> None:
+    mesh = tetrahedron(colors=False)
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / name.lower())
+    (tmp_path / name.lower()).rename(tmp_path / name)
+    back = read_mesh(tmp_path / name)
+    np.testing.assert_array_equal(back.vertices[back.faces], mesh.vertices[mesh.faces])
+
+
+def test_the_colours_of_an_obj_file_are_read(tmp_path: Path) -> None:
+    mesh = tetrahedron()
+    colored = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
+    colored.export(tmp_path / "a.obj")
+    back = read_mesh(tmp_path / "a.obj")
+    assert back.colors is not None
+    np.testing.assert_array_equal(back.colors, mesh.colors)
+
+
+@pytest.mark.parametrize("text", ["v 0 0\n", "v 0 0 0\nf 1 2 x\n", "v 0 0 0\nf 1 2 3\n", "v 0 0 0\n"])
+def test_a_broken_obj_is_a_data_error(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(DataError):
+        read_mesh(tmp_path / "a.obj")
+
+
+def test_real_meshes_are_read(shared: Callable[[str], Path]) -> None:
+    mesh = read_mesh(shared("rendered_bottle") / "mesh_gt.ply")
+    assert (len(mesh.vertices), len(mesh.faces)) == (20341, 40670)
+    assert np.allclose(mesh.vertices.min(0), [-0.9, -0.9, -0.85], atol=1e-3)
