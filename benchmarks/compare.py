@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 MEMORY_STEPS = frozenset({"sort", "bin", "index_slots", "optimizer", "densification"})
-LEAST_GROWTH, SPREADS, LEAST_MS = 0.10, 2.0, 0.2
+MIN_GROWTH, SPREADS, MIN_MS = 0.10, 2.0, 0.2
 MEMORY_GROWTH = 0.01
 
 
@@ -59,12 +59,12 @@ def _steps(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[tuple[str, st
 def _judge(name: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Change]:
     for step, prefix, probe_a, probe_b in _steps(a, b):
         median_a, median_b = a[f"{prefix}ms"][step], b[f"{prefix}ms"][step]
-        if max(median_a, median_b) < LEAST_MS:
+        if max(median_a, median_b) < MIN_MS:
             continue
         best_a, best_b = a[f"{prefix}best_ms"][step], b[f"{prefix}best_ms"][step]
         noise = sum(x[f"{prefix}spread_ms"][step] / max(median, 1e-9) for x, median in ((a, median_a), (b, median_b)))
         growths = [probe_b * y / (probe_a * max(x, 1e-6)) for x, y in ((median_a, median_b), (best_a, best_b))]
-        yield Change(name, step, min(growths), 1.0 + max(LEAST_GROWTH, SPREADS * noise))
+        yield Change(name, step, min(growths), 1.0 + max(MIN_GROWTH, SPREADS * noise))
     yield Change(name, "bytes_per_splat", b["bytes_per_splat"] / a["bytes_per_splat"], 1.0 + MEMORY_GROWTH)
 
 

@@ -18,7 +18,7 @@ from PIL import Image
 from gs2d.core.camera import Camera
 from gs2d.core.images import write_image
 from gs2d.io.meshes import read_mesh
-from gs2d.report.mesh_images import mesh_pictures
+from gs2d.report.mesh_images import mesh_images
 
 
 def views_of(run: Path) -> int:
@@ -26,24 +26,24 @@ def views_of(run: Path) -> int:
     return len(json.loads((run / "renders" / "index.json").read_text())["views"])
 
 
-def pictures_of(run: Path, view: int, stage: str | None, kinds: Sequence[str]) -> list[np.ndarray]:
+def images_of(run: Path, view: int, stage: str | None, kinds: Sequence[str]) -> list[np.ndarray]:
     """Photograph, renderings of some kinds and mesh of one view of a run, uint8 [H, W, 3] each."""
     shown = json.loads((run / "renders" / "index.json").read_text())["views"][view]
     stages = [entry["name"] for entry in json.loads((run / "metrics.json").read_text())["stages"]]
     folder = run / "renders" / (stage or stages[-1])
     files = [run / "renders" / "photos" / f"{shown['file']}.png"]
     files += [folder / f"{shown['file']}.{kind}.png" for kind in kinds]
-    pictures = [np.asarray(Image.open(file).convert("RGB")) for file in files]
+    images = [np.asarray(Image.open(file).convert("RGB")) for file in files]
     saved = shown["camera"]
     camera = Camera(**{**saved, "T_cam_world": np.asarray(saved["T_cam_world"])})
-    clay = mesh_pictures(read_mesh(run / "mesh.ply"), [camera], width=camera.width)[0].shape
-    return [*pictures, (clay * 255).round().astype(np.uint8)]
+    clay = mesh_images(read_mesh(run / "mesh.ply"), [camera], width=camera.width)[0].shape
+    return [*images, (clay * 255).round().astype(np.uint8)]
 
 
 def strip(run: Path, view: int, stage: str | None, size: int) -> list[np.ndarray]:
     """The pictures of one view of a run, uint8 [size, size, 3] each."""
-    pictures = pictures_of(run, view, stage, ("color", "normal", "depth"))
-    return [np.asarray(Image.fromarray(p).resize((size, size), Image.Resampling.LANCZOS)) for p in pictures]
+    images = images_of(run, view, stage, ("color", "normal", "depth"))
+    return [np.asarray(Image.fromarray(p).resize((size, size), Image.Resampling.LANCZOS)) for p in images]
 
 
 def main() -> None:
@@ -56,9 +56,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=300)
     args = parser.parse_args()
     rows = [np.concatenate(strip(run, args.view, args.stage, args.size), axis=1) for run in args.runs]
-    picture = np.concatenate(rows, axis=0)
-    used = np.flatnonzero((picture != 255).any(axis=(1, 2)))  # white margins above and below say nothing
-    write_image(args.out, picture[used[0] : used[-1] + 1])
+    image = np.concatenate(rows, axis=0)
+    used = np.flatnonzero((image != 255).any(axis=(1, 2)))  # white margins above and below say nothing
+    write_image(args.out, image[used[0] : used[-1] + 1])
 
 
 if __name__ == "__main__":

@@ -89,8 +89,8 @@ def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
         "test": {key: float(np.mean([score[key] for score in tests])) for key in ("psnr", "ssim", "fitted")},
         "worst": min(score["psnr"] for score in tests),
         "train": float(np.mean([score["psnr"] for score in trains])),
-        "hidden": total(hidden).share,
-        "hidden_worst": max((points.share or 0.0 for points in hidden), default=0.0),
+        "hidden": total(hidden).fraction,
+        "hidden_worst": max((points.fraction or 0.0 for points in hidden), default=0.0),
         "near_weight": near_weight(scene, splats, settings),
         "splats": len(splats),
     }

@@ -27,13 +27,13 @@ from benchmarks.timing import machine
 from gs2d.core.camera import Camera, look_at
 from gs2d.meshing.bounds import derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
-from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.evidence import gather
 from gs2d.meshing.integrate import BACKENDS, fusion_backend
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
 from gs2d.meshing.tsdf import fuse
-from gs2d.meshing.unbounded import fuse_nested, nested_marching_cubes
-from gs2d.meshing.unbounded_bounds import derive_nest
+from gs2d.meshing.unbounded import cascade_marching_cubes, fuse_cascade
+from gs2d.meshing.unbounded_bounds import derive_cascade
 from gs2d.meshing.volume import Volume
 
 RADIUS = 0.9
@@ -68,7 +68,7 @@ def sphere_map(camera: Camera) -> DepthMap:
     inside = b * b - a * (camera.center @ camera.center - RADIUS**2)
     depth = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, 0)
     color = 0.5 + 0.5 * np.sin(20 * (camera.center + depth[..., None] * step))
-    return depth_map(Frame(camera, depth, color, depth > 0))
+    return depth_map(RenderedView(camera, depth, color, depth > 0))
 
 
 def orbit(count: int, size: int) -> list[Camera]:
@@ -105,9 +105,9 @@ def run(
     volumes: Sequence[Volume]
     if unbounded:
         core = np.array([[-RADIUS] * 3, [RADIUS] * 3]) / 2
-        nest = derive_nest(samples, cameras, bbox=core, voxel=limits.voxel, truncation=limits.truncation)
-        volumes = timed("fuse", lambda: fuse_nested(maps, nest, threads=threads, backend=backend))
-        mesh = timed("marching cubes", lambda: nested_marching_cubes(volumes, nest, far_weight=1.0))
+        cascade = derive_cascade(samples, cameras, bbox=core, voxel=limits.voxel, truncation=limits.truncation)
+        volumes = timed("fuse", lambda: fuse_cascade(maps, cascade, threads=threads, backend=backend))
+        mesh = timed("marching cubes", lambda: cascade_marching_cubes(volumes, cascade, far_weight=1.0))
     else:
         volumes = [timed("fuse", lambda: fuse(maps, limits, threads=threads, backend=backend))]
         mesh = timed("marching cubes", lambda: marching_cubes(volumes[0]))

@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 COMMITTED = Path(__file__).parent / "results" / "instructions.json"
 CALLGRIND_TOLERANCE = 0.02
 LOOP_TOLERANCE = 0.03
-LEAST_VECTOR, LONGEST = 15, 400  # zmm instructions of a loop that counts; longer ones are jumps back from cold code
+MIN_VECTOR, LONGEST = 15, 400  # zmm instructions of a loop that counts; longer ones are jumps back from cold code
 # mangled names of the functions with the blend loops -> label
 LOOP_FUNCTIONS = {
     "blend_tileERNS": "forward",
@@ -127,7 +127,7 @@ def _functions(listing: str) -> dict[str, str]:
 
 
 def vector_loops(disassembly: str) -> list[tuple[int, int]]:
-    """(instructions, zmm instructions) of each innermost loop with at least LEAST_VECTOR of the latter, sorted."""
+    """(instructions, zmm instructions) of each innermost loop with at least MIN_VECTOR of the latter, sorted."""
     lines = re.findall(r"^\s+([0-9a-f]+):\t(\S+)\s*(.*)$", disassembly, flags=re.MULTILINE)
     index = {int(address, 16): i for i, (address, _, _) in enumerate(lines)}
     loops = set()
@@ -137,7 +137,7 @@ def vector_loops(disassembly: str) -> list[tuple[int, int]]:
             loops.add((index[int(target[0], 16)], i))
     inner = [a for a in loops if not any(a != b and a[0] <= b[0] and b[1] <= a[1] for b in loops)]
     measured = [(end - start + 1, sum("zmm" in line[2] for line in lines[start : end + 1])) for start, end in inner]
-    return sorted(pair for pair in measured if pair[1] >= LEAST_VECTOR and pair[0] <= LONGEST)
+    return sorted(pair for pair in measured if pair[1] >= MIN_VECTOR and pair[0] <= LONGEST)
 
 
 def excess(measured: Counts, committed: Counts, tolerance: float) -> list[str]:

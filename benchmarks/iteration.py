@@ -36,7 +36,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.memory import hold
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene, View
-from gs2d.kernels.library import Library, prepare
+from gs2d.kernels.library import Library, ready_library
 from gs2d.render.api import rasterize
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
@@ -113,7 +113,7 @@ def page_faults() -> int:
 def run(count: int, size: int, threads: int, repeats: int, recipe: str = "2dgs-r") -> dict[str, object]:
     """Median and best milliseconds of an iteration of each stage."""
     torch.set_num_threads(threads)
-    library = prepare()
+    library = ready_library()
     times = iteration_times(room_workload(count, size, size), library, repeats, recipe)
     result = {
         name: asdict(row.timing) | {"fma_gflops": row.fma_gflops, "page_faults": round(row.page_faults, 1)}

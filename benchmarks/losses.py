@@ -24,7 +24,7 @@ from torch import Tensor
 from benchmarks.timing import Timing, machine, measure, peak_probe
 from gs2d.core.camera import Camera, look_at
 from gs2d.kernels import losses as ops
-from gs2d.kernels.library import load, prepare
+from gs2d.kernels.library import load, ready_library
 from gs2d.losses import reference
 
 
@@ -49,7 +49,7 @@ class Frame:
     mean: Tensor  # [H, W, 3]
     mask: Tensor  # [H, W]
     normal: Tensor  # [H, W, 3]
-    depth: Tensor  # [H, W] wu
+    depth: Tensor  # [H, W] world units
     alpha: Tensor  # [H, W]
     camera: Camera
 
@@ -126,7 +126,7 @@ def run(sizes: Sequence[int], threads: Sequence[int], repeats: int) -> list[Row]
         for n in threads:
             for name, (native, slow) in cases.items():
                 torch.set_num_threads(n)
-                probe = peak_probe(prepare())
+                probe = peak_probe(ready_library())
                 fast = measure(native, repeats=repeats)
                 other = None if slow is None else measure(slow, repeats=max(3, repeats // 8), warmup=1)
                 rows.append(Row(name, size, n, fast, other, probe))

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 CHUNKS = 16  # of bin.cpp
-LEAST_SLOTS = 4096  # of gradient_sums.cpp
+MIN_SLOTS = 4096  # of gradient_sums.cpp
 TILE, LINE = 16, 64
 GROUP = 4  # of frame.h
 SLOT = 64 + 16 + 1  # bytes
@@ -66,7 +66,7 @@ def view_bytes(work: ViewWork) -> int:
         (4 * work.width * work.height, 4),  # saved
         (CHUNKS * t, 4),  # histogram
         (t + 1, 8),  # slot_begin
-        (min(t, s // (LEAST_SLOTS // 2)) + 3, 40),  # chunks
+        (min(t, s // (MIN_SLOTS // 2)) + 3, 40),  # chunks
     )
     scratch, slots = _room(FORWARD_SCRATCH * n, 1), 2 * _lines(SLOT * work.largest_chunk)
     if slots > scratch:  # it grows

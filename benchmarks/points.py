@@ -37,7 +37,7 @@ class Row:
 
 
 def pixel_widths(points: np.ndarray, scene: Scene) -> np.ndarray:
-    """Width of a pixel at each point [P] wu, in the training view that sees it from nearest; infinite if none does."""
+    """Width of a pixel at each point [P] (world units) in the nearest training view that sees it; infinity if none."""
     widths = np.full(len(points), np.inf)
     for view in scene.train:
         pixels, depth = view.camera.project(points)
@@ -69,8 +69,8 @@ def main() -> None:
     print("|---" * (4 + len(WITHIN)) + "|")
     for run in parser.parse_args().runs:
         row = measure(run)
-        shares = " | ".join(f"{100 * share:.1f} %" for share in row.within.values())
-        print(f"| {run} | {row.points:,} | {row.median:.3f} | {row.mean:.3f} | {shares} |", flush=True)
+        fractions = " | ".join(f"{100 * fraction:.1f} %" for fraction in row.within.values())
+        print(f"| {run} | {row.points:,} | {row.median:.3f} | {row.mean:.3f} | {fractions} |", flush=True)
 
 
 if __name__ == "__main__":

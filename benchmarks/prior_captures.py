@@ -98,12 +98,12 @@ def write_maps(out: Path, mesh: Mesh, order: list[Shot], maps: str, seed: int) -
         Image.fromarray(made).save(path)
 
 
-def write_colmap(out: Path, pictures: dict[str, list[tuple[Camera, np.ndarray]]]) -> list[Shot]:
+def write_colmap(out: Path, images: dict[str, list[tuple[Camera, np.ndarray]]]) -> list[Shot]:
     """A COLMAP capture in which every 4th photograph is a test view; points from the others."""
     import pycolmap
 
     (out / "images").mkdir()
-    train, test = list(pictures["train"]), list(pictures["test"])
+    train, test = list(images["train"]), list(images["test"])
     order: list[Shot] = []
     while train:
         is_test = len(order) % TEST_EVERY == 0
@@ -209,7 +209,7 @@ def room_mesh() -> tuple[Mesh, np.ndarray]:
     return Mesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int32)), np.array(owner)
 
 
-def room_picture(mesh: Mesh, owner: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+def room_image(mesh: Mesh, owner: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
     """uint8 [H, W, 3]: plain walls and ceiling, a floor of boards, textured things, one lamp, a little noise."""
     samples = 3
     hits = cast_camera(mesh.vertices, mesh.faces, camera, samples=samples)
@@ -255,7 +255,7 @@ def of_room(views: int, tests: int, seed: int) -> tuple[Mesh, dict[str, list[tup
             )
             target = eye + np.array([np.cos(angle), np.sin(angle), -0.25 + 0.15 * np.sin(3.1 * k)])
             camera = look_at(eye, target, UP, width=SIZE, height=SIZE, fx=f)
-            found[split].append((camera, room_picture(mesh, owner, camera, rng)))
+            found[split].append((camera, room_image(mesh, owner, camera, rng)))
     return mesh, found
 
 
@@ -271,12 +271,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     room = args.capture == "room"
-    mesh, pictures = (
+    mesh, images = (
         of_room(args.views, args.tests, args.seed) if room else of_capture(Path(args.capture), args.every, args.tests)
     )
     args.out.mkdir(parents=True)
     write_mesh(args.out / "mesh_gt.ply", mesh)
-    write_maps(args.out, mesh, write_colmap(args.out, pictures), args.maps, args.seed)
+    write_maps(args.out, mesh, write_colmap(args.out, images), args.maps, args.seed)
 
 
 if __name__ == "__main__":

@@ -54,8 +54,8 @@ def main() -> None:
         mesh, splats = read_mesh((job.scene.root or run) / "mesh_gt.ply"), read_splats(run / SPLATS)
         for split, views in (("test", job.scene.test), ("train", job.scene.train)):
             error = errors(splats, views, mesh, job)
-            shares = " | ".join(f"{100 * (error < w).mean():.1f} %" for w in WITHIN)
-            print(f"| {run} | {split} | {100 * np.median(error):.2f} % | {100 * error.mean():.2f} % | {shares} |")
+            fractions = " | ".join(f"{100 * (error < w).mean():.1f} %" for w in WITHIN)
+            print(f"| {run} | {split} | {100 * np.median(error):.2f} % | {100 * error.mean():.2f} % | {fractions} |")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from benchmarks.iteration import bench_trainer
 from benchmarks.stages import Passes, count_work
 from benchmarks.timing import machine
 from benchmarks.workload import AbsentError, Workload, places, room_workload, run_workload
-from gs2d.kernels.library import Library, prepare
+from gs2d.kernels.library import Library, ready_library
 from gs2d.training.trainer import Trainer
 
 GOAL = 1.3
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     document: dict[str, Any] = {"machine": machine(), "threads": args.threads, "goal": GOAL, "rows": [], "skipped": {}}
     try:
         torch.set_num_threads(args.threads)
-        library = prepare()
+        library = ready_library()
         for run in args.runs:
             try:
                 document["rows"].append(compare_run(library, run, args.rounds))

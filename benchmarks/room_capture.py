@@ -24,17 +24,17 @@ from gs2d.render.types import RasterSettings
 
 VIEWS, SIZE = 292, (1560, 1040)  # px; half of it is what bonsai has as images_4
 SPLATS, POINTS = 200_000, 60_000
-HALF = np.array([3.0, 3.0, 1.4])  # wu, of the room
+HALF = np.array([3.0, 3.0, 1.4])  # world units, of the room
 QUALITY = 92  # of the JPEG files
 FOUND = 0.15  # of the points that a picture shows: as many as a matcher finds again, about 9 pictures a point
 HIDDEN = 0.02  # of the depth, by which a point may lie behind what is drawn there
 
 
 def surfaces(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Places [count, 3] wu on walls, floor, ceiling, a table top and three balls, with normals."""
+    """Places [count, 3] world units on walls, floor, ceiling, a table top and three balls, with normals."""
     places, normals = [], []
-    shares = [0.09] * 6 + [0.16] + [0.1] * 3
-    numbers = np.floor(np.array(shares) * count).astype(int)
+    fractions = [0.09] * 6 + [0.16] + [0.1] * 3
+    numbers = np.floor(np.array(fractions) * count).astype(int)
     numbers[0] += count - numbers.sum()
     for side in range(6):
         at = rng.uniform(-1, 1, (numbers[side], 3))

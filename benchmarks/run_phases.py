@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from benchmarks.sampler import Rule
 
-RECORDER, LOOP = "pipeline/run_logger.py", "training/trainer.py"
+RUN_LOGGER, LOOP = "pipeline/run_logger.py", "training/trainer.py"
 RUN_PHASES = (  # names that a version of the code does not have are found nowhere in it
-    Rule("read the capture", (("pipeline/job.py", "prepare"), ("pipeline/job.py", "reload_job"))),
-    Rule("PSNR curve", ((RECORDER, "_probe_psnr"),)),
+    Rule("read the capture", (("pipeline/job.py", "prepare_job"), ("pipeline/job.py", "reload_job"))),
+    Rule("PSNR curve", ((RUN_LOGGER, "_probe_psnr"),)),
     Rule("pictures", (("pipeline/render.py", "draw_stage"),)),
-    Rule("score a stage", ((RECORDER, "_score_stage"), (RECORDER, "_score_entry"))),
-    Rule("checkpoints", ((RECORDER, "_save"),)),
+    Rule("score a stage", ((RUN_LOGGER, "_score_stage"), (RUN_LOGGER, "_score_entry"))),
+    Rule("checkpoints", ((RUN_LOGGER, "_save"),)),
     Rule("initial splats", ((LOOP, "_new_state"),)),
     Rule("rank by E_i", (("training/rank_clone.py", "rank_by_error"),)),
-    Rule("fill the stage 2 cache", (("training/cached_objective.py", "choose_evaluator"),)),
+    Rule("fill the stage 2 cache", (("training/cached_objective.py", "choose_objective"),)),
     Rule("mesh", (("pipeline/mesh.py", "extract_mesh"),)),
     Rule("report", (("pipeline/jobs.py", "report_run"),)),
     Rule("training iterations", ((LOOP, "step"),)),

@@ -23,7 +23,7 @@ from gs2d.io.run_dir import open_run
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.job import Job, reload_job
 from gs2d.render.api import rasterize
-from gs2d.training.objective import seen_rows
+from gs2d.training.objective import visible_mask
 
 
 @torch.no_grad()
@@ -44,10 +44,13 @@ def report(run: Path, longer: float) -> None:
     """The figures of one run."""
     job = reload_job(open_run(run), lambda event: None)
     splats = read_splats(run / "splats.ply")
-    seen = seen_rows(splats, job.scene, job.settings, job.backend)
+    seen = visible_mask(splats, job.scene, job.settings, job.backend)
     sizes = splats.scales.max(dim=1).values
     long = sizes > longer * job.scene.extent
-    print(f"{run}: {len(splats):,} splats, crossing ones: {job.settings.crossing}, longest {float(sizes.max()):.4g} wu")
+    print(
+        f"{run}: {len(splats):,} splats, crossing ones: {job.settings.near_plane_policy}, "
+        f"longest {float(sizes.max()):.4g} world units"
+    )
     kept = {"all": seen | ~seen, f"without {int((~seen).sum())} unseen": seen}
     kept |= {f"without {int(long.sum())} long": ~long, "without both": seen & ~long}
     for name, rows in kept.items():

@@ -153,11 +153,11 @@ def optimizer_step(workload: Workload) -> Callable[[], float]:
     state = TrainState(workload.splats.clone(), torch.Generator().manual_seed(4))
     begin_stage(state, stage)
     gradients = {name: torch.randn(t.shape, generator=state.generator) for name, t in state.splats.items()}
-    rates = dict.fromkeys(gradients, 1e-4)
+    lr = dict.fromkeys(gradients, 1e-4)
 
     def step() -> float:
         start = time.perf_counter()
-        native_adam_step(state, stage, gradients, rates)
+        native_adam_step(state, stage, gradients, lr)
         return 1e3 * (time.perf_counter() - start)
 
     return step

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from PIL import Image
 
-from benchmarks.figure import pictures_of, views_of
+from benchmarks.figure import images_of, views_of
 from gs2d.io.run_dir import MESH, METRICS
 
 HEIGHT, GAP, QUALITY = 240, 4, 85  # px, px, of JPEG
@@ -34,15 +34,15 @@ class Shown(Protocol):
 def gallery_row(run: Path, height: int = HEIGHT) -> Image.Image:
     """The middle one of the views that a run drew, as photograph, rendering, normals and mesh at one height."""
     view = views_of(run) // 2
-    pictures = [
+    images = [
         Image.fromarray(p).resize((max(1, round(height * p.shape[1] / p.shape[0])), height), Image.Resampling.LANCZOS)
-        for p in pictures_of(run, view, None, KINDS)
+        for p in images_of(run, view, None, KINDS)
     ]
-    row = Image.new("RGB", (sum(p.width for p in pictures) + GAP * (len(pictures) - 1), height), "white")
+    row = Image.new("RGB", (sum(p.width for p in images) + GAP * (len(images) - 1), height), "white")
     left = 0
-    for picture in pictures:
-        row.paste(picture, (left, 0))
-        left += picture.width + GAP
+    for image in images:
+        row.paste(image, (left, 0))
+        left += image.width + GAP
     return row
 
 

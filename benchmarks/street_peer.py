@@ -74,11 +74,11 @@ class Window:
         out[c:d, a:b] = image[k:m, i:j]
         return out
 
-    def place(self, picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    def place(self, image: np.ndarray, height: int, width: int) -> np.ndarray:
         """The reverse of :meth:`cut`: an image [height, width, C] with these pixels; black elsewhere."""
-        out = np.zeros((height, width, *picture.shape[2:]), dtype=picture.dtype)
+        out = np.zeros((height, width, *image.shape[2:]), dtype=image.dtype)
         (a, b, i, j), (c, d, k, m) = (self._overlap(*span) for span in self._spans(out))
-        out[k:m, i:j] = picture[c:d, a:b]
+        out[k:m, i:j] = image[c:d, a:b]
         return out
 
     def _spans(self, image: np.ndarray) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
@@ -156,7 +156,7 @@ def write_capture(folder: Path, scene: Scene, views: Sequence[View], windows: Se
     model.mkdir(parents=True, exist_ok=True)
     cameras, images = [struct.pack("<Q", len(views))], [struct.pack("<Q", len(views))]
     for number, (view, window) in enumerate(zip(views, windows, strict=True), start=1):
-        name, camera = picture_name(number, view), window.camera(view.camera)
+        name, camera = image_name(number, view), window.camera(view.camera)
         path = folder / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         write_image(path, window.cut(view.image()[:, :, :3]))
@@ -170,7 +170,7 @@ def write_capture(folder: Path, scene: Scene, views: Sequence[View], windows: Se
     (model / "points3D.bin").write_bytes(_points(scene))
 
 
-def picture_name(number: int, view: View) -> str:
+def image_name(number: int, view: View) -> str:
     """A name of its own for a view's picture, whatever folders and endings the views have."""
     return f"{number:04d}-{Path(view.name).stem}.png"
 
@@ -269,9 +269,9 @@ def draw_test_views(
     binary: Path, capture: Path, folder: Path, scene: Scene, windows: Sequence[Window], iterations: int
 ) -> list[Path]:
     """Its pictures of the test views, cut to the views' pixels; files that are there are not drawn again."""
-    files, pictures = [], folder / "renders"
+    files, images = [], folder / "renders"
     for number, view in list(enumerate(scene.views, start=1))[len(scene.train) :]:
-        name, file = picture_name(number, view), pictures / f"{number:04d}.png"
+        name, file = image_name(number, view), images / f"{number:04d}.png"
         files.append(file)
         if file.exists():
             continue
@@ -283,13 +283,13 @@ def draw_test_views(
         if len(drawn) != 1:
             raise DataError(f"the peer drew {len(drawn)} pictures of {view.name}, expected 1")
         camera = view.camera
-        pictures.mkdir(exist_ok=True)
+        images.mkdir(exist_ok=True)
         write_image(file, windows[number - 1].place(read_image(drawn[0]), camera.height, camera.width))
         shutil.rmtree(out)
     return files
 
 
-def score_pictures(job: Job, files: Sequence[Path]) -> dict[str, Any]:
+def score_images(job: Job, files: Sequence[Path]) -> dict[str, Any]:
     """Our metrics of pictures of the test views, as they are and with colours matched."""
     plain: dict[str, ImageMetrics] = {}
     matched: dict[str, ImageMetrics] = {}
@@ -334,7 +334,7 @@ def measure_peer(
         trained = _trained(binary, folder / TRAIN, place, budget, variant)
         files = draw_test_views(binary, folder / ALL, place, scene, around, trained["iterations"])
         facts = {name: trained[name] for name in ("iterations", "cpu_seconds", "seconds", "peak_rss_bytes")}
-        rows[variant] = {**facts, "gaussians": vertices_of(place / SPLATS), "scores": score_pictures(job, files)}
+        rows[variant] = {**facts, "gaussians": vertices_of(place / SPLATS), "scores": score_images(job, files)}
     best = max(rows, key=lambda name: (rows[name]["scores"]["test"] or {"psnr": 0.0})["psnr"])
     return {"variant": best, "cpu_seconds_allowed": round(budget, 2), **rows[best], "variants": rows}
 

@@ -133,7 +133,7 @@ def _cpu_seconds_so_far(pid: int) -> float | None:
 
 
 # -- a capture -----------------------------------------------------------------------------------------------------
-def copy_photographs(source: Path, target: Path) -> int:
+def copy_images(source: Path, target: Path) -> int:
     """Copy the photographs of a folder to one where nothing else is; how many there are.
 
     Raises
@@ -162,7 +162,7 @@ def run_reconstruct(source: Path, folder: Path, quality: str, extra: Sequence[st
     """Run the command for a capture unless it was run to its end before; run folder, what it took, photographs."""
     run, process_file = folder / "run", folder / PROCESS
     photos = folder / PHOTOS / folder.name  # the report is named after its folder
-    count = copy_photographs(source, photos)
+    count = copy_images(source, photos)
     words = reconstruct_command(photos, count, run, quality, extra)
     if process_file.exists():
         before = Process(**json.loads(process_file.read_text()))
@@ -230,14 +230,14 @@ def score_run(path: Path) -> dict[str, Any]:
         "test_plain": scores(job.scene.test),
         "test_matched": scores(job.scene.test, match=True),
         "train": scores(job.scene.train, exposures=exposures),
-        "hidden": hidden_share(job, splats),
+        "hidden": hidden_fraction(job, splats),
         "splats": len(splats),
         "downscale": job.downscale,
         "pixels": [job.scene.views[0].camera.width, job.scene.views[0].camera.height],
     }
 
 
-def hidden_share(job: Job, splats: Splats) -> dict[str, Any] | None:
+def hidden_fraction(job: Job, splats: Splats) -> dict[str, Any] | None:
     """Sparse points that the rendered median depth of test views hides; None without test views or points."""
     if job.scene.observe is None or not job.scene.test:
         return None
@@ -247,14 +247,14 @@ def hidden_share(job: Job, splats: Splats) -> dict[str, Any] | None:
             depth = rasterize(splats, view.camera, job.settings, backend=job.backend).depth_median.cpu().numpy()
         counts[view.name] = hidden_points(np.asarray(depth), observed.in_view(view.name, view.camera))
     whole = total(list(counts.values()))
-    if whole.share is None:
+    if whole.fraction is None:
         return None
-    shares = {name: count.share for name, count in counts.items() if count.share is not None}
-    worst = max(shares, key=lambda name: shares[name])
+    fractions = {name: count.fraction for name, count in counts.items() if count.fraction is not None}
+    worst = max(fractions, key=lambda name: fractions[name])
     return {
         "points": whole.shown,
-        "share": round(whole.share, 5),
-        "worst_share": round(shares[worst], 5),
+        "share": round(whole.fraction, 5),
+        "worst_share": round(fractions[worst], 5),
         "worst_view": worst,
     }
 
@@ -319,7 +319,7 @@ def measure_mesh(path: Path) -> dict[str, Any]:
         subject = find_subject(sights(job, splats))
     except DataError as error:
         return facts | {"subject": str(error), "share_in_subject": None}
-    return facts | {"subject": subject.kind, "share_in_subject": round(share_in_box(mesh, subject.box), 4)}
+    return facts | {"subject": subject.kind, "share_in_subject": round(fraction_in_box(mesh, subject.box), 4)}
 
 
 def pixels_of(job: Job, splats: Splats, mesh: Mesh) -> float:
@@ -329,7 +329,7 @@ def pixels_of(job: Job, splats: Splats, mesh: Mesh) -> float:
     return pixels(mesh, gather(mesh, maps, SAME_SURFACE * job.scene.extent))
 
 
-def share_in_box(mesh: Mesh, box: np.ndarray) -> float:
+def fraction_in_box(mesh: Mesh, box: np.ndarray) -> float:
     """Part of a mesh's area that is of faces whose middle lies in a box [2, 3]; 0 of a mesh without area."""
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

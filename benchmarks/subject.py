@@ -37,7 +37,7 @@ GOAL = 0.98  # of the area
 
 
 @dataclass(frozen=True)
-class Share:
+class Fraction:
     """What of a mesh lies in the masks of its subject.
 
     Attributes
@@ -46,7 +46,7 @@ class Share:
         Photographs with a mask.
     faces, inside_faces : int
     area : float
-        wu^2.
+        world units^2.
     inside, unseen : float
         Parts of the area: in the masks, and in no frame.
     """
@@ -59,7 +59,7 @@ class Share:
     unseen: float
 
 
-def share_inside(mesh: Mesh, masks: Iterable[tuple[Camera, np.ndarray]]) -> Share:
+def fraction_inside(mesh: Mesh, masks: Iterable[tuple[Camera, np.ndarray]]) -> Fraction:
     """Return the part of a mesh's area that lies in the masks (bool [H, W]) of the cameras.
 
     Raises
@@ -84,7 +84,7 @@ def share_inside(mesh: Mesh, masks: Iterable[tuple[Camera, np.ndarray]]) -> Shar
     inside = (framed > 0) & (within >= HALF * framed)
     whole = float(areas.sum())
     parts = (float(areas[chosen].sum()) / whole for chosen in (inside, framed == 0))
-    return Share(count, len(areas), int(inside.sum()), whole, *parts)
+    return Fraction(count, len(areas), int(inside.sum()), whole, *parts)
 
 
 def masks_of(views: Iterable[View], folder: Path) -> list[tuple[Camera, np.ndarray]]:
@@ -110,8 +110,8 @@ def measure(run: Path, folder: Path, mesh: Path | None = None) -> dict[str, Any]
     """
     file = run / MESH if mesh is None else mesh
     job = reload_job(open_run(run), lambda event: None)
-    share = share_inside(read_mesh(file), masks_of(job.scene.views, folder))
-    return {"run": run.name, "mesh": file.name, **vars(share)}
+    fraction = fraction_inside(read_mesh(file), masks_of(job.scene.views, folder))
+    return {"run": run.name, "mesh": file.name, **vars(fraction)}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

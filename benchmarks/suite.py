@@ -34,7 +34,7 @@ def workload_result(library: Library, workload: Workload, seconds: float, least:
     iterations = iteration_times(workload, library, repeats)
     stages = {f"stage{index + 1}": row.timing for index, row in enumerate(iterations.values())}
 
-    def share_of_peak(flops: dict[str, int]) -> dict[str, float]:
+    def fraction_of_peak(flops: dict[str, int]) -> dict[str, float]:
         best = {name: steps[f"blend_{name}"].best for name in flops}
         return {n: rounded(fraction(flops[n], work.pairs, best[n], peak.fma_gflops)) for n in flops}
 
@@ -56,8 +56,8 @@ def workload_result(library: Library, workload: Workload, seconds: float, least:
             f"stage{index + 1}": round(row.page_faults, 1) for index, row in enumerate(iterations.values())
         },
         "stage2_fill_ms_by_view": rounded(iterations["appearance"].extra_ms_of_first_by_view),
-        "fma_fraction": share_of_peak(USEFUL),
-        "fma_fraction_executed": share_of_peak(EXECUTED),
+        "fma_fraction": fraction_of_peak(USEFUL),
+        "fma_fraction_executed": fraction_of_peak(EXECUTED),
         "probe": {name: rounded(value) for name, value in asdict(peak).items()},
         "bytes_per_splat": rounded(measured.frame_bytes / work.splats),
         "memory": {"frame_bytes": measured.frame_bytes, "predicted_bytes": view_bytes(work)},

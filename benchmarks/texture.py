@@ -35,7 +35,7 @@ from gs2d.pipeline.texture import textured_mesh
 SAMPLES = 2  # rays a pixel along each axis
 
 
-def picture(
+def image(
     mesh: Mesh | TexturedMesh, camera: Camera, background: Sequence[float] = (1.0, 1.0, 1.0), samples: int = SAMPLES
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mesh, unshaded, [H, W, 3] in [0, 1], and how much of each pixel it covers [H, W]."""
@@ -71,7 +71,7 @@ def compare(
         whole, inside = [], []
         for i, view in enumerate(views):
             target = view.target(background)
-            drawn, covered = picture(mesh, view.camera, background)
+            drawn, covered = image(mesh, view.camera, background)
             alpha = view.alpha()
             both = (covered == 1) & (alpha == 1 if alpha is not None else True)
             whole.append(psnr(drawn, target))

@@ -15,7 +15,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import load_scene
 from gs2d.io.splat_ply import read_splats
 
-CROSSING = 0.003  # of the splats, in addition: what views of indoor captures hold
+NEAR_PLANE_POLICIES = 0.003  # of the splats, in addition: what views of indoor captures hold
 PLACES = ((0.3, -0.5, -4.0), (-0.9, -0.8, -3.8), (1.2, -0.3, -3.9), (0.0, -1.4, -4.2))
 
 
@@ -149,10 +149,10 @@ def name_of(count: int, width: int, height: int) -> str:
 
 
 def room_workload(count: int, width: int, height: int, *, crossing: bool = False) -> Workload:
-    """The room with four views; ``crossing`` appends splats across the camera plane that nobody sees."""
+    """The room with four views; ``near_plane_policy`` appends splats across the camera plane that nobody sees."""
     splats, name = room(count), name_of(count, width, height)
     if crossing:
-        more = underfoot(max(1, round(CROSSING * count)))
+        more = underfoot(max(1, round(NEAR_PLANE_POLICIES * count)))
         splats = Splats(**{key: torch.cat([part, getattr(more, key)]) for key, part in splats.items()})
     return Workload(name + "-crossing" * crossing, splats, places(width, height))
 

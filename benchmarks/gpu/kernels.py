@@ -93,7 +93,7 @@ def measure_scene(bench: Bench, count: int, width: int, height: int, spread: str
     yield "kernels_ms", lambda: kernels(bench, scene)
     yield "passes", lambda: passes(bench, scene)
     yield "sorts_ms", lambda: sorts(bench, scene)
-    yield "iteration", lambda: iterations(bench, scene, pictures(bench, scene))
+    yield "iteration", lambda: iterations(bench, scene, images(bench, scene))
     times = result["iteration"].get("surface_kernels_ms", {}) | result["kernels_ms"]
     floors = {name: floor for name, floor in FLOORS.get((count, width), {}).items() if name in times}
     yield "floors_ms", lambda: floors
@@ -106,7 +106,7 @@ def measure_peers(bench: Bench, count: int, width: int, height: int, spread: str
         yield from ((name, lambda name=name: peer(bench, None, [], name)) for name in PEERS)
         return
     scene = _scene(bench, count, width, height, spread)
-    targets = pictures(bench, scene)
+    targets = images(bench, scene)
     yield "iteration_beside_peers", lambda: iterations(bench, scene, targets, stages=1)
     ours = result["iteration_beside_peers"].get("surface", {}).get("median")
     for name in PEERS:
@@ -195,7 +195,7 @@ def sorts(bench: Bench, scene: GpuScene) -> dict[str, Any]:
     return found
 
 
-def pictures(bench: Bench, scene: GpuScene) -> list[Tensor]:
+def images(bench: Bench, scene: GpuScene) -> list[Tensor]:
     """Targets [H, W, 3] of the cameras, in [0, 1]."""
     with torch.no_grad():
         return [

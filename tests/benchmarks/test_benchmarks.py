@@ -52,7 +52,7 @@ def test_the_short_form_writes_every_figure_of_every_workload(quick: dict[str, A
         assert all(result["best_ms"][step] > 0 for step in STEPS - {"sh_forward", "sh_backward"})
         assert set(result["iteration_ms"]) == {"stage1", "stage2", "stage3"}
         assert result["stage2_fill_ms_by_view"] > 0
-        assert all(0 < share < 1 for share in result["fma_fraction"].values())
+        assert all(0 < fraction < 1 for fraction in result["fma_fraction"].values())
         assert set(result["fma_fraction"]) == {"forward", "backward"}
         assert result["bytes_per_splat"] > 140
 

@@ -32,9 +32,9 @@ def committed() -> dict[str, Any]:
 
 
 def test_only_innermost_vector_loops_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(instructions, "LEAST_VECTOR", 1)
+    monkeypatch.setattr(instructions, "MIN_VECTOR", 1)
     assert instructions.vector_loops(LISTING) == [(3, 1)]  # 16, 1c, 20; the loop from 10 to 28 holds it
-    monkeypatch.setattr(instructions, "LEAST_VECTOR", 2)
+    monkeypatch.setattr(instructions, "MIN_VECTOR", 2)
     assert instructions.vector_loops(LISTING) == []
 
 

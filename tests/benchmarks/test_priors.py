@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from benchmarks.prior_captures import of_room, relative_map, room_mesh, room_picture, sensor_map, write_maps
+from benchmarks.prior_captures import of_room, relative_map, room_image, room_mesh, sensor_map, write_maps
 
 from gs2d.core.camera import look_at
 from gs2d.data.priors import read_depth, read_normals
@@ -27,18 +27,18 @@ def test_maps_are_those_of_the_room_spoilt_as_their_sources_spoil_them(tmp_path:
         "sensor/depths/a.png",
     ]
     metres = read_depth(tmp_path / "sensor/depths/a.png") / 1000
-    known = metres > 0
+    valid = metres > 0
     assert metres.shape == (72, 96)
-    assert 0.6 < known.mean() < 0.95
-    error = (metres / depth[::2, ::2] - 1)[known]
+    assert 0.6 < valid.mean() < 0.95
+    error = (metres / depth[::2, ::2] - 1)[valid]
     assert 0.008 < error.std() < 0.012
     values = read_depth(tmp_path / "relative/depths/a.png").astype(float)
     assert np.corrcoef(values.ravel(), (1 / depth).ravel())[0, 1] > 0.95
     normals = read_normals(tmp_path / "normal/normals/a.png")
     assert (normals[..., 2] > 0).mean() > 0.9  # OpenGL's z points back
-    picture = room_picture(mesh, owner, camera, np.random.default_rng(0))
-    assert picture.shape == (144, 192, 3)
-    assert picture.std() > 10
+    image = room_image(mesh, owner, camera, np.random.default_rng(0))
+    assert image.shape == (144, 192, 3)
+    assert image.std() > 10
 
 
 def test_a_sensor_knows_nothing_of_the_background_and_a_network_neither() -> None:

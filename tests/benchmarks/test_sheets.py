@@ -18,7 +18,7 @@ from tiny import write_capture
 
 
 def planted(splats: Splats, mean: tuple[float, float, float], scale: float) -> Splats:
-    """The splats and a white, opaque one at ``mean``, flat in z, of ``scale`` wu in x and y."""
+    """The splats and a white, opaque one at ``mean``, flat in z, of ``scale`` world units in x and y."""
     one = replace(
         splats.rows(torch.zeros(1, dtype=torch.long)),
         means=torch.tensor([mean]),

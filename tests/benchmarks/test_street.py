@@ -130,8 +130,8 @@ def test_the_part_of_a_mesh_in_the_subjects_box_is_by_area() -> None:
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [9, 0, 0], [5, 2, 0]], dtype=np.float32)
     mesh = Mesh(corners, np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32))  # areas 0.5 and 4
     box = np.array([[-1.0, -1, -1], [1, 1, 1]])
-    assert street_runs.share_in_box(mesh, box) == pytest.approx(0.5 / 4.5)
-    assert street_runs.share_in_box(Mesh(corners, np.zeros((0, 3), np.int32)), box) == 0.0
+    assert street_runs.fraction_in_box(mesh, box) == pytest.approx(0.5 / 4.5)
+    assert street_runs.fraction_in_box(Mesh(corners, np.zeros((0, 3), np.int32)), box) == 0.0
 
 
 # -- the table -----------------------------------------------------------------------------------------------------
@@ -228,11 +228,11 @@ def test_the_gallery_shows_four_pictures_a_capture_and_says_which_may_not_be_pub
     chosen = [capture for capture in street.CAPTURES if capture.name in ("bottle", "bust", "fox")]
     files = street_gallery.write_gallery(tmp_path / "gallery", chosen, tmp_path / "runs", "draft")
     assert [file.name for file in files] == ["bust-draft.jpg", "bottle-draft.jpg"]
-    picture = np.asarray(Image.open(files[0]).convert("L"), dtype=int)
-    assert picture.shape == (240, 4 * 300 + 3 * 4)
-    middles = [picture[120, 150 + 304 * k] for k in range(4)]
+    image = np.asarray(Image.open(files[0]).convert("L"), dtype=int)
+    assert image.shape == (240, 4 * 300 + 3 * 4)
+    middles = [image[120, 150 + 304 * k] for k in range(4)]
     assert np.abs(np.subtract(middles[:3], (250, 150, 50))).max() < 4
-    assert picture[5, -295] > 250  # beside the mesh
+    assert image[5, -295] > 250  # beside the mesh
     assert middles[3] < 230
     page = (tmp_path / "gallery" / "gallery-draft.md").read_text()
     assert "no: CC BY-NC-SA" in page

@@ -15,7 +15,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
 from gs2d.pipeline.train import train
-from tiny import ball_picture, write_ball_mesh, write_capture
+from tiny import ball_image, write_ball_mesh, write_capture
 
 ON_X, ON_Y = [(3, 0, 0), (-3, 0, 0)], [(0, 3, 0), (0, -3, 0), (0.5, 3, 0)]
 
@@ -25,7 +25,7 @@ def masks(places: list[tuple[float, float, float]]) -> list[tuple[Camera, np.nda
     found = []
     for place in places:
         camera = look_at(np.array(place, float), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=80, height=80, fx=100.0)
-        found.append((camera, ball_picture(camera)[..., 3] > 0))
+        found.append((camera, ball_image(camera)[..., 3] > 0))
     return found
 
 
@@ -39,24 +39,24 @@ def squares(*corners: tuple[float, float, float], side: float = 0.1) -> Mesh:
 
 def test_area_counts_as_inside_where_half_of_the_pictures_that_show_it_have_it_in_the_mask() -> None:
     middle, above, nowhere, beside = (0, 0, 0), (0, 0, 1.0), (0, 0, 40), (0.95, -0.05, 0)
-    share = subject.share_inside(squares(middle, middle, above, nowhere), masks(ON_X + ON_Y))
-    assert (share.masks, share.faces, share.inside_faces) == (5, 8, 4)
-    assert (share.area, share.inside, share.unseen) == pytest.approx((0.04, 0.5, 0.25))
-    assert subject.share_inside(squares(beside), masks(ON_X + ON_Y[:2])).inside == 1.0  # two of four
-    assert subject.share_inside(squares(beside), masks(ON_X + ON_Y)).inside == 0.0  # two of five
+    fraction = subject.fraction_inside(squares(middle, middle, above, nowhere), masks(ON_X + ON_Y))
+    assert (fraction.masks, fraction.faces, fraction.inside_faces) == (5, 8, 4)
+    assert (fraction.area, fraction.inside, fraction.unseen) == pytest.approx((0.04, 0.5, 0.25))
+    assert subject.fraction_inside(squares(beside), masks(ON_X + ON_Y[:2])).inside == 1.0  # two of four
+    assert subject.fraction_inside(squares(beside), masks(ON_X + ON_Y)).inside == 0.0  # two of five
 
 
 def test_the_share_is_of_the_area_and_not_of_the_number_of_faces() -> None:
     small, large = squares((0, 0, 0)), squares((0.0, 0.0, 0.9), side=0.2)
     both = Mesh(np.concatenate([small.vertices, large.vertices]), np.concatenate([small.faces, large.faces + 4]))
-    assert subject.share_inside(both, masks(ON_X + ON_Y)).inside == pytest.approx(0.2)
+    assert subject.fraction_inside(both, masks(ON_X + ON_Y)).inside == pytest.approx(0.2)
 
 
 def test_without_masks_or_area_there_is_no_share() -> None:
     with pytest.raises(DataError, match="got 0 masks"):
-        subject.share_inside(squares((0, 0, 0)), [])
+        subject.fraction_inside(squares((0, 0, 0)), [])
     with pytest.raises(DataError, match="and 0 faces"):
-        subject.share_inside(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), masks(ON_X))
+        subject.fraction_inside(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)), masks(ON_X))
 
 
 def test_the_masks_of_a_folder_judge_the_mesh_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

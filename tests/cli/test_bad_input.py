@@ -13,7 +13,7 @@ import pytest
 
 from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
-from tiny import ball_cameras, ball_picture, write_ball_mesh, write_capture
+from tiny import ball_cameras, ball_image, write_ball_mesh, write_capture
 
 
 def missing(folder: Path) -> None:
@@ -38,7 +38,7 @@ def colmap(folder: Path, model: int = 1) -> None:
 
     body = struct.pack("<Q", len(cameras))
     for i, camera in enumerate(cameras):
-        Image.fromarray(ball_picture(camera)[..., :3]).save(folder / "images" / f"{i}.png")
+        Image.fromarray(ball_image(camera)[..., :3]).save(folder / "images" / f"{i}.png")
         x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
         body += struct.pack("<i7di", i + 1, w, x, y, z, *camera.T_cam_world[:3, 3], 1)
         body += f"{i}.png".encode() + b"\0" + struct.pack("<Q", 0)
@@ -87,7 +87,7 @@ def cut_json_of_opensfm(folder: Path) -> None:
     (folder / "reconstruction.json").write_text('[{"cameras": {')
 
 
-def xml_of_metashape_without_photographs(folder: Path) -> None:
+def xml_of_metashape_without_images(folder: Path) -> None:
     folder.mkdir()
     place = "<transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>"
     cameras = f"<cameras><camera id='0' sensor_id='0' label='a'>{place}</camera></cameras>"
@@ -103,7 +103,7 @@ def meshroom_before_its_poses(folder: Path) -> None:
     ("make", "named"),
     [
         (cut_json_of_opensfm, "reconstruction.json"),
-        (xml_of_metashape_without_photographs, "listed in cameras.xml"),
+        (xml_of_metashape_without_images, "listed in cameras.xml"),
         (meshroom_before_its_poses, "StructureFromMotion"),
         (missing, "capture"),
         (empty, "capture"),
@@ -172,12 +172,12 @@ def test_masks_that_leave_nothing_to_learn_from_are_an_error(
 
 def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None:
     from gs2d.pipeline.events import Event
-    from gs2d.pipeline.job import prepare
+    from gs2d.pipeline.job import prepare_job
     from gs2d.pipeline.options import TrainOptions
 
     masked_colmap(tmp_path / "capture", (1,))
     heard: list[Event] = []
-    prepare(TrainOptions(scene=tmp_path / "capture", out=tmp_path / "run"), heard.append)
+    prepare_job(TrainOptions(scene=tmp_path / "capture", out=tmp_path / "run"), heard.append)
     assert any("masks of 1 of 3 views leave no pixel, first 1.png: nothing is learned" in str(e) for e in heard)
 
 

@@ -12,7 +12,7 @@ import pytest
 from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
 from gs2d.config.presets import RECIPES
-from gs2d.pipeline.job import prepare
+from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.options import TrainOptions
 from tiny import write_ball_mesh, write_capture
 
@@ -100,7 +100,7 @@ def test_info_and_training_name_each_piece_that_a_scene_of_a_data_set_lacks(
         f"missing: {path}" for path in gone
     ]
     notices: list[str] = []
-    prepare(TrainOptions(scene=scene, out=tmp_path / "run"), lambda e: notices.append(getattr(e, "text", "")))
+    prepare_job(TrainOptions(scene=scene, out=tmp_path / "run"), lambda e: notices.append(getattr(e, "text", "")))
     told = [text for text in notices if " is missing (for training): get it from" in text]
     assert [text.split(" is missing")[0] for text in told] == [str(path) for path in gone[:3]]
     assert "... and 2 more pieces are missing; `gs2d info` lists them" in notices

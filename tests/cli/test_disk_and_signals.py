@@ -75,13 +75,13 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
 ) -> None:
     from gs2d.pipeline import run_logger as recorder
 
-    put = recorder.Recorder._score_stage
+    put = recorder.RunLogger._score_stage
 
-    def interrupted(self: recorder.Recorder, index: int) -> None:
+    def interrupted(self: recorder.RunLogger, index: int) -> None:
         put(self, index)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(recorder.Recorder, "_score_stage", interrupted)
+    monkeypatch.setattr(recorder.RunLogger, "_score_stage", interrupted)
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--threads", "1", *TINY]
     assert run(words) == 130
     line = capsys.readouterr().err.strip()
@@ -230,7 +230,7 @@ def test_an_os_error_that_the_user_can_mend_is_one_line(
     monkeypatch.setattr(jobs, "report_run", denied)
     assert run(["report", str(trained)]) == 2
     assert "Permission denied" in one_line(capsys.readouterr().err)
-    assert app_module.OURS == 1
+    assert app_module.EXIT_BUG == 1
 
 
 @pytest.mark.parametrize("quiet", [True, False])

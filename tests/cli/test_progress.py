@@ -156,14 +156,14 @@ def test_the_whole_run_is_unknown_until_training_is_measured_and_then_a_range() 
     whole.on_plan(Plan(plan.TRAINED))  # of `train` within `reconstruct`
     whole.on_expected(Expected(100.0, 400.0))
     whole.on_phase(Phase("training 2dgs", 1000))
-    shares = sum(part.of_training or 0.0 for part in plan.TRAINED)
-    assert whole.left() == Left(pytest.approx(100 * (1 + shares / 2)), pytest.approx(400 * (1 + shares * 2)))
+    fractions = sum(part.of_training or 0.0 for part in plan.TRAINED)
+    assert whole.left() == Left(pytest.approx(100 * (1 + fractions / 2)), pytest.approx(400 * (1 + fractions * 2)))
     clock.now = 100.0
     whole.on_step(500)  # from its own speed: 100 s more, or half as much again
     left = whole.left()
     assert left is not None
-    assert left.least == pytest.approx(100 + 200 * shares / 2)
-    assert left.most == pytest.approx(150 + 250 * shares * 2)
+    assert left.least == pytest.approx(100 + 200 * fractions / 2)
+    assert left.most == pytest.approx(150 + 250 * fractions * 2)
     whole.on_phase(Phase("scoring test views", 8))  # within training: not a step of it
     whole.on_step(8)
     assert whole.line().startswith("part 5 of 7: training; whole run: ")

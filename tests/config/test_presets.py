@@ -48,11 +48,11 @@ def test_2dgs_is_the_official_recipe() -> None:
     assert dict(stage.train) == dict.fromkeys(ALL, "all")
     assert stage.densify == GradDensify()
     assert stage.sh_interval == 1000
-    rates = stage.rates
-    assert (rates.means, rates.means_final, rates.means_horizon) == (1.6e-4, 1.6e-6, 30_000)
-    assert (rates.sh0, rates.shN, rates.opacity_logits) == (2.5e-3, 1.25e-4, 0.05)
-    assert (rates.log_scales, rates.quats) == (5e-3, 1e-3)
-    assert (rates.beta1, rates.beta2, rates.eps) == (0.9, 0.999, 1e-15)
+    lr = stage.lr
+    assert (lr.means, lr.means_final, lr.means_decay_steps) == (1.6e-4, 1.6e-6, 30_000)
+    assert (lr.sh0, lr.shN, lr.opacity_logits) == (2.5e-3, 1.25e-4, 0.05)
+    assert (lr.log_scales, lr.quats) == (5e-3, 1e-3)
+    assert (lr.beta1, lr.beta2, lr.eps) == (0.9, 0.999, 1e-15)
 
 
 def test_2dgs_r_has_the_three_stages_of_the_paper() -> None:
@@ -67,7 +67,7 @@ def test_2dgs_r_has_the_three_stages_of_the_paper() -> None:
     assert weights(refine) == {"l1": (0.8, 0), "ssim": (0.2, 0), "normal_consistency": (0.05, 0)}
     for stage in (appearance, refine):
         assert stage.densify is None
-        assert stage.rates.means_at(1) == pytest.approx(1.6e-6)
+        assert stage.lr.means_at(1) == pytest.approx(1.6e-6)
         assert stage.moments == "fresh"
         assert stage.sh_interval == 0
 
@@ -79,7 +79,7 @@ def test_the_fair_control_shares_its_first_stage_and_trains_as_long_as_2dgs_r() 
     more = control.stages[1]
     assert more.moments == "kept"
     assert more.densify is None
-    assert more.rates.means_at(1) == pytest.approx(1.6e-6)
+    assert more.lr.means_at(1) == pytest.approx(1.6e-6)
     assert weights(more)["normal_consistency"] == (0.05, 0)
 
 

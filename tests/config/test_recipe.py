@@ -15,10 +15,10 @@ from gs2d.config.recipe import (
     CloneInPlace,
     Exposure,
     GradDensify,
+    LearningRates,
     LossTerm,
     PoseRefinement,
     RankByError,
-    Rates,
     Recipe,
     Stage,
     validate,
@@ -43,16 +43,16 @@ def test_recipe_modules_never_import_torch() -> None:
 
 
 def test_the_rate_of_the_means_is_log_linear_and_stays_at_its_end() -> None:
-    rates = Rates(means=1e-4, means_final=1e-6, means_horizon=100)
-    assert rates.means_at(0) == pytest.approx(1e-4)
-    assert rates.means_at(50) == pytest.approx(1e-5)  # geometric mean
-    assert rates.means_at(100) == pytest.approx(1e-6)
-    assert rates.means_at(5000) == pytest.approx(1e-6)
+    lr = LearningRates(means=1e-4, means_final=1e-6, means_decay_steps=100)
+    assert lr.means_at(0) == pytest.approx(1e-4)
+    assert lr.means_at(50) == pytest.approx(1e-5)  # geometric mean
+    assert lr.means_at(100) == pytest.approx(1e-6)
+    assert lr.means_at(5000) == pytest.approx(1e-6)
 
 
 def test_rates_at_the_end_are_constant_and_leave_the_others() -> None:
-    assert Rates().at_end(30_000) == replace(Rates(), means=1.6e-6, means_final=1.6e-6)
-    half = Rates(means=1e-4, means_final=1e-6, means_horizon=100).at_end(50)
+    assert LearningRates().at_end(30_000) == replace(LearningRates(), means=1.6e-6, means_final=1.6e-6)
+    half = LearningRates(means=1e-4, means_final=1e-6, means_decay_steps=100).at_end(50)
     assert half.means == half.means_final == pytest.approx(1e-5)
     assert half.means_at(1) == pytest.approx(1e-5)
 
@@ -76,9 +76,9 @@ def test_last_reset_ends_resets_and_reset_at_adds_some() -> None:
 
 def test_faint_splats_are_spared_for_exactly_the_grace_after_a_reset() -> None:
     densify = GradDensify(prune_grace=100)
-    spared = [i for i in range(2900, 3200) if densify.spares_faint(i, white=False)]
+    spared = [i for i in range(2900, 3200) if densify.in_prune_grace(i, white=False)]
     assert spared == list(range(3001, 3101))
-    assert not GradDensify().spares_faint(3001, white=False)
+    assert not GradDensify().in_prune_grace(3001, white=False)
 
 
 def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
@@ -115,9 +115,9 @@ def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
         (one(on_enter=(RankByError(top_percent=101.0),)), "top_percent"),
         (one(on_enter=(RankByError(writes="all"),)), "cannot be called 'all'"),
         (one(moments="old"), "moments must be one of fresh, kept"),
-        (one(rates=Rates(sh0=-1.0)), "rates.sh0"),
-        (one(rates=Rates(means=0.0)), "must be positive"),
-        (one(rates=Rates(beta2=1.0)), "below 1"),
+        (one(lr=LearningRates(sh0=-1.0)), "lr.sh0"),
+        (one(lr=LearningRates(means=0.0)), "must be positive"),
+        (one(lr=LearningRates(beta2=1.0)), "below 1"),
         (one(densify=GradDensify(every=0)), "densify.every"),
         (one(densify=GradDensify(reset_opacity=0.0)), "reset_opacity"),
         (one(densify=GradDensify(max_splats=0)), "max_splats"),
@@ -138,7 +138,7 @@ def test_validate_names_the_stage_and_what_exists(recipe: Recipe, message: str) 
         ("rate_final", -1.0, "exposure.rate_final must be a finite number >= 0"),
         ("prior", float("nan"), "exposure.prior must be a finite number"),
         ("beta1", 1.0, "exposure.beta1 and recipe 'r': exposure.beta2 must be below 1"),
-        ("horizon", 0, "exposure.horizon must be an integer >= 1"),
+        ("decay_steps", 0, "exposure.decay_steps must be an integer >= 1"),
         ("start", -1, "exposure.start must be an integer >= 0"),
     ],
 )
@@ -180,8 +180,8 @@ def test_comparisons_of_views_are_checked_like_the_stages(field: str, value: flo
             "lidar",
             "depth_prior.source must be one of auto, sparse, sensor, relative; got 'lidar'",
         ),
-        ("final", 0.0, "depth_prior.final must be in (0, 1], got 0.0"),
-        ("horizon", 0, "depth_prior.horizon must be an integer >= 1"),
+        ("final_factor", 0.0, "depth_prior.final_factor must be in (0, 1], got 0.0"),
+        ("decay_steps", 0, "depth_prior.decay_steps must be an integer >= 1"),
         ("opacity", 1.0, "depth_prior.opacity must be below 1"),
         ("noise", 0.0, "depth_prior.noise must be positive"),
         ("min_track", 1, "depth_prior.min_track must be an integer >= 2"),
@@ -209,11 +209,11 @@ def test_a_loss_on_what_is_known_and_how_it_is_known_come_together(kind: str, va
 
 
 def test_the_weight_of_a_prior_falls_log_linearly_to_its_share() -> None:
-    prior = DepthPrior(final=0.01, horizon=100)
-    assert prior.share_at(0) == 1
-    assert prior.share_at(50) == pytest.approx(0.1)
-    assert prior.share_at(100) == prior.share_at(1000) == pytest.approx(0.01)
-    assert NormalPrior(final=1.0).share_at(7) == 1
+    prior = DepthPrior(final_factor=0.01, decay_steps=100)
+    assert prior.weight_at(0) == 1
+    assert prior.weight_at(50) == pytest.approx(0.1)
+    assert prior.weight_at(100) == prior.weight_at(1000) == pytest.approx(0.01)
+    assert NormalPrior(final_factor=1.0).weight_at(7) == 1
 
 
 def test_losses_of_two_views_and_how_they_are_compared_come_together() -> None:
@@ -229,7 +229,7 @@ def test_losses_of_two_views_and_how_they_are_compared_come_together() -> None:
         ("rate", 0.0, "recipe 'r': poses.rate must be positive, got 0.0 (poses=null leaves cameras alone)"),
         ("rate", 1e30, "recipe 'r': poses.rate must be at most 1 (rad, extents), got 1e+30"),
         ("beta2", 1.0, "poses.beta1 and recipe 'r': poses.beta2 must be below 1"),
-        ("horizon", 0, "poses.horizon must be an integer >= 1"),
+        ("decay_steps", 0, "poses.decay_steps must be an integer >= 1"),
         ("start", -1, "poses.start must be an integer >= 0"),
     ],
 )

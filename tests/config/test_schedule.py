@@ -23,8 +23,8 @@ def test_a_tenth_scales_lengths_starts_sh_interval_and_horizon() -> None:
     assert [s.iterations for s in (surface, appearance, refine)] == [3000, 1000, 2000]
     assert [term.start for term in surface.losses] == [0, 0, 700]
     assert surface.sh_interval == 100
-    assert surface.rates.means_horizon == 3000
-    assert surface.rates.means_at(surface.iterations) == pytest.approx(1.6e-6)
+    assert surface.lr.means_decay_steps == 3000
+    assert surface.lr.means_at(surface.iterations) == pytest.approx(1.6e-6)
     densify = surface.densify
     assert densify is not None
     # 100, 200, ..., 1400: fourteen fit, so the interval stays
@@ -106,7 +106,7 @@ def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
     recipe = get_recipe("2dgs-exposure")
     # start: 500 of 30,000; a tenth of the schedule waits 200, not 50; at most a sixth of its 3000, 1200 or 300.
     facts = {factor: scale_schedule(recipe, factor).exposure for factor in (1.0, 0.5, 0.1, 0.04, 0.01)}
-    assert {f: (e.horizon, e.start) for f, e in facts.items() if e is not None} == {
+    assert {f: (e.decay_steps, e.start) for f, e in facts.items() if e is not None} == {
         1.0: (30_000, 500),
         0.5: (15_000, 250),
         0.1: (3_000, 200),
@@ -118,7 +118,7 @@ def test_exposures_wait_for_colours_by_the_count_of_iterations() -> None:
 
 def test_poses_take_longer_steps_where_they_have_fewer_turns() -> None:
     facts = {factor: scale_schedule(get_recipe("2dgs-poses"), factor).poses for factor in (1.0, 0.25, 0.01)}
-    assert {f: (p.horizon, p.start) for f, p in facts.items() if p is not None} == {
+    assert {f: (p.decay_steps, p.start) for f, p in facts.items() if p is not None} == {
         1.0: (30_000, 500),
         0.25: (7_500, 200),
         0.01: (300, 50),
@@ -135,5 +135,5 @@ def test_steps_are_longer_where_there_are_fewer_and_nothing_else_changes() -> No
     assert longer_steps(recipe, 1.0) is recipe
     assert longer_steps(recipe, 4.0) is recipe
     for stage, before in zip(longer_steps(recipe, 1 / 16).stages, recipe.stages, strict=True):
-        longer = {name: 2 * getattr(before.rates, name) for name in (*ALL, "means_final")}
-        assert stage == replace(before, rates=replace(before.rates, **longer))
+        longer = {name: 2 * getattr(before.lr, name) for name in (*ALL, "means_final")}
+        assert stage == replace(before, lr=replace(before.lr, **longer))

@@ -30,14 +30,14 @@ def test_json_with_an_unknown_key_or_a_missing_one_or_a_wrong_type_is_an_error()
         return str(caught.value)
 
     assert "has no field 'colour'" in broken("data['colour'] = 1")
-    assert "stage 'refine'.rates has no field 'sh1'" in broken("data['stages'][2]['rates']['sh1'] = 1")
+    assert "stage 'refine'.lr has no field 'sh1'" in broken("data['stages'][2]['lr']['sh1'] = 1")
     assert "lacks the field 'iterations'" in broken("del data['stages'][0]['iterations']")
     assert "stage 'surface'.iterations must be an integer, got 'many'" in broken(
         "data['stages'][0]['iterations'] = 'many'"
     )
     assert "stage 'surface'.iterations must be an integer, got True" in broken("data['stages'][0]['iterations'] = True")
     assert "must be a list" in broken("data['stages'] = 3")
-    assert "must be an object" in broken("data['stages'][0]['rates'] = [1]")
+    assert "must be an object" in broken("data['stages'][0]['lr'] = [1]")
     assert "one of rank_by_error, clone_in_place; got 'clone'" in broken(
         "data['stages'][2]['on_enter'][0]['action'] = 'clone'"
     )
@@ -57,7 +57,7 @@ def test_overrides_reach_every_level() -> None:
         "refine.on_enter.clone_in_place.opacity=preserve",
         "refine.train.means=null",
         "refine.train.opacity_logits=clones",
-        "refine.rates.sh0=1",
+        "refine.lr.sh0=1",
     )
     surface, appearance, refine = recipe.stages
     assert recipe.seed == 7
@@ -73,7 +73,7 @@ def test_overrides_reach_every_level() -> None:
         "shN": "all",
         "opacity_logits": "clones",
     }
-    assert refine.rates.sh0 == 1.0
+    assert refine.lr.sh0 == 1.0
 
 
 def test_overrides_that_are_not_named_stay_as_they_were() -> None:

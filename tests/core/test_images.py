@@ -36,8 +36,8 @@ def test_every_kind_of_file_becomes_8_bit_rgb_or_rgba(tmp_path: Path) -> None:
     palette = Image.fromarray(np.array([[0, 1, 2]], np.uint8), "P")
     palette.putpalette([10, 20, 30, 40, 50, 60, 70, 80, 90])
     cases["p.png"] = (palette, [[[10, 20, 30], [40, 50, 60], [70, 80, 90]]])
-    for name, (picture, expected) in cases.items():
-        picture.save(tmp_path / name)
+    for name, (image, expected) in cases.items():
+        image.save(tmp_path / name)
         got = read_image(tmp_path / name)
         assert got.dtype == np.uint8
         np.testing.assert_array_equal(got, expected, err_msg=name)

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gs2d.core.camera import look_at
-from gs2d.core.transforms import camera_extent, focus_point, moved, nearest_distances, quats_to_matrices, rigid_motion
+from gs2d.core.transforms import camera_extent, focus_point, nearest_distances, perturb_pose, quats_to_matrices, se3_exp
 from gs2d.errors import ShapeError
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -35,30 +35,30 @@ def test_a_zero_quaternion_is_no_rotation() -> None:
 def test_a_rigid_motion_turns_by_its_vector_and_moves_along_its_arc() -> None:
     # A quarter turn about z at speed 2 along x: a quarter of a circle of radius 2 / (pi / 2), to (r, r, 0).
     quarter, r = math.pi / 2, 2 / (math.pi / 2)
-    T = rigid_motion(torch.tensor([0, 0, quarter, 2, 0, 0], dtype=torch.float64))
+    T = se3_exp(torch.tensor([0, 0, quarter, 2, 0, 0], dtype=torch.float64))
     expected = torch.tensor([[0.0, -1, 0, r], [1, 0, 0, r], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
     torch.testing.assert_close(T, expected)
     turn = np.array([0.3, -2.0, 1.1])
-    found = rigid_motion(torch.tensor([*turn, 0, 0, 0], dtype=torch.float64))[:3, :3].numpy()
+    found = se3_exp(torch.tensor([*turn, 0, 0, 0], dtype=torch.float64))[:3, :3].numpy()
     np.testing.assert_allclose(found, Rotation.from_rotvec(turn).as_matrix(), atol=1e-14)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1.0])
 def test_a_rigid_motion_is_differentiable_everywhere(size: float) -> None:
     motion = (size * torch.tensor([0.3, -0.2, 0.5, 1, 2, -1], dtype=torch.float64)).requires_grad_()
-    assert torch.autograd.gradcheck(rigid_motion, (motion,), atol=1e-7)
-    assert torch.equal(rigid_motion(torch.zeros(6)), torch.eye(4))
+    assert torch.autograd.gradcheck(se3_exp, (motion,), atol=1e-7)
+    assert torch.equal(se3_exp(torch.zeros(6)), torch.eye(4))
 
 
 def test_a_moved_camera_turns_about_its_own_centre_and_moves_along_its_own_axes() -> None:
     camera = look_at(np.array([1.0, 2.0, 3.0]), np.zeros(3), UP, width=6, height=4, fx=5)
-    turned = moved(camera, torch.tensor([0.1, 0.2, 0.3, 0, 0, 0], dtype=torch.float64))
+    turned = perturb_pose(camera, torch.tensor([0.1, 0.2, 0.3, 0, 0, 0], dtype=torch.float64))
     np.testing.assert_allclose(turned.center, camera.center, atol=1e-14)
     assert turned.pose is None  # nothing learns
-    shifted = moved(camera, torch.tensor([0, 0, 0, 0.0, 0, 0.5], dtype=torch.float64))
+    shifted = perturb_pose(camera, torch.tensor([0, 0, 0, 0.0, 0, 0.5], dtype=torch.float64))
     np.testing.assert_allclose(shifted.center, camera.center - 0.5 * camera.forward, atol=1e-14)
     motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    twice = moved(moved(camera, motion), motion)
+    twice = perturb_pose(perturb_pose(camera, motion), motion)
     assert twice.pose is not None
     twice.pose[0, 3].backward()
     assert motion.grad is not None
@@ -67,7 +67,7 @@ def test_a_moved_camera_turns_about_its_own_centre_and_moves_along_its_own_axes(
 
 def test_a_motion_of_another_size_is_refused() -> None:
     with pytest.raises(ShapeError, match=r"motion must be \[6\], got \[1, 6\]"):
-        rigid_motion(torch.zeros(1, 6))
+        se3_exp(torch.zeros(1, 6))
 
 
 def test_nearest_distances_are_the_rms_to_the_three_nearest_others() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from capture_writers import ColmapModel, ring, small_blender, small_colmap, small_dtu, write_picture
+from capture_writers import ColmapModel, ring, small_blender, small_colmap, small_dtu, write_image_of
 from gs2d.config.datasets import DATASETS, get_dataset
 from gs2d.data import detect_format, load_scene
 from gs2d.data.benchmarks import describe, find_scenes, find_truth, missing_lines, protocol_of, recognise
@@ -78,7 +78,7 @@ def write_360(data: Path) -> Path:
     root = data / "360_v2/garden"
     model = small_colmap(root, count=3)
     for image in model.images:
-        write_picture(root / "images_4" / image[3], 10, 8)
+        write_image_of(root / "images_4" / image[3], 10, 8)
     (root / "poses_bounds.npy").write_text("")
     return root
 
@@ -117,17 +117,17 @@ def test_a_whole_data_set_loads(tmp_path: Path, layout: str) -> None:
 
 def files_of(layout: str) -> list[str]:
     """What each writer writes, so that pytest can name every case before anything is written."""
-    pictures = [f"{i:06d}.png" for i in range(3)]
+    images = [f"{i:06d}.png" for i in range(3)]
     masks = [f"{i:03d}.png" for i in range(3)]
     model = [f"sparse/0/{stem}.bin" for stem in ("cameras", "images", "points3D")]
     if layout == "dtu-2dgs":
         root, official = "DTU/scan24", "Official_DTU_Dataset"
         truth = ["Points/stl/stl024_total.ply", "ObsMask/ObsMask24_10.mat", "ObsMask/Plane24.mat"]
-        capture = [f"images/{p}" for p in pictures] + [f"mask/{m}" for m in masks] + model
+        capture = [f"images/{p}" for p in images] + [f"mask/{m}" for m in masks] + model
         capture += ["cameras.npz", "cameras_sphere.npz"]
         return [f"{root}/{f}" for f in capture] + [f"{official}/{f}" for f in truth]
     if layout == "dtu-neus":
-        capture = [f"image/{p}" for p in pictures] + [f"mask/{m}" for m in masks] + ["cameras_sphere.npz"]
+        capture = [f"image/{p}" for p in images] + [f"mask/{m}" for m in masks] + ["cameras_sphere.npz"]
         mat = [f"SampleSet/MVS Data/ObsMask/{n}" for n in ("ObsMask65_10.mat", "Plane65.mat")]
         return [f"data_DTU/dtu_scan65/{f}" for f in capture] + ["Points/stl/stl065_total.ply", *mat]
     if layout == "tnt":

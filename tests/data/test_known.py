@@ -15,13 +15,13 @@ from PIL import Image
 from capture_writers import ring, small_colmap
 from gs2d.core.splats import Splats
 from gs2d.data import View, load_scene
-from gs2d.data.cache import Picture
+from gs2d.data.cache import DecodedImage
 from gs2d.data.undistort import colmap_intrinsics, source_positions
 from gs2d.pipeline import mesh as surface
 from gs2d.pipeline.events import ignore
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.report.images import HATCHED, IGNORED, known_picture
+from gs2d.report.images import HATCHED, IGNORED, valid_image
 from gs2d.training.targets import DeviceTargets, Targets
 
 WIDTH, HEIGHT = 160, 120
@@ -49,24 +49,24 @@ def reached() -> np.ndarray:
 def test_what_the_photograph_does_not_reach_is_unknown_and_also_outside_the_mask(tmp_path: Path) -> None:
     plain, masked = distorted(tmp_path / "a"), distorted(tmp_path / "b", mask=True)
     for view in (plain, masked):
-        np.testing.assert_array_equal(view.known(), reached())
-        assert not view.known()[0, 0]
-        assert (view.image()[~view.known()] == 0).all()
+        np.testing.assert_array_equal(view.valid(), reached())
+        assert not view.valid()[0, 0]
+        assert (view.image()[~view.valid()] == 0).all()
         np.testing.assert_array_equal(view.usable(masks=False), reached())
     np.testing.assert_array_equal(plain.mask(), reached())
     assert masked.mask()[60, 40]
     assert not masked.mask()[60, 120]
-    assert masked.known()[60, 120]
+    assert masked.valid()[60, 120]
     np.testing.assert_array_equal(masked.usable(masks=True), masked.mask())
 
 
 def test_all_of_a_photograph_without_distortion_is_known(tmp_path: Path) -> None:
     view = distorted(tmp_path / "a", (110.0, 80.0, 60.0, 0.0))
-    assert view.known() is None
+    assert view.valid() is None
     assert view.mask() is None
     assert view.usable(masks=False) is None
     masked = distorted(tmp_path / "b", (110.0, 80.0, 60.0, 0.0), mask=True)
-    assert masked.known() is None
+    assert masked.valid() is None
     assert masked.usable(masks=False) is None
     assert not masked.usable(masks=True)[60, 120]
 
@@ -81,47 +81,47 @@ def test_nerfstudio_captures_say_it_too(tmp_path: Path) -> None:
     f, cx, cy, k1 = PINCUSHION
     facts = {"fl_x": f, "fl_y": f, "cx": cx, "cy": cy, "w": WIDTH, "h": HEIGHT, "k1": k1, "camera_model": "OPENCV"}
     (tmp_path / "transforms.json").write_text(json.dumps({**facts, "frames": frames}))
-    np.testing.assert_array_equal(load_scene(tmp_path, test_every=0).train[0].known(), reached())
+    np.testing.assert_array_equal(load_scene(tmp_path, test_every=0).train[0].valid(), reached())
 
 
 def test_a_smaller_picture_knows_what_all_its_pixels_know(tmp_path: Path) -> None:
     distorted(tmp_path)
     view = load_scene(tmp_path, test_every=0, downscale=4).train[0]
     blocks = reached().reshape(HEIGHT // 4, 4, WIDTH // 4, 4).all(axis=(1, 3))
-    np.testing.assert_array_equal(view.known(), blocks)
+    np.testing.assert_array_equal(view.valid(), blocks)
 
 
 def test_a_mask_that_is_what_is_known_takes_no_memory_twice() -> None:
-    known = np.eye(4, dtype=bool)
-    picture = Picture(np.zeros((4, 4, 3), np.uint8), known, None, known)
-    assert picture.nbytes == 48 + 16
+    valid = np.eye(4, dtype=bool)
+    image = DecodedImage(np.zeros((4, 4, 3), np.uint8), valid, None, valid)
+    assert image.nbytes == 48 + 16
 
 
-def pictures(unknown: int) -> View:
+def images(unknown: int) -> View:
     """A view of 8 x 8 pixels, of which the left half is unknown and has this value."""
     image = np.full((8, 8, 3), 200, np.uint8)
     image[:, :4] = unknown
-    known = np.ones((8, 8), bool)
-    known[:, :4] = False
+    valid = np.ones((8, 8), bool)
+    valid[:, :4] = False
     camera = ring(1, width=8, height=8, f=8.0)[0]
-    return View.from_arrays("a", camera, image, known=known)
+    return View.from_arrays("a", camera, image, valid=valid)
 
 
 @pytest.mark.parametrize("use_masks", [True, False])
 def test_unknown_pixels_are_no_target_of_any_protocol(use_masks: bool) -> None:
-    view = pictures(0)
+    view = images(0)
     black = (0.0, 0.0, 0.0)
     made: list[Any] = [
         Targets([view], black, use_masks=use_masks, with_maps=False)[0],
         DeviceTargets([view], black, use_masks=use_masks, device=torch.device("cpu"))[0],
     ]
     for target in made:
-        np.testing.assert_array_equal(target.mask.numpy(), view.known())
+        np.testing.assert_array_equal(target.mask.numpy(), view.valid())
 
 
 @pytest.mark.parametrize("use_masks", [True, False])
 def test_the_depth_of_unknown_pixels_is_not_fused(use_masks: bool) -> None:
-    view = pictures(0)
+    view = images(0)
     splat = Splats(
         means=torch.zeros(1, 3),
         quats=torch.tensor([[0.7, 0.0, 0.7, 0.0]]),
@@ -143,15 +143,15 @@ def test_the_depth_of_unknown_pixels_is_not_fused(use_masks: bool) -> None:
 
 
 def test_a_photograph_is_hatched_where_it_ends() -> None:
-    known = np.ones((20, 20), bool)
-    known[:, :10] = False
-    photo = np.where(known[..., None], 0.5, np.zeros(3)).astype(np.float32)
-    shown = known_picture(photo, known)
+    valid = np.ones((20, 20), bool)
+    valid[:, :10] = False
+    photo = np.where(valid[..., None], 0.5, np.zeros(3)).astype(np.float32)
+    shown = valid_image(photo, valid)
     assert shown.dtype == np.float32
-    np.testing.assert_array_equal(shown[known], photo[known])
-    tones = np.unique(shown[~known], axis=0)
+    np.testing.assert_array_equal(shown[valid], photo[valid])
+    tones = np.unique(shown[~valid], axis=0)
     np.testing.assert_allclose(tones, [IGNORED, HATCHED], atol=1e-6)
-    assert known_picture(photo, None) is photo
-    straight = known_picture(np.zeros((20, 20, 4), np.uint8), known)
-    assert (straight[~known][:, 3] == 255).all()
-    assert straight[~known].min() > 200
+    assert valid_image(photo, None) is photo
+    straight = valid_image(np.zeros((20, 20, 4), np.uint8), valid)
+    assert (straight[~valid][:, 3] == 255).all()
+    assert straight[~valid].min() > 200

@@ -21,7 +21,7 @@ Shared = Callable[[str], Path]
 
 
 def observations(root: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """For each image of the COLMAP model: its observed points [M, 3] wu and where it saw them [M, 2] px."""
+    """For each image of the COLMAP model: its observed points [M, 3] world units and where it saw them [M, 2] px."""
     folder, kind = model_folder(root)
     points = read_points(folder, kind)
     row = {int(i): r for r, i in enumerate(points.ids)}
@@ -148,8 +148,8 @@ def test_the_fox_s_epipolar_geometry_holds_after_undistortion(shared: Shared) ->
     for first, second in ((20, 24), (36, 40), (12, 20)):
         a, b = scene.train[first], scene.train[second]
         medians = []
-        for picture_a, picture_b in ((a.image(), b.image()), (read_image(a.path), read_image(b.path))):
-            (pa, da), (pb, db) = features(picture_a), features(picture_b)
+        for image_a, image_b in ((a.image(), b.image()), (read_image(a.path), read_image(b.path))):
+            (pa, da), (pb, db) = features(image_a), features(image_b)
             pairs = match_descriptors(da, db, max_ratio=0.6, cross_check=True)
             distance = epipolar_px(a.camera, b.camera, pa[pairs[:, 0]], pb[pairs[:, 1]])
             distance = distance[distance < 10]  # the rest are wrong matches

@@ -11,7 +11,7 @@ import pytest
 
 from capture_writers import ring, small_blender, small_colmap, small_dtu, small_nerfstudio, tree_hash
 from foreign_writers import small_alicevision, small_metashape, small_opensfm
-from gs2d.data import ImageCache, Picture, PointCloud, View, detect_format, load_scene
+from gs2d.data import DecodedImage, ImageCache, PointCloud, View, detect_format, load_scene
 from gs2d.errors import DataError, ShapeError
 
 WRITERS: dict[str, Callable[[Path], object]] = {
@@ -25,8 +25,8 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-def picture(value: int) -> Picture:
-    return Picture(np.full((10, 10, 3), value, np.uint8))
+def image(value: int) -> DecodedImage:
+    return DecodedImage(np.full((10, 10, 3), value, np.uint8))
 
 
 @pytest.mark.parametrize("format", WRITERS)
@@ -112,9 +112,9 @@ def test_the_cache_drops_the_least_recently_used_and_never_exceeds_its_bound() -
     made: list[int] = []
 
     def get(value: int) -> int:
-        def decode() -> Picture:
+        def decode() -> DecodedImage:
             made.append(value)
-            return picture(value)
+            return image(value)
 
         return int(cache.get(value, decode).image[0, 0, 0])
 
@@ -122,7 +122,7 @@ def test_the_cache_drops_the_least_recently_used_and_never_exceeds_its_bound() -
     assert made == [1, 2, 3, 2]  # 2 was older than 1 when 3 came
     assert (cache.nbytes, len(cache)) == (600, 2)
     tiny = ImageCache(299)
-    tiny.get(1, lambda: picture(1))
+    tiny.get(1, lambda: image(1))
     assert (tiny.nbytes, len(tiny)) == (0, 0)
 
 
@@ -132,7 +132,7 @@ def test_the_cache_is_safe_for_threads() -> None:
 
     def work(seed: int) -> None:
         for value in np.random.default_rng(seed).integers(0, 20, 500).tolist():
-            if cache.get(value, lambda v=value: picture(v)).image[0, 0, 0] != value:
+            if cache.get(value, lambda v=value: image(v)).image[0, 0, 0] != value:
                 wrong.append(value)
 
     threads = [threading.Thread(target=work, args=(seed,)) for seed in range(4)]

@@ -111,13 +111,13 @@ def test_a_distorted_grid_becomes_straight(tmp_path: Path, model: str) -> None:
 
     # The line x = 72 (a rising zero of the wave): its place in each row, by interpolation, has no bend.
     rows = [r for r in range(5, HEIGHT - 5) if mask[r, 70:75].all()]
-    crossing = []
+    near_plane_policy = []
     for row in rows:
         values = image[row, 69:75, 0] - 128
         at = int(np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))[0])
-        crossing.append(69.5 + at + values[at] / (values[at] - values[at + 1]))
+        near_plane_policy.append(69.5 + at + values[at] / (values[at] - values[at + 1]))
     assert len(rows) > 60
-    assert np.abs(np.array(crossing) - 72.0).max() < 0.06
+    assert np.abs(np.array(near_plane_policy) - 72.0).max() < 0.06
 
 
 def test_pixels_that_the_photograph_did_not_see_are_masked_out_and_empty(tmp_path: Path) -> None:

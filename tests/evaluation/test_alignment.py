@@ -81,7 +81,7 @@ def test_camera_centres_are_aligned_through_wrong_ones(wrong: int) -> None:
     fit = ransac_similarity(source, target, threshold=0.2)
     assert not fit.inliers[:wrong].any()
     assert fit.inliers[wrong:].all()
-    assert fit.share == pytest.approx((60 - wrong) / 60)
+    assert fit.fraction == pytest.approx((60 - wrong) / 60)
     assert fit.rms == pytest.approx(0.01 * math.sqrt(3), rel=0.25)
     assert np.linalg.norm(apply(fit.T_target_source, source) - moved(KNOWN, source), axis=1).max() < 0.02
     again = ransac_similarity(source, target, threshold=0.2)
@@ -138,7 +138,7 @@ def test_a_surface_that_was_turned_shifted_and_scaled_is_brought_back(degrees: f
         step = icp(apply(found, source), target, threshold=threshold, iterations=150, rms_change=1e-12)
         found = step.T_target_source @ found
     np.testing.assert_allclose(found, T, atol=1e-9)
-    assert step.share == 1
+    assert step.fraction == 1
     assert step.rms == pytest.approx(0, abs=1e-9)
 
 
@@ -159,7 +159,7 @@ def test_other_points_of_the_same_surface_are_aligned_to_a_few_per_cent() -> Non
 def test_equal_clouds_stay_where_they_are_after_one_step() -> None:
     result = icp(waves(500, 0), waves(500, 0), threshold=0.1, iterations=30)
     np.testing.assert_allclose(result.T_target_source, np.eye(4), atol=1e-12)
-    assert (result.iterations, result.converged, result.share_before, result.share, result.rms) == (
+    assert (result.iterations, result.converged, result.fraction_before, result.fraction, result.rms) == (
         1, True, 1, 1, pytest.approx(0, abs=1e-12)
     )  # fmt: skip
 
@@ -167,6 +167,6 @@ def test_equal_clouds_stay_where_they_are_after_one_step() -> None:
 def test_clouds_out_of_reach_of_each_other_are_not_moved() -> None:
     result = icp(waves(500, 0), waves(500, 0) + 10, threshold=0.1, iterations=30)
     np.testing.assert_array_equal(result.T_target_source, np.eye(4))
-    assert (result.share, result.rms, result.rms_before) == (0, None, None)
+    assert (result.fraction, result.rms, result.rms_before) == (0, None, None)
     nothing = icp(waves(5, 0), np.zeros((0, 3)), threshold=0.1, iterations=30)
-    assert nothing.share == 0
+    assert nothing.fraction == 0

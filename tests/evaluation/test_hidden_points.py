@@ -23,8 +23,8 @@ def test_the_fraction_of_depth_is_a_parameter() -> None:
 
 def test_the_share_of_no_points_is_unknown_and_not_zero() -> None:
     nothing = PointsInView(np.zeros((0, 2)), np.zeros(0))
-    assert hidden_points(np.ones((1, 4)), nothing).share is None
-    assert HiddenPoints(shown=4, hidden=1).share == 0.25
+    assert hidden_points(np.ones((1, 4)), nothing).fraction is None
+    assert HiddenPoints(shown=4, hidden=1).fraction == 0.25
 
 
 def test_views_are_pooled_by_points() -> None:

@@ -60,7 +60,7 @@ def test_a_scene_of_tanks_and_temples_is_scored_by_its_protocol(tmp_path: Path, 
     assert 0 < result["f_score"] < 0.3  # waves of 60 mm
     check = result["self_check"]
     assert check["ok"]
-    assert check["camera_share"] == 1
+    assert check["camera_fraction"] == 1
     assert len(check["stages"]) == 3
     assert result["protocol"]["camera_threshold"] == 0.2
     assert result["ground_truth"] == str(truth / "Truck.ply")
@@ -78,7 +78,7 @@ def test_a_photograph_that_was_left_out_keeps_the_others_with_their_cameras(tmp_
     (root / "images/000001.jpg").unlink()
     result, _ = scored(mesh, root, tmp_path / "surface")
     assert result["self_check"]["cameras"] == 58
-    assert result["self_check"]["camera_share"] == 1
+    assert result["self_check"]["camera_fraction"] == 1
     assert result["self_check"]["camera_rms"] < 0.02
 
 

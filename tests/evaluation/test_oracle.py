@@ -36,8 +36,8 @@ def test_the_f_score_its_alignment_and_every_stage_are_open3d_s(figures: dict) -
     score = evaluate_tnt(Mesh(scene.vertices, scene.faces), NAMES, scene.centers, truth, TAU)
     for ours, theirs in zip(score.alignment.stages, figures["stages"], strict=True):
         assert ours.points == theirs["points"]
-        assert ours.share_before == pytest.approx(theirs["share_before"], abs=1e-12)
-        assert ours.share == pytest.approx(theirs["share"], abs=1e-12)
+        assert ours.fraction_before == pytest.approx(theirs["share_before"], abs=1e-12)
+        assert ours.fraction == pytest.approx(theirs["share"], abs=1e-12)
         assert ours.rms_before == pytest.approx(theirs["rms_before"], rel=1e-9)
         assert ours.rms == pytest.approx(theirs["rms"], rel=1e-9)
     np.testing.assert_allclose(score.alignment.T_truth_mesh, figures["stages"][-1]["T"], atol=1e-10)

@@ -110,7 +110,7 @@ def test_masked_faces_get_no_samples_and_no_area_gives_none() -> None:
 
 
 def depths(mesh: Mesh, camera: Camera) -> np.ndarray:
-    """Depth [H, W] wu of the nearest face, 0 where there is none."""
+    """Depth [H, W] world units of the nearest face, 0 where there is none."""
     return cast_camera(mesh.vertices.astype(np.float64), mesh.faces, camera).depth
 
 
@@ -257,7 +257,7 @@ def test_a_point_cloud_is_a_truth_too_and_points_outside_all_images_do_not_count
     assert score.truth_points == 2000
     assert score.truth_hidden == pytest.approx(1 / 4001)
     assert score.scores[0].recall == 1
-    assert score.scores[0].precision == 1  # 4000 points on 4 wu^2: nearest neighbours at about 0.016
+    assert score.scores[0].precision == 1  # 4000 points on 4 world units^2: nearest neighbours at about 0.016
     assert 0.01 < (score.accuracy or 0) < 0.02
 
 

@@ -12,7 +12,7 @@ from gs2d.config.surface_protocols import TNT_SURFACE
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
 from gs2d.evaluation.crop import CropVolume, box
-from gs2d.evaluation.surface_clouds import FAR, GOOD, OUT, ScoredClouds, distance_colors, picture, write_clouds
+from gs2d.evaluation.surface_clouds import FAR, GOOD, OUT, ScoredClouds, distance_colors, draw_clouds, write_clouds
 from gs2d.evaluation.tanks_and_temples import TntScore, evaluate_tnt, f_score, point_set
 from gs2d.evaluation.tanks_and_temples_files import TntTruth
 from gs2d.io.meshes import read_points
@@ -137,7 +137,7 @@ def test_a_log_that_does_not_belong_to_the_transform_is_caught(elsewhere: tuple[
     wrong[:, :3, 3] = scene.centers  # the capture's own frame, which _trans.txt does not start from
     got = score(scene, trajectory=wrong)
     assert not got.alignment.ok
-    assert got.alignment.camera_share == 1
+    assert got.alignment.camera_fraction == 1
     (line,) = got.alignment.messages
     assert "the cameras fit Truck_COLMAP_SfM.log, the surface does not fit the scan" in line
     assert "TNT_GOF has a log of the same name" in line
@@ -177,7 +177,7 @@ def test_few_cameras_that_agree_are_told(elsewhere: tuple[TntScene, TntScore]) -
     log = scene.log.copy()
     log[::2, :3, 3] += np.random.default_rng(0).uniform(1, 3, (30, 3))
     got = score(scene, trajectory=log)
-    assert got.alignment.camera_share == 0.5
+    assert got.alignment.camera_fraction == 0.5
     assert "only 50% of the cameras agree with Truck_COLMAP_SfM.log within 0.2 m" in got.alignment.messages[0]
     assert not got.alignment.ok
 
@@ -210,14 +210,14 @@ def test_clouds_are_green_up_to_tau_red_far_off_and_grey_beyond_reach(tmp_path: 
     np.testing.assert_array_equal(precision.colors[4], OUT)
     assert len(read_points(tmp_path / names["recall_cloud"]).points) == 2
     assert (tmp_path / names["picture"]).exists()
-    image = picture(clouds)
+    image = draw_clouds(clouds)
     assert image.shape == (640, 960, 3)
     assert (image == GOOD).all(axis=2).any()
     lower = image[320:]
     assert not (lower == FAR).all(axis=2).any()  # the truth has no wrong point
     floating = ScoredClouds(np.array([[1e4, 0, 0]]), np.array([np.inf]), points[:4], distances[:4], 1.0)
-    assert (picture(floating)[320:] == GOOD).all(axis=2).sum() > 2 * 4  # the truth is not shrunk to one dot
-    assert picture(ScoredClouds(points[:0], distances[:0], points[:0], distances[:0], 1.0)).shape == (640, 960, 3)
+    assert (draw_clouds(floating)[320:] == GOOD).all(axis=2).sum() > 2 * 4  # the truth is not shrunk to one dot
+    assert draw_clouds(ScoredClouds(points[:0], distances[:0], points[:0], distances[:0], 1.0)).shape == (640, 960, 3)
 
 
 def test_the_hills_are_not_symmetric() -> None:

@@ -140,9 +140,9 @@ def test_figures_are_drawn_and_the_map_is_of_the_run_that_ranks(runs: dict[str, 
     text = files[0].read_text()
     assert "<!-- 2DGS-R (ours) -->" in text
     assert "<!-- refine -->" in text
-    picture = read_image(files[2])
-    assert picture.shape[1] > 1000
-    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 500
+    image = read_image(files[2])
+    assert image.shape[1] > 1000
+    assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 500
 
 
 def test_the_ranking_is_that_of_training(runs: dict[str, Path]) -> None:

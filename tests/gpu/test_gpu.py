@@ -111,11 +111,11 @@ def test_ptx_for_devices_to_come_is_translated_by_the_driver(gpu: Backend) -> No
     """Of a device that NVRTC does not know; here the device is known, and gives the same image to rounding."""
     splats, camera = scene()
     device = torch.device("cuda", torch.cuda.current_device())
-    known = launch.launcher_for(device)
-    assert isinstance(known, launch.GpuLauncher)
+    valid = launch.launcher_for(device)
+    assert isinstance(valid, launch.GpuLauncher)
     later = launch.GpuLauncher(
         device,
-        architecture_of=lambda _: known.architecture.replace("sm_", "compute_"),
+        architecture_of=lambda _: valid.architecture.replace("sm_", "compute_"),
         code_of=lambda name, arch: compile_source(name, arch).code,
     )
     try:
@@ -124,7 +124,7 @@ def test_ptx_for_devices_to_come_is_translated_by_the_driver(gpu: Backend) -> No
         if "UNSUPPORTED_PTX" in str(error):
             pytest.skip("the driver is older than NVRTC")
         raise
-    expected = cuda.rasterize_with(known, splats.to(device), camera, SETTINGS)
+    expected = cuda.rasterize_with(valid, splats.to(device), camera, SETTINGS)
     assert float((found.color - expected.color).abs().median()) < 1e-6
 
 
@@ -187,8 +187,8 @@ def no_waiting(allowed: int) -> Iterator[None]:
             yield
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    waits = [w for w in said if "synchronizing CUDA operation" in str(w.message)]  # not: "is a prototype"
-    assert len(waits) <= allowed, [f"{w.filename}:{w.lineno} {w.message}" for w in waits]
+    is_async = [w for w in said if "synchronizing CUDA operation" in str(w.message)]  # not: "is a prototype"
+    assert len(is_async) <= allowed, [f"{w.filename}:{w.lineno} {w.message}" for w in is_async]
 
 
 @pytest.mark.parametrize("stage", [0, 1, 2])
@@ -250,8 +250,8 @@ def test_photographs_in_pinned_memory_are_those_on_the_device(gpu: Backend) -> N
     for _ in range(2):
         for index in range(len(views)):
             assert torch.equal(kept[index].image, pinned[index].image)
-    assert all(picture.image.is_pinned() for picture in pinned._kept.values())
-    assert all(picture.image.is_cuda for picture in kept._kept.values())
+    assert all(image.image.is_pinned() for image in pinned._kept.values())
+    assert all(image.image.is_cuda for image in kept._kept.values())
     assert len(pinned._kept) == len(kept._kept) == len(views)
 
 

@@ -121,7 +121,7 @@ class Page:
         self.send("Input.dispatchKeyEvent", type="keyDown", key=key, **code, **text, **more)
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key, **code, **more)
 
-    def picture(self, path: Path | None = None, *, whole: bool = False) -> np.ndarray:
+    def image(self, path: Path | None = None, *, whole: bool = False) -> np.ndarray:
         """Return the window (or the whole document) as [H, W, 3] in [0, 1]; write it where a path is given."""
         data = base64.b64decode(self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"])
         if path is not None:

@@ -30,7 +30,7 @@ def ring(count: int, *, width: int = 40, height: int = 30, f: float = 35.0, radi
     return [look_at(eye, np.zeros(3), up, width=width, height=height, fx=f) for eye in eyes]
 
 
-def write_picture(path: Path, width: int = 40, height: int = 30, *, seed: int = 0, alpha: bool = False) -> np.ndarray:
+def write_image_of(path: Path, width: int = 40, height: int = 30, *, seed: int = 0, alpha: bool = False) -> np.ndarray:
     """A random PNG or JPEG; returns its pixels as they were before encoding."""
     pixels = np.random.default_rng(seed).integers(0, 256, (height, width, 4 if alpha else 3)).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def small_colmap(
         # Written in reverse, with ids that are no indices: order must come from the names.
         name = f"{count - 1 - index}.png"
         model.images.append((100 + index, camera.T_cam_world, 7, name, [(1.5, 2.5, -1)] * (index % 3)))
-        write_picture(root / "images" / name, seed=index)
+        write_image_of(root / "images" / name, seed=index)
     rng = np.random.default_rng(5)
     for index in range(20):
         track = [(100, 0)] * (index % 4)
@@ -126,7 +126,7 @@ def small_blender(root: Path, *, train: int = 4, test: int = 2, width: int = 40,
     for split, chosen in (("train", cameras[:train]), ("test", cameras[train:])):
         frames = []
         for index, camera in enumerate(chosen):
-            write_picture(root / split / f"r_{index}.png", width, height, seed=index, alpha=True)
+            write_image_of(root / split / f"r_{index}.png", width, height, seed=index, alpha=True)
             frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": opengl_camera_to_world(camera)})
         meta = {"camera_angle_x": 2 * math.atan(width / 2 / 35.0), "frames": frames}
         if chosen:
@@ -141,7 +141,7 @@ def small_nerfstudio(
     cameras = ring(count)
     frames = []
     for index, camera in enumerate(cameras):
-        write_picture(root / "images" / f"f_{index:02d}.png", seed=index)
+        write_image_of(root / "images" / f"f_{index:02d}.png", seed=index)
         entry = {"file_path": f"images/f_{index:02d}.png", "transform_matrix": opengl_camera_to_world(camera)}
         frames.append({**entry, **(frame or {})})
     shared = {"fl_x": 35.0, "fl_y": 36.0, "cx": 18.5, "cy": 16.25, "w": 40, "h": 30}
@@ -166,7 +166,7 @@ def small_dtu(
         arrays[f"world_mat_{index}"] = (P * (-3.0 if index == 1 else 1.0)).astype(np.float64)
         arrays[f"scale_mat_{index}"] = SCALE_MAT
         arrays[f"world_mat_inv_{index}"] = np.linalg.inv(P)
-        write_picture(root / images / f"{index:06d}.png", seed=index)
+        write_image_of(root / images / f"{index:06d}.png", seed=index)
         mask = np.zeros((30, 40), np.uint8)
         mask[10:20, 5 : 20 + index] = 255
         (root / "mask").mkdir(exist_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gs2d.core.camera import look_at
-from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 
 
 def waves(count: int, *, colored: bool) -> list[DepthMap]:
@@ -18,5 +18,5 @@ def waves(count: int, *, colored: bool) -> list[DepthMap]:
         depth = 2.0 + 0.1 * np.sin(np.arange(20.0)) + 0.02 * rng.standard_normal((16, 20))
         valid = rng.random((16, 20)) > 0.1
         color = rng.random((16, 20, 3)) if colored and k != 2 else None
-        found.append(depth_map(Frame(camera, depth, color, valid * rng.random((16, 20)) if k % 2 else valid)))
+        found.append(depth_map(RenderedView(camera, depth, color, valid * rng.random((16, 20)) if k % 2 else valid)))
     return found

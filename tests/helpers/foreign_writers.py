@@ -44,7 +44,7 @@ def poses(count: int = 9) -> dict[str, np.ndarray]:
     return {f"a_{i}.jpg": camera.T_cam_world for i, camera in enumerate(ring(count))}
 
 
-def write_photographs(folder: Path, names: dict[str, np.ndarray]) -> None:
+def write_images(folder: Path, names: dict[str, np.ndarray]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for seed, name in enumerate(names):
         small = np.random.default_rng(seed).integers(0, 256, (6, 8, 3)).astype(np.uint8)
@@ -64,7 +64,7 @@ def as_colmap(root: Path, lens: Lens, count: int = 9) -> Path:
     xyz, rgb = points()
     model.points = [(i + 1, x, tuple(c.tolist()), 0.5, []) for i, (x, c) in enumerate(zip(xyz, rgb, strict=True))]
     model.write(root / "sparse/0")
-    write_photographs(root / "images", poses(count))
+    write_images(root / "images", poses(count))
     return root
 
 
@@ -110,7 +110,7 @@ def opensfm_reconstruction(camera: dict[str, Any], shots: dict[str, np.ndarray])
 def small_opensfm(
     root: Path, lens: Lens = OFF_CENTRE, *, where: str = ".", camera: dict[str, Any] | None = None
 ) -> None:
-    write_photographs(root / "images", poses())
+    write_images(root / "images", poses())
     (root / where).mkdir(parents=True, exist_ok=True)
     value = [opensfm_reconstruction(camera or opensfm_camera(lens), poses())]
     (root / where / "reconstruction.json").write_text(json.dumps(value))
@@ -166,7 +166,7 @@ def small_metashape(
     root: Path, lens: Lens = OFF_CENTRE, *, more: str = "", labels: str = "{}", extra: str = "", kind: str = "frame"
 ) -> None:
     """``labels``: how a photograph's name without its ending becomes a label; ``more``: cameras besides."""
-    write_photographs(root / "images", poses())
+    write_images(root / "images", poses())
     cameras = "".join(
         f"<camera id='{i}' sensor_id='0' label='{labels.format(name[:-4])}'><transform>{metashape_transform(T)}"
         "</transform><orientation>1</orientation></camera>"
@@ -244,5 +244,5 @@ def alicevision_scene(lens: Lens, version: tuple[int, int, int], *, structure: b
 def small_alicevision(
     root: Path, lens: Lens = OFF_CENTRE, *, version: tuple[int, int, int] = (1, 2, 8), name: str = "cameras.sfm"
 ) -> None:
-    write_photographs(root / "images", poses())
+    write_images(root / "images", poses())
     (root / name).write_text(json.dumps(alicevision_scene(lens, version), indent=4))

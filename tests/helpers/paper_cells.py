@@ -15,9 +15,9 @@ TINY = ["--schedule-scale", "0.0005", "--set", "init_points=100", "--set", "surf
 
 
 def make_cell(scene: str = "a", seed: int = 0, data_set: str = TNT, **figures: float | None) -> Cell:
-    known = {**dict.fromkeys(FIGURES), **figures}
-    reasons = {name: "because" for name, value in known.items() if value is None}
-    return Cell(scene, data_set, seed, known, reasons, Path("run"))
+    valid = {**dict.fromkeys(FIGURES), **figures}
+    reasons = {name: "because" for name, value in valid.items() if value is None}
+    return Cell(scene, data_set, seed, valid, reasons, Path("run"))
 
 
 def make_row(name: str, *cells: Cell, paper: Mapping[str, Any] | None = None) -> Row:

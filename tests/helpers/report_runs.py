@@ -14,7 +14,7 @@ from gs2d.core.json_files import write_json
 from gs2d.core.mesh import Mesh
 from gs2d.io.meshes import write_mesh
 from gs2d.meshing.raycast import cast_camera
-from gs2d.report.images import depth_picture, error_picture, highlight_picture, normal_picture
+from gs2d.report.images import depth_image, error_image, highlight_image, normal_image
 from gs2d.synthetic.shapes import torus_knot, tube
 
 STAGES = (("surface", 3000), ("appearance", 1000), ("refine", 2000))
@@ -64,7 +64,7 @@ def events() -> list[dict[str, Any]]:
     offset = 0
     for index, (name, iterations) in enumerate(STAGES):
         if name == "appearance":
-            lines.append({"kind": "ranked", "stage": name, "group": "high_error", "count": 200, "share": 0.123})
+            lines.append({"kind": "ranked", "stage": name, "group": "high_error", "count": 200, "fraction": 0.123})
         if name == "refine":
             lines.append({"kind": "cloned", "stage": name, "count": 200, "opacity": "copy", "splats": 20200})
         lines.append({"kind": "stage_start", "stage": name, "iterations": iterations, "splats": 5000})
@@ -86,7 +86,7 @@ def events() -> list[dict[str, Any]]:
                 line["psnr"] = 20 + 7 * (1 - np.exp(-4 * t)) + 0.2 * index
             lines.append(line)
             if name == "surface" and iteration % 1000 == 0:
-                pruned = {"pruned_faint": 4, "pruned_large": 1}
+                pruned = {"pruned_by_opacity": 4, "pruned_large": 1}
                 lines.append(
                     {"kind": "densify", "stage": name, "iteration": iteration, "cloned": 10, "split": 20, **pruned}
                 )
@@ -113,13 +113,13 @@ def write_renders(folder: Path, size: int) -> None:
         write_image(folder / "renders" / "photos" / f"{split}__r_{k}.png", photo)
         for index, (stage, _) in enumerate(STAGES):
             color = np.clip(photo + rng.normal(0, 0.06 - 0.02 * index, photo.shape) * alpha[..., None], 0, 1)
-            pictures = {"color": color, "normal": normal_picture(normal, alpha)}
-            pictures["depth"] = depth_picture(hits.depth, alpha)
-            pictures["error"] = error_picture(color, photo)
+            images = {"color": color, "normal": normal_image(normal, alpha)}
+            images["depth"] = depth_image(hits.depth, alpha)
+            images["error"] = error_image(color, photo)
             if index:
-                pictures["high_error"] = highlight_picture(color, alpha * (np.sin(40 * hits.depth) > 0.6))
+                images["high_error"] = highlight_image(color, alpha * (np.sin(40 * hits.depth) > 0.6))
             (folder / "renders" / stage).mkdir(exist_ok=True)
-            for kind, image in pictures.items():
+            for kind, image in images.items():
                 write_image(folder / "renders" / stage / f"{split}__r_{k}.{kind}.png", image)
     index = {"views": views, "stages": [name for name, _ in STAGES], "images": ["color", "normal", "depth", "error"]}
     write_json(folder / "renders" / "index.json", index)

@@ -18,7 +18,7 @@ STORED = {
     6: Image.Transpose.ROTATE_90,
     8: Image.Transpose.ROTATE_270,
 }  # EXIF -> to store
-_CELLS = 512  # of a texture, over 4 wu
+_CELLS = 512  # of a texture, over 4 world units
 
 
 def textures(seed: int = 0) -> np.ndarray:
@@ -31,13 +31,13 @@ def textures(seed: int = 0) -> np.ndarray:
     return np.asarray(255 * (out - out.min()) / (out.max() - out.min()))
 
 
-def room_picture(camera: Camera, walls: np.ndarray) -> np.ndarray:
+def room_image(camera: Camera, walls: np.ndarray) -> np.ndarray:
     """uint8 [H, W, 3]: floor z = 0 and walls x = 0, y = 0 of the octant x, y, z > 0, each with its own texture."""
     samples = 2  # along each side of a pixel
     rows, columns = (np.mgrid[: camera.height * samples, : camera.width * samples] + 0.5) / samples
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
     rays = rays @ camera.rotation
-    picture, nearest = np.zeros((*rows.shape, 3)), np.full(rows.shape, np.inf)
+    image, nearest = np.zeros((*rows.shape, 3)), np.full(rows.shape, np.inf)
     for axis in range(3):
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -camera.center[axis] / rays[..., axis]
@@ -45,9 +45,9 @@ def room_picture(camera: Camera, walls: np.ndarray) -> np.ndarray:
         others = [other for other in range(3) if other != axis]
         points = camera.center[others] + np.where(hit, distance, 0.0)[..., None] * rays[..., others]
         cell = np.floor(points * (_CELLS / 4)).astype(int) % _CELLS
-        picture = np.where(hit[..., None], walls[axis][cell[..., 0], cell[..., 1]], picture)
+        image = np.where(hit[..., None], walls[axis][cell[..., 0], cell[..., 1]], image)
         nearest = np.where(hit, distance, nearest)
-    blocks = picture.reshape(camera.height, samples, camera.width, samples, 3).mean(axis=(1, 3))
+    blocks = image.reshape(camera.height, samples, camera.width, samples, 3).mean(axis=(1, 3))
     return np.rint(blocks).astype(np.uint8)
 
 
@@ -67,7 +67,7 @@ def write_room(folder: Path, count: int = 12, *, seed: int = 0, suffix: str = ".
     folder.mkdir(parents=True, exist_ok=True)
     cameras, walls = room_cameras(count), textures(seed)
     for i, camera in enumerate(cameras):
-        Image.fromarray(room_picture(camera, walls)).save(folder / f"{start + i:03}{suffix}", quality=95)
+        Image.fromarray(room_image(camera, walls)).save(folder / f"{start + i:03}{suffix}", quality=95)
     return cameras
 
 

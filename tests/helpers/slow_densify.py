@@ -93,7 +93,7 @@ def _append_children(state: TrainState, mask: Tensor, densify: GradDensify) -> N
     rows = parents.repeat(densify.split_count)
     children = state.splats.rows(rows)
     draws = torch.randn(len(rows), 2, generator=state.generator, dtype=children.dtype).to(children.device)
-    in_plane = draws * children.scales  # [M, 2] wu
+    in_plane = draws * children.scales  # [M, 2] world units
     frames = quats_to_matrices(children.quats)[:, :, :2]  # [M, 3, 2] columns t_u, t_v
     children.means += (frames * in_plane[:, None, :]).sum(dim=2)
     children.log_scales -= math.log(densify.split_shrink)
@@ -105,7 +105,7 @@ def _prunable(
 ) -> tuple[Tensor, Tensor]:
     """Splats that are too faint, and splats that are too large, bool [N] each."""
     faint = splats.opacities < densify.opacity_cull
-    if densify.spares_faint(iteration, white=white):
+    if densify.in_prune_grace(iteration, white=white):
         faint = torch.zeros_like(faint)
     large = splats.scales.amax(dim=1) > densify.scale_cull * extent
     if iteration <= densify.reset_every:

@@ -8,19 +8,19 @@ import numpy as np
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import FusionLimits
-from gs2d.meshing.depth_maps import Frame
+from gs2d.meshing.bounds import FusionBounds
+from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.volume import BLOCK, VOXELS, Volume
 
 
-def limits(half: float, voxel: float, truncation: float | None = None, depth_limit: float = 100.0) -> FusionLimits:
+def limits(half: float, voxel: float, truncation: float | None = None, depth_limit: float = 100.0) -> FusionBounds:
     """A cube of half side ``half`` around the origin."""
     trunc = truncation if truncation is not None else 5 * voxel
     low, high = (-half, -half, -half), (half, half, half)
-    return FusionLimits(low, high, 2 * half, voxel, trunc, depth_limit, 1.0, 1.0, voxel, 0.0)
+    return FusionBounds(low, high, 2 * half, voxel, trunc, depth_limit, 1.0, 1.0, voxel, 0.0)
 
 
-def volume_of(field: Callable[[np.ndarray], np.ndarray], lim: FusionLimits, blocks: int) -> Volume:
+def volume_of(field: Callable[[np.ndarray], np.ndarray], lim: FusionBounds, blocks: int) -> Volume:
     """A volume of blocks^3 blocks, all known, that holds a field of points [P, 3] -> [P]."""
     dims = (blocks, blocks, blocks)
     corner = np.stack(np.unravel_index(np.arange(blocks**3), dims), axis=1) * BLOCK
@@ -100,8 +100,8 @@ def orbit(count: int, distance: float, size: int = 96, focal: float = 120.0) -> 
     return [look_at(e, origin, up, width=size, height=size, fx=focal) for e, up in zip(eyes, ups, strict=True)]
 
 
-def sphere_frames(cameras: list[Camera], radius: float = 1.0) -> list[Frame]:
-    return [Frame(camera, sphere_depth(camera, radius)) for camera in cameras]
+def sphere_frames(cameras: list[Camera], radius: float = 1.0) -> list[RenderedView]:
+    return [RenderedView(camera, sphere_depth(camera, radius)) for camera in cameras]
 
 
 def tetrahedron(colors: bool = True, dtype: type = np.float32) -> Mesh:

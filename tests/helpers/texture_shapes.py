@@ -9,7 +9,7 @@ import numpy as np
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.atlas import Atlas
-from gs2d.meshing.bake import Photograph
+from gs2d.meshing.bake import ColorSource
 from gs2d.meshing.raycast import cast_camera
 
 Paint = Callable[[np.ndarray], np.ndarray]  # places [n, 3] to colours [n, 3] in [0, 1]
@@ -54,7 +54,7 @@ def checkers(places: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 + 0.2 * places * (1, -1, 1) + 0.25 * wave * (1.0, 0.6, -0.4))
 
 
-def photograph(mesh: Mesh, camera: Camera, paint: Paint, gain: float = 1.0, samples: int = 3) -> Photograph:
+def photograph(mesh: Mesh, camera: Camera, paint: Paint, gain: float = 1.0, samples: int = 3) -> ColorSource:
     """What the camera sees, unlit, RGBA with straight alpha."""
     hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, camera, samples=samples)
     hit = hits.face >= 0
@@ -63,7 +63,7 @@ def photograph(mesh: Mesh, camera: Camera, paint: Paint, gain: float = 1.0, samp
     rays[hit] = np.concatenate([np.clip(gain * paint(places), 0, 1), np.ones((len(places), 1))], axis=1)
     blocks = rays.reshape(camera.height, samples, camera.width, samples, 4).mean(axis=(1, 3))
     blocks[..., :3] /= np.maximum(blocks[..., 3:], 1e-9)
-    return Photograph(camera, np.rint(255 * blocks).astype(np.uint8))
+    return ColorSource(camera, np.rint(255 * blocks).astype(np.uint8))
 
 
 def ring(count: int, distance: float = 4.0, size: int = 96, turn: float = 0.0) -> list[Camera]:

@@ -12,10 +12,10 @@ from gs2d.core.camera import Camera, look_at
 
 SIZE = 24
 ANGLE = 0.7  # radians, field of view
-RADIUS = 0.8  # of the ball, wu
+RADIUS = 0.8  # of the ball, world units
 
 
-def ball_picture(camera: Camera) -> np.ndarray:
+def ball_image(camera: Camera) -> np.ndarray:
     """RGBA uint8 [H, W, 4] of the ball at the origin: red, green and blue follow x, y, z; mottled."""
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
@@ -46,7 +46,7 @@ def write_capture(folder: Path, *, train: int = 6, test: int = 2, size: int = SI
         (folder / split).mkdir(parents=True)
         frames = []
         for i, camera in enumerate(ball_cameras(count, size, phase)):
-            Image.fromarray(ball_picture(camera)).save(folder / split / f"r_{i}.png")
+            Image.fromarray(ball_image(camera)).save(folder / split / f"r_{i}.png")
             pose = np.linalg.inv(camera.T_cam_world) @ np.diag([1.0, -1.0, -1.0, 1.0])  # to OpenGL axes
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
         (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": ANGLE, "frames": frames}))

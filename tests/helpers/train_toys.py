@@ -10,7 +10,7 @@ import torch
 from gs2d.config.multiview import MultiView
 from gs2d.config.presets import appearance, refine, surface, with_multiview
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import GradDensify, Rates, Recipe
+from gs2d.config.recipe import GradDensify, LearningRates, Recipe
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
@@ -103,7 +103,7 @@ def short(absgs: bool = False) -> Recipe:
                 densify=densify,
                 sh_interval=3,
                 losses=tuple(replace(term, start=min(term.start, 4)) for term in first.losses),
-                rates=Rates(means_horizon=10),
+                lr=LearningRates(means_decay_steps=10),
             ),
             replace(appearance(k=20.0), iterations=4),
             replace(refine(), iterations=5),
@@ -132,7 +132,7 @@ def backends() -> list[str]:
     return ["reference", "cpu"]
 
 
-class Recorder:
+class RunLogger:
     """Keeps the events, and a copy of the splats at each."""
 
     def __init__(self) -> None:
@@ -153,8 +153,8 @@ class Recorder:
         raise AssertionError(f"no {kind.__name__} in {stage}")
 
 
-def train(scene: Scene, recipe: Recipe, **options: object) -> tuple[Trainer, Recorder]:
-    recorder = Recorder()
+def train(scene: Scene, recipe: Recipe, **options: object) -> tuple[Trainer, RunLogger]:
+    recorder = RunLogger()
     trainer = Trainer(
         scene,
         recipe,

@@ -23,7 +23,7 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 + 0.4 * np.tanh(0.3 * value))
 
 
-def photograph(camera: Camera, gain: float = 1.0) -> np.ndarray:
+def image(camera: Camera, gain: float = 1.0) -> np.ndarray:
     """The wall as a camera at z = 0 sees it, uint8; its left third is bare."""
     x = (np.arange(WIDTH) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(HEIGHT) + 0.5 - camera.cy) / camera.fy
@@ -43,7 +43,7 @@ def wall(gains: tuple[float, ...] = (1.0,) * 5) -> Scene:
         for i, x in enumerate(np.linspace(-0.8, 0.8, 5))
     ]  # fmt: skip
     views = tuple(
-        View.from_arrays(f"{i}.png", c, photograph(c, g)) for i, (c, g) in enumerate(zip(cameras, gains, strict=True))
+        View.from_arrays(f"{i}.png", c, image(c, g)) for i, (c, g) in enumerate(zip(cameras, gains, strict=True))
     )
     rng = np.random.default_rng(1)
     points = np.stack([rng.uniform(-1.1, 1.8, 300), rng.uniform(-1.4, 1.4, 300), np.full(300, WALL)], axis=1)

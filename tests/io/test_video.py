@@ -87,8 +87,8 @@ def test_a_webp_video_has_all_frames_at_its_rate(frames: list[Path], tmp_path: P
             video.seek(i)
             video.load()
             durations.append(video.info["duration"])
-            with Image.open(path) as picture:
-                error = np.asarray(video.convert("RGB"), float) - np.asarray(picture, float)
+            with Image.open(path) as image:
+                error = np.asarray(video.convert("RGB"), float) - np.asarray(image, float)
             assert np.sqrt((error**2).mean()) < 15
     assert durations == [33, 34, 33, 33, 34, 33]  # ms that add up to 200
 

@@ -8,7 +8,7 @@ import torch
 from benchmarks.workload import room_workload
 
 from gs2d.core.splats import Splats
-from gs2d.kernels.buffer_pool import LINE, Recycler
+from gs2d.kernels.buffer_pool import LINE, BufferPool
 from gs2d.kernels.library import Library
 from gs2d.render.cpu import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings
@@ -17,7 +17,7 @@ FLOAT = torch.float32
 
 
 def test_memory_comes_back_when_the_last_view_of_a_tensor_is_gone() -> None:
-    recycler = Recycler(least_bytes=64)
+    recycler = BufferPool(min_bytes=64)
     tensor = recycler.empty((10, 3), FLOAT)
     first, row = tensor.data_ptr(), tensor[4]
     assert tensor.is_contiguous()
@@ -33,14 +33,14 @@ def test_memory_comes_back_when_the_last_view_of_a_tensor_is_gone() -> None:
 
 
 def test_tensors_that_the_c_library_keeps_itself_are_its_own() -> None:
-    recycler = Recycler(least_bytes=64)
+    recycler = BufferPool(min_bytes=64)
     tensor = recycler.empty((15,), FLOAT)  # 60 bytes
     del tensor
     assert recycler.free_bytes == 0
 
 
 def test_a_block_that_splats_have_outgrown_is_given_up() -> None:
-    recycler = Recycler(least_bytes=64)
+    recycler = BufferPool(min_bytes=64)
     tensor = recycler.empty((1000,), FLOAT)
     del tensor
     assert recycler.free_bytes == (4000 + LINE) * 17 // 16
@@ -50,7 +50,7 @@ def test_a_block_that_splats_have_outgrown_is_given_up() -> None:
 
 
 def test_blocks_of_other_sizes_wait_for_their_next_request_but_not_for_ever() -> None:
-    recycler = Recycler(least_bytes=64)
+    recycler = BufferPool(min_bytes=64)
     kept, small = recycler.empty((100_000,), FLOAT), (100,)
     del kept
     for _ in range(64):
@@ -62,7 +62,7 @@ def test_blocks_of_other_sizes_wait_for_their_next_request_but_not_for_ever() ->
 
 def test_images_and_gradients_in_used_memory_have_the_same_bits(native: Library) -> None:
     recycling = copy.copy(native)
-    recycling.recycler = Recycler(least_bytes=1)
+    recycling.recycler = BufferPool(min_bytes=1)
     room = room_workload(300, 40, 33)
 
     def differentiated(library: Library) -> list[torch.Tensor]:

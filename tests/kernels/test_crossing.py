@@ -57,7 +57,7 @@ def everything(
     return found
 
 
-@pytest.mark.parametrize("change", [{}, {"near": 0.02, "error_cutoff": 5.0}, {"crossing": "box"}], ids=str)
+@pytest.mark.parametrize("change", [{}, {"near": 0.02, "error_cutoff": 5.0}, {"near_plane_policy": "box"}], ids=str)
 def test_culling_splats_without_an_ellipse_changes_no_bit(any_native: Library, change: dict[str, float]) -> None:
     settings = replace(SETTINGS, **change)  # type: ignore[arg-type]
     seen = 0

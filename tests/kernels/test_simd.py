@@ -125,8 +125,10 @@ def test_numbers_that_are_not_zero_are_found_for_every_block_of_a_tile(any_nativ
     n = any_native.lanes
     function = any_native.function("gs2d_selftest_nonzero", ctypes.c_uint32, [ctypes.c_void_p])
     random = np.random.default_rng(0)
-    for share in (0.0, 0.1, 0.9, 1.0):
-        numbers = np.where(random.random(256 // n) < share, random.integers(1, 1 << n, 256 // n), 0).astype(np.uint32)
+    for fraction in (0.0, 0.1, 0.9, 1.0):
+        numbers = np.where(random.random(256 // n) < fraction, random.integers(1, 1 << n, 256 // n), 0).astype(
+            np.uint32
+        )
         assert function(numbers.ctypes.data) == sum(1 << b for b, number in enumerate(numbers) if number)
 
 

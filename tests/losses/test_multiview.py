@@ -11,16 +11,16 @@ from torch import Tensor
 
 from gs2d.config.multiview import MultiView
 from gs2d.core.camera import Camera, look_at
-from gs2d.core.transforms import moved
+from gs2d.core.transforms import perturb_pose
 from gs2d.losses.multiview import (
     Neighbour,
-    TwoViews,
+    ViewPair,
     _sample,
     _Sampled,
     choose_pixels,
     geometric,
     photometric,
-    prepare,
+    prepare_image,
 )
 
 SETTINGS = MultiView(patches=40, radius=2, texture=0.01, occluded=4.0)
@@ -43,7 +43,7 @@ def plane_depth(camera: Camera) -> Tensor:
     return torch.as_tensor(-(camera.center @ PLANE_NORMAL) / (rays @ camera.rotation @ PLANE_NORMAL))
 
 
-def plane_photograph(camera: Camera) -> Tensor:
+def plane_image(camera: Camera) -> Tensor:
     """A smooth texture on the plane, as the camera sees it [H, W, 3]."""
     j, i = np.mgrid[: camera.height, : camera.width] + 0.5
     z = plane_depth(camera).numpy()
@@ -61,27 +61,27 @@ class Case:
     normal: Tensor
     neighbour: Neighbour
 
-    def views(self, depth: Tensor | None = None, normal: Tensor | None = None) -> TwoViews:
+    def views(self, depth: Tensor | None = None, normal: Tensor | None = None) -> ViewPair:
         depth = self.depth if depth is None else depth
         normal = self.normal if normal is None else normal
-        return TwoViews(depth, normal, self.neighbour.here.textured, HERE, self.neighbour)
+        return ViewPair(depth, normal, self.neighbour.reference.textured, HERE, self.neighbour)
 
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    photographs = [prepare(plane_photograph(camera), None, SETTINGS) for camera in (HERE, THERE)]
+    images = [prepare_image(plane_image(camera), None, SETTINGS) for camera in (HERE, THERE)]
     draws = torch.rand(SETTINGS.patches, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    neighbour = Neighbour(*photographs, THERE, plane_depth(THERE), draws, SETTINGS)
+    neighbour = Neighbour(*images, THERE, plane_depth(THERE), draws, SETTINGS)
     normal = torch.as_tensor(PLANE_NORMAL).expand(HERE.height, HERE.width, 3)
     return Case(plane_depth(HERE), normal, neighbour)
 
 
 def test_at_the_true_plane_patches_look_alike_and_pixels_come_back_to_themselves(case: Case) -> None:
     views = case.views()
-    ncc, known = views.similarity
+    ncc, valid = views.similarity
     error, back = views.round_trip
-    assert known.sum() > 25
-    assert float(ncc[known].min()) > 0.99  # what is missing is bilinear sampling of a curved texture
+    assert valid.sum() > 25
+    assert float(ncc[valid].min()) > 0.99  # what is missing is bilinear sampling of a curved texture
     assert float(error[back].max()) < 1e-2  # and of a depth that is not linear in the pixel
     assert float(photometric(views)) < 0.003
     assert float(geometric(views)) < 0.003
@@ -110,7 +110,7 @@ def test_the_gradient_points_to_the_true_normal(case: Case) -> None:
 
 
 def test_gradients_are_those_of_finite_differences(case: Case) -> None:
-    index, chosen = choose_pixels(case.neighbour.here.textured, case.neighbour.draws)
+    index, chosen = choose_pixels(case.neighbour.reference.textured, case.neighbour.draws)
     g = torch.Generator().manual_seed(1)
     d = case.depth.flatten()[index] + 0.01 * torch.randn(len(index), generator=g, dtype=torch.float64)
     n = case.normal.reshape(-1, 3)[index] * 0.8 + 0.05 * torch.randn(len(index), 3, generator=g, dtype=torch.float64)
@@ -129,10 +129,10 @@ def test_gradients_are_those_of_finite_differences(case: Case) -> None:
 
 def test_a_view_without_a_pixel_to_ask_has_loss_zero_and_no_gradient() -> None:
     camera, draws = replace(HERE, width=3, height=3), torch.rand(5)
-    photograph = prepare(torch.rand(3, 3, 3), None, MultiView(patches=5))  # smaller than a patch of 7 px
-    neighbour = Neighbour(photograph, photograph, camera, torch.ones(3, 3), draws, MultiView(patches=5))
+    image = prepare_image(torch.rand(3, 3, 3), None, MultiView(patches=5))  # smaller than a patch of 7 px
+    neighbour = Neighbour(image, image, camera, torch.ones(3, 3), draws, MultiView(patches=5))
     depth, normal = torch.ones(3, 3, requires_grad=True), torch.full((3, 3, 3), torch.nan, requires_grad=True)
-    views = TwoViews(depth, normal, photograph.textured, camera, neighbour)
+    views = ViewPair(depth, normal, image.textured, camera, neighbour)
     loss = photometric(views) + geometric(views)
     assert loss.item() == 0
     assert all(not g.any() for g in torch.autograd.grad(loss, (depth, normal)))
@@ -159,16 +159,16 @@ def test_pixels_are_asked_once_each_and_evenly_and_all_of_them_where_they_are_fe
 def test_the_mean_runs_over_all_pixels_that_are_not_masked_whatever_the_number_asked(case: Case) -> None:
     depth = case.depth + 0.02
     everything = replace(case.neighbour, draws=torch.full((2000,), 0.5, dtype=torch.float64))
-    views = TwoViews(depth, case.normal, everything.here.textured, HERE, everything)
+    views = ViewPair(depth, case.normal, everything.reference.textured, HERE, everything)
     whole, count = photometric(views), views.depth.numel()
-    ncc, known = views.similarity
-    assert whole.item() == pytest.approx(((1 - ncc) * views.weights)[known].sum().item() / count)
+    ncc, valid = views.similarity
+    assert whole.item() == pytest.approx(((1 - ncc) * views.weights)[valid].sum().item() / count)
     half = torch.arange(count).view(depth.shape) % 2 == 0
-    masked = TwoViews(depth, case.normal, everything.here.textured & half, HERE, everything, half)
+    masked = ViewPair(depth, case.normal, everything.reference.textured & half, HERE, everything, half)
     assert photometric(masked).item() == pytest.approx(whole.item(), rel=0.05)  # half of the sum, half of the pixels
     g = torch.Generator().manual_seed(0)
     few = [replace(everything, draws=torch.rand(60, generator=g, dtype=torch.float64)) for _ in range(20)]
-    sampled = [photometric(TwoViews(depth, case.normal, everything.here.textured, HERE, n)).item() for n in few]
+    sampled = [photometric(ViewPair(depth, case.normal, everything.reference.textured, HERE, n)).item() for n in few]
     assert float(np.mean(sampled)) == pytest.approx(whole.item(), rel=0.1)
 
 
@@ -176,14 +176,18 @@ def test_a_camera_that_learns_gets_the_gradient_of_finite_differences(case: Case
     start = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.02], dtype=torch.float64)
 
     def values(motion: Tensor) -> tuple[Tensor, Tensor]:
-        views = TwoViews(case.depth, case.normal, case.neighbour.here.textured, moved(HERE, motion), case.neighbour)
+        views = ViewPair(
+            case.depth, case.normal, case.neighbour.reference.textured, perturb_pose(HERE, motion), case.neighbour
+        )
         views.__dict__["weights"] = torch.ones(SETTINGS.patches, dtype=torch.float64)
         return photometric(views), geometric(views)
 
     assert torch.autograd.gradcheck(values, (start.requires_grad_(),), eps=1e-7, atol=1e-6)
-    still = TwoViews(case.depth, case.normal, case.neighbour.here.textured, HERE, case.neighbour)
+    still = ViewPair(case.depth, case.normal, case.neighbour.reference.textured, HERE, case.neighbour)
     held = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    learning = TwoViews(case.depth, case.normal, case.neighbour.here.textured, moved(HERE, held), case.neighbour)
+    learning = ViewPair(
+        case.depth, case.normal, case.neighbour.reference.textured, perturb_pose(HERE, held), case.neighbour
+    )
     torch.testing.assert_close(photometric(learning), photometric(still))
 
 
@@ -204,17 +208,19 @@ def test_a_gpu_samples_photographs_like_a_cpu() -> None:
 def test_values_and_gradients_have_the_same_bits_for_any_number_of_threads() -> None:
     g = torch.Generator().manual_seed(3)
     settings, size = MultiView(patches=3000, occluded=100.0), 120
-    here, there = (replace(c, width=size, height=size, fx=150.0, fy=150.0, cx=60.0, cy=60.0) for c in (HERE, THERE))
-    photographs = [prepare(torch.rand(size, size, 3, generator=g), None, settings) for _ in range(2)]
+    reference, source = (
+        replace(c, width=size, height=size, fx=150.0, fy=150.0, cx=60.0, cy=60.0) for c in (HERE, THERE)
+    )
+    images = [prepare_image(torch.rand(size, size, 3, generator=g), None, settings) for _ in range(2)]
     normal = torch.as_tensor(PLANE_NORMAL).float() + 0.05 * torch.randn(size, size, 3, generator=g)
-    depth = plane_depth(here).float() * (1 + 0.01 * torch.rand(size, size, generator=g))
-    neighbour = Neighbour(*photographs, there, plane_depth(there).float(), torch.rand(3000, generator=g), settings)
+    depth = plane_depth(reference).float() * (1 + 0.01 * torch.rand(size, size, generator=g))
+    neighbour = Neighbour(*images, source, plane_depth(source).float(), torch.rand(3000, generator=g), settings)
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             leaves = depth.clone().requires_grad_(), normal.clone().requires_grad_()
-            views = TwoViews(*leaves, photographs[0].textured, here, neighbour)
+            views = ViewPair(*leaves, images[0].textured, reference, neighbour)
             loss = photometric(views) + geometric(views)
             found.append([loss.detach(), *torch.autograd.grad(loss, leaves)])
     finally:

@@ -10,10 +10,10 @@ from gs2d.config.recipe import LossTerm
 from gs2d.errors import RecipeError
 from gs2d.losses.api import compute_losses
 from gs2d.losses.priors import (
-    LEAST_POINTS,
+    MIN_POINTS,
     Depths,
-    KnownDepths,
-    KnownNormals,
+    MetricDepth,
+    NormalTarget,
     PointDepths,
     Prior,
     RelativeDepths,
@@ -27,14 +27,14 @@ from loss_images import make_camera, make_output
 HIT = torch.ones(4, 5, dtype=torch.float64)
 
 
-def known(depth: Tensor) -> KnownDepths:
+def valid(depth: Tensor) -> MetricDepth:
     """A map that knows the depths above 0."""
-    return KnownDepths(1 / torch.where(depth > 0, depth, 1), depth > 0)
+    return MetricDepth(1 / torch.where(depth > 0, depth, 1), depth > 0)
 
 
-def directed(normals: Tensor) -> KnownNormals:
+def directed(normals: Tensor) -> NormalTarget:
     """Normals that are known where they are not 0."""
-    return KnownNormals(normals, (normals != 0).any(dim=2).to(normals))
+    return NormalTarget(normals, (normals != 0).any(dim=2).to(normals))
 
 
 def points(pixels: list[list[int]], weights: list[list[float]], depth: list[float]) -> PointDepths:
@@ -45,9 +45,9 @@ def points(pixels: list[list[int]], weights: list[list[float]], depth: list[floa
 def test_a_map_counts_relative_errors_over_all_pixels_and_unknown_ones_as_none() -> None:
     depth, truth = torch.full((4, 5), 2.0).double(), torch.zeros(4, 5).double()
     truth[0, 0], truth[1, 2], truth[3, 4] = 1.0, 2.0, 4.0  # errors 1, 0, 1/2; 17 pixels unknown
-    loss = depth_prior(Prior(known(truth), noise=1e-9), depth, HIT)
+    loss = depth_prior(Prior(valid(truth), noise=1e-9), depth, HIT)
     assert loss.item() == pytest.approx(1.5 / 20)
-    assert depth_prior(Prior(known(truth), depth_share=0.25, noise=1e-9), depth, HIT).item() == pytest.approx(
+    assert depth_prior(Prior(valid(truth), depth_weight=0.25, noise=1e-9), depth, HIT).item() == pytest.approx(
         0.25 * 1.5 / 20
     )
 
@@ -55,7 +55,7 @@ def test_a_map_counts_relative_errors_over_all_pixels_and_unknown_ones_as_none()
 def test_pixels_that_are_hardly_covered_are_not_asked() -> None:
     depth, alpha = torch.full((4, 5), 2.0).double(), HIT.clone()
     alpha[0, 0], depth[1, 1] = 0.4, 0.0  # too thin, nothing hit
-    loss = depth_prior(Prior(known(torch.ones(4, 5).double()), opacity=0.5, noise=1e-9), depth, alpha)
+    loss = depth_prior(Prior(valid(torch.ones(4, 5).double()), opacity=0.5, noise=1e-9), depth, alpha)
     assert loss.item() == pytest.approx(18 / 20)
 
 
@@ -65,13 +65,13 @@ def test_a_point_between_pixels_is_compared_with_the_plane_through_them() -> Non
     depth[:, 1] = 4.0
     middle = points([[0, 1, 2, 3]], [[0.25] * 4], [2.0])
     assert depth_prior(Prior(middle, noise=1e-9), depth, HIT[:2, :2]).item() == pytest.approx(
-        (8 / 3 / 2 - 1) / LEAST_POINTS
+        (8 / 3 / 2 - 1) / MIN_POINTS
     )
 
 
 def test_many_points_weigh_as_much_as_a_whole_picture_and_few_less() -> None:
     depth = torch.full((2, 2), 2.0).double()
-    for count, expected in ((LEAST_POINTS // 2, 0.5), (LEAST_POINTS, 1.0), (3 * LEAST_POINTS, 1.0)):
+    for count, expected in ((MIN_POINTS // 2, 0.5), (MIN_POINTS, 1.0), (3 * MIN_POINTS, 1.0)):
         many = points([[0, 1, 2, 3]] * count, [[1.0, 0, 0, 0]] * count, [1.0] * count)
         assert depth_prior(Prior(many, noise=1e-9), depth, HIT[:2, :2]).item() == pytest.approx(expected)
 
@@ -80,7 +80,7 @@ def test_a_point_at_the_edge_of_what_was_hit_is_not_asked() -> None:
     depth, alpha = torch.full((2, 2), 2.0).double(), HIT[:2, :2].clone()
     alpha[1, 1] = 0.0
     asked = points([[0, 1, 2, 3], [0, 1, 2, 2]], [[0.25] * 4] * 2, [1.0, 1.0])
-    assert depth_prior(Prior(asked, noise=1e-9), depth, alpha).item() == pytest.approx(1 / LEAST_POINTS)
+    assert depth_prior(Prior(asked, noise=1e-9), depth, alpha).item() == pytest.approx(1 / MIN_POINTS)
     assert depth_prior(Prior(points([], [], [])), depth, alpha).item() == 0
 
 
@@ -88,7 +88,7 @@ def test_errors_that_are_to_be_expected_cost_their_square() -> None:
     truth = torch.ones(4, 5).double()
     for depth, expected in ((1.05, 0.05**2 / 0.2), (0.9, 0.05), (1.5, 0.45)):  # noise 0.1: e^2 / 0.2, then e - 0.05
         rendered = torch.full((4, 5), depth, dtype=torch.float64)
-        loss = depth_prior(Prior(known(truth), noise=0.1), rendered, HIT)
+        loss = depth_prior(Prior(valid(truth), noise=0.1), rendered, HIT)
         assert loss.item() == pytest.approx(expected)
 
 
@@ -111,7 +111,7 @@ def priors() -> dict[str, Depths]:
     weights = torch.rand(9, 4, generator=g).double()
     weights /= weights.sum(dim=1, keepdim=True)
     return {
-        "map": known(truth),
+        "map": valid(truth),
         "points": PointDepths(at, weights, 1 + torch.rand(9, generator=g).double()),
     }
 
@@ -119,7 +119,7 @@ def priors() -> dict[str, Depths]:
 @pytest.mark.parametrize("kind", ["map", "points"])
 def test_gradients_of_depths_are_those_of_finite_differences(kind: str) -> None:
     output = make_output(6, 7, seed=1)
-    prior = Prior(priors()[kind], depth_share=0.3)
+    prior = Prior(priors()[kind], depth_weight=0.3)
     assert torch.autograd.gradcheck(lambda z: depth_prior(prior, z, output.alpha), (output.depth_mean,), atol=1e-7)
 
 
@@ -169,13 +169,13 @@ def test_a_fifth_of_wrong_pixels_hardly_moves_the_fit() -> None:
 def test_a_map_that_runs_the_other_way_says_nothing() -> None:
     depth = 1 + torch.rand(12, 13).double()
     relative = RelativeDepths(depth, depth > 0, "disparity")  # larger where farther: no disparity
-    assert aligned(relative, depth, depth > 0).known.sum() == 0
+    assert aligned(relative, depth, depth > 0).valid.sum() == 0
     assert depth_prior(Prior(relative), depth, torch.ones_like(depth)).item() == 0
 
 
 def test_where_nothing_was_hit_nothing_breaks() -> None:
     nothing, relative = torch.zeros(4, 5).double().requires_grad_(), torch.rand(4, 5).double()
-    for prior in (known(HIT), RelativeDepths(relative, HIT > 0, "depth"), points([[0, 1, 5, 6]], [[0.25] * 4], [1.0])):
+    for prior in (valid(HIT), RelativeDepths(relative, HIT > 0, "depth"), points([[0, 1, 5, 6]], [[0.25] * 4], [1.0])):
         loss = depth_prior(Prior(prior), nothing, torch.zeros(4, 5))
         assert loss.item() == 0
         (gradient,) = torch.autograd.grad(loss, [nothing])

@@ -16,8 +16,8 @@ from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.losses import reference
 from gs2d.losses.api import FUSED_LOSSES, LOSSES, compute_losses, target_maps
-from gs2d.losses.multiview import Neighbour, prepare
-from gs2d.losses.priors import KnownDepths, KnownNormals, Prior
+from gs2d.losses.multiview import Neighbour, prepare_image
+from gs2d.losses.priors import MetricDepth, NormalTarget, Prior
 from gs2d.render.types import RenderOutput
 from loss_images import make_camera, make_output
 
@@ -58,18 +58,18 @@ def one_loss(
 
 def one_prior(target: Tensor) -> Prior:
     """Depths and normals made of the colours of a target."""
-    known, directions = torch.ones_like(target[..., 0]), torch.nn.functional.normalize(target, dim=2)
-    return Prior(KnownDepths(0.5 + target[..., 1], known > 0), KnownNormals(directions, known), opacity=0.2)
+    valid, directions = torch.ones_like(target[..., 0]), torch.nn.functional.normalize(target, dim=2)
+    return Prior(MetricDepth(0.5 + target[..., 1], valid > 0), NormalTarget(directions, valid), opacity=0.2)
 
 
 def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:
     """The same photograph from a little to the right, every patch of 3 px asked, nothing hidden."""
     settings = MultiView(patches=target.shape[0] * target.shape[1], radius=1, texture=1e-3, opacity=0.01, occluded=1e3)
-    photograph, aside = prepare(target, mask, settings), camera.T_cam_world.copy()
+    image, aside = prepare_image(target, mask, settings), camera.T_cam_world.copy()
     aside[0, 3] -= 0.1
     depth = torch.full_like(target[..., 0], 1.5)
     draws = torch.full((settings.patches,), 0.5)
-    return Neighbour(photograph, photograph, replace(camera, T_cam_world=aside), depth, draws, settings)
+    return Neighbour(image, image, replace(camera, T_cam_world=aside), depth, draws, settings)
 
 
 @pytest.mark.parametrize("kind", list(LOSSES))
@@ -90,7 +90,7 @@ def test_what_was_rendered_at_an_ignored_pixel_has_no_influence(
                 mask if image.dim() == 2 else mask[..., None], image.detach(), torch.full_like(image.detach(), junk)
             ).requires_grad_()
             for name, image in vars(clean).items()
-            if name not in ("radii", "turning_normal")
+            if name not in ("radii", "normal_without_pose_grad")
         }
         output = RenderOutput(**leaves, radii=clean.radii)
         loss = one_loss(kind, output, target, mask, camera, backend=backend)
@@ -131,7 +131,7 @@ def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked:
     g = torch.Generator().manual_seed(2)
     target = torch.rand(height, width, 3, generator=g, dtype=torch.float64)
     mask = torch.rand(height, width, generator=g) < 0.85 if masked else None
-    images = {name: image for name, image in vars(output).items() if name not in ("radii", "turning_normal")}
+    images = {name: image for name, image in vars(output).items() if name not in ("radii", "normal_without_pose_grad")}
     if kind in ("normal_consistency", *PRIOR_KINDS):  # alpha is detached there, which finite differences cannot know
         images["alpha"] = images["alpha"].detach()
 

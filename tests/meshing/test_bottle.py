@@ -14,7 +14,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.io.meshes import read_mesh
-from gs2d.meshing.depth_maps import Frame
+from gs2d.meshing.depth_maps import RenderedView
 from gs2d.meshing.extract import extract
 
 SIZE = 200
@@ -48,7 +48,7 @@ def test_exact_depth_of_the_bottle_scene_gives_its_surface_back(shared: Callable
     folder = shared("rendered_bottle")
     truth, seen = read_mesh(folder / "mesh_gt.ply"), np.load(folder / "mesh_gt_seen.npy")
     cameras = cameras_of(folder)
-    result = extract([Frame(c, ray_cast(truth, c)) for c in cameras], threads=1)
+    result = extract([RenderedView(c, ray_cast(truth, c)) for c in cameras], threads=1)
     assert result.limits.voxel == pytest.approx(0.007, abs=0.001)  # half a pixel: 4 / 278 / 2
     assert result.limits.truncation == pytest.approx(5 * result.limits.voxel)  # exact maps agree
     assert result.limits.cut_fraction == 0

@@ -9,9 +9,9 @@ import pytest
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.errors import ProtocolError
-from gs2d.meshing.bounds import DepthSample, FusionLimits, backproject, derive_limits, sample_depths, widen_truncation
+from gs2d.meshing.bounds import DepthSample, FusionBounds, backproject, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
-from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.extract import extract
 from surface_shapes import box_depth, orbit, sphere_depth
 
@@ -31,7 +31,7 @@ def line(count: int, low: float, high: float) -> np.ndarray:
 CAMERA = look_at(np.array([0, -5.0, 0]), np.zeros(3), UP, width=64, height=64, fx=64)
 
 
-def limits_of(maps: list[DepthMap], **options: float) -> FusionLimits:
+def limits_of(maps: list[DepthMap], **options: float) -> FusionBounds:
     return derive_limits([sample_depths(m) for m in maps], [m.camera for m in maps], **options)  # type: ignore[arg-type]
 
 
@@ -111,7 +111,7 @@ def test_limits_that_make_no_sense_are_refused_in_one_line(options: dict) -> Non
 
 
 def test_no_depth_at_all_is_refused() -> None:
-    empty = depth_map(Frame(CAMERA, np.zeros((64, 64))))
+    empty = depth_map(RenderedView(CAMERA, np.zeros((64, 64))))
     with pytest.raises(ProtocolError, match="got none"):
         limits_of([empty])
     with pytest.raises(ProtocolError, match="got none"):
@@ -130,7 +130,7 @@ def orbit_maps(error: float, seed: int = 0) -> list[DepthMap]:
         k, phase = rng.normal(0, 0.15, (12, 2)), rng.uniform(0, 2 * np.pi, 12)
         waves = np.cos(u[..., None] * k[:, 0] + v[..., None] * k[:, 1] + phase).sum(-1) / np.sqrt(6)
         depth = sphere_depth(camera, 1.0)
-        maps.append(depth_map(Frame(camera, np.where(depth > 0, depth + error * waves, 0))))
+        maps.append(depth_map(RenderedView(camera, np.where(depth > 0, depth + error * waves, 0))))
     return maps
 
 
@@ -161,7 +161,7 @@ def test_occlusion_is_no_disagreement() -> None:
     for camera in cameras:
         small = box_depth(camera, np.array([-0.4, -1.5, -0.4]), np.array([0.4, -1.0, 0.4]))
         wall = box_depth(camera, np.array([-3, 0.0, -3]), np.array([3, 0.5, 3]))
-        maps.append(depth_map(Frame(camera, np.where(small > 0, small, wall))))
+        maps.append(depth_map(RenderedView(camera, np.where(small > 0, small, wall))))
     noise = noise_of(maps)
     assert noise is not None
     assert noise < 0.01
@@ -185,7 +185,7 @@ def test_the_truncation_is_twenty_times_the_noise_within_five_and_twenty_voxels_
 
 
 def test_noisy_maps_are_fused_better_with_the_widened_truncation() -> None:
-    frames = [Frame(m.camera, m.depth) for m in orbit_maps(0.02)]
+    frames = [RenderedView(m.camera, m.depth) for m in orbit_maps(0.02)]
     wide = extract(frames, voxel=0.007, threads=1)
     narrow = extract(frames, voxel=0.007, truncation=0.035, threads=1)
     assert wide.limits.truncation == pytest.approx(0.025 * wide.limits.side)  # 0.049

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.depth_maps import Frame, depth_map
-from gs2d.meshing.evidence import FACES_A_PIXEL, areas, clean, gather, least_views, simplified_to
+from gs2d.meshing.depth_maps import RenderedView, depth_map
+from gs2d.meshing.evidence import FACES_A_PIXEL, areas, clean, gather, min_views, simplified_to
 from gs2d.meshing.extract import extract
 from surface_shapes import orbit, sphere_depth
 
 BOX = np.array([[-2.0, -2, -2], [2, 2, 2]])
 
 
-def frames(count: int, *, sheets: int = 0) -> list[Frame]:
+def frames(count: int, *, sheets: int = 0) -> list[RenderedView]:
     """A coloured ball from all round; the first views have a sheet before it, in a corner of their pictures."""
     made = []
     for number, camera in enumerate(orbit(count, 4.0, size=32, focal=40.0)):
@@ -24,7 +24,7 @@ def frames(count: int, *, sheets: int = 0) -> list[Frame]:
         if number < sheets:
             depth[:10, :10] = 2.6
         color = np.full((camera.height, camera.width, 3), (200, 40, 90), np.uint8)
-        made.append(Frame(camera, depth, color))
+        made.append(RenderedView(camera, depth, color))
     return made
 
 
@@ -75,7 +75,7 @@ def test_vertices_know_who_saw_them_and_who_sees_through_them() -> None:
     mesh = Mesh(np.concatenate([near, sheet]).astype(np.float32), np.array([[0, 1, 2], [3, 4, 5]], np.int32), None)
     outwards = np.cross(near[1] - near[0], near[2] - near[0]) @ ahead > 0
     mesh = mesh if outwards else replace(mesh, faces=mesh.faces[:, ::-1].copy())
-    maps = [depth_map(Frame(camera, sphere_depth(camera, 1.0))) for camera in cameras]
+    maps = [depth_map(RenderedView(camera, sphere_depth(camera, 1.0))) for camera in cameras]
     evidence = gather(mesh, maps, 0.1)
     assert (evidence.support[:3] >= 1).all()
     assert (evidence.against[:3] == 0).all()
@@ -111,13 +111,13 @@ def test_what_views_say_is_said_vertex_by_vertex_whatever_the_parts(monkeypatch:
 
 
 def test_few_photographs_need_fewer_witnesses() -> None:
-    assert [least_views(count) for count in (1, 2, 11, 12, 300)] == [1, 2, 2, 3, 3]
+    assert [min_views(count) for count in (1, 2, 11, 12, 300)] == [1, 2, 2, 3, 3]
 
 
 def test_a_mesh_of_nothing_that_was_seen_is_empty_and_no_error() -> None:
     mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), None)
     camera = orbit(1, 4.0)[0]
-    found = clean(mesh, [depth_map(Frame(camera, np.zeros((camera.height, camera.width))))], 1, 0.1)
+    found = clean(mesh, [depth_map(RenderedView(camera, np.zeros((camera.height, camera.width))))], 1, 0.1)
     assert (len(found.mesh.faces), found.pixels, found.unsupported) == (0, 0.0, 1.0)
 
 

@@ -13,13 +13,13 @@ from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.library import available_variants, load
 from gs2d.kernels.tsdf import arguments_of
 from gs2d.meshing.bounds import sample_depths
-from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.integrate import add_natively, fusion_backend, integrator
-from gs2d.meshing.sampling import prepare
+from gs2d.meshing.sampling import make_sampler
 from gs2d.meshing.tsdf import block_finder, fuse, touched_blocks
-from gs2d.meshing.unbounded import fuse_nested
-from gs2d.meshing.unbounded_bounds import derive_nest
-from gs2d.meshing.volume import Volume, block_grid, unknown_volume
+from gs2d.meshing.unbounded import fuse_cascade
+from gs2d.meshing.unbounded_bounds import derive_cascade
+from gs2d.meshing.volume import Volume, block_grid, invalid_volume
 from surface_shapes import limits, orbit, sphere_depth
 
 ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")
@@ -37,7 +37,7 @@ def views(count: int = 6) -> list[DepthMap]:
         valid = rng.random((64, 64)) > 0.05
         weights = valid * rng.random((64, 64)) if k % 2 else valid
         color = rng.integers(0, 256, (64, 64, 3), dtype=np.uint8) if k % 3 else None
-        found.append(depth_map(Frame(camera, depth, color, weights)))
+        found.append(depth_map(RenderedView(camera, depth, color, weights)))
     return found
 
 
@@ -88,9 +88,9 @@ def test_without_colours_too(variant: str, monkeypatch: pytest.MonkeyPatch) -> N
 @native
 def test_every_level_of_a_nest_is_that_of_numpy() -> None:
     frames = views()
-    nest = derive_nest([sample_depths(view) for view in frames], [view.camera for view in frames], resolution=32)
-    found = fuse_nested(frames, nest, threads=2, backend="cpu")
-    expected = fuse_nested(frames, nest, threads=1, backend="reference")
+    cascade = derive_cascade([sample_depths(view) for view in frames], [view.camera for view in frames], resolution=32)
+    found = fuse_cascade(frames, cascade, threads=2, backend="cpu")
+    expected = fuse_cascade(frames, cascade, threads=1, backend="reference")
     assert sum(len(volume.keys) > 0 for volume in expected) > 1
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one.tsdf, other.tsdf)
@@ -102,8 +102,8 @@ def wall(depth: float) -> tuple[Volume, DepthMap, Camera]:
     camera = Camera(64, 64, 16.0, 16.0, 32.0, 32.0, np.eye(4))
     lim = replace(LIMITS, lower=(-1.0, -1.0, 1.0), upper=(0.5, 0.5, 2.5), voxel=0.25, truncation=1.0, depth_limit=9.0)
     color = np.full((64, 64, 3), 200, np.uint8)
-    volume = unknown_volume(lim, block_grid(lim), np.zeros(1, np.int64), colored=True, frames=1)
-    return volume, depth_map(Frame(camera, np.full((64, 64), depth), color)), camera
+    volume = invalid_volume(lim, block_grid(lim), np.zeros(1, np.int64), colored=True, frames=1)
+    return volume, depth_map(RenderedView(camera, np.full((64, 64), depth), color)), camera
 
 
 @pytest.mark.parametrize("backend", ["reference", pytest.param("cpu", marks=native)])
@@ -115,10 +115,10 @@ def test_a_voxel_moves_as_worked_by_hand(backend: str) -> None:
     the weight (1 - 0.5) + (1 - 0.75).
     """
     volume, first, camera = wall(1.5)
-    second = depth_map(Frame(camera, np.full((64, 64), 1.75), np.full((64, 64, 3), 100, np.uint8)))
+    second = depth_map(RenderedView(camera, np.full((64, 64), 1.75), np.full((64, 64, 3), 100, np.uint8)))
     with integrator([volume], backend, 1) as add:
         for item in (first, second):
-            add(prepare(item, volume.limits))
+            add(make_sampler(item, volume.limits))
     z = volume.tsdf[0].reshape(8, 8, 8)[4, 4]
     np.testing.assert_allclose(z, [0.625, 0.375, 0.125, -0.125, -0.375, -0.625, -0.75, 0.0], atol=1e-6)
     np.testing.assert_allclose(volume.weight[0].reshape(8, 8, 8)[4, 4], [2, 2, 2, 2, 2, 2, 1, 0], atol=1e-6)
@@ -148,7 +148,7 @@ def test_without_the_native_library_auto_is_numpy_and_cpu_is_refused(
 @native
 def test_an_array_of_another_type_is_refused_before_native_code_reads_it() -> None:
     volume, item, _ = wall(1.5)
-    view = replace(prepare(item, volume.limits), depth=np.zeros(66 * 66))
+    view = replace(make_sampler(item, volume.limits), depth=np.zeros(66 * 66))
     with pytest.raises(ShapeError, match="depth must be contiguous float32"), add_natively([volume], load(), 1) as add:
         add(view)
     with pytest.raises(ShapeError, match="rows"):

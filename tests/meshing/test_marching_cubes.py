@@ -50,8 +50,8 @@ def test_a_single_inside_corner_makes_one_triangle_around_it_that_faces_away() -
 def test_every_case_uses_exactly_the_edges_that_cross() -> None:
     table = case_table()
     for case in range(256):
-        crossing = {e for e, (a, c) in enumerate(EDGES) if (case >> c & 1) != (case >> (c | 1 << a) & 1)}
-        assert set(table.edges[table.starts[case] : table.starts[case + 1]].reshape(-1).tolist()) == crossing
+        near_plane_policy = {e for e, (a, c) in enumerate(EDGES) if (case >> c & 1) != (case >> (c | 1 << a) & 1)}
+        assert set(table.edges[table.starts[case] : table.starts[case + 1]].reshape(-1).tolist()) == near_plane_policy
 
 
 def test_a_sphere_has_its_radius_and_is_closed_and_faces_outward() -> None:
@@ -106,16 +106,16 @@ def test_blocks_in_any_cut_give_the_same_surface_without_seams() -> None:
 
 def test_unknown_voxels_make_no_surface() -> None:
     lim = limits(1.0, 2 / 32)
-    known = volume_of(sphere(0.7), lim, 4)
-    weight = known.weight.copy()
-    weight[known.blocks[:, 0] >= 2] = 0.5  # half of space below the least weight
-    half = Volume(lim, known.dims, known.keys, known.tsdf, weight, None, None, 1)
+    valid = volume_of(sphere(0.7), lim, 4)
+    weight = valid.weight.copy()
+    weight[valid.blocks[:, 0] >= 2] = 0.5  # half of space below the least weight
+    half = Volume(lim, valid.dims, valid.keys, valid.tsdf, weight, None, None, 1)
     mesh = marching_cubes(half, min_weight=1.0)
     boundary = lim.lower[0] + 2 * BLOCK * lim.voxel
     assert len(mesh.faces) > 100
     assert mesh.vertices[:, 0].max() < boundary
     assert marching_cubes(half, min_weight=0.5).vertices[:, 0].max() == pytest.approx(0.7, abs=0.01)
-    nothing = Volume(lim, known.dims, known.keys, known.tsdf, np.zeros_like(weight), None, None, 1)
+    nothing = Volume(lim, valid.dims, valid.keys, valid.tsdf, np.zeros_like(weight), None, None, 1)
     assert len(marching_cubes(nothing, min_weight=0.0).faces) == 0
 
 

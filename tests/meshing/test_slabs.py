@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gs2d.meshing.bounds import derive_limits, sample_depths
-from gs2d.meshing.depth_maps import DepthMap, Frame, depth_map
+from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.marching_cubes import marching_cubes
 from gs2d.meshing.slabs import fused_surface, slabs
 from gs2d.meshing.tsdf import find_blocks, fuse, fuse_blocks
@@ -20,17 +20,17 @@ def maps(*, colored: bool) -> list[DepthMap]:
     found = []
     for camera in orbit(6, 4.0, size=32, focal=40.0):
         color = random.integers(0, 255, (camera.height, camera.width, 3)).astype(np.uint8) if colored else None
-        found.append(depth_map(Frame(camera, sphere_depth(camera, 1.0), color)))
+        found.append(depth_map(RenderedView(camera, sphere_depth(camera, 1.0), color)))
     return found
 
 
 @pytest.mark.parametrize("colored", [False, True])
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_the_mesh_of_slabs_is_that_of_the_whole_volume(colored: bool, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.6])
+def test_the_mesh_of_slabs_is_that_of_the_whole_volume(colored: bool, fraction: float) -> None:
     seen = maps(colored=colored)
     limits = derive_limits([sample_depths(item) for item in seen], [item.camera for item in seen], voxel=0.05)
     blocks = find_blocks(seen, limits, threads=1)
-    most = int(share * blocks.nbytes)
+    most = int(fraction * blocks.nbytes)
     assert len(list(slabs(blocks, most))) > 1
     whole = marching_cubes(fuse(seen, limits, threads=1))
     parts = fused_surface(seen, limits, blocks, slab_bytes=most, threads=1)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from benchmarks.texture import picture, psnr
+from benchmarks.texture import image, psnr
 
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import BackendError, DataError, DiskError, ProtocolError
@@ -19,8 +19,8 @@ from gs2d.meshing import atlas as atlas_module
 from gs2d.meshing.atlas import simplified, texels_of, unwrap, vertex_normals
 from gs2d.meshing.bake import (
     FEATHER,
-    LEAST_FEATHER,
-    Photograph,
+    MIN_FEATHER,
+    ColorSource,
     bake,
     bilinear,
     feather,
@@ -33,10 +33,10 @@ from texture_shapes import above, box, checkers, flat_atlas, grid_plane, join, p
 RED, GREEN, BLUE = (np.array(c, float) for c in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
 
 
-def plain(camera_height: float, color: np.ndarray, size: int = 64) -> Photograph:
+def plain(camera_height: float, color: np.ndarray, size: int = 64) -> ColorSource:
     """A picture of one colour, from above."""
     image = np.broadcast_to(np.rint(255 * color).astype(np.uint8), (size, size, 3))
-    return Photograph(above(camera_height, size), np.ascontiguousarray(image))
+    return ColorSource(above(camera_height, size), np.ascontiguousarray(image))
 
 
 def middle(texture: np.ndarray) -> list[int]:
@@ -46,8 +46,8 @@ def middle(texture: np.ndarray) -> list[int]:
 def test_a_checkered_box_is_drawn_from_its_texture_as_its_photographs_show_it() -> None:
     pytest.importorskip("xatlas")
     mesh = box()
-    photographs = [photograph(mesh, camera, checkers) for camera in ring(14)]
-    baked = bake(unwrap(mesh, 256), photographs, 256, threads=1)
+    images = [photograph(mesh, camera, checkers) for camera in ring(14)]
+    baked = bake(unwrap(mesh, 256), images, 256, threads=1)
     assert baked.unseen < 10  # of 60 000: at the corners
     colors = np.rint(255 * np.clip(checkers(mesh.vertices), 0, 1)).astype(np.uint8)
     by_vertex, by_texture = [], []
@@ -55,8 +55,8 @@ def test_a_checkered_box_is_drawn_from_its_texture_as_its_photographs_show_it() 
         truth = photograph(mesh, camera, checkers)
         target = np.where(truth.image[..., 3:] > 0, truth.image[..., :3] / 255, 1.0)
         inside = truth.image[..., 3] == 255
-        by_texture.append(psnr(picture(baked.mesh, camera)[0][inside], target[inside]))
-        by_vertex.append(psnr(picture(Mesh(mesh.vertices, mesh.faces, colors), camera)[0][inside], target[inside]))
+        by_texture.append(psnr(image(baked.mesh, camera)[0][inside], target[inside]))
+        by_vertex.append(psnr(image(Mesh(mesh.vertices, mesh.faces, colors), camera)[0][inside], target[inside]))
     assert min(by_texture) > 31
     assert max(by_vertex) < 20  # six squares of colours for three of checkers
 
@@ -70,9 +70,9 @@ def test_a_texel_takes_the_photographs_with_most_pixels_per_area_less_the_first_
 
 
 def test_the_order_of_photographs_does_not_matter() -> None:
-    photographs = [plain(z, c, 256) for z, c in ((1, RED), (2, BLUE), (4, GREEN), (8, RED))]
-    one = bake(flat_atlas(grid_plane()), photographs, 64, best=2, threads=1)
-    other = bake(flat_atlas(grid_plane()), photographs[::-1], 64, best=2, threads=2)
+    images = [plain(z, c, 256) for z, c in ((1, RED), (2, BLUE), (4, GREEN), (8, RED))]
+    one = bake(flat_atlas(grid_plane()), images, 64, best=2, threads=1)
+    other = bake(flat_atlas(grid_plane()), images[::-1], 64, best=2, threads=2)
     np.testing.assert_array_equal(one.mesh.texture, other.mesh.texture)
 
 
@@ -88,8 +88,8 @@ def test_a_slanted_view_counts_by_its_cosine() -> None:
 
     eye = 2 * np.array([np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
     slanted = look_at(eye, np.zeros(3), np.array([0, 1.0, 0]), width=256, height=256, fx=64.0)
-    photographs = [plain(2, RED, 256), Photograph(slanted, plain(2, BLUE, 256).image)]
-    baked = bake(flat_atlas(grid_plane(16)), photographs, 64, best=2, threads=1)
+    images = [plain(2, RED, 256), ColorSource(slanted, plain(2, BLUE, 256).image)]
+    baked = bake(flat_atlas(grid_plane(16)), images, 64, best=2, threads=1)
     assert middle(baked.mesh.texture) == pytest.approx([170, 0, 85], abs=2)
 
 
@@ -100,28 +100,28 @@ def test_what_stands_before_the_surface_does_not_colour_it() -> None:
     uv = np.concatenate([0.25 + 0.25 * floor.vertices[:, :2], 0.75 + 0.2 * plate.vertices[:, :2]]).astype(np.float32)
     sheet = atlas_module.Atlas(both, np.arange(len(both.vertices)), both.faces, uv, charts=2)
     image = np.zeros((200, 200, 3), np.uint8)
-    photographs = [Photograph(above(4.0, 200, 300.0), image + np.uint8([255, 0, 0]))]
-    baked = bake(sheet, photographs, 128, best=1, threads=1)
-    # seen from 4 wu above, a plate of half the side 0.5 wu above the floor hides (0.5 * 4 / 3.5)^2 of it
+    images = [ColorSource(above(4.0, 200, 300.0), image + np.uint8([255, 0, 0]))]
+    baked = bake(sheet, images, 128, best=1, threads=1)
+    # seen from 4 above, a plate of half the side 0.5 above the floor hides (0.5 * 4 / 3.5)^2 of it (world units)
     floor_texels = (128 * 0.5) ** 2
     assert baked.unseen == pytest.approx(floor_texels * (4 / 3.5) ** 2 / 4, rel=0.15)
-    aside = [Photograph(camera, image + np.uint8([0, 0, 255])) for camera in ring(8, 4.0, 200)[::2]]
-    texture = bake(sheet, photographs + aside, 128, best=1, threads=1).mesh.texture
+    aside = [ColorSource(camera, image + np.uint8([0, 0, 255])) for camera in ring(8, 4.0, 200)[::2]]
+    texture = bake(sheet, images + aside, 128, best=1, threads=1).mesh.texture
     assert texture[32, 32].tolist() == [0, 0, 255]  # the middle of the floor
     assert texture[96, 96].tolist() == [255, 0, 0]  # the plate
 
 
 def test_pixels_that_are_masked_or_transparent_are_not_used() -> None:
-    masked = Photograph(above(1, 256), plain(1, RED, 256).image, np.zeros((256, 256), bool))
+    masked = ColorSource(above(1, 256), plain(1, RED, 256).image, np.zeros((256, 256), bool))
     clear = np.concatenate([plain(1, GREEN, 256).image, np.zeros((256, 256, 1), np.uint8)], axis=2)
-    photographs = [masked, Photograph(above(1, 256), clear), plain(2, BLUE, 256)]
-    assert middle(bake(flat_atlas(grid_plane()), photographs, 64, threads=1).mesh.texture) == [0, 0, 255]
+    images = [masked, ColorSource(above(1, 256), clear), plain(2, BLUE, 256)]
+    assert middle(bake(flat_atlas(grid_plane()), images, 64, threads=1).mesh.texture) == [0, 0, 255]
     with pytest.raises(ProtocolError, match="none of 1 does"):
         bake(flat_atlas(grid_plane()), [masked], 64, threads=1)
 
 
 def test_the_back_of_a_surface_has_no_colour() -> None:
-    below = Photograph(above(-2.0, 256), plain(2, RED, 256).image)
+    below = ColorSource(above(-2.0, 256), plain(2, RED, 256).image)
     with pytest.raises(ProtocolError, match="photographs that see the mesh"):
         bake(flat_atlas(grid_plane()), [below], 64, threads=1)
 
@@ -134,7 +134,7 @@ def test_gains_between_photographs_leave_no_step_at_the_border_of_a_picture() ->
     image[..., :3] = 153  # 0.6
     valid = np.zeros((128, 128), bool)
     valid[:, :64] = True
-    texture = bake(flat_atlas(mesh), [one, Photograph(one.camera, image, valid)], 128, best=2, threads=1).mesh.texture
+    texture = bake(flat_atlas(mesh), [one, ColorSource(one.camera, image, valid)], 128, best=2, threads=1).mesh.texture
     row = texture[64, :, 0].astype(int)
     assert row[16] == 140  # (128 + 153) / 2
     assert row[120] == 128
@@ -150,7 +150,7 @@ def test_feathering_falls_towards_outlines_but_not_on_slanted_planes() -> None:
     step = plane.copy()
     step[:, 20:] *= 0.7
     values = feather(step, focal, shown)[15]
-    assert values[19] == values[20] == np.float32(LEAST_FEATHER)
+    assert values[19] == values[20] == np.float32(MIN_FEATHER)
     np.testing.assert_allclose(values[21:25], np.array([1, 2, 3, 4]) / FEATHER)
     assert feather(np.where(step > 0, 0, step), focal, shown).max() == 0
     border = feather(plane, focal, shown)[15]
@@ -239,7 +239,7 @@ def test_faces_without_area_have_finite_places_in_the_texture() -> None:
 
 
 def test_the_size_of_a_texture_follows_the_pixels() -> None:
-    # 2 x 2 wu at 64 px per wu: 128 px, 256 half pixels, / sqrt(0.55) = 345: 512. From twice as near: 690: 1024.
+    # 2 x 2 world units, 64 px each: 128 px, 256 half pixels, / sqrt(0.55) = 345: 512. From twice as near: 690: 1024.
     assert texture_size(grid_plane(), [above(1.0, 256, 64.0), above(2.0, 256, 64.0)]) == 512
     assert texture_size(grid_plane(), [above(0.5, 256, 64.0)]) == 1024
     assert texture_size(grid_plane(), [above(-1.0, 256, 64.0)]) == 256  # nobody sees it: the least

@@ -11,11 +11,11 @@ import torch
 from gs2d.core.camera import Camera, look_at
 from gs2d.errors import DiskError, ProtocolError, ShapeError
 from gs2d.meshing.bounds import derive_limits, sample_depths
-from gs2d.meshing.depth_maps import DepthMap, Frame, Spool, depth_map
+from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool, depth_map
 from gs2d.meshing.extract import extract
 from gs2d.meshing.integrate import FULL_WEIGHT_BEHIND
 from gs2d.meshing.marching_cubes import components, marching_cubes
-from gs2d.meshing.tsdf import fuse, least_blocks, touched_blocks
+from gs2d.meshing.tsdf import fuse, min_blocks, touched_blocks
 from gs2d.meshing.volume import BLOCK, block_bytes, block_grid
 from surface_shapes import (
     box_depth,
@@ -32,7 +32,7 @@ from surface_shapes import (
 LIMITS = limits(1.3, 0.03)
 
 
-def maps(frames: list[Frame]) -> list[DepthMap]:
+def maps(frames: list[RenderedView]) -> list[DepthMap]:
     return [depth_map(frame) for frame in frames]
 
 
@@ -49,13 +49,13 @@ def test_a_sphere_seen_from_all_round_is_closed_and_has_its_radius() -> None:
 def test_an_oblique_plane_is_flat_to_a_small_part_of_a_voxel() -> None:
     """Plane z = 4 + 0.8 x before the camera at the origin: depth 4 / (1 - 0.8 x') at the pixel ray (x', y', 1).
 
-    Read at the nearest pixel, it would be wrong by up to half a pixel of 0.02 wu times 0.8: 0.4 voxel along z.
+    Read at the nearest pixel, it would be wrong by up to half a pixel of 0.02 world units times 0.8: 0.4 voxel along z.
     """
     camera = Camera(160, 120, 200.0, 200.0, 80.0, 60.0, np.eye(4))
     slope = (np.arange(160) + 0.5 - 80) / 200
     depth = np.broadcast_to(4 / (1 - 0.8 * slope), (120, 160))
     lim = replace(limits(1.0, 0.02), lower=(-1.0, -0.8, 3.2), upper=(0.8, 0.8, 4.8))
-    mesh = marching_cubes(fuse([depth_map(Frame(camera, depth))], lim, threads=1))
+    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], lim, threads=1))
     error = (mesh.vertices[:, 2] - 4 - 0.8 * mesh.vertices[:, 0]) / np.hypot(1, 0.8)
     assert np.abs(error).max() < 0.02 * lim.voxel
 
@@ -68,7 +68,7 @@ def test_depth_is_not_made_up_across_a_depth_edge() -> None:
     camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
     depth = np.where(np.arange(64) < 32, 2.0, 3.0) * np.ones((64, 1))
     lim = replace(limits(1.0, 0.02), lower=(-1.0, -0.5, 1.5), upper=(1.0, 0.5, 3.5))
-    mesh = marching_cubes(fuse([depth_map(Frame(camera, depth))], lim, threads=1))
+    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], lim, threads=1))
     z = mesh.vertices[:, 2]
     near = z < 2 + FULL_WEIGHT_BEHIND * lim.truncation + lim.voxel
     assert (np.abs(z[near & (np.abs(mesh.vertices[:, 0]) > 0.05)] - 2) < 0.01).all()
@@ -81,7 +81,7 @@ def test_unseen_space_makes_no_shell() -> None:
     """One camera sees half a sphere: one open sheet, nothing behind it and nothing around the image's edge."""
     camera = look_at(np.array([0, -3.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), width=160, height=160, fx=200)
     depth = sphere_depth(camera, 1.0)
-    mesh = marching_cubes(fuse([depth_map(Frame(camera, depth))], limits(1.3, 0.02), threads=1))
+    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, depth))], limits(1.3, 0.02), threads=1))
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.02
     assert mesh.vertices[:, 1].max() < -1 / 3 + 0.05  # the outline seen from 3 away is at y = -1/3
     _, uses, _ = edge_uses(mesh)
@@ -95,7 +95,7 @@ def test_a_thin_plate_seen_from_both_sides_has_two_faces_and_no_other_layer(thic
     half = 0.5 * thickness_voxels * voxel
     low, high = np.array([-0.6, -0.6, -half]), np.array([0.6, 0.6, half])
     cameras = orbit(36, 3.0, size=160, focal=220.0)
-    frames = [Frame(camera, box_depth(camera, low, high)) for camera in cameras]
+    frames = [RenderedView(camera, box_depth(camera, low, high)) for camera in cameras]
     mesh = marching_cubes(fuse(maps(frames), limits(0.8, voxel), threads=1))
     inner = np.abs(mesh.vertices[:, :2]).max(1) < 0.5
     height = np.abs(mesh.vertices[inner, 2])
@@ -114,9 +114,9 @@ def test_invalid_pixels_and_pixels_without_depth_carry_nothing() -> None:
     depth = sphere_depth(camera, 1.0)
     valid = np.zeros(depth.shape, bool)
     with pytest.raises(ProtocolError, match="got none"):
-        fuse([depth_map(Frame(camera, depth, valid=valid))], LIMITS)
+        fuse([depth_map(RenderedView(camera, depth, valid=valid))], LIMITS)
     valid[:, :48] = True
-    left = depth_map(Frame(camera, np.where(depth > 0, depth, np.nan), valid=valid))
+    left = depth_map(RenderedView(camera, np.where(depth > 0, depth, np.nan), valid=valid))
     assert (left.depth[:, 48:] == 0).all()
     assert np.isfinite(left.depth).all()
     mesh = marching_cubes(fuse([left], LIMITS, threads=1))
@@ -128,7 +128,7 @@ def test_weights_of_pixels_weigh() -> None:
     """Two views from one place, of walls at 2.00 and 2.04, weighted 3 to 1: the wall is at 2.01."""
     camera = Camera(64, 64, 80.0, 80.0, 32.0, 32.0, np.eye(4))
     one = np.ones((64, 64))
-    frames = [Frame(camera, 2.00 * one, valid=3 * one), Frame(camera, 2.04 * one, valid=1 * one)]
+    frames = [RenderedView(camera, 2.00 * one, valid=3 * one), RenderedView(camera, 2.04 * one, valid=1 * one)]
     lim = replace(limits(1.0, 0.02), lower=(-0.5, -0.5, 1.5), upper=(0.5, 0.5, 2.5), truncation=0.2)
     mesh = marching_cubes(fuse(maps(frames), lim, threads=1))
     np.testing.assert_allclose(mesh.vertices[:, 2], 2.01, atol=1e-4)
@@ -140,7 +140,7 @@ def test_free_space_clears_a_phantom_that_other_views_look_through() -> None:
     phantom = np.asarray(frames[0].depth).copy()
     phantom[28:36, 28:36] = 1.95  # 0.15 before the surface
     for position in (0, 30):  # wherever it comes in the order
-        order = [*frames[1 : 1 + position], Frame(cameras[0], phantom), *frames[1 + position :]]
+        order = [*frames[1 : 1 + position], RenderedView(cameras[0], phantom), *frames[1 + position :]]
         mesh = marching_cubes(fuse(maps(order), LIMITS, threads=1))
         assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.92
 
@@ -153,7 +153,7 @@ def test_colours_come_from_the_views_that_see_the_surface() -> None:
         o, d = rays(camera)
         point = o + depth[..., None] * d
         color = np.where(point[..., 2:] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])  # red above, blue below
-        frames.append(Frame(camera, depth, color, depth > 0))
+        frames.append(RenderedView(camera, depth, color, depth > 0))
     mesh = marching_cubes(fuse(maps(frames), LIMITS, threads=1))
     assert mesh.colors is not None
     top, bottom = mesh.vertices[:, 2] > 0.1, mesh.vertices[:, 2] < -0.1
@@ -172,7 +172,9 @@ def test_the_result_does_not_depend_on_threads() -> None:
 def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pyramid of farthest depths is an optimisation: compare with every block in front of the camera."""
     cameras = orbit(8, 3.0)
-    frames = maps([Frame(c, box_depth(c, np.array([-0.9, -0.5, -0.2]), np.array([0.3, 0.8, 0.9]))) for c in cameras])
+    frames = maps(
+        [RenderedView(c, box_depth(c, np.array([-0.9, -0.5, -0.2]), np.array([0.3, 0.8, 0.9]))) for c in cameras]
+    )
     fast = fuse(frames, LIMITS, threads=1)
     monkeypatch.setattr(
         "gs2d.meshing.integrate.block_visibility",
@@ -189,9 +191,9 @@ def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: 
 def test_the_blocks_near_a_depth_map_are_those_of_a_plain_loop(marked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples every half block from -0.15 to 0.15 of each pixel's depth; each takes the two nearest blocks by axis."""
     if not marked:
-        monkeypatch.setattr("gs2d.meshing.tsdf._MOST_MARKS", 0)  # as for a grid that is too large to mark
+        monkeypatch.setattr("gs2d.meshing.tsdf._MAX_MARKS", 0)  # as for a grid that is too large to mark
     camera = look_at(np.array([0.4, -2.5, 0.3]), np.zeros(3), np.array([0, 0, 1.0]), width=24, height=20, fx=40)
-    item = depth_map(Frame(camera, sphere_depth(camera, 1.0)))
+    item = depth_map(RenderedView(camera, sphere_depth(camera, 1.0)))
     dims = block_grid(LIMITS)
     expected = set()
     for row, column in zip(*np.nonzero(item.depth), strict=True):
@@ -210,7 +212,7 @@ def test_the_blocks_near_a_depth_map_are_those_of_a_plain_loop(marked: bool, mon
 
 def test_every_voxel_within_the_truncation_of_a_seen_point_has_a_block() -> None:
     camera = orbit(1, 3.0)[0]
-    item = depth_map(Frame(camera, sphere_depth(camera, 1.0)))
+    item = depth_map(RenderedView(camera, sphere_depth(camera, 1.0)))
     dims = block_grid(LIMITS)
     keys = set(touched_blocks(item, LIMITS, dims).tolist())
     sample = sample_depths(item, 10**9)
@@ -227,7 +229,7 @@ def test_a_pixel_wider_than_a_block_leaves_no_gaps() -> None:
     """A wall at 2, pixels 0.25 wide, blocks 0.04 wide: the sheet has no holes."""
     camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
     lim = replace(limits(1.0, 0.005), lower=(-0.3, -0.3, 1.8), upper=(0.3, 0.3, 2.2))
-    mesh = marching_cubes(fuse([depth_map(Frame(camera, np.full((8, 8), 2.0)))], lim, threads=1))
+    mesh = marching_cubes(fuse([depth_map(RenderedView(camera, np.full((8, 8), 2.0)))], lim, threads=1))
     assert components(mesh).max() == 0
     edges, uses, _ = edge_uses(mesh)
     border = np.abs(mesh.vertices[edges[uses == 1]][..., :2]).max(axis=(1, 2))
@@ -248,7 +250,7 @@ def test_memory_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
 
 @pytest.mark.parametrize("voxel", [1e-3, 1e-6])
 def test_a_voxel_that_is_far_too_small_is_refused_at_once(voxel: float) -> None:
-    """To count blocks of 1e-6 wu voxels would take for ever, and all memory. Two errors later a voxel fits."""
+    """To count blocks of 1e-6 world units voxels would take for ever, and all memory. Two errors later a voxel fits."""
     frames = maps(sphere_frames(orbit(10, 3.0)))
     max_bytes = 1500 * block_bytes(False)
     for least in ("at least ", ""):
@@ -265,11 +267,11 @@ def test_the_least_number_of_blocks_is_not_above_the_number(truncation: float, m
         lim = limits(half, 0.02, truncation)
         for item in maps(sphere_frames(orbit(3, 3.0))):
             number = len(touched_blocks(item, lim, block_grid(lim)))
-            assert 0.04 * number < least_blocks(item, lim) <= number
+            assert 0.04 * number < min_blocks(item, lim) <= number
 
 
 def test_a_truncation_larger_than_the_box_is_refused() -> None:
-    with pytest.raises(ProtocolError, match=r"at most the side of the box, 2\.6 wu, was expected, got 1e\+09"):
+    with pytest.raises(ProtocolError, match=r"at most the side of the box, 2\.6 world units, was expected, got 1e\+09"):
         fuse(maps(sphere_frames(orbit(2, 3.0))), limits(1.3, 0.03, 1e9), threads=1)
 
 
@@ -295,10 +297,10 @@ def test_maps_of_another_size_than_the_camera_are_refused() -> None:
     camera = orbit(1, 3.0)[0]
     depth = np.ones((96, 96))
     for frame in (
-        Frame(camera, np.ones((96, 95))),
-        Frame(camera, depth, color=np.zeros((96, 96))),
-        Frame(camera, depth, valid=np.ones((95, 96), bool)),
-        Frame(camera, depth, valid=-depth),
+        RenderedView(camera, np.ones((96, 95))),
+        RenderedView(camera, depth, color=np.zeros((96, 96))),
+        RenderedView(camera, depth, valid=np.ones((95, 96), bool)),
+        RenderedView(camera, depth, valid=-depth),
     ):
         with pytest.raises(ShapeError):
             depth_map(frame)
@@ -307,9 +309,9 @@ def test_maps_of_another_size_than_the_camera_are_refused() -> None:
 def test_torch_tensors_and_arrays_are_the_same_frame() -> None:
     camera = orbit(1, 3.0)[0]
     depth, color = sphere_depth(camera, 1.0).astype(np.float32), np.full((96, 96, 3), 0.5, np.float32)
-    a = depth_map(Frame(camera, depth, color, depth > 0))
+    a = depth_map(RenderedView(camera, depth, color, depth > 0))
     t = torch.from_numpy
-    b = depth_map(Frame(camera, t(depth).requires_grad_(), t(color), t(depth > 0)))
+    b = depth_map(RenderedView(camera, t(depth).requires_grad_(), t(color), t(depth > 0)))
     np.testing.assert_array_equal(a.depth, b.depth)
     assert a.color is not None
     assert b.color is not None
@@ -322,7 +324,11 @@ def test_a_spool_gives_back_what_it_was_given_as_often_as_asked() -> None:
     depth = sphere_depth(camera, 1.0)
     rng = np.random.default_rng(0)
     color = rng.integers(0, 256, (96, 96, 3), dtype=np.uint8)
-    frames = [Frame(camera, depth), Frame(camera, depth, color), Frame(camera, depth, color, rng.random((96, 96)))]
+    frames = [
+        RenderedView(camera, depth),
+        RenderedView(camera, depth, color),
+        RenderedView(camera, depth, color, rng.random((96, 96))),
+    ]
     with Spool() as spool:
         spool.extend(iter(frames))
         assert len(spool) == 3
@@ -360,7 +366,7 @@ def test_an_orbit_at_uneven_distances_keeps_the_whole_scene() -> None:
     eyes = [np.array([x, -y, 0.0]) for x, y in ((0.0, 0.4), (-1.0, 4.0), (1.0, 4.0), (0.0, 5.0))]
     up = np.array([0, 0, 1.0])
     cameras = [look_at(e, np.array([e[0], 0, 0]), up, width=128, height=128, fx=110) for e in eyes]
-    frames = [Frame(c, box_depth(c, *wall)) for c in cameras]
+    frames = [RenderedView(c, box_depth(c, *wall)) for c in cameras]
     derived = derive_limits([sample_depths(depth_map(f)) for f in frames], cameras, resolution=100)
     assert derived.depth_limit > 5
     mesh = extract(frames, resolution=100, threads=1).mesh

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cascade_scenes import BALL, GROUND, cascade_of, outdoor_frames, volumes_of
 from gs2d.core.camera import look_at
 from gs2d.errors import ProtocolError
 from gs2d.meshing.bounds import sample_depths
-from gs2d.meshing.depth_maps import Frame, depth_map
+from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.meshing.marching_cubes import components
-from gs2d.meshing.unbounded import fuse_nested, nested_marching_cubes
-from gs2d.meshing.unbounded_bounds import STEP, derive_nest, known_depth
+from gs2d.meshing.unbounded import cascade_marching_cubes, fuse_cascade
+from gs2d.meshing.unbounded_bounds import STEP, derive_cascade, valid_depth
 from gs2d.meshing.volume import BLOCK, VOXELS, block_bytes
-from nest_scenes import BALL, GROUND, nest_of, outdoor_frames, volumes_of
 from surface_shapes import edge_uses, is_closed_manifold, orbit, rays, signed_volume, sphere_depth
 
 
@@ -32,25 +32,25 @@ def test_a_sphere_across_levels_is_one_closed_surface_as_exact_as_each_levels_vo
 
     A join's cells reach three voxels of the finer level, so allow four times as much there.
     """
-    nest = nest_of(4)
-    mesh = nested_marching_cubes(
-        volumes_of(nest, lambda p: np.linalg.norm(p - np.asarray(center), axis=1) - radius), nest, far_weight=1.0
+    cascade = cascade_of(4)
+    mesh = cascade_marching_cubes(
+        volumes_of(cascade, lambda p: np.linalg.norm(p - np.asarray(center), axis=1) - radius), cascade, far_weight=1.0
     )
     assert is_closed_manifold(mesh)
     assert components(mesh).max() == 0
     assert signed_volume(mesh) == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.01)
     error = np.abs(np.linalg.norm(mesh.vertices - np.asarray(center), axis=1) - radius)
-    level = np.minimum(nest.level_of(mesh.vertices.astype(np.float64)), 3)
+    level = np.minimum(cascade.level_of(mesh.vertices.astype(np.float64)), 3)
     assert len(np.unique(level)) > 1
-    assert (error < 0.03 * nest.levels[0].voxel * 2.0**level).all()
+    assert (error < 0.03 * cascade.levels[0].voxel * 2.0**level).all()
 
 
 def test_any_field_whatever_gives_a_closed_surface_across_the_joins() -> None:
     """Random values at every voxel, outside at the rim of the outermost level: all 256 cases, on all joins."""
-    nest = nest_of(3)
+    cascade = cascade_of(3)
     rng = np.random.default_rng(3)
-    volumes = volumes_of(nest, lambda p: np.where(np.abs(p).max(axis=1) > 3.6, 1.0, rng.normal(size=len(p))))
-    mesh = nested_marching_cubes(volumes, nest, far_weight=1.0)
+    volumes = volumes_of(cascade, lambda p: np.where(np.abs(p).max(axis=1) > 3.6, 1.0, rng.normal(size=len(p))))
+    mesh = cascade_marching_cubes(volumes, cascade, far_weight=1.0)
     _, uses, upward = edge_uses(mesh)
     assert len(mesh.faces) > 50_000
     assert (uses % 2 == 0).all()  # no border
@@ -60,13 +60,13 @@ def test_any_field_whatever_gives_a_closed_surface_across_the_joins() -> None:
 
 def test_every_place_belongs_to_one_level() -> None:
     """Cubes of half 1, 2 and 4: a voxel of 1/16, 1/8, 1/4, and no voxel of one level inside the level within."""
-    nest = nest_of(3)
+    cascade = cascade_of(3)
     points = np.array([[0.0, 0.99, 0.0], [1.01, 0.0, 0.0], [0.0, -1.99, 1.0], [2.5, 0.0, 0.0], [0.0, 0.0, 4.1]])
-    np.testing.assert_array_equal(nest.level_of(points), [0, 1, 1, 2, 3])
+    np.testing.assert_array_equal(cascade.level_of(points), [0, 1, 1, 2, 3])
     local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
-    for k, volume in enumerate(volumes_of(nest, lambda p: p[:, 0])):
+    for k, volume in enumerate(volumes_of(cascade, lambda p: p[:, 0])):
         at = np.asarray(volume.limits.lower) + (volume.blocks[:, None] * BLOCK + local) * volume.limits.voxel
-        np.testing.assert_array_equal(nest.level_of(at.reshape(-1, 3)), k)
+        np.testing.assert_array_equal(cascade.level_of(at.reshape(-1, 3)), k)
         assert len(volume.keys) == (64 if k == 0 else 56)  # 4^3 blocks, without the 2^3 in the middle
 
 
@@ -79,16 +79,16 @@ def test_spheres_near_and_far_are_exact_to_a_part_of_their_levels_voxel() -> Non
         for z in (-1.0, 0.0, 1.0) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)
     ]  # fmt: skip
     for radius in (1.5, 5.0, 20.0):
-        nest = nest_of(6)
+        cascade = cascade_of(6)
         maps = []
         for camera in cameras:
             origin, step = rays(camera)  # inside the sphere: |o + s d| = R, the farther root
             a, b, c = (step**2).sum(-1), step @ origin, origin @ origin - radius**2
-            maps.append(depth_map(Frame(camera, (-b + np.sqrt(b * b - a * c)) / a)))
-        volumes = fuse_nested(maps, nest, threads=1)
-        mesh = nested_marching_cubes(volumes, nest, far_weight=1.0)
+            maps.append(depth_map(RenderedView(camera, (-b + np.sqrt(b * b - a * c)) / a)))
+        volumes = fuse_cascade(maps, cascade, threads=1)
+        mesh = cascade_marching_cubes(volumes, cascade, far_weight=1.0)
         distance = np.linalg.norm(mesh.vertices, axis=1)
-        voxel = nest.levels[0].voxel * 2.0 ** nest.level_of(mesh.vertices.astype(np.float64))
+        voxel = cascade.levels[0].voxel * 2.0 ** cascade.level_of(mesh.vertices.astype(np.float64))
         assert len(mesh.faces) > 500
         assert (np.abs(distance - radius) < 0.5 * voxel).all()
         assert np.mean(np.abs(distance - radius) / voxel) < 0.12
@@ -96,16 +96,16 @@ def test_spheres_near_and_far_are_exact_to_a_part_of_their_levels_voxel() -> Non
 
 def test_a_plane_through_all_levels_has_one_layer_and_no_hole_at_the_joins() -> None:
     """Ground at z = -0.3 under a camera that looks along it: only its rim is open, and every column is crossed once."""
-    nest = nest_of(5)
+    cascade = cascade_of(5)
     eyes = [(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
     maps = []
     for x, y in eyes:
         camera = look_at(
             np.array([x, y, 12.0]), np.array([x, y, 0.0]), np.array([0, 1.0, 0]), width=256, height=256, fx=110
         )
-        maps.append(depth_map(Frame(camera, np.full((256, 256), 12.3))))
-    mesh = nested_marching_cubes(fuse_nested(maps, nest, threads=1), nest, far_weight=1.0)
-    assert np.abs(mesh.vertices[:, 2] + 0.3).max() < 0.02 * nest.levels[0].voxel
+        maps.append(depth_map(RenderedView(camera, np.full((256, 256), 12.3))))
+    mesh = cascade_marching_cubes(fuse_cascade(maps, cascade, threads=1), cascade, far_weight=1.0)
+    assert np.abs(mesh.vertices[:, 2] + 0.3).max() < 0.02 * cascade.levels[0].voxel
     edges, uses, _ = edge_uses(mesh)
     assert uses.max() == 2
     rim = mesh.vertices[edges[uses == 1]].reshape(-1, 3)
@@ -154,27 +154,27 @@ def test_the_bounded_box_does_not_hold_the_far_ground() -> None:
 def test_depth_is_known_as_far_as_half_a_pixel_of_parallax_moves_a_point_less_than_the_truncation() -> None:
     """Cameras at distance 2 from their mean: baseline 4; focal length 120 px, band 0.05: 0.05 * 4 * 120 / 0.5 = 48."""
     cameras = orbit(50, 2.0)
-    assert known_depth(cameras, 0.05) == pytest.approx(48, rel=0.02)
-    assert known_depth(cameras[:1], 0.05) == np.inf
+    assert valid_depth(cameras, 0.05) == pytest.approx(48, rel=0.02)
+    assert valid_depth(cameras[:1], 0.05) == np.inf
 
 
 def test_the_innermost_cube_holds_the_nearer_half_and_the_given_limits_are_kept() -> None:
     cameras = orbit(12, 3.0)
-    samples = [sample_depths(depth_map(Frame(c, sphere_depth(c, 1.0)))) for c in cameras]
-    nest = derive_nest(samples, cameras, resolution=100)
-    assert nest.voxels % STEP == 0
-    assert nest.half < 1.4
-    given = derive_nest(samples, cameras, bbox=np.array([[-1, -1, -1], [1, 3, 1]]), voxel=0.1, truncation=0.3)
+    samples = [sample_depths(depth_map(RenderedView(c, sphere_depth(c, 1.0)))) for c in cameras]
+    cascade = derive_cascade(samples, cameras, resolution=100)
+    assert cascade.voxels % STEP == 0
+    assert cascade.half < 1.4
+    given = derive_cascade(samples, cameras, bbox=np.array([[-1, -1, -1], [1, 3, 1]]), voxel=0.1, truncation=0.3)
     assert given.levels[0].voxel == 0.1
     assert given.center == (0.0, 1.0, 0.0)
     assert given.half == pytest.approx(3.2)  # 40 voxels, made up to 64
     assert [level.truncation for level in given.levels] == pytest.approx([0.3 * 2**k for k in range(len(given.levels))])
     with pytest.raises(ProtocolError, match="voxel must be positive"):
-        derive_nest(samples, cameras, voxel=-1.0)
+        derive_cascade(samples, cameras, voxel=-1.0)
     with pytest.raises(ProtocolError, match="depth_limit must exceed"):
-        derive_nest(samples, cameras, depth_limit=0.1)
+        derive_cascade(samples, cameras, depth_limit=0.1)
     with pytest.raises(ProtocolError, match="at least one seen pixel"):
-        derive_nest([], cameras)
+        derive_cascade([], cameras)
 
 
 def test_memory_of_all_levels_together_is_bounded_and_the_error_names_a_voxel_that_fits() -> None:
@@ -190,14 +190,14 @@ def test_memory_of_all_levels_together_is_bounded_and_the_error_names_a_voxel_th
 
 def test_the_result_does_not_depend_on_threads_or_on_levels_without_blocks() -> None:
     maps = [depth_map(f) for f in outdoor_frames("unseen", views=6, size=48)]
-    nest = nest_of(4, depth_limit=6.0)
-    one = nested_marching_cubes(fuse_nested(maps, nest, threads=1), nest, far_weight=1.0)
-    two = nested_marching_cubes(fuse_nested(maps, nest, threads=2), nest, far_weight=1.0)
+    cascade = cascade_of(4, depth_limit=6.0)
+    one = cascade_marching_cubes(fuse_cascade(maps, cascade, threads=1), cascade, far_weight=1.0)
+    two = cascade_marching_cubes(fuse_cascade(maps, cascade, threads=2), cascade, far_weight=1.0)
     np.testing.assert_array_equal(one.vertices, two.vertices)
-    more = nest_of(9, depth_limit=6.0)
-    same = nested_marching_cubes(fuse_nested(maps, more, threads=1), more, far_weight=1.0)
+    more = cascade_of(9, depth_limit=6.0)
+    same = cascade_marching_cubes(fuse_cascade(maps, more, threads=1), more, far_weight=1.0)
     assert len(same.faces) == len(one.faces)
     with pytest.raises(TypeError, match="read twice"):
-        fuse_nested(iter(maps), nest)
+        fuse_cascade(iter(maps), cascade)
     with pytest.raises(ProtocolError, match="depth inside"):
-        fuse_nested([replace(m, depth=np.zeros_like(m.depth)) for m in maps], nest)
+        fuse_cascade([replace(m, depth=np.zeros_like(m.depth)) for m in maps], cascade)

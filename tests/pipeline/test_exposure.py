@@ -24,12 +24,12 @@ from gs2d.pipeline.evaluate import score_views
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.exposure import matched_by_halves, read_exposures
 from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import build_recipe, prepare
+from gs2d.pipeline.job import build_recipe, prepare_job
 from gs2d.pipeline.jobs import evaluate_run, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 from gs2d.pipeline.paths import orbit_cameras
 from gs2d.pipeline.render import render_view
-from gs2d.pipeline.texture import TextureOptions, _photographs
+from gs2d.pipeline.texture import TextureOptions, _images
 from gs2d.pipeline.train import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains
@@ -68,7 +68,7 @@ def test_the_demo_s_training_pictures_have_gains_whose_mean_is_one(
 ) -> None:
     drawn = np.random.default_rng(0).integers(0, 256, (16, 16, 4)).astype(np.uint8)
     monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
-    monkeypatch.setattr(toy, "render_picture", lambda *_: toy.Picture(drawn, np.zeros(1, bool)))
+    monkeypatch.setattr(toy, "render_image", lambda *_: toy.SyntheticImage(drawn, np.zeros(1, bool)))
     for name, vary in (("plain", False), ("varied", True)):
         toy.write_demo_capture(tmp_path / name, train_views=3, test_views=1, size=16, vary_exposure=vary)
     truth = json.loads((tmp_path / "varied" / GAINS).read_text())
@@ -167,13 +167,11 @@ def test_the_texture_takes_photographs_in_the_exposure_of_the_scene(run: RunFold
     _, job, splats = open_job(run.path, 1, ignore)
     transforms = read_exposures(run, job.recipe)
     views = job.scene.train[:2]
-    for view, photograph in zip(
-        views, _photographs(job, views, splats, TextureOptions(), transforms, ignore), strict=True
-    ):
+    for view, image in zip(views, _images(job, views, splats, TextureOptions(), transforms, ignore), strict=True):
         A, b = np.split(transforms[view.name].double().numpy(), [3], axis=1)
         inside = view.image()[..., 3] > 0
         expected = 255 * np.clip((view.image()[inside][:, :3] / 255 - b[:, 0]) @ np.linalg.inv(A).T, 0, 1)
-        assert np.abs(photograph.image[inside][:, :3] - expected).max() <= 0.51
+        assert np.abs(image.image[inside][:, :3] - expected).max() <= 0.51
 
 
 def test_figures_of_e_i_compare_in_the_exposures_that_were_found(run: RunFolder, tmp_path: Path) -> None:
@@ -205,8 +203,8 @@ def test_a_stopped_run_resumes_to_the_same_splats_and_exposures(run: RunFolder, 
 
 
 def test_stages_are_not_shared_between_runs_with_and_without_exposures(varied: Path, tmp_path: Path) -> None:
-    plain = prepare(options(varied, tmp_path / "a"), ignore)
-    with_them = prepare(learning(varied, tmp_path / "b"), ignore)
+    plain = prepare_job(options(varied, tmp_path / "a"), ignore)
+    with_them = prepare_job(learning(varied, tmp_path / "b"), ignore)
     assert plain.stage_key(0) != with_them.stage_key(0)
     same_stages = replace(with_them, recipe=replace(with_them.recipe, exposure=None))
     assert same_stages.stage_key(0) != with_them.stage_key(0)

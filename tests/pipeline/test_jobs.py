@@ -164,9 +164,9 @@ def test_strings_are_paths_too(undisturbed: RunFolder, tmp_path: Path) -> None:
     run: Any = str(undisturbed.path)
     result = export_run(run, str(tmp_path / "a.ply"), "3dgs")  # type: ignore[arg-type]
     assert result["file"] == str(tmp_path / "a.ply")
-    film, frames = str(tmp_path / "a.webp"), str(tmp_path / "frames")
-    assert render_run(run, orbit=2, video=film, out=frames)["images"] == 2  # type: ignore[arg-type]
-    assert EvaluateOptions(ground_truth=film).ground_truth == tmp_path / "a.webp"  # type: ignore[arg-type]
+    video, frames = str(tmp_path / "a.webp"), str(tmp_path / "frames")
+    assert render_run(run, orbit=2, video=video, out=frames)["images"] == 2  # type: ignore[arg-type]
+    assert EvaluateOptions(ground_truth=video).ground_truth == tmp_path / "a.webp"  # type: ignore[arg-type]
     given = TrainOptions(scene="capture", out="run", cache="cache")  # type: ignore[arg-type]
     assert (given.scene, given.out, given.cache) == (Path("capture"), Path("run"), Path("cache"))
     assert given.start_from is None
@@ -241,11 +241,11 @@ def test_a_rendering_is_not_written_over_a_photograph(
         return [Path(view.name).stem for view in views]  # as in captures without sub-folders
 
     monkeypatch.setattr("gs2d.pipeline.jobs.file_names", plain)
-    photograph = capture / "test" / "r_0.png"
-    before = photograph.read_bytes()
+    image = capture / "test" / "r_0.png"
+    before = image.read_bytes()
     with pytest.raises(RunError, match=r"--out would write over the capture's photograph .*r_0\.png"):
         render_run(undisturbed.path, out=capture / "test", threads=1)
-    assert photograph.read_bytes() == before
+    assert image.read_bytes() == before
     assert render_run(undisturbed.path, out=tmp_path / "out", threads=1)["images"] == 2
 
 

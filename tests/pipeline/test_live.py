@@ -22,13 +22,13 @@ from gs2d.core.splats import Splats
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline import live as module
 from gs2d.pipeline.events import Event, Notice, Phase, Step, ignore
-from gs2d.pipeline.job import Job, prepare
+from gs2d.pipeline.job import Job, prepare_job
 from gs2d.pipeline.live import Live
 from gs2d.pipeline.train import train
 from gs2d.training.events import Progress, StageEntering
 from gs2d.training.state import TrainState
 from gs2d.viewer.exact import Drawn
-from gs2d.viewer.server import Stage
+from gs2d.viewer.server import ViewerStage
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
@@ -45,8 +45,8 @@ def test_a_watched_training_has_the_bytes_of_an_unwatched_one(
     pytest.importorskip("viser", reason="viser is not installed (extra `view`)")
     from viser_client import Client
 
-    monkeypatch.setattr(module, "LEAST_SECONDS", 0.0)
-    monkeypatch.setattr(module, "MOST_SHARE", 1e9)
+    monkeypatch.setattr(module, "MIN_SECONDS", 0.0)
+    monkeypatch.setattr(module, "MAX_FRACTION", 1e9)
     seen: list[Client] = []
     wrong: list[BaseException] = []
     done = threading.Event()
@@ -90,7 +90,7 @@ class FakeViewer:
     def __init__(self) -> None:
         self.watchers = 1
         self.texts: list[str] = []
-        self.stages: list[Stage] = []
+        self.stages: list[ViewerStage] = []
         self.switches: dict[str, Callable[[bool], None]] = {}
         self.broken: Exception | None = None
         self.closed = False
@@ -99,13 +99,13 @@ class FakeViewer:
         self.texts.append(text)
         return self.texts.append
 
-    def add_stages(self, stages: dict[str, Stage]) -> None:
+    def add_stages(self, stages: dict[str, ViewerStage]) -> None:
         self.stages += stages.values()
 
     def add_switch(self, label: str, on_change: Callable[[bool], None]) -> None:
         self.switches[label] = on_change
 
-    def replace_stage(self, _name: str, stage: Stage) -> None:
+    def replace_stage(self, _name: str, stage: ViewerStage) -> None:
         if self.broken is not None:
             raise self.broken
         self.stages.append(stage)
@@ -118,7 +118,7 @@ class FakeViewer:
 
 @pytest.fixture(scope="module")
 def job(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
-    return prepare(options(capture, tmp_path_factory.mktemp("runs") / "run"), ignore)
+    return prepare_job(options(capture, tmp_path_factory.mktemp("runs") / "run"), ignore)
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_refreshes_take_a_small_share_of_the_time(job: Job, splats: Splats, monk
             pass
 
     monkeypatch.setattr(module, "preview", work)
-    monkeypatch.setattr(module, "MOST_SHARE", 0.01)
+    monkeypatch.setattr(module, "MAX_FRACTION", 0.01)
     viewer = FakeViewer()
     live = Live(viewer, job, ignore)  # type: ignore[arg-type]
     live.on_training_event(progress(), state_of(splats))
@@ -303,9 +303,7 @@ def test_without_viser_one_line_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert run(["train", str(capture), "--out", str(tmp_path / "run"), "--quiet", "--viewer"]) == 2
-    assert "the viewer needs viser, which is not installed; pip install 'viser>=" in one_line(
-        capsys.readouterr().err
-    )
+    assert "the viewer needs viser, which is not installed; pip install 'viser>=" in one_line(capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -13,8 +13,8 @@ import torch
 
 from gs2d.core.camera import look_at
 from gs2d.data import Scene, View
-from gs2d.data.cache import TRIM_EVERY, ImageCache, Picture
-from gs2d.kernels.buffer_pool import Recycler
+from gs2d.data.cache import TRIM_EVERY, DecodedImage, ImageCache
+from gs2d.kernels.buffer_pool import BufferPool
 from gs2d.pipeline.memory import release
 
 HOLES = """
@@ -81,9 +81,9 @@ def test_a_scene_that_forgets_its_pictures_decodes_them_again(tmp_path: Path) ->
     camera = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]), width=4, height=4, fx=5.0)
 
     def view(name: str) -> View:
-        def decode() -> Picture:
+        def decode() -> DecodedImage:
             decoded.append(name)
-            return Picture(np.full((4, 4, 3), len(name), np.uint8))
+            return DecodedImage(np.full((4, 4, 3), len(name), np.uint8))
 
         return View(name, camera, decode, cache)
 
@@ -104,12 +104,12 @@ def test_what_decoding_left_goes_back_however_a_picture_was_asked_for(monkeypatc
     cache = ImageCache(1 << 20)
     for name in range(40):
         for _ in range(3):  # held pictures are not decoded again
-            cache.get(name, lambda: Picture(np.zeros((4, 4, 3), np.uint8)))
+            cache.get(name, lambda: DecodedImage(np.zeros((4, 4, 3), np.uint8)))
     assert len(given_back) == 40 // TRIM_EVERY
 
 
 def test_buffers_that_nobody_holds_are_given_up() -> None:
-    recycler = Recycler(least_bytes=1024)
+    recycler = BufferPool(min_bytes=1024)
     held = recycler.empty((1024,), torch.float32)
     held[:] = 7
     recycler.empty((2048,), torch.float32)  # dropped at once

@@ -15,7 +15,7 @@ from gs2d.errors import DiskError, ProtocolError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline import train as train_module
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.events import Event, Missing
+from gs2d.pipeline.events import Event, MissingFile
 from gs2d.pipeline.jobs import report_run
 from gs2d.pipeline.train import train
 
@@ -73,24 +73,20 @@ def test_what_cannot_be_made_is_said_and_leaves_the_others(
     monkeypatch.setattr(f"gs2d.pipeline.{place}", failing(error))
     heard: list[Event] = []
     train(options(capture, finished, resume=True), heard.append)
-    missing = [event for event in heard if isinstance(event, Missing)]
+    missing = [event for event in heard if isinstance(event, MissingFile)]
     assert [(event.what, event.reason) for event in missing] == [(what, reason)]
     assert missing[0].command == (command and command.format(run=finished))
     assert missing[0].error is error
     assert {name for name in MADE if (finished / name).exists()} == set(MADE) - {what}
 
 
-def test_a_report_without_its_mesh_says_so(
-    capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_without_its_mesh_says_so(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train_module, "extract_mesh", failing(ProtocolError("depth was expected, got none")))
     train(options(capture, finished, resume=True))
     assert "There is no mesh.ply" in (finished / "report.html").read_text()
 
 
-def test_a_full_disk_ends_the_run_all_the_same(
-    capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_the_run_all_the_same(capture: Path, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = disk_error(finished / "report.html", OSError(errno.ENOSPC, "No space left on device"))
     monkeypatch.setattr("gs2d.pipeline.train.report_run", failing(full))
     with pytest.raises(DiskError, match="No space left"):
@@ -123,14 +119,14 @@ def test_a_section_that_fails_loses_no_other_section(
     (copy / "renders" / "index.json").write_text("{")
     heard: list[Event] = []
     report_run(copy, heard.append)
-    whats = [event.what for event in heard if isinstance(event, Missing)]
+    whats = [event.what for event in heard if isinstance(event, MissingFile)]
     assert whats == [
         "cameras of the pictures in report.html",
         "pictures at the top in report.html",
         "pictures of the stages in report.html",
         "curves in report.html",
     ]
-    assert {event.command for event in heard if isinstance(event, Missing)} == {f"gs2d report {copy}"}
+    assert {event.command for event in heard if isinstance(event, MissingFile)} == {f"gs2d report {copy}"}
     text = (copy / "report.html").read_text()
     assert "The curves could not be made: no curve today" in text
     assert "What was run" in text

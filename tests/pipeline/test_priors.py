@@ -16,7 +16,7 @@ from ball_runs import SMALL, Stop, comparable, options
 from gs2d.errors import DataError, RecipeError
 from gs2d.io.run_dir import REPORT, RunFolder
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.job import build_recipe, prepare
+from gs2d.pipeline.job import build_recipe, prepare_job
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
 from tiny import RADIUS, SIZE, ball_cameras
@@ -25,7 +25,7 @@ EAGER = (*SMALL, "depth_prior.opacity=0.05")
 
 
 @pytest.fixture(scope="module")
-def known(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def valid(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The ball with a sensor's depth maps in thousandths, and normals."""
     folder = tmp_path_factory.mktemp("data") / "known"
     shutil.copytree(capture, folder)
@@ -51,8 +51,8 @@ def knowing(capture: Path, out: Path, **changes: Any) -> TrainOptions:
 
 
 @pytest.fixture(scope="module")
-def run(known: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    return train(knowing(known, tmp_path_factory.mktemp("runs") / "known"))
+def run(valid: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return train(knowing(valid, tmp_path_factory.mktemp("runs") / "known"))
 
 
 def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
@@ -79,39 +79,39 @@ def test_a_run_without_priors_says_nothing_about_them(undisturbed: RunFolder) ->
     assert not any("prior" in key for stage in undisturbed.metrics()["stages"] for key in stage)
 
 
-def test_a_stopped_run_resumes_to_the_same_bytes(run: RunFolder, known: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_resumes_to_the_same_bytes(run: RunFolder, valid: Path, tmp_path: Path) -> None:
     def listen(event: Event) -> None:
         if isinstance(event, Step) and event.done >= 21 and "loss" in event.detail:
             raise Stop
 
     with pytest.raises(Stop):
-        train(knowing(known, tmp_path / "run"), listen)
-    assert comparable(train(knowing(known, tmp_path / "run", resume=True))) == comparable(run)
+        train(knowing(valid, tmp_path / "run"), listen)
+    assert comparable(train(knowing(valid, tmp_path / "run", resume=True))) == comparable(run)
 
 
-def test_what_is_known_decides_which_stages_are_shared_and_is_said(known: Path, tmp_path: Path) -> None:
+def test_what_is_known_decides_which_stages_are_shared_and_is_said(valid: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    job = prepare(knowing(known, tmp_path / "a"), lambda e: said.append(e.text) if isinstance(e, Notice) else None)
+    job = prepare_job(knowing(valid, tmp_path / "a"), lambda e: said.append(e.text) if isinstance(e, Notice) else None)
     assert "known depths: maps of a sensor in 6 of 6 training views, 4" in " ".join(said)
     assert "known normals: 6 of 6 training views, axes opengl" in said
     assert "depth maps: 6 of 8 views have one in depths (--depth-prior uses them)" in said
-    plain = prepare(options(known, tmp_path / "b"), ignore)
+    plain = prepare_job(options(valid, tmp_path / "b"), ignore)
     assert job.stage_key(0) != plain.stage_key(0)
     changed = tmp_path / "changed"
-    shutil.copytree(known, changed)
+    shutil.copytree(valid, changed)
     path = changed / "depths" / "train" / "r_0.png"
     values = np.array(Image.open(path))
     values[values > 0] += 1
     Image.fromarray(values).save(path)
-    assert prepare(knowing(changed, tmp_path / "c"), ignore).pictures_digest != job.pictures_digest
-    assert prepare(options(changed, tmp_path / "d"), ignore).pictures_digest == plain.pictures_digest
+    assert prepare_job(knowing(changed, tmp_path / "c"), ignore).images_digest != job.images_digest
+    assert prepare_job(options(changed, tmp_path / "d"), ignore).images_digest == plain.images_digest
 
 
-def test_maps_of_a_run_that_is_resumed_must_be_the_same(known: Path, tmp_path: Path) -> None:
+def test_maps_of_a_run_that_is_resumed_must_be_the_same(valid: Path, tmp_path: Path) -> None:
     from gs2d.errors import RunError
 
     changed = tmp_path / "changed"
-    shutil.copytree(known, changed)
+    shutil.copytree(valid, changed)
 
     def listen(event: Event) -> None:
         if isinstance(event, Step) and event.done >= 10 and "loss" in event.detail:
@@ -125,17 +125,17 @@ def test_maps_of_a_run_that_is_resumed_must_be_the_same(known: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("source", ["auto", "relative"])
-def test_relative_maps_without_points_are_fitted_to_what_is_rendered(known: Path, tmp_path: Path, source: str) -> None:
+def test_relative_maps_without_points_are_fitted_to_what_is_rendered(valid: Path, tmp_path: Path, source: str) -> None:
     said: list[str] = []
-    made = knowing(known, tmp_path / "run", depth_prior=source, normal_prior=False, recipe="2dgs")
+    made = knowing(valid, tmp_path / "run", depth_prior=source, normal_prior=False, recipe="2dgs")
     found = train(made, lambda event: said.append(event.text) if isinstance(event, Notice) else None)
     assert any("scale and shift by what is rendered in 6" in text for text in said)
     assert found.metrics()["stages"][-1]["depth_prior"]["median"] >= 0
 
 
-def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(known: Path, tmp_path: Path) -> None:
+def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(valid: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken"
-    shutil.copytree(known, broken)
+    shutil.copytree(valid, broken)
     Image.fromarray(np.zeros((SIZE, SIZE, 3), np.uint8)).save(broken / "depths" / "train" / "r_4.png")
     with pytest.raises(DataError, match=r"r_4.png must be a grey image of 16 bits"):
         train(knowing(broken, tmp_path / "run"))
@@ -155,7 +155,7 @@ def test_the_option_is_the_named_recipe_and_takes_a_source() -> None:
     assert flagged == build_recipe("2dgs-r-depth", **rest)
     assert flagged == build_recipe("2dgs-r-depth", depth_prior="auto", **rest)
     assert flagged.depth_prior is not None
-    assert flagged.depth_prior.horizon == 3000
+    assert flagged.depth_prior.decay_steps == 3000
     chosen = build_recipe("2dgs-r-depth", depth_prior="sparse", **rest).depth_prior
     assert chosen == replace(flagged.depth_prior, source="sparse")
     assert [any(t.kind == "depth_prior" for t in s.losses) for s in flagged.stages] == [True, False, True]

@@ -14,7 +14,7 @@ import torch
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.config.presets import get_recipe
 from gs2d.core.camera import Camera
-from gs2d.core.transforms import camera_extent, common_motion, moved, similarity_motions
+from gs2d.core.transforms import camera_extent, common_motion, perturb_pose, similarity_motions
 from gs2d.data import load_scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.evaluation.images import mean_metrics
@@ -23,7 +23,7 @@ from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.evaluate import score_views
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.finished import open_job
-from gs2d.pipeline.job import build_recipe, prepare, reload_job
+from gs2d.pipeline.job import build_recipe, prepare_job, reload_job
 from gs2d.pipeline.jobs import evaluate_run, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.refined_poses import aligned, how_far
@@ -58,8 +58,8 @@ def test_the_demo_s_training_cameras_are_off_and_the_true_ones_beside_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(toy, "bake", lambda *_, **__: None)  # a picture that takes no rays
-    picture = toy.Picture(np.full((16, 16, 4), 200, np.uint8), np.zeros(1, bool))
-    monkeypatch.setattr(toy, "render_picture", lambda *_: picture)
+    image = toy.SyntheticImage(np.full((16, 16, 4), 200, np.uint8), np.zeros(1, bool))
+    monkeypatch.setattr(toy, "render_image", lambda *_: image)
     for name, vary in (("plain", False), ("varied", True)):
         toy.write_demo_capture(tmp_path / name, train_views=5, test_views=1, size=16, vary_poses=vary)
     plain, varied = (tmp_path / name for name in ("plain", "varied"))
@@ -91,9 +91,9 @@ def test_a_disturbance_has_its_size_and_no_motion_in_common() -> None:
 def test_how_far_a_camera_moved_is_said_in_degrees_extents_and_pixels() -> None:
     camera = Camera(100, 100, 200.0, 200.0, 50.0, 50.0, np.eye(4))
     ahead = np.array([0.0, 0.0, 4.0])
-    aside = moved(camera, torch.tensor([0, 0, 0, 0.04, 0, 0], dtype=torch.float64))
+    aside = perturb_pose(camera, torch.tensor([0, 0, 0, 0.04, 0, 0], dtype=torch.float64))
     assert how_far(camera, aside, ahead, 2.0) == pytest.approx({"degrees": 0, "shift": 0.02, "pixels": 2}, abs=1e-9)
-    turned = moved(camera, torch.tensor([0, 0, 0.01, 0, 0, 0], dtype=torch.float64))
+    turned = perturb_pose(camera, torch.tensor([0, 0, 0.01, 0, 0, 0], dtype=torch.float64))
     assert how_far(camera, turned, ahead, 2.0)["degrees"] == pytest.approx(np.degrees(0.01))
     behind = how_far(camera, aside, -ahead, 2.0)["pixels"]
     assert behind == pytest.approx(200 * 0.04 / 0.2)  # nothing nearer than a tenth of the extent
@@ -165,9 +165,9 @@ def test_a_view_is_aligned_to_where_the_splats_look_like_its_photograph(run: Run
     _, job, splats = open_job(run.path, 1, ignore)
     view, drawing = job.scene.train[0], (job.settings, job.backend)
     color = render_view(splats, view, *drawing).color.clamp(0, 1).numpy()
-    photograph = type(view).from_arrays("a", view.camera, np.rint(255 * color).astype(np.uint8))
-    off = moved(view.camera, torch.tensor([0.01, -0.01, 0, 0.01, 0.02, 0], dtype=torch.float64))
-    (found,) = aligned(splats, [photograph.at(off.T_cam_world)], *drawing, job.scene.extent, ignore)
+    image = type(view).from_arrays("a", view.camera, np.rint(255 * color).astype(np.uint8))
+    off = perturb_pose(view.camera, torch.tensor([0.01, -0.01, 0, 0.01, 0.02, 0], dtype=torch.float64))
+    (found,) = aligned(splats, [image.at(off.T_cam_world)], *drawing, job.scene.extent, ignore)
     middle = np.zeros(3)
     before, after = (how_far(view.camera, c, middle, job.scene.extent)["pixels"] for c in (off, found.camera))
     assert after < 0.3 * before
@@ -190,8 +190,8 @@ def test_a_stopped_run_resumes_to_the_same_splats_and_poses(run: RunFolder, capt
 
 
 def test_stages_are_not_shared_between_runs_with_and_without_poses(capture: Path, tmp_path: Path) -> None:
-    plain = prepare(options(capture, tmp_path / "a"), ignore)
-    with_them = prepare(learning(capture, tmp_path / "b"), ignore)
+    plain = prepare_job(options(capture, tmp_path / "a"), ignore)
+    with_them = prepare_job(learning(capture, tmp_path / "b"), ignore)
     assert plain.stage_key(0) != with_them.stage_key(0)
     same_stages = replace(with_them, recipe=replace(with_them.recipe, poses=None))
     assert same_stages.stage_key(0) != with_them.stage_key(0)
@@ -254,9 +254,9 @@ def test_the_report_shows_how_far_the_cameras_moved(run: RunFolder) -> None:
 
 
 def test_the_report_speaks_of_test_views_where_there_are_some(tmp_path: Path) -> None:
-    moved = {"pixels": 1.0, "degrees": 0.1, "shift": 0.01}
+    perturb_pose = {"pixels": 1.0, "degrees": 0.1, "shift": 0.01}
     path = tmp_path / "poses.json"
-    path.write_text(json.dumps({"frames": [{"name": "a.png", "split": "train", "moved": moved}]}))
+    path.write_text(json.dumps({"frames": [{"name": "a.png", "split": "train", "moved": perturb_pose}]}))
     assert "Test views keep the cameras of the capture" in poses_section(path, {"test": {"psnr": 30.0}})
     assert "Test views" not in poses_section(path, {"test": None})
 

@@ -15,7 +15,7 @@ from ball_runs import SMALL, Stop, comparable, options, spawn
 from gs2d.errors import DiskError, RunError
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
-from gs2d.pipeline.job import prepare
+from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.train import train
 
 
@@ -149,7 +149,7 @@ def test_another_seed_or_setting_does_not_take_a_stage_from_the_cache(capture: P
     first = options(capture, tmp_path / "a", recipe="2dgs", cache=cache)
     train(first)
     train(replace(first, out=tmp_path / "b", seed=1))
-    train(replace(first, out=tmp_path / "c", overrides=(*SMALL, "surface.rates.sh0=0.003")))
+    train(replace(first, out=tmp_path / "c", overrides=(*SMALL, "surface.lr.sh0=0.003")))
     train(replace(first, out=tmp_path / "d", downscale=2))
     assert len(list(cache.glob("*.pt"))) == 4
     assert all("reused_from" not in open_run(tmp_path / x).metrics()["stages"][0] for x in "abcd")
@@ -159,7 +159,9 @@ def test_runs_share_stages_with_and_without_cached_views_up_to_the_one_that_uses
     capture: Path, tmp_path: Path
 ) -> None:
     jobs = [
-        prepare(options(capture, tmp_path, overrides=(*SMALL, f"appearance.iterations={iterations}"), **more), ignore)
+        prepare_job(
+            options(capture, tmp_path, overrides=(*SMALL, f"appearance.iterations={iterations}"), **more), ignore
+        )
         for iterations in (11, 12)  # six views: cached from twelve iterations
         for more in ({}, {"stage2_cache_mb": 0})
     ]

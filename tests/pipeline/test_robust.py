@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gs2d.config.protocols import DTU, GENERIC
-from gs2d.config.recipe import Rates
+from gs2d.config.recipe import LearningRates
 from gs2d.core.camera import look_at
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import Scene, View
@@ -82,7 +82,7 @@ def test_training_is_robust_where_protocol_and_capture_allow_it(
     for part in (recipe.dense_start, recipe.free_space, recipe.opacity_decay):
         assert (part is not None) == robust
     assert (recipe.exposure is not None) == exposure
-    assert (recipe.stages[0].rates.sh0 > Rates().sh0) == robust  # a tenth of the schedule: longer steps
+    assert (recipe.stages[0].lr.sh0 > LearningRates().sh0) == robust  # a tenth of the schedule: longer steps
 
 
 def test_what_was_decided_is_said() -> None:

@@ -18,7 +18,7 @@ from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import DemoOptions, demo
 from gs2d.pipeline.estimate import duration
 from gs2d.pipeline.events import Event, Notice, Step, ignore
-from gs2d.pipeline.job import prepare
+from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.train import train
 from tiny import write_capture
 
@@ -230,7 +230,7 @@ def test_every_so_many_th_view_is_a_test_view(tmp_path: Path, every: int, test: 
     capture = tmp_path / "capture"
     write_capture(capture, train=8, test=0, size=20)
     (capture / "transforms_train.json").rename(capture / "transforms.json")  # of nerfstudio: without a split
-    job = prepare(options(capture, tmp_path / "run", test_every=every), ignore)
+    job = prepare_job(options(capture, tmp_path / "run", test_every=every), ignore)
     assert (len(job.scene.train), len(job.scene.test)) == (8 - test, test)
 
 
@@ -238,4 +238,4 @@ def test_a_capture_with_a_split_of_its_own_takes_no_other(capture: Path, tmp_pat
     with pytest.raises(
         ProtocolError, match=r"--test-every is for captures without a split of their own, got .*leave it"
     ):
-        prepare(options(capture, tmp_path / "run", test_every=4), ignore)
+        prepare_job(options(capture, tmp_path / "run", test_every=4), ignore)

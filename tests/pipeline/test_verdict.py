@@ -24,7 +24,7 @@ from gs2d.pipeline.verdict.measures import (
     blur_of,
     measures_from_json,
     neighbours_of,
-    placed_photographs,
+    placed_images,
 )
 from gs2d.report.sections.verdict import graded, verdict_section
 
@@ -173,12 +173,12 @@ def test_cameras_that_look_outwards_have_no_subject_around_which_to_be_near() ->
 
 
 def test_placed_photographs_are_those_of_the_capture(tmp_path: Path) -> None:
-    assert placed_photographs(None) == placed_photographs(tmp_path) == (None, None, ())
+    assert placed_images(None) == placed_images(tmp_path) == (None, None, ())
     rows = [{"source": "a.jpg", "placed": True}, {"source": "b.jpg", "placed": False}]
     write_json(tmp_path / "poses.json", {"placed": 1, "count": 2, "photographs": rows})
-    assert placed_photographs(tmp_path) == (1, 2, ("b.jpg",))
+    assert placed_images(tmp_path) == (1, 2, ("b.jpg",))
     write_json(tmp_path / "poses.json", {"frames": []})  # another program's
-    assert placed_photographs(tmp_path) == (None, None, ())
+    assert placed_images(tmp_path) == (None, None, ())
 
 
 # -- in a run and its report -------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ from render_scenes import front_camera, splat
         ({"background": (0.0, 0.0)}, "background must be 3 numbers in"),
         ({"sh_degree": 4}, "sh_degree must be 0 to 3, got 4"),
         ({"lowpass_depth": "both"}, "lowpass_depth must be 'center' or 'plane'"),
-        ({"crossing": "yes"}, "crossing must be 'draw', 'cull' or 'box', got 'yes'"),
+        ({"near_plane_policy": "yes"}, "near_plane_policy must be 'draw', 'cull' or 'box', got 'yes'"),
     ],
 )
 def test_settings_out_of_range_are_refused(change: dict[str, Any], message: str) -> None:

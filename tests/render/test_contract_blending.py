@@ -2,7 +2,7 @@
 
 Every test runs on every backend. Unless stated: camera at the origin along +z, 9 x 9 px, focal length 10 px, so that
 pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 2 with scale 0.4, where one pixel is
-0.2 wu: u = k / 2, rho3d = k^2 / 4.
+0.2 world units: u = k / 2, rho3d = k^2 / 4.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from torch.testing import assert_close
 from gs2d.config.recipe import LossTerm
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.core.transforms import moved
+from gs2d.core.transforms import perturb_pose
 from gs2d.errors import ShapeError
 from gs2d.losses.api import compute_losses
 from gs2d.losses.reference import normal_consistency, normal_consistency_per_splat
@@ -59,7 +59,7 @@ def along_motions(gradient: Tensor | None, camera: Camera) -> Tensor:
     at_rest = torch.zeros(6, dtype=torch.float64)
 
     def placed(motion: Tensor) -> Tensor:
-        pose = moved(camera, motion).pose
+        pose = perturb_pose(camera, motion).pose
         assert pose is not None
         return pose
 
@@ -110,7 +110,7 @@ def test_20_the_gradient_is_what_finite_differences_find() -> None:
     found, step = along_motions(pose.grad, camera), 1e-6
     for k, motion in enumerate(step * torch.eye(6, dtype=torch.float64)):
         ends = [
-            float(contraction(rasterize(splats, moved(camera, end), backend="reference"), cotangents))
+            float(contraction(rasterize(splats, perturb_pose(camera, end), backend="reference"), cotangents))
             for end in (motion, -motion)
         ]
         assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float(found[k]), rel=1e-4, abs=1e-4)
@@ -140,7 +140,7 @@ def test_20_images_and_all_other_gradients_keep_their_bits(backend: Backend) -> 
 
 def test_20_a_camera_without_a_pose_costs_nothing(cpu: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
     splats, camera, _ = scene(0, dtype=torch.float32)
-    monkeypatch.setattr("gs2d.render.api.carried", None)  # would raise
+    monkeypatch.setattr("gs2d.render.api.attach_pose_grad", None)  # would raise
     rasterize(requiring_grad(splats), camera, backend=cpu).color.sum().backward()
     with torch.no_grad():
         rasterize(splats, learning(camera)[0], backend=cpu)
@@ -246,15 +246,15 @@ def test_a_camera_finds_its_way_back_to_a_photograph(cpu: Backend) -> None:
     camera = random_camera(rng)
     camera = replace(camera, width=40, height=30, fx=40.0, fy=40.0, cx=20.0, cy=15.0)
     splats = random_splats(rng, camera, 60, ("plain",)).to(dtype=torch.float32)
-    photograph = rasterize(splats, camera, backend=cpu).color
-    lost = moved(camera, torch.tensor([0.02, -0.01, 0.015, 0.05, -0.04, 0.03], dtype=torch.float64))
+    image = rasterize(splats, camera, backend=cpu).color
+    lost = perturb_pose(camera, torch.tensor([0.02, -0.01, 0.015, 0.05, -0.04, 0.03], dtype=torch.float64))
     motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([motion], lr=3e-3)
     for _ in range(120):
         optimizer.zero_grad()
-        (rasterize(splats, moved(lost, motion), backend=cpu).color - photograph).abs().mean().backward()
+        (rasterize(splats, perturb_pose(lost, motion), backend=cpu).color - image).abs().mean().backward()
         optimizer.step()
-    found = moved(lost, motion.detach()).T_cam_world @ np.linalg.inv(camera.T_cam_world)
+    found = perturb_pose(lost, motion.detach()).T_cam_world @ np.linalg.inv(camera.T_cam_world)
     start = lost.T_cam_world @ np.linalg.inv(camera.T_cam_world)
     assert np.abs(found - np.eye(4)).max() < 0.1 * np.abs(start - np.eye(4)).max()
 

@@ -2,7 +2,7 @@
 
 Every test runs on every backend. Unless stated: camera at the origin along +z, 9 x 9 px, focal length 10 px, so that
 pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 2 with scale 0.4, where one pixel is
-0.2 wu: u = k / 2, rho3d = k^2 / 4.
+0.2 world units: u = k / 2, rho3d = k^2 / 4.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def test_01_the_principal_point_is_general(backend: Backend) -> None:
 
 
 def test_01_focal_lengths_of_the_two_axes_are_separate(backend: Backend) -> None:
-    # With fy = 20 a pixel is 0.1 wu high: v = k / 4, and rho2d = 2 k^2 is larger: rho = k^2 / 16.
+    # With fy = 20 a pixel is 0.1 world units high: v = k / 4, and rho2d = 2 k^2 is larger: rho = k^2 / 16.
     alpha = rasterize(splat(opacity=0.5), front_camera(fy=20.0), backend=backend).alpha
     equal(alpha[4, 6], 0.5 * exp(-4 / 8))
     equal(alpha[6, 4], 0.5 * exp(-4 / 32))

@@ -2,7 +2,7 @@
 
 Every test runs on every backend. Unless stated: camera at the origin along +z, 9 x 9 px, focal length 10 px, so that
 pixel (column 4 + k, row 4) looks along (k / 10, 0, 1); a splat faces it at z = 2 with scale 0.4, where one pixel is
-0.2 wu: u = k / 2, rho3d = k^2 / 4.
+0.2 world units: u = k / 2, rho3d = k^2 / 4.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def radius(backend: Backend, scene: Splats, camera: Camera) -> float:
 
 def test_14_the_radius_is_half_the_longer_side_of_the_box(backend: Backend) -> None:
     camera = front_camera(33, 33)
-    assert radius(backend, splat(), camera) == pytest.approx(K_HALF * 0.4 * 5, rel=1e-4)  # 5 px per wu at z = 2
+    assert radius(backend, splat(), camera) == pytest.approx(K_HALF * 0.4 * 5, rel=1e-4)  # 5 px per world unit at z = 2
     assert radius(backend, splat(scales=(0.1, 0.5)), camera) == pytest.approx(K_HALF * 0.5 * 5, rel=1e-4)
 
 
@@ -225,7 +225,7 @@ def test_17_near_culls_errors_by_splat_and_by_pair(backend: Backend) -> None:
 
 
 # 19 --------------------------------------------------------------------------------------------------------------
-CULL = RasterSettings(crossing="cull")
+CULL = RasterSettings(near_plane_policy="cull")
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.9])
@@ -259,8 +259,8 @@ def test_19_both_axes_reach_together(backend: Backend) -> None:
 
 
 def test_19_culled_splats_change_nothing_and_have_no_gradients(backend: Backend) -> None:
-    plain, crossing = splat(opacity=0.6), splat((0, 0, 0.5), scales=(3, 3), axis=Y_AXIS, degrees=85)
-    both = requiring_grad(stack(crossing, plain))
+    plain, near_plane_policy = splat(opacity=0.6), splat((0, 0, 0.5), scales=(3, 3), axis=Y_AXIS, degrees=85)
+    both = requiring_grad(stack(near_plane_policy, plain))
     out = rasterize(both, front_camera(), CULL, backend=backend)
     alone = rasterize(plain, front_camera(), CULL, backend=backend)
     for name in IMAGES:
@@ -273,7 +273,7 @@ def test_19_culled_splats_change_nothing_and_have_no_gradients(backend: Backend)
     assert bool((both.means.grad[1] != 0).any())
 
 
-BOX = RasterSettings(crossing="box")
+BOX = RasterSettings(near_plane_policy="box")
 
 
 def slanted(backend: Backend, camera: Camera, settings: RasterSettings) -> tuple[Tensor, float, float]:

@@ -14,7 +14,7 @@ from gs2d.render.exposure import (
     expose,
     fit_exposure,
     identity,
-    take_back,
+    remove_exposure,
 )
 
 
@@ -112,9 +112,9 @@ def test_a_grey_picture_fits_without_wild_colours() -> None:
 def test_a_photograph_goes_back_to_the_exposure_of_the_scene() -> None:
     scene = np.array([[[40, 80, 120, 7], [100, 60, 20, 255]]], np.uint8)
     transform = gains(1.5, 1.2, 0.8, 0.04).numpy()
-    photograph = scene.copy()
-    photograph[..., :3] = np.rint(scene[..., :3] * [1.5, 1.2, 0.8] + 255 * 0.04)
-    back = take_back(photograph, transform)
+    image = scene.copy()
+    image[..., :3] = np.rint(scene[..., :3] * [1.5, 1.2, 0.8] + 255 * 0.04)
+    back = remove_exposure(image, transform)
     assert np.abs(back.astype(int) - scene).max() <= 1  # rounded twice
     assert np.array_equal(back[..., 3], scene[..., 3])
 

@@ -114,8 +114,8 @@ def test_a_larger_image_with_many_tiles_and_layers_agrees(native: Backend) -> No
         {"transmittance_min": 0.2},
         {"lowpass_px": 1.7},
         {"sh_degree": 1, "background": (1.0, 1.0, 1.0)},
-        {"crossing": "cull"},
-        {"crossing": "box"},
+        {"near_plane_policy": "cull"},
+        {"near_plane_policy": "box"},
     ],
     ids=str,
 )

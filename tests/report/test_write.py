@@ -240,11 +240,11 @@ def test_every_figure_of_a_surface_score_is_explained_in_the_report() -> None:
 
     from gs2d.evaluation.surface import SurfaceScore
 
-    known = {field.name for field in fields(SurfaceScore)} - {
+    valid = {field.name for field in fields(SurfaceScore)} - {
         "scores",
         "clouds",
     }  # tables and point clouds, not figures
-    assert known <= set(report_surface._MEANINGS)
+    assert valid <= set(report_surface._MEANINGS)
 
 
 def test_a_run_that_was_given_a_title_has_it_as_the_heading() -> None:
@@ -315,9 +315,9 @@ def test_smoothing_keeps_constants_and_ends() -> None:
 # -- colours -----------------------------------------------------------------------------------------------------------
 def test_a_normal_is_its_direction_whatever_its_length_and_white_where_nothing_is() -> None:
     normal = np.array([[[0, 0, 2.0], [-0.3, 0, 0], [0, 0, 0], [0, 0.5, 0]]])
-    picture = report_images.normal_picture(normal, np.array([[1.0, 1.0, 0.0, 0.5]]))
+    image = report_images.normal_image(normal, np.array([[1.0, 1.0, 0.0, 0.5]]))
     # (n + 1) / 2; the last is half transparent: 0.5 (0.5, 1, 0.5) + 0.5.
-    np.testing.assert_allclose(picture[0], [[0.5, 0.5, 1], [0, 0.5, 0.5], [1, 1, 1], [0.75, 1, 0.75]], atol=1e-6)
+    np.testing.assert_allclose(image[0], [[0.5, 0.5, 1], [0, 0.5, 0.5], [1, 1, 1], [0.75, 1, 0.75]], atol=1e-6)
 
 
 def test_depths_go_from_light_to_dark_between_their_limits() -> None:
@@ -325,12 +325,12 @@ def test_depths_go_from_light_to_dark_between_their_limits() -> None:
     alpha = np.ones_like(depth)
     near, far = report_images.depth_limits(depth, alpha)
     assert (near, far) == pytest.approx((2.02, 3.98))  # 1st and 99th percentile of 2, 2.02 ... 4
-    picture = report_images.depth_picture(depth, alpha)
+    image = report_images.depth_image(depth, alpha)
     scale = report_images.depth_scale(3)
-    np.testing.assert_allclose(picture[0, [0, 50, 100]], scale, atol=1e-5)
-    brightness = picture[0].mean(axis=1)
+    np.testing.assert_allclose(image[0, [0, 50, 100]], scale, atol=1e-5)
+    brightness = image[0].mean(axis=1)
     assert brightness[0] > brightness[50] > brightness[100]
-    empty = report_images.depth_picture(np.zeros((1, 2)), np.zeros((1, 2)))
+    empty = report_images.depth_image(np.zeros((1, 2)), np.zeros((1, 2)))
     np.testing.assert_array_equal(empty, 1.0)
 
 
@@ -340,26 +340,26 @@ def test_errors_are_means_over_channels_on_a_fixed_scale() -> None:
     color[0, 1] += [0.3, 0, 0]  # mean 0.1: the middle of 0 ... 0.2
     color[0, 2] += 0.5
     color[0, 3] = 7.0  # clipped to 1 before it is compared
-    picture = report_images.error_picture(color, photo)
+    image = report_images.error_image(color, photo)
     scale = report_images.error_scale(3)
-    np.testing.assert_allclose(picture[0], scale[[0, 1, 2, 2]], atol=1e-6)
-    masked = report_images.error_picture(color, photo, mask=np.array([[True, False, True, True]]))
+    np.testing.assert_allclose(image[0], scale[[0, 1, 2, 2]], atol=1e-6)
+    masked = report_images.error_image(color, photo, mask=np.array([[True, False, True, True]]))
     np.testing.assert_allclose(masked[0, 1], report_images.IGNORED)
 
 
 def test_high_error_splats_are_magenta_over_grey() -> None:
     color = np.full((1, 2, 3), [0.2, 0.6, 0.4])
-    picture = report_images.highlight_picture(color, np.array([[0.0, 1.0]]))
-    assert np.ptp(picture[0, 0]) < 1e-6
-    assert picture[0, 1, 0] > 3 * picture[0, 1, 1]
-    assert picture[0, 1, 2] > 3 * picture[0, 1, 1]
+    image = report_images.highlight_image(color, np.array([[0.0, 1.0]]))
+    assert np.ptp(image[0, 0]) < 1e-6
+    assert image[0, 1, 0] > 3 * image[0, 1, 1]
+    assert image[0, 1, 2] > 3 * image[0, 1, 1]
 
 
 def test_pictures_refuse_arrays_of_other_sizes() -> None:
     with pytest.raises(ShapeError, match="alpha must be"):
-        report_images.normal_picture(np.zeros((2, 3, 3)), np.zeros((3, 2)))
+        report_images.normal_image(np.zeros((2, 3, 3)), np.zeros((3, 2)))
     with pytest.raises(ShapeError, match="color must be"):
-        report_images.error_picture(np.zeros((2, 2, 3)), np.zeros((2, 3, 3)))
+        report_images.error_image(np.zeros((2, 2, 3)), np.zeros((2, 3, 3)))
 
 
 # -- the mesh ----------------------------------------------------------------------------------------------------------
@@ -368,7 +368,7 @@ def test_the_mesh_is_shaded_by_its_faces_and_coloured_by_its_vertices() -> None:
     vertices = np.array([[-1, -1, 2.0], [1, -1, 2.0], [1, 1, 2.0], [-1, 1, 2.0]])
     mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.full((4, 3), 51, np.uint8))
     camera = Camera(40, 20, 20.0, 20.0, 20.0, 10.0, np.eye(4))
-    shown = report_mesh.mesh_pictures(mesh, [camera], width=40)[0]
+    shown = report_mesh.mesh_images(mesh, [camera], width=40)[0]
     assert shown.shape.shape == (20, 40, 3)
     # The normal that faces the camera is -z; its cosine with the lamp is 1 / |(0.45, 0.65, 1)| = 0.78447.
     expected = np.array([0.86, 0.86, 0.88]) * (0.22 + 0.78 * 0.784465)

@@ -14,7 +14,7 @@ from PIL import ExifTags, Image, ImageOps
 from gs2d.core.camera import look_at
 from gs2d.core.images import image_size, read_image
 from gs2d.errors import DataError
-from gs2d.sfm.image_copies import stage_photos
+from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import AVIF, HEIF, Photo, camera_groups, find_photos, read_photos, turn
 from gs2d.sfm.pairs import neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import rotation_to_z, up_direction
@@ -22,7 +22,7 @@ from gs2d.sfm.upright import rotation_to_z, up_direction
 DETAILS = ExifTags.IFD.Exif
 
 
-def picture(
+def image(
     path: Path, *, size: tuple[int, int] = (24, 16), orientation: int = 1, model: str = "", focal: float = 0
 ) -> None:
     """A JPEG or PNG whose left half is red and whose top is bright, with EXIF."""
@@ -46,7 +46,7 @@ def photos_of(root: Path) -> list[Photo]:
 
 def test_photographs_are_found_in_subfolders_and_sorted_as_people_count(tmp_path: Path) -> None:
     for name in ("b/frame_10.jpg", "b/frame_2.jpg", "a 1.JPG", "c.png", ".hidden.jpg", ".git/d.jpg", "__MACOSX/e.jpg"):
-        picture(tmp_path / name)
+        image(tmp_path / name)
     found, notes = find_photos(tmp_path)
     assert [path.relative_to(tmp_path).as_posix() for path in found] == [
         "a 1.JPG", "b/frame_2.jpg", "b/frame_10.jpg", "c.png"
@@ -59,7 +59,7 @@ def test_folders_that_are_linked_are_read_once_and_a_pipe_is_not_waited_for(tmp_
     root.mkdir()
     (tmp_path / "disk").mkdir()
     for i in range(3):
-        picture(tmp_path / "disk" / f"{i}.png")
+        image(tmp_path / "disk" / f"{i}.png")
     (root / "monday").symlink_to(tmp_path / "disk")
     (root / "again").symlink_to(root)  # a way that does not end
     os.mkfifo(root / "pipe.jpg")
@@ -70,7 +70,7 @@ def test_folders_that_are_linked_are_read_once_and_a_pipe_is_not_waited_for(tmp_
 
 def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: Path) -> None:
     for name in ("a b.png", "a_b.png", "c.tif", "c.tif.png", "d\udcff.png"):
-        picture(tmp_path / name)
+        image(tmp_path / name)
     names = {photo.label: photo.name for photo in photos_of(tmp_path)}
     assert names == {
         "a b.png": "a_b.png",
@@ -84,7 +84,7 @@ def test_names_in_the_capture_have_no_white_space_and_stay_different(tmp_path: P
 @pytest.mark.skipif(bool(HEIF), reason="a package for HEIC is installed")
 def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path) -> None:
     for i in range(3):
-        picture(tmp_path / f"{i}.jpg")
+        image(tmp_path / f"{i}.jpg")
     for name in ("x.HEIC", "y.heic", "clip.MOV", "notes.txt", "masks/0.jpg.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"?")
@@ -102,7 +102,7 @@ def write_nothing(root: Path) -> Path:
 
 
 def write_file(root: Path) -> Path:
-    picture(root / "one.jpg")
+    image(root / "one.jpg")
     return root / "one.jpg"
 
 
@@ -111,8 +111,8 @@ def write_empty(root: Path) -> Path:
 
 
 def write_two(root: Path) -> Path:
-    picture(root / "0.jpg")
-    picture(root / "1.jpg")
+    image(root / "0.jpg")
+    image(root / "1.jpg")
     return root
 
 
@@ -157,7 +157,7 @@ def test_a_folder_without_photographs_is_one_line_with_a_remedy(tmp_path: Path, 
 
 def test_a_photograph_that_does_not_decode_is_named(tmp_path: Path) -> None:
     for i in range(3):
-        picture(tmp_path / f"{i}.jpg", size=(64, 64))
+        image(tmp_path / f"{i}.jpg", size=(64, 64))
     path = tmp_path / "1.jpg"
     path.write_bytes(path.read_bytes()[:400])
     with pytest.raises(DataError, match=r"1\.jpg does not decode: .*; replace or remove the file"):
@@ -166,7 +166,7 @@ def test_a_photograph_that_does_not_decode_is_named(tmp_path: Path) -> None:
 
 def test_a_damaged_exif_block_is_no_exif_block(tmp_path: Path) -> None:
     for i in range(3):
-        picture(tmp_path / f"{i}.jpg", orientation=6, model="phone")
+        image(tmp_path / f"{i}.jpg", orientation=6, model="phone")
     path = tmp_path / "0.jpg"
     raw = path.read_bytes()
     at = raw.index(b"Exif\0\0") + 6
@@ -178,7 +178,7 @@ def test_a_damaged_exif_block_is_no_exif_block(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_picture_is_turned_as_pillow_turns_it(tmp_path: Path, orientation: int) -> None:
-    picture(tmp_path / "a.png", orientation=orientation)
+    image(tmp_path / "a.png", orientation=orientation)
     with Image.open(tmp_path / "a.png") as file:
         expected = np.asarray(ImageOps.exif_transpose(file))
     got = turn(Image.fromarray(read_image(tmp_path / "a.png")), orientation)
@@ -186,13 +186,13 @@ def test_a_picture_is_turned_as_pillow_turns_it(tmp_path: Path, orientation: int
 
 
 def stage(root: Path, folder: Path, *, max_size: int | None = None, link: bool = False) -> list[str]:
-    return list(stage_photos(photos_of(root), folder, max_size=max_size, link=link, threads=1))
+    return list(copy_images(photos_of(root), folder, max_size=max_size, link=link, threads=1))
 
 
 def test_upright_photographs_are_copied_byte_for_byte_and_theirs_stay_as_they_were(tmp_path: Path) -> None:
     root = tmp_path / "photos"
     for name in ("0.jpg", "sub/1.png", "2.jpg"):
-        picture(root / name)
+        image(root / name)
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in root.rglob("*.*")}
     assert stage(root, tmp_path / "images") == ["copied"] * 3
     for path, (content, _) in before.items():
@@ -202,9 +202,9 @@ def test_upright_photographs_are_copied_byte_for_byte_and_theirs_stay_as_they_we
 
 def test_a_photograph_that_exif_turns_is_stored_upright_and_keeps_its_focal_length(tmp_path: Path) -> None:
     root = tmp_path / "photos"
-    picture(root / "0.jpg", size=(64, 48), orientation=6, model="phone", focal=4.25)
-    picture(root / "1.jpg", size=(64, 48), orientation=3)
-    picture(root / "2.png", size=(64, 48), orientation=8)
+    image(root / "0.jpg", size=(64, 48), orientation=6, model="phone", focal=4.25)
+    image(root / "1.jpg", size=(64, 48), orientation=3)
+    image(root / "2.png", size=(64, 48), orientation=8)
     assert stage(root, tmp_path / "images") == ["turned"] * 3
     for name, size in (("0.jpg", (48, 64)), ("1.jpg", (64, 48)), ("2.png", (48, 64))):
         with Image.open(root / name) as theirs, Image.open(tmp_path / "images" / name) as ours:
@@ -221,7 +221,7 @@ def test_a_photograph_that_exif_turns_is_stored_upright_and_keeps_its_focal_leng
 def test_the_profile_of_inks_is_not_kept_where_the_pixels_become_rgb(tmp_path: Path) -> None:
     root = tmp_path / "photos"
     for i in range(3):
-        picture(root / f"{i}.jpg")
+        image(root / f"{i}.jpg")
     for name, mode in (("0.jpg", "CMYK"), ("1.jpg", "RGB")):
         exif = Image.Exif()
         exif[ExifTags.Base.Orientation] = 3
@@ -237,9 +237,9 @@ def test_the_profile_of_inks_is_not_kept_where_the_pixels_become_rgb(tmp_path: P
 
 def test_max_size_bounds_the_longer_side_and_leaves_small_photographs_alone(tmp_path: Path) -> None:
     root = tmp_path / "photos"
-    picture(root / "0.jpg", size=(100, 60))
-    picture(root / "1.jpg", size=(100, 60), orientation=6)
-    picture(root / "2.jpg", size=(40, 50))
+    image(root / "0.jpg", size=(100, 60))
+    image(root / "1.jpg", size=(100, 60), orientation=6)
+    image(root / "2.jpg", size=(40, 50))
     assert stage(root, tmp_path / "images", max_size=50) == ["resized", "resized", "copied"]
     sizes = [image_size(tmp_path / "images" / f"{i}.jpg") for i in range(3)]
     assert sizes == [(50, 30), (30, 50), (40, 50)]
@@ -247,8 +247,8 @@ def test_max_size_bounds_the_longer_side_and_leaves_small_photographs_alone(tmp_
 
 def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> None:
     root = tmp_path / "photos"
-    picture(root / "0.jpg")
-    picture(root / "1.bmp")
+    image(root / "0.jpg")
+    image(root / "1.bmp")
     Image.fromarray(np.full((16, 24), 40_000, np.uint16)).save(root / "2.tif")
     assert stage(root, tmp_path / "images") == ["copied", "converted", "converted"]
     with Image.open(tmp_path / "images/2.tif.png") as file:
@@ -259,7 +259,7 @@ def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> N
 def test_avif_becomes_upright_png(tmp_path: Path) -> None:
     root = tmp_path / "photos"
     for i, orientation in enumerate((1, 6, 8)):  # AVIF stores the turn as one of its own, which Pillow tells as EXIF
-        picture(root / f"{i}.avif", size=(64, 48), orientation=orientation, model="phone")
+        image(root / f"{i}.avif", size=(64, 48), orientation=orientation, model="phone")
     assert find_photos(root)[1] == ()
     assert stage(root, tmp_path / "images") == ["converted", "turned", "turned"]
     for i, size in enumerate(((64, 48), (48, 64), (48, 64))):
@@ -279,7 +279,7 @@ def test_a_package_that_reads_heic_is_used_where_there_is_one(tmp_path: Path) ->
         "    Image.register_extensions('HEIF', ['.heic'])\n"
     )
     for i in range(3):
-        picture(tmp_path / f"photos/{i}.bmp", size=(24, 16))
+        image(tmp_path / f"photos/{i}.bmp", size=(24, 16))
         os.rename(tmp_path / f"photos/{i}.bmp", tmp_path / f"photos/{i}.HEIC")
     program = (
         "import sys; from pathlib import Path; from gs2d.sfm.images import find_photos, read_photos\n"
@@ -294,21 +294,21 @@ def test_a_package_that_reads_heic_is_used_where_there_is_one(tmp_path: Path) ->
 
 def test_link_makes_hard_links_of_what_needs_no_change(tmp_path: Path) -> None:
     root = tmp_path / "photos"
-    picture(root / "0.jpg")
-    picture(root / "1.jpg", orientation=3)
-    picture(root / "2.jpg")
+    image(root / "0.jpg")
+    image(root / "1.jpg", orientation=3)
+    image(root / "2.jpg")
     assert stage(root, tmp_path / "images", link=True) == ["linked", "turned", "linked"]
     assert os.path.samefile(root / "0.jpg", tmp_path / "images/0.jpg")
 
 
 def test_photographs_of_one_folder_size_camera_and_focal_length_share_a_camera(tmp_path: Path) -> None:
-    picture(tmp_path / "0.jpg", model="A", focal=5)
-    picture(tmp_path / "1.jpg", model="A", focal=5)
-    picture(tmp_path / "2.jpg", model="A", focal=9)  # zoomed
-    picture(tmp_path / "3.jpg", model="B", focal=5)
-    picture(tmp_path / "4.jpg", size=(16, 24), model="A", focal=5, orientation=6)  # upright it is 24 x 16 as the first
-    picture(tmp_path / "5.jpg", size=(16, 24), model="A", focal=5)
-    picture(tmp_path / "sub/6.jpg", model="A", focal=5)
+    image(tmp_path / "0.jpg", model="A", focal=5)
+    image(tmp_path / "1.jpg", model="A", focal=5)
+    image(tmp_path / "2.jpg", model="A", focal=9)  # zoomed
+    image(tmp_path / "3.jpg", model="B", focal=5)
+    image(tmp_path / "4.jpg", size=(16, 24), model="A", focal=5, orientation=6)  # upright it is 24 x 16 as the first
+    image(tmp_path / "5.jpg", size=(16, 24), model="A", focal=5)
+    image(tmp_path / "sub/6.jpg", model="A", focal=5)
     photos = photos_of(tmp_path)
     sizes = [photo.size for photo in photos]
     assert camera_groups(photos, sizes, "auto") == [[0, 1, 4], [2], [3], [5], [6]]
@@ -377,11 +377,11 @@ def test_similar_photographs_are_paired_and_strangers_are_not() -> None:
     """Six photographs of one thing and six of another, interleaved: each finds its own kind."""
     rng = np.random.default_rng(0)
     things = rng.integers(0, 255, (2, 200, 128))
-    photographs = [np.clip(things[i % 2] + rng.normal(0, 9, (200, 128)), 0, 255).astype(np.uint8) for i in range(12)]
-    pairs = similar_pairs(lambda i: photographs[i], 12, neighbours=3)
+    images = [np.clip(things[i % 2] + rng.normal(0, 9, (200, 128)), 0, 255).astype(np.uint8) for i in range(12)]
+    pairs = similar_pairs(lambda i: images[i], 12, neighbours=3)
     assert len(pairs) >= 12
     assert all(i % 2 == j % 2 and i < j for i, j in pairs)
-    assert similar_pairs(lambda i: photographs[i], 12, neighbours=3) == pairs
+    assert similar_pairs(lambda i: images[i], 12, neighbours=3) == pairs
 
 
 def test_photographs_without_features_have_no_similar_ones() -> None:

@@ -19,14 +19,14 @@ from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.sfm import PosesOptions, find_poses
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, solve
-from gs2d.sfm.model import Piece, camera_line, check_any, why_not_placed
-from gs2d.sfm.workspace import check_out, put_in_place, workplace
+from gs2d.sfm.model import SfmModel, camera_line, check_any, why_not_placed
+from gs2d.sfm.workspace import check_out, put_in_place, workspace
 
 
-def piece(*names: str) -> Piece:
+def piece(*names: str) -> SfmModel:
     images = tuple(ColmapImage(i, 1, name, np.eye(4)) for i, name in enumerate(names))
     points = ColmapPoints(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0))
-    return Piece(images, {}, points, 0.5, 3.0, 20.0, True)
+    return SfmModel(images, {}, points, 0.5, 3.0, 20.0, True)
 
 
 FEATURES = {**dict.fromkeys("abcdefg", 900), "blurred": 7}
@@ -229,7 +229,7 @@ def test_the_folder_one_is_in_is_not_replaced(tmp_path: Path, monkeypatch: pytes
 def test_a_capture_takes_its_place_as_a_whole_and_an_older_one_goes(tmp_path: Path) -> None:
     out = tmp_path / "room"
     for content in ("first", "second"):
-        with workplace(out) as work:
+        with workspace(out) as work:
             (work / "capture").mkdir()
             (work / "capture" / "poses.json").write_text(content)
             put_in_place(work / "capture", out, work)
@@ -244,7 +244,7 @@ def test_what_a_killed_command_left_is_removed_and_an_older_capture_comes_back(t
     (left / "old" / "poses.json").write_text("mine")
     (left / "capture" / "images").mkdir(parents=True)
     (left / "database.db").touch()
-    with workplace(tmp_path / "room") as work:
+    with workspace(tmp_path / "room") as work:
         assert [path.name for path in work.iterdir()] == [".lock"]
     assert (tmp_path / "room" / "poses.json").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["room"]
@@ -256,7 +256,7 @@ def test_two_commands_do_not_make_the_same_capture(tmp_path: Path) -> None:
     with (
         RunFolder(work).locked(),
         pytest.raises(RunError, match="is being made by another process"),
-        workplace(tmp_path / "room"),
+        workspace(tmp_path / "room"),
     ):
         raise AssertionError("both have it")
     assert work.is_dir()  # theirs

@@ -27,8 +27,8 @@ from gs2d.errors import RunError
 from gs2d.pipeline.events import Event, Phase
 from gs2d.pipeline.sfm import PosesOptions, find_poses
 from gs2d.sfm.lens import MODELS
-from gs2d.sfm.workspace import workplace
-from room_photos import FOCAL, SIZE, UP, Room, room_picture, textures, write_room
+from gs2d.sfm.workspace import workspace
+from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
 
 def poses(photos: Path, out: Path, *words: str) -> int:
@@ -82,9 +82,9 @@ def test_the_capture_has_what_training_reads_and_nothing_else(room: Room) -> Non
     assert scene.points is not None
     assert len(scene.points) == room.printed["points"] > 500
     assert not any("undistorted on load" in note for note in scene.notes)  # drawn by a pinhole: no lens was needed
-    picture = read_image(room.capture / "poses.png")
-    assert picture.shape[0] > 300
-    assert (np.ptp(picture.astype(int), axis=2) > 60).sum() > 500  # red cameras
+    image = read_image(room.capture / "poses.png")
+    assert image.shape[0] > 300
+    assert (np.ptp(image.astype(int), axis=2) > 60).sum() > 500  # red cameras
 
 
 def test_what_is_known_of_each_photograph_is_printed_and_written(room: Room) -> None:
@@ -193,7 +193,7 @@ def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, caps
         target = np.array([0.0, 0.9 - 0.25 * i, 0.9])
         camera = look_at(np.array([2.5, 2.0, 1.2]), target, UP, width=SIZE, height=SIZE, fx=FOCAL)
         (tmp_path / "photos").mkdir(exist_ok=True)
-        Image.fromarray(room_picture(camera, textures())).save(tmp_path / "photos" / f"{i}.png")
+        Image.fromarray(room_image(camera, textures())).save(tmp_path / "photos" / f"{i}.png")
     assert poses(tmp_path / "photos", tmp_path / "capture", "--matching", "similar", "--overlap", "1") == 0
     assert "the photographs were taken from nearly one place" in capsys.readouterr().err
 
@@ -231,7 +231,7 @@ def test_an_interrupted_command_leaves_no_capture_and_no_process(room: Room, tmp
         time.sleep(0.05)
     assert not workers_of(work)
     if number == signal.SIGKILL:
-        with workplace(tmp_path / "capture"):
+        with workspace(tmp_path / "capture"):
             assert [path.name for path in work.iterdir()] == [".lock"]
         assert not work.exists()
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gs2d.sfm.second_round import LEAST_SEEN, NEXT, PARTNERS, partners, refuse_unsupported
+from gs2d.sfm.second_round import MIN_SEEN, NEXT, PARTNERS, partners, refuse_unsupported
 from synthetic_model import synthetic_model
 
 NAMES = [f"{i:03}.jpg" for i in range(40)]
@@ -69,7 +69,7 @@ def test_photographs_that_agree_with_each_other_only_are_taken_out(pycolmap: Any
     refused = refuse_unsupported(piece, [f"{i:03}.jpg" for i in range(8, 12)])
     assert sorted(refused) == ["008.jpg", "009.jpg", "010.jpg", "011.jpg"]
     assert refused["008.jpg"].startswith("only 0 points of known place agree")
-    assert f"expected {LEAST_SEEN} or more" in refused["008.jpg"]
+    assert f"expected {MIN_SEEN} or more" in refused["008.jpg"]
     assert piece.num_reg_images() == 8
 
 

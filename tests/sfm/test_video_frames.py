@@ -23,12 +23,12 @@ from room_photos import write_room
 real = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="there is no ffmpeg on this machine")
 
 
-def write_video(path: Path, pictures: list[Image.Image], *options: str) -> Path:
+def write_video(path: Path, images: list[Image.Image], *options: str) -> Path:
     """A video of these pictures, at odd times: phones have no fixed rate."""
     folder = path.with_suffix(".pictures")
     folder.mkdir(parents=True)
-    for i, picture in enumerate(pictures):
-        picture.save(folder / f"{i}.png")
+    for i, image in enumerate(images):
+        image.save(folder / f"{i}.png")
     times = "setpts='(N+0.4*mod(N,3))/(10*TB)'"
     words = ["ffmpeg", "-v", "error", "-r", "10", "-start_number", "0", "-i", "%d.png", "-vf", times]
     subprocess.run([*words, "-vsync", "0", "-c:v", "mpeg4", "-q:v", "2", *options, str(path)], check=True, cwd=folder)
@@ -53,8 +53,8 @@ def test_the_sharpest_of_each_stretch_is_chosen_and_every_frame_where_there_are_
 @real
 def test_the_frames_that_are_written_are_those_that_were_judged_sharpest(tmp_path: Path) -> None:
     sharp = {1, 5, 6, 11}
-    pictures = [pattern(i) if i in sharp else pattern(i).filter(ImageFilter.GaussianBlur(2)) for i in range(12)]
-    video = look_into(write_video(tmp_path / "50 % of -it.mp4", pictures))
+    images = [pattern(i) if i in sharp else pattern(i).filter(ImageFilter.GaussianBlur(2)) for i in range(12)]
+    video = look_into(write_video(tmp_path / "50 % of -it.mp4", images))
     assert (video.frames, video.hdr) == (12, None)
     numbers = choose(list(sharpness_of(video)), 4)
     assert numbers == sorted(sharp)
@@ -63,7 +63,7 @@ def test_the_frames_that_are_written_are_those_that_were_judged_sharpest(tmp_pat
     for path, number in zip(taken, numbers, strict=True):
         with Image.open(path) as file:
             assert (file.format, file.size) == ("JPEG", (96, 64))
-            assert np.asarray(file).mean() == pytest.approx(np.asarray(pictures[number]).mean(), abs=3)
+            assert np.asarray(file).mean() == pytest.approx(np.asarray(images[number]).mean(), abs=3)
 
 
 @real
@@ -123,9 +123,7 @@ def test_a_video_becomes_a_capture_with_its_frames(tmp_path: Path, monkeypatch: 
     write_room(tmp_path / "room", 10)
     photos = [Image.open(path).convert("RGB") for path in sorted((tmp_path / "room").rglob("*.jpg"))]
     blurred = [photo.filter(ImageFilter.GaussianBlur(4)) for photo in photos]
-    video = write_video(
-        tmp_path / "room.mp4", [picture for pair in zip(blurred, photos, strict=True) for picture in pair]
-    )
+    video = write_video(tmp_path / "room.mp4", [image for pair in zip(blurred, photos, strict=True) for image in pair])
     said: list[Event] = []
     result = find_poses(
         PosesOptions(photos=video, out=tmp_path / "capture", frames=len(photos), threads=2), said.append

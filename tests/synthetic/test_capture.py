@@ -264,8 +264,8 @@ def test_the_flat_plinth_carries_a_texture_that_varies_faster_than_its_geometry(
     plinth = scene.parts[0]
     assert plinth.name == "plinth"
     assert np.ptp(plinth.patch.vertices[:, 2]) == 0.0  # exactly flat
-    red = plinth.texture[300:724, 300:724, 0]  # a part of the tiled floor, 0.0021 wu per texel
-    step = 10  # texels, 0.021 wu: two pixels of a 256 px picture
+    red = plinth.texture[300:724, 300:724, 0]  # a part of the tiled floor, 0.0021 world units per texel
+    step = 10  # texels, 0.021 world units: two pixels of a 256 px picture
     assert np.abs(red[step:] - red[:-step]).mean() > 0.12
 
 
@@ -329,7 +329,7 @@ def test_a_capture_that_failed_is_not_taken_for_a_capture(tmp_path: Path, monkey
     monkeypatch.setattr(toy, "write_image", full_disk)
     monkeypatch.setattr(toy, "bake", lambda scene, threads: None)
     monkeypatch.setattr(
-        toy, "render_picture", lambda *_: toy.Picture(np.zeros((16, 16, 4), np.uint8), np.zeros(1, dtype=bool))
+        toy, "render_image", lambda *_: toy.SyntheticImage(np.zeros((16, 16, 4), np.uint8), np.zeros(1, dtype=bool))
     )
     (tmp_path / "transforms_train.json").write_text("{}")  # of an earlier capture in the same folder
     with pytest.raises(DiskError, match="No space left"):

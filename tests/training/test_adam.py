@@ -7,13 +7,13 @@ import math
 import pytest
 import torch
 
-from gs2d.config.recipe import Rates, Stage
+from gs2d.config.recipe import LearningRates, Stage
 from gs2d.core.splats import ATTRIBUTES
-from gs2d.training.adam import adam_step, begin_stage, rates_at
+from gs2d.training.adam import adam_step, begin_stage, lr_at
 from gs2d.training.state import TrainState
 from train_toys import full_state, random_splats
 
-RATES = dict(zip(ATTRIBUTES, (1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3), strict=True))
+LR = dict(zip(ATTRIBUTES, (1e-3, 2e-3, 3e-3, 4e-3, 5e-3, 6e-3), strict=True))
 
 
 def fresh_state(count: int = 9) -> TrainState:
@@ -30,11 +30,11 @@ def test_twenty_steps_equal_torch_adam() -> None:
     begin_stage(state, stage)
     mirror = {name: tensor.clone().requires_grad_() for name, tensor in state.splats.items()}
     torch_adam = torch.optim.Adam(
-        [{"params": [mirror[name]], "lr": RATES[name]} for name in ATTRIBUTES], eps=1e-15, foreach=False
+        [{"params": [mirror[name]], "lr": LR[name]} for name in ATTRIBUTES], eps=1e-15, foreach=False
     )
     for i in range(20):
         grads = gradients(state, i)
-        adam_step(state, stage, grads, RATES)
+        adam_step(state, stage, grads, LR)
         for name in ATTRIBUTES:
             mirror[name].grad = grads[name]
         torch_adam.step()
@@ -48,7 +48,7 @@ def test_the_first_step_moves_by_the_rate_against_the_sign_of_the_gradient() -> 
     state.splats.opacity_logits = torch.tensor([0.0, 1.0])
     begin_stage(state, stage)
     grads = gradients(state, 0) | {"opacity_logits": torch.tensor([1e-4, -30.0])}
-    adam_step(state, stage, grads, RATES | {"opacity_logits": 0.05})
+    adam_step(state, stage, grads, LR | {"opacity_logits": 0.05})
     assert state.splats.opacity_logits.tolist() == pytest.approx([-0.05, 1.05])
 
 
@@ -59,7 +59,7 @@ def test_rows_outside_the_group_and_attributes_outside_the_stage_keep_their_bits
     stage = Stage("s", 5, train={"sh0": "g", "means": "all"})
     begin_stage(state, stage)
     for i in range(5):
-        adam_step(state, stage, gradients(state, i), RATES)
+        adam_step(state, stage, gradients(state, i), LR)
     for name, tensor in state.splats.items():
         changed = (
             (tensor != dict(before.items())[name]).flatten(1).any(dim=1)
@@ -82,8 +82,8 @@ def test_a_row_group_trains_as_its_rows_would_alone() -> None:
     begin_stage(alone, whole)
     for i in range(5):
         grads = gradients(state, i)
-        adam_step(state, grouped, grads, RATES)
-        adam_step(alone, whole, {"shN": grads["shN"][mask]}, RATES)
+        adam_step(state, grouped, grads, LR)
+        adam_step(alone, whole, {"shN": grads["shN"][mask]}, LR)
     assert torch.equal(state.splats.shN[mask], alone.splats.shN)
 
 
@@ -92,7 +92,7 @@ def test_an_empty_group_trains_nothing() -> None:
     state.groups["g"] = torch.zeros(9, dtype=torch.bool)
     before, stage = state.splats.clone(), Stage("s", 1, train={"sh0": "g"})
     begin_stage(state, stage)
-    adam_step(state, stage, gradients(state, 0), RATES)
+    adam_step(state, stage, gradients(state, 0), LR)
     assert torch.equal(state.splats.sh0, before.sh0)
 
 
@@ -100,7 +100,7 @@ def test_a_skipped_attribute_keeps_its_bits_and_its_count() -> None:
     state, stage = fresh_state(), Stage("s", 1)
     begin_stage(state, stage)
     before = state.splats.clone()
-    adam_step(state, stage, gradients(state, 0), RATES, skip=("opacity_logits",))
+    adam_step(state, stage, gradients(state, 0), LR, skip=("opacity_logits",))
     assert torch.equal(state.splats.opacity_logits, before.opacity_logits)
     assert state.moments["opacity_logits"].steps == 0
     assert not torch.equal(state.splats.means, before.means)
@@ -119,10 +119,10 @@ def test_fresh_moments_are_zero_and_kept_ones_are_kept() -> None:
 
 
 def test_rates_decay_only_for_the_means_which_scale_with_the_extent() -> None:
-    first, last = rates_at(Rates(), 0, 2.0), rates_at(Rates(), 30_000, 2.0)
+    first, last = lr_at(LearningRates(), 0, 2.0), lr_at(LearningRates(), 30_000, 2.0)
     assert first["means"] == pytest.approx(3.2e-4)
     assert last["means"] == pytest.approx(3.2e-6)
-    assert rates_at(Rates(), 15_000, 2.0)["means"] == pytest.approx(2 * math.sqrt(1.6e-4 * 1.6e-6))
+    assert lr_at(LearningRates(), 15_000, 2.0)["means"] == pytest.approx(2 * math.sqrt(1.6e-4 * 1.6e-6))
     assert {k: v for k, v in first.items() if k != "means"} == {k: v for k, v in last.items() if k != "means"}
     assert first["opacity_logits"] == 0.05
 
@@ -131,5 +131,5 @@ def test_degree_0_has_no_higher_coefficients_to_train() -> None:
     state = TrainState(random_splats(4, degree=0), torch.Generator())
     stage = Stage("s", 1)
     begin_stage(state, stage)
-    adam_step(state, stage, gradients(state, 0), RATES)
+    adam_step(state, stage, gradients(state, 0), LR)
     assert state.splats.shN.shape == (4, 0, 3)

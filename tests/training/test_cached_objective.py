@@ -15,8 +15,8 @@ from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.data.scene import Scene, View
 from gs2d.training import events
-from gs2d.training.cached_objective import CachedViews, choose_evaluator, is_cacheable
-from gs2d.training.objective import WholeViews
+from gs2d.training.cached_objective import CachedViews, choose_objective, is_cacheable
+from gs2d.training.objective import FullRender
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from train_toys import SIZE, VIEWS, backends, random_splats, same
@@ -91,7 +91,7 @@ def test_two_hundred_iterations_end_where_the_plain_path_ends(masked: Scene) -> 
         start = made.splats.clone()
         for _ in range(200):
             made.step()
-        assert isinstance(made._evaluator, CachedViews if room else WholeViews)
+        assert isinstance(made._objective, CachedViews if room else FullRender)
         ends.append(made.splats)
     moved = (ends[0].sh0 - start.sh0).abs().max()
     assert moved > 0.1
@@ -124,8 +124,8 @@ def test_no_view_is_cached_where_most_would_not_fit(masked: Scene) -> None:
     first = views_of(made).views[0].nbytes
     stage = made.recipe.stages[0]
     half = first * VIEWS // 2
-    assert choose_evaluator(made._whole, made.state, stage, half - 1) is made._whole
-    assert isinstance(choose_evaluator(made._whole, made.state, stage, half), CachedViews)
+    assert choose_objective(made._whole, made.state, stage, half - 1) is made._whole
+    assert isinstance(choose_objective(made._whole, made.state, stage, half), CachedViews)
 
 
 @needs_cpu
@@ -158,10 +158,10 @@ def test_an_empty_group_changes_nothing_and_still_has_its_losses(masked: Scene) 
     before = made.splats.clone()
     for _ in range(3):
         made.step()
-    assert isinstance(made._evaluator, CachedViews)
+    assert isinstance(made._objective, CachedViews)
     assert same(made.splats, before)
     stage = made.recipe.stages[0]
-    a, b = (e.evaluate(made.state, stage, 1, 0) for e in (made._evaluator, made._whole))
+    a, b = (e.evaluate(made.state, stage, 1, 0) for e in (made._objective, made._whole))
     assert a.losses == b.losses  # the frozen image is the plain one, to the bit
 
 
@@ -179,12 +179,12 @@ def test_views_that_show_no_splat_of_the_group_have_losses_and_zero_gradients(ma
 def test_the_cache_is_freed_at_the_end_of_its_stage(masked: Scene) -> None:
     seen: list[tuple[type, type]] = []
     made = trainer(
-        masked, ROOM, progress_every=99, on_event=lambda event: seen.append((type(event), type(made._evaluator)))
+        masked, ROOM, progress_every=99, on_event=lambda event: seen.append((type(event), type(made._objective)))
     )
     made.run()
-    assert [used for event, used in seen if event is events.Progress] == [CachedViews, WholeViews]
+    assert [used for event, used in seen if event is events.Progress] == [CachedViews, FullRender]
     assert {used for event, used in seen if event is not events.Progress} == {type(None)}
-    assert made._evaluator is None
+    assert made._objective is None
 
 
 def test_only_stages_that_train_colours_of_a_group_by_colour_losses_on_the_native_backend_are_cached() -> None:

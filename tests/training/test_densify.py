@@ -72,7 +72,7 @@ def test_small_splats_are_cloned_and_large_ones_split_from_the_threshold_on() ->
     )
     before = state.splats.clone()
     counts = run(state)
-    assert counts == DensifyCounts(cloned=1, split=1, pruned_faint=0, pruned_large=0)
+    assert counts == DensifyCounts(cloned=1, split=1, pruned_by_opacity=0, pruned_large=0)
     after = state.splats
     # rows: 0, 1, 3 (2 was split), the clone of 0, two children of 2
     assert len(after) == 6
@@ -115,7 +115,7 @@ def test_splats_below_the_opacity_cull_are_pruned_clones_and_children_included()
     state = state_of(
         [(0.005, 0.005), (0.02, 0.02), (0.02, 0.02)], [0.04, 0.04, 0.0501], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]
     )
-    assert run(state) == DensifyCounts(cloned=1, split=1, pruned_faint=4, pruned_large=0)
+    assert run(state) == DensifyCounts(cloned=1, split=1, pruned_by_opacity=4, pruned_large=0)
     assert len(state.splats) == 1
 
 
@@ -133,7 +133,7 @@ def test_nothing_is_pruned_for_opacity_within_the_grace_of_a_reset() -> None:
 
     def pruned(iteration: int) -> int:
         state = state_of([(0.02, 0.02)] * 2, [0.01, 0.5], [0.0, 0.0], [1.0, 1.0])
-        return run(state, densify, iteration=iteration).pruned_faint
+        return run(state, densify, iteration=iteration).pruned_by_opacity
 
     assert [pruned(i) for i in (2999, 3000, 3001, 3100, 3101)] == [1, 1, 0, 0, 1]
 
@@ -146,7 +146,7 @@ def test_absgs_splits_by_the_absolute_gradient_and_clones_by_the_signed_one() ->
     )
     assert state.statistics is not None
     state.statistics.absolute = torch.tensor([0.0, 9e-4, 3e-4, 4e-4])
-    assert run(state, densify) == DensifyCounts(cloned=1, split=1, pruned_faint=0, pruned_large=0)
+    assert run(state, densify) == DensifyCounts(cloned=1, split=1, pruned_by_opacity=0, pruned_large=0)
     # rows 0, 1, 2 stay, then the clone of 0, then the children of 3
     torch.testing.assert_close(state.splats.scales[4:], torch.full((2, 2), 0.02 / 1.6))
 

@@ -10,7 +10,7 @@ import torch
 
 from gs2d.config.presets import surface
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import ALL, Rates, Recipe
+from gs2d.config.recipe import ALL, LearningRates, Recipe
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
@@ -74,6 +74,6 @@ def test_nan_in_a_parameter_stops_at_the_door_though_the_rasterizer_would_skip_i
 
 
 def test_an_update_that_leaves_the_finite_numbers_stops(scene: Scene) -> None:
-    wild = replace(surface(), iterations=3, densify=None, rates=Rates(sh0=1e39))
+    wild = replace(surface(), iterations=3, densify=None, lr=LearningRates(sh0=1e39))
     with pytest.raises(DivergedError, match="iteration 1 of stage 'surface': sh0 is NaN"):
         train(scene, Recipe("r", (wild,)))

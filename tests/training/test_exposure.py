@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gs2d.config.presets import appearance, refine, surface, with_exposure
 from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC
-from gs2d.config.recipe import Exposure, Rates, Recipe
+from gs2d.config.recipe import Exposure, LearningRates, Recipe
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import camera_extent
@@ -26,7 +26,7 @@ from gs2d.render.types import RasterSettings
 from gs2d.synthetic.perturb_exposure import random_gains
 from gs2d.training import events
 from gs2d.training.cached_objective import CachedViews
-from gs2d.training.exposure import Exposures, as_photographed, exposure_step, uncount
+from gs2d.training.exposure import Exposures, apply_exposure, exposure_step, uncount
 from gs2d.training.objective import clipped_pixels
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target
@@ -49,7 +49,7 @@ def by(settings: Exposure, iterations: int = 100) -> Recipe:
 
 def quick() -> Recipe:
     """``short`` with exposures from its third iteration on."""
-    return replace(short(), exposure=Exposure(start=2, horizon=10))
+    return replace(short(), exposure=Exposure(start=2, decay_steps=10))
 
 
 def exposures(views: int = 3) -> Exposures:
@@ -80,7 +80,7 @@ def test_the_mean_of_all_transforms_is_the_identity_and_only_the_view_s_own_numb
 
 
 def test_the_rate_decays_over_the_whole_run() -> None:
-    settings = Exposure(rate=0.1, rate_final=0.001, horizon=100, start=0)
+    settings = Exposure(rate=0.1, rate_final=0.001, decay_steps=100, start=0)
     assert settings.rate_at(50) == pytest.approx(0.01)  # the geometric mean, half way
     assert settings.rate_at(100) == settings.rate_at(500) == pytest.approx(0.001)
     recipe = replace(by(settings, 40), stages=(by(settings, 40).stages[0], replace(refine(), iterations=20)))
@@ -193,9 +193,9 @@ def test_the_white_behind_a_photograph_with_an_alpha_channel_has_no_exposure(sce
 
 
 def test_pixels_at_the_ceiling_are_clipped_but_not_the_white_behind_a_photograph() -> None:
-    photograph = torch.tensor([[[1.0, 0.9, 1.0], [1.0, 1.0, 1.0]]])
-    assert clipped_pixels(Target(photograph, None, None)).tolist() == [[[True, False, True], [True, True, True]]]
-    cut_out = Target(photograph, None, None, silhouette=torch.tensor([[0.5, 0.0]]))
+    image = torch.tensor([[[1.0, 0.9, 1.0], [1.0, 1.0, 1.0]]])
+    assert clipped_pixels(Target(image, None, None)).tolist() == [[[True, False, True], [True, True, True]]]
+    cut_out = Target(image, None, None, silhouette=torch.tensor([[0.5, 0.0]]))
     assert clipped_pixels(cut_out).tolist() == [[[True, False, True], [False, False, False]]]
 
 
@@ -204,7 +204,7 @@ def test_errors_are_ranked_in_the_exposure_of_the_photograph(scene: Scene, backe
     splats, view = random_splats(40, seed=1), scene.train[0]
     image, settings = torch.from_numpy(view.target((0.0, 0.0, 0.0))), RasterSettings()
     plain = splat_errors(splats, view.camera, image, settings, backend=backend)
-    dim, changed = as_photographed(splats, view.camera, 0.5 * torch.eye(3, 4), settings)
+    dim, changed = apply_exposure(splats, view.camera, 0.5 * torch.eye(3, 4), settings)
     assert torch.allclose(
         splat_errors(dim, view.camera, image / 2, changed, backend=backend), plain / 2, rtol=1e-4, atol=1e-4
     )
@@ -272,7 +272,7 @@ def test_a_state_with_the_exposures_of_other_views_or_none_is_refused(scene: Sce
 TRAIN, TEST = 16, 4
 
 
-def photograph(truth: Splats, camera: Camera, gain: np.ndarray) -> np.ndarray:
+def image(truth: Splats, camera: Camera, gain: np.ndarray) -> np.ndarray:
     with torch.no_grad():
         color = rasterize(truth, camera, RasterSettings(), backend="reference").color.numpy()
     return np.rint(255 * np.clip(color * gain, 0, 1)).astype(np.uint8)
@@ -298,7 +298,7 @@ def varied() -> tuple[Scene, Splats, np.ndarray]:
     ]
     gains = np.concatenate([random_gains(TRAIN, 0), np.ones((TEST, 3))])
     views = [
-        View.from_arrays(f"{i:03d}.png", camera, photograph(truth, camera, gain))
+        View.from_arrays(f"{i:03d}.png", camera, image(truth, camera, gain))
         for i, (camera, gain) in enumerate(zip(cameras, gains, strict=True))
     ]
     scene = Scene(
@@ -316,10 +316,10 @@ def varied() -> tuple[Scene, Splats, np.ndarray]:
 @needs_cpu
 def test_the_gains_are_found_and_new_views_gain_by_it(varied: tuple[Scene, Splats, np.ndarray]) -> None:
     scene, truth, gains = varied
-    stage = replace(surface(), iterations=480, densify=None, sh_interval=50, rates=Rates(means_horizon=480))
+    stage = replace(surface(), iterations=480, densify=None, sh_interval=50, lr=LearningRates(means_decay_steps=480))
     plain = Recipe("plain", (stage,))
     scores, grey = [], np.empty(0)
-    for recipe in (plain, replace(plain, exposure=Exposure(horizon=480, start=0))):
+    for recipe in (plain, replace(plain, exposure=Exposure(decay_steps=480, start=0))):
         state = TrainState(truth.clone(), torch.Generator().manual_seed(0))
         state.exposures = Exposures.start(TRAIN, state.splats.means) if recipe.exposure else None
         trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=state)

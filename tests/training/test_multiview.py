@@ -15,7 +15,7 @@ from gs2d.core.camera import look_at
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
 from gs2d.render.api import rasterize
-from gs2d.training.multiview import Photographs, draw_turn, find_neighbours
+from gs2d.training.multiview import ImageFiles, draw_turn, find_neighbours
 from gs2d.training.targets import Targets
 from gs2d.training.trainer import Trainer
 from saved_states import reload, saved
@@ -102,7 +102,7 @@ def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> Non
     view = View.from_arrays("0", camera, image, mask)
     target = Targets((view,), (1.0, 1.0, 1.0), use_masks=True, with_maps=False)[0]
     settings = MultiView(radius=2)
-    clear = Photographs((view,), settings).of(0, target).clear.numpy()
+    clear = ImageFiles((view,), settings).of(0, target).clear.numpy()
     expected = np.zeros((20, 20), bool)
     expected[2:-2, 2:-2] = True
     expected[2:7, 4:9] = False
@@ -112,9 +112,9 @@ def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> Non
 
 def test_photographs_beyond_the_room_are_made_anew(scene: Scene) -> None:
     targets = Targets(scene.train, (0.0, 0.0, 0.0), use_masks=False, with_maps=False)
-    kept, none = Photographs(scene.train, WIDE), Photographs(scene.train, WIDE, limit_bytes=0)
+    kept, none = ImageFiles(scene.train, WIDE), ImageFiles(scene.train, WIDE, limit_bytes=0)
     for index in (0, 1, 0):
-        a, b = (photographs.of(index, targets[index]) for photographs in (kept, none))
+        a, b = (images.of(index, targets[index]) for images in (kept, none))
         assert torch.equal(a.grey, b.grey)
         assert torch.equal(a.textured, b.textured)
     assert kept.of(0, targets[0]) is kept.of(0, targets[0])

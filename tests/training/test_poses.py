@@ -11,15 +11,15 @@ import torch
 
 from gs2d.config.presets import appearance, surface
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import PoseRefinement, Rates, Recipe
+from gs2d.config.recipe import LearningRates, PoseRefinement, Recipe
 from gs2d.core.camera import look_at
-from gs2d.core.transforms import common_motion, moved, rigid_motion, similarity_motions
+from gs2d.core.transforms import common_motion, perturb_pose, se3_exp, similarity_motions
 from gs2d.data.scene import Scene
 from gs2d.errors import DivergedError, RunError
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.synthetic.perturb_poses import disturbed
-from gs2d.training import per_image as per_view
+from gs2d.training import per_image
 from gs2d.training.cached_objective import CachedViews
 from gs2d.training.poses import Poses, pose_rate, pose_step
 from gs2d.training.state import TrainState
@@ -36,7 +36,7 @@ def scene() -> Scene:
 
 def quick() -> Recipe:
     """``short`` with poses from its third iteration on."""
-    return replace(short(), poses=PoseRefinement(rate=1e-2, rate_final=1e-3, start=2, horizon=10))
+    return replace(short(), poses=PoseRefinement(rate=1e-2, rate_final=1e-3, start=2, decay_steps=10))
 
 
 def poses(scene: Scene) -> Poses:
@@ -81,11 +81,11 @@ def test_the_motions_by_a_similarity_are_those_of_cameras_that_keep_their_pictur
     given, step, extent = poses(scene).given.numpy(), 1e-6, 2.0
     middle = np.mean([view.camera.center for view in scene.train], axis=0)
     w, v, grow = np.eye(7)[k, :3] * step, np.eye(7)[k, 3:6] * step * extent, 1 + step * (k == 6)
-    S = rigid_motion(torch.tensor([*w, 0.0, 0.0, 0.0], dtype=torch.float64)).numpy()
+    S = se3_exp(torch.tensor([*w, 0.0, 0.0, 0.0], dtype=torch.float64)).numpy()
     motions = similarity_motions(given, extent)[:, :, k] * step * np.array([1, 1, 1, extent, extent, extent])
     for view, motion in zip(scene.train, motions, strict=True):
         camera = view.camera
-        now = moved(camera, torch.from_numpy(motion))
+        now = perturb_pose(camera, torch.from_numpy(motion))
         expected = middle + v + grow * S[:3, :3] @ (camera.center - middle)
         np.testing.assert_allclose(now.center, expected, atol=1e-10)
         np.testing.assert_allclose(now.rotation, camera.rotation @ S[:3, :3].T, atol=1e-10)
@@ -114,7 +114,7 @@ def test_the_gradient_is_that_of_the_loss_by_a_motion(scene: Scene) -> None:
         for k, motion in enumerate(step * torch.eye(6, dtype=torch.float64)):
             values = []
             for sign in (1, -1):
-                there = moved(camera, sign * motion * torch.tensor([1.0] * 3 + [scene.extent] * 3))
+                there = perturb_pose(camera, sign * motion * torch.tensor([1.0] * 3 + [scene.extent] * 3))
                 output = rasterize(state.splats, there, whole.settings(recipe.stages[0], 1), backend=backend)
                 terms = whole.differentiate(state, recipe.stages[0], 1, 2, there, output, {})[0]
                 values.append(float(sum(terms.values())))
@@ -125,11 +125,11 @@ def test_the_gradient_is_that_of_the_loss_by_a_motion(scene: Scene) -> None:
 # -- where they learn ---------------------------------------------------------------------------------------------
 def test_poses_learn_after_their_start_and_where_all_splats_move() -> None:
     recipe = quick()
-    rates = [[pose_rate(recipe, k, i) for i in range(1, s.iterations + 1)] for k, s in enumerate(recipe.stages)]
-    assert rates[0][:2] == [0, 0]
-    assert all(a > b > 0 for a, b in zip(rates[0][2:], rates[0][3:], strict=False))
-    assert not any(rates[1])  # appearance: only colours learn
-    assert rates[2] == pytest.approx([1e-3] * 5)  # refine: at the final rate
+    lr = [[pose_rate(recipe, k, i) for i in range(1, s.iterations + 1)] for k, s in enumerate(recipe.stages)]
+    assert lr[0][:2] == [0, 0]
+    assert all(a > b > 0 for a, b in zip(lr[0][2:], lr[0][3:], strict=False))
+    assert not any(lr[1])  # appearance: only colours learn
+    assert lr[2] == pytest.approx([1e-3] * 5)  # refine: at the final rate
     assert pose_rate(short(), 0, 5) == 0
 
 
@@ -168,7 +168,7 @@ def test_cached_views_are_of_the_cameras_that_were_found(scene: Scene) -> None:
 
 
 def test_errors_are_ranked_from_where_the_cameras_are(scene: Scene) -> None:
-    away = {view.name: moved(view.camera, torch.full((6,), 0.05, dtype=torch.float64)) for view in scene.train}
+    away = {view.name: perturb_pose(view.camera, torch.full((6,), 0.05, dtype=torch.float64)) for view in scene.train}
     backend, state = backends()[-1], TrainState(random_splats(40, seed=1), torch.Generator())
     state.poses = poses(scene)
     state.poses.given = torch.from_numpy(np.stack([away[view.name].T_cam_world for view in scene.train]))
@@ -177,7 +177,7 @@ def test_errors_are_ranked_from_where_the_cameras_are(scene: Scene) -> None:
     plain = Trainer(there, short(), GENERIC, backend=backend, state=TrainState(state.splats, torch.Generator()))
     for a, b in zip(learning._errors_by_view(False), plain._errors_by_view(False), strict=True):
         assert torch.equal(a, b)
-    now = per_view.scene_now(state, scene)
+    now = per_image.scene_now(state, scene)
     for view, other in zip(now.train, there.train, strict=True):
         np.testing.assert_allclose(view.camera.T_cam_world, other.camera.T_cam_world, atol=1e-12)
         assert view.image() is not None
@@ -241,16 +241,16 @@ def test_a_pose_that_is_not_finite_ends_training(scene: Scene, monkeypatch: pyte
         trainer.step()
     assert trainer.state.poses is not None
     trainer.state.poses.offsets[0, 0] = torch.nan
-    assert per_view.broken(trainer.state) == "a pose"
+    assert per_image.find_nonfinite(trainer.state) == "a pose"
 
 
 def test_an_update_that_was_cancelled_on_the_device_changes_nothing(scene: Scene) -> None:
     state = TrainState(random_splats(5), torch.Generator())
     state.poses = poses(scene)
     gradients = {"pose": torch.ones(6, dtype=torch.float64)}
-    per_view.learn(state, quick(), 5, 1, gradients, torch.tensor(1, dtype=torch.int32))
+    per_image.update(state, quick(), 5, 1, gradients, torch.tensor(1, dtype=torch.int32))
     assert state.poses.steps == [0] * VIEWS
-    per_view.learn(state, quick(), 5, 1, gradients, torch.tensor(0, dtype=torch.int32))
+    per_image.update(state, quick(), 5, 1, gradients, torch.tensor(0, dtype=torch.int32))
     assert state.poses.steps == [0, 1, 0, 0, 0, 0]
 
 
@@ -263,7 +263,7 @@ def test_cameras_that_are_off_are_found_and_new_views_gain() -> None:
         look_at(np.array([3 * np.cos(a), 3 * np.sin(a), z]), np.zeros(3), np.eye(3)[2], width=SIZE, height=SIZE, fx=30)
         for a, z in zip(angles, heights, strict=True)
     ]
-    off = [*disturbed(cameras[:16], 0, degrees=4.0, share=0.04), *cameras[16:]]
+    off = [*disturbed(cameras[:16], 0, degrees=4.0, fraction=0.04), *cameras[16:]]
     base = make_scene()
     views = []
     for k, (camera, said) in enumerate(zip(cameras, off, strict=True)):
@@ -272,8 +272,8 @@ def test_cameras_that_are_off_are_found_and_new_views_gain() -> None:
         image = (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         views.append(type(base.train[0]).from_arrays(f"{k:02d}.png", camera, image).at(said.T_cam_world))
     scene = replace(base, train=tuple(views[:16]), test=tuple(views[16:]))
-    stage = replace(surface(), iterations=600, densify=None, sh_interval=300, rates=Rates(means_horizon=600))
-    settings = PoseRefinement(rate=3e-3, rate_final=1e-4, start=100, horizon=600)
+    stage = replace(surface(), iterations=600, densify=None, sh_interval=300, lr=LearningRates(means_decay_steps=600))
+    settings = PoseRefinement(rate=3e-3, rate_final=1e-4, start=100, decay_steps=600)
     psnr, left = [], []
     for learned in (None, settings):
         trainer = Trainer(scene, Recipe("one", (stage,), poses=learned, init_points=60), GENERIC, backend="cpu")
@@ -284,7 +284,7 @@ def test_cameras_that_are_off_are_found_and_new_views_gain() -> None:
                 color = rasterize(splats, view.camera, trainer.settings, backend="cpu").color
             errors.append(float((color - torch.from_numpy(view.target((0.0, 0.0, 0.0)))).square().mean()))
         psnr.append(-10 * np.log10(np.mean(errors)))
-        now = per_view.scene_now(trainer.state, scene).train
+        now = per_image.scene_now(trainer.state, scene).train
         grid = np.stack(np.meshgrid(*[[-0.5, 0.0, 0.5]] * 3), axis=-1).reshape(-1, 3)
         apart = [v.camera.project(grid)[0] - c.project(grid)[0] for v, c in zip(now, cameras, strict=False)]
         left.append(np.sqrt(np.mean(np.square(apart))))

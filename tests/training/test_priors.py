@@ -12,18 +12,18 @@ import torch
 from gs2d.config.presets import with_depth_prior, with_normal_prior
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Rates, Recipe
+from gs2d.config.recipe import LearningRates, Recipe
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.data.priors import DepthMap, MapFiles, ObservedPoints
+from gs2d.data.priors import MapFiles, ObservedPoints, PriorDepth
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
-from gs2d.losses.priors import KnownDepths, PointDepths, RelativeDepths
+from gs2d.losses.priors import MetricDepth, PointDepths, RelativeDepths
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.training.initialize import initial_splats, turned_to
 from gs2d.training.priors import (
-    known_depths,
     line_of,
+    metric_depths,
     plan_depths,
     plan_normals,
     plane_normals,
@@ -44,8 +44,8 @@ class Maps:
     files: MapFiles
     whole: bool = False
 
-    def depth(self) -> DepthMap:
-        return DepthMap(self.values.astype(np.float32), self.whole)
+    def depth(self) -> PriorDepth:
+        return PriorDepth(self.values.astype(np.float32), self.whole)
 
     def normal(self) -> np.ndarray:
         return self.values.astype(np.float32)
@@ -111,15 +111,15 @@ def test_points_of_few_photographs_or_large_errors_are_not_trusted(scene: Scene)
 def test_points_are_where_the_camera_sees_them_with_the_pixels_around(scene: Scene) -> None:
     both, view = observed(scene), scene.train[2]
     plan = plan_depths(both, DepthPrior())
-    known = known_depths(view, plan, DepthPrior(), torch.float64)
-    assert isinstance(known, PointDepths)
-    rows, columns = known.pixels // SIZE, known.pixels % SIZE
-    x = (known.weights * (columns + 0.5)).sum(dim=1).numpy()
-    y = (known.weights * (rows + 0.5)).sum(dim=1).numpy()
+    valid = metric_depths(view, plan, DepthPrior(), torch.float64)
+    assert isinstance(valid, PointDepths)
+    rows, columns = valid.pixels // SIZE, valid.pixels % SIZE
+    x = (valid.weights * (columns + 0.5)).sum(dim=1).numpy()
+    y = (valid.weights * (rows + 0.5)).sum(dim=1).numpy()
     assert scene.points is not None
     pixels, depth = view.camera.project(scene.points.points)
     places = {(round(a, 6), round(b, 6)): d for (a, b), d in zip(pixels.tolist(), depth.tolist(), strict=True)}
-    for a, b, d in zip(x.tolist(), y.tolist(), known.depth.tolist(), strict=True):
+    for a, b, d in zip(x.tolist(), y.tolist(), valid.depth.tolist(), strict=True):
         assert places[(round(a, 6), round(b, 6))] == pytest.approx(d)
 
 
@@ -128,9 +128,9 @@ def test_whole_numbers_are_thousandths_unless_the_capture_or_the_recipe_says_oth
     def disparity(whole: bool, unit: float | None, of_file: float | None) -> float:
         made = mapped(scene, lambda _, depth: np.full_like(depth, 4.0), whole=whole, unit=of_file)
         settings = DepthPrior("sensor", unit=unit)
-        known = known_depths(made.train[0], plan_depths(made, settings), settings)
-        assert isinstance(known, KnownDepths)
-        return float(known.disparity[0, 0])
+        valid = metric_depths(made.train[0], plan_depths(made, settings), settings)
+        assert isinstance(valid, MetricDepth)
+        return float(valid.disparity[0, 0])
 
     assert disparity(True, None, None) == pytest.approx(250)
     assert disparity(False, None, None) == pytest.approx(0.25)
@@ -177,14 +177,14 @@ def test_relative_maps_are_brought_to_the_points_and_tell_what_they_are_linear_i
     plan = plan_depths(made, settings)
     assert plan.space == space
     for view, true in zip(made.train, exact.train, strict=True):
-        known = known_depths(view, plan, settings, torch.float64)
-        assert isinstance(known, KnownDepths)
+        valid = metric_depths(view, plan, settings, torch.float64)
+        assert isinstance(valid, MetricDepth)
         depth = torch.from_numpy(true.maps.values).double()  # type: ignore[union-attr]
-        there = known.known
-        assert (depth[there] * known.disparity[there] - 1).abs().median() < 1e-4
+        there = valid.valid
+        assert (depth[there] * valid.disparity[there] - 1).abs().median() < 1e-4
     rendered = replace(settings, align="rendered")
     assert plan_depths(made, rendered).observed is None
-    assert isinstance(known_depths(made.train[0], plan_depths(made, rendered), rendered), RelativeDepths)
+    assert isinstance(metric_depths(made.train[0], plan_depths(made, rendered), rendered), RelativeDepths)
 
 
 def test_there_is_no_line_through_few_points_equal_values_or_the_wrong_way() -> None:
@@ -226,9 +226,12 @@ def test_training_starts_from_places_on_the_maps_too(scene: Scene) -> None:
     added = len(cloud) - len(own)
     assert 100 <= added <= 126
     assert (cloud.points[added:] == own.points).all()
-    share = added // 6
+    fraction = added // 6
     for k, view in enumerate(made.train):
-        points, colors = cloud.points[k * share : (k + 1) * share], cloud.colors[k * share : (k + 1) * share]  # type: ignore[index]
+        points, colors = (
+            cloud.points[k * fraction : (k + 1) * fraction],
+            cloud.colors[k * fraction : (k + 1) * fraction],
+        )  # type: ignore[index]
         pixels, depth = view.camera.project(points)
         assert np.allclose(depth, 3.0)
         assert np.allclose(pixels % 1, 0.5)  # at pixel centres, in their colours
@@ -307,8 +310,8 @@ def test_known_depths_move_means_and_no_colours(scene: Scene, backend: str, sour
 def test_known_depths_bring_the_splats_nearer_to_the_surface(scene: Scene) -> None:
     made, _ = cases(scene)["sensor"]
     first = short().stages[0]
-    rates = Rates(means=5e-3, means_final=1e-3, means_horizon=40)
-    plain = Recipe("plain", (replace(first, iterations=40, densify=None, losses=first.losses[:2], rates=rates),))
+    lr = LearningRates(means=5e-3, means_final=1e-3, means_decay_steps=40)
+    plain = Recipe("plain", (replace(first, iterations=40, densify=None, losses=first.losses[:2], lr=lr),))
 
     def error(recipe: Recipe) -> float:
         trainer, found = Trainer(made, recipe, GENERIC, backend="reference"), []
@@ -328,7 +331,7 @@ def test_the_loss_falls_with_the_share_of_the_run(scene: Scene) -> None:
     made, recipe = cases(scene)["sensor"]
     recipe = eager(recipe)
     assert recipe.depth_prior is not None
-    recipe = replace(recipe, depth_prior=replace(recipe.depth_prior, horizon=20, final=0.01))
+    recipe = replace(recipe, depth_prior=replace(recipe.depth_prior, decay_steps=20, final_factor=0.01))
     trainer = Trainer(made, recipe, GENERIC, backend="reference")
     trainer.enter(0)
     stage, whole = trainer.recipe.stages[0], trainer._whole
@@ -366,12 +369,12 @@ def test_what_is_known_beyond_the_room_is_made_anew(scene: Scene) -> None:
     made, recipe = cases(scene)["sensor"]
     kept, none = Priors(made, recipe), Priors(made, recipe, limit_bytes=0)
     for index in (0, 1):
-        a, b = (p.known(index, torch.float32)[0] for p in (kept, none))
-        assert isinstance(a, KnownDepths)
-        assert isinstance(b, KnownDepths)
+        a, b = (p.at(index, torch.float32)[0] for p in (kept, none))
+        assert isinstance(a, MetricDepth)
+        assert isinstance(b, MetricDepth)
         assert torch.equal(a.disparity, b.disparity)
-    assert kept.known(0, torch.float32)[0] is kept.known(0, torch.float32)[0]
-    assert none.known(0, torch.float32)[0] is not none.known(0, torch.float32)[0]
+    assert kept.at(0, torch.float32)[0] is kept.at(0, torch.float32)[0]
+    assert none.at(0, torch.float32)[0] is not none.at(0, torch.float32)[0]
 
 
 def test_normals_are_trained_by_maps(scene: Scene, backend: str) -> None:

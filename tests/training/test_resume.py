@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gs2d.config.presets import proceed
+from gs2d.config.presets import continue_training
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene
@@ -67,7 +67,7 @@ def test_a_run_that_is_killed_in_an_event_resumes_from_its_last_save_to_the_same
 
 def test_a_finished_stage_can_be_shared_with_a_recipe_of_the_same_first_stage(scene: Scene) -> None:
     first = short().stages[0]
-    longer = Recipe("longer", (first, replace(proceed(), iterations=4)))
+    longer = Recipe("longer", (first, replace(continue_training(), iterations=4)))
     at_finish: list[bytes] = []
 
     def on_event(event: events.Event) -> None:

@@ -48,9 +48,9 @@ def splat_at(*places: tuple[float, float, float], scale: float = 0.02) -> Splats
 def test_a_sweep_finds_the_depth_of_a_textured_wall_and_says_nothing_of_a_bare_one() -> None:
     sweep = swept_wall()
     depth = sweep.depths[2][:, 20:]  # type: ignore[attr-defined]
-    known = depth > 0
-    assert known.mean() > 0.8
-    assert np.median(np.abs(depth[known] / WALL - 1)) < 0.02  # a quarter of a pixel
+    valid = depth > 0
+    assert valid.mean() > 0.8
+    assert np.median(np.abs(depth[valid] / WALL - 1)) < 0.02  # a quarter of a pixel
     bare = sweep.depths[2][4:-4, 2:6]  # type: ignore[attr-defined]
     assert (bare > 0).mean() < 0.1
 
@@ -129,7 +129,7 @@ def test_a_ball_around_each_camera_is_free_also_behind_it(maps: FreeSpaceMaps) -
 
 
 def test_a_large_splat_is_looked_at_by_its_ends_too() -> None:
-    beside = (4.5, 0.0, 3.2)  # out of every picture; its left end, 3 wu away, is before the wall
+    beside = (4.5, 0.0, 3.2)  # out of every picture; its left end, 3 world units away, is before the wall
     large, small = splat_at(beside, scale=3.0), splat_at(beside)
     maps = FreeSpaceMaps(swept_wall(), FreeSpace(ball=0.0))  # type: ignore[arg-type]
     assert maps.inside(small).tolist() == [False]

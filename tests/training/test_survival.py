@@ -9,7 +9,7 @@ import torch
 
 from gs2d.config.presets import get_recipe, surface
 from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC, Protocol
-from gs2d.config.recipe import GradDensify, LossTerm, Rates, Recipe
+from gs2d.config.recipe import GradDensify, LearningRates, LossTerm, Recipe
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
@@ -63,7 +63,7 @@ def first_stage(factor: float, **changes: object) -> Recipe:
                 iterations=stage.densify.stop,
                 train={"opacity_logits": "all"},
                 losses=(LossTerm("l1", 1.0),),
-                rates=Rates(beta1=0.0, beta2=0.0),
+                lr=LearningRates(beta1=0.0, beta2=0.0),
                 densify=replace(stage.densify, **changes),  # type: ignore[arg-type]
             ),
         ),

@@ -41,7 +41,7 @@ def test_the_stages_run_in_order_and_tell_what_they_do(scene: Scene) -> None:
     assert [set(e.losses) for e in progress[14:]] == [{"l1", "ssim", "normal_consistency"}] * 5
     assert [e.sh_degree for e in progress] == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3] + [3] * 9
     assert progress[0].loss == pytest.approx(sum(progress[0].losses.values()))
-    assert progress[9].rates["means"] == pytest.approx(1.6e-6 * scene.extent)
+    assert progress[9].lr["means"] == pytest.approx(1.6e-6 * scene.extent)
     assert trainer.done
     (ranked,) = [e for e in recorder.events if isinstance(e, events.Ranked)]
     (cloned,) = [e for e in recorder.events if isinstance(e, events.Cloned)]
@@ -77,11 +77,11 @@ def test_frozen_rows_and_attributes_are_bit_identical_through_a_stage(scene: Sce
         assert torch.equal(dict(end.items())[name], tensor) == (name == "opacity_logits"), name
 
 
-@pytest.mark.parametrize(("crossing", "unseen"), [("cull", 2), ("box", 1), ("draw", 0)])
+@pytest.mark.parametrize(("near_plane_policy", "unseen"), [("cull", 2), ("box", 1), ("draw", 0)])
 def test_splats_that_no_training_view_sees_go_at_the_end_of_a_stage_unless_crossing_ones_are_drawn(
-    scene: Scene, backend: str, crossing: str, unseen: int
+    scene: Scene, backend: str, near_plane_policy: str, unseen: int
 ) -> None:
-    # A needle of 50 wu along x: no camera of the ring (3 wu away, at 0, 60, ... degrees) has x in its image plane, so
+    # A needle of 50 along x: no camera of the ring (3 away, at 0, 60, ... degrees) has x in its image plane, so
     # its disc reaches every camera plane. These pictures are smaller than a tile: its box holds them. And a small splat
     # far above, which is never in sight; where crossing splats are drawn, it stays as by the official training.
     splats = random_splats(12, seed=1)
@@ -96,23 +96,23 @@ def test_splats_that_no_training_view_sees_go_at_the_end_of_a_stage_unless_cross
     )
     state.groups["needle"] = torch.arange(14) == 12
     recipe = Recipe("r", (replace(surface(), iterations=2, densify=None),))
-    protocol = replace(GENERIC, crossing=crossing)
+    protocol = replace(GENERIC, near_plane_policy=near_plane_policy)
     trainer, recorder = train(scene, recipe, protocol=protocol, state=state, backend=backend)
     finished = recorder.events[-1]
     assert isinstance(finished, events.StageFinished)
     assert finished.unseen == unseen
     assert len(trainer.splats) == finished.splats == 14 - unseen
     trainer.state.check()
-    assert int(trainer.state.groups["needle"].sum()) == (crossing != "cull")
+    assert int(trainer.state.groups["needle"].sum()) == (near_plane_policy != "cull")
     before, after = recorder.splats[-2], recorder.splats[-1]
     assert len(before) == 14
     for view in scene.train:
-        pictures = [rasterize(s, view.camera, trainer.settings, backend=backend).color for s in (before, after)]
-        assert torch.equal(*pictures)
+        images = [rasterize(s, view.camera, trainer.settings, backend=backend).color for s in (before, after)]
+        assert torch.equal(*images)
 
 
 def test_a_stage_that_moves_nothing_drops_nothing(scene: Scene) -> None:
-    protocol = replace(GENERIC, crossing="cull")
+    protocol = replace(GENERIC, near_plane_policy="cull")
     _, recorder = train(scene, short(), protocol=protocol)
     done = [event for event in recorder.events if isinstance(event, events.StageFinished)]
     start, end = (recorder.at(kind, "appearance") for kind in (events.StageStarted, events.StageFinished))

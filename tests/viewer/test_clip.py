@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.viewer.clip import ClipBox, clip_commands
-from gs2d.viewer.exact import Frame
+from gs2d.viewer.exact import ViewerFrame
 from gs2d.viewer.splats import Preview
 
 
@@ -56,7 +56,7 @@ class Page:
 
 def test_the_box_clips_the_preview_while_it_is_on_and_names_the_commands() -> None:
     page, changes = Page(), []
-    frame = Frame(np.array([10.0, 0, 0]), 2.0)
+    frame = ViewerFrame(np.array([10.0, 0, 0]), 2.0)
     box = np.array([[9.0, -1, -1], [11.0, 1, 1]])
     clip = ClipBox(page, frame, box, "runs/my x", lambda: changes.append(1), of_run=True)
     centers = np.array([[10.0, 0, 0], [10.9, 0.9, 0], [12, 0, 0]], np.float32)

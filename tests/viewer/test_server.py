@@ -27,11 +27,11 @@ from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.registry import LAYOUTS, write_layout
 from gs2d.io.meshes import glb_bytes, glb_turn, write_textured
 from gs2d.pipeline.view import ViewOptions, open_viewer
-from gs2d.viewer.exact import Drawn, ExactPictures, Frame, camera_of
+from gs2d.viewer.exact import Drawn, ExactImages, ViewerFrame, camera_of
 from gs2d.viewer.server import free_port, quaternion, thumbnail
 from gs2d.viewer.splats import preview
 
-WORLD = Frame(np.zeros(3), 1.0)
+WORLD = ViewerFrame(np.zeros(3), 1.0)
 
 
 def splats_at(means: list[list[float]], sizes: list[list[float]], quats: list[list[float]] | None = None) -> Splats:
@@ -52,7 +52,7 @@ def eye(position: tuple[float, float, float]) -> Camera:
 
 
 def test_the_covariance_of_a_disc_is_that_of_its_axes_in_units_of_a_typical_splat() -> None:
-    # median of the scales 1, 2, 2, 2: 2 wu is 1. A quarter turn about x takes the disc's y axis to z.
+    # median of the scales 1, 2, 2, 2: 2 world units is 1. A quarter turn about x takes the disc's y axis to z.
     turn = [2**-0.5, 2**-0.5, 0.0, 0.0]
     found = preview(splats_at([[0, 0, 4], [2, 0, 0]], [[1.0, 2.0], [2.0, 2.0]], [[1.0, 0, 0, 0], turn]))
     assert found.scale == pytest.approx(2)
@@ -86,7 +86,7 @@ def test_covariances_stay_within_the_16_bits_in_which_they_are_sent() -> None:
 
 def test_the_camera_of_a_browser_is_ours() -> None:
     camera = look_at(np.array([3.0, 1, 2]), np.array([0.5, 0, 0]), np.array([0, 0, 1.0]), width=300, height=200, fx=250)
-    frame = Frame(np.array([1.0, 0, -1]), 4.0)
+    frame = ViewerFrame(np.array([1.0, 0, -1]), 4.0)
     view = SimpleNamespace(
         wxyz=quaternion(camera.rotation.T),
         position=frame.inside(camera.center),
@@ -110,7 +110,7 @@ class FakeServer:
     def __init__(self) -> None:
         self.clients: dict[int, Any] = {}
         self.connected: list[Callable[[Any], None]] = []
-        self.pictures: list[tuple[int, tuple[int, ...], float]] = []  # client, size, largest depth
+        self.images: list[tuple[int, tuple[int, ...], float]] = []  # client, size, largest depth
 
     def on_client_connect(self, call: Callable[[Any], None]) -> None:
         self.connected.append(call)
@@ -134,7 +134,7 @@ class FakeServer:
 
         def draw(image: np.ndarray | None, *, depth: np.ndarray | None = None, **_: Any) -> None:
             size = () if image is None else image.shape[:2]
-            self.pictures.append((number, size, 0.0 if depth is None else float(depth.max())))
+            self.images.append((number, size, 0.0 if depth is None else float(depth.max())))
 
         client = SimpleNamespace(client_id=number, camera=camera, moved=lambda: [call(camera) for call in calls])
         client.scene = SimpleNamespace(set_background_image=draw)
@@ -158,19 +158,19 @@ def flat(camera: Camera, _kind: str) -> Drawn:
 
 def test_exact_pictures_are_coarse_while_a_browser_moves_and_sharp_when_it_is_still() -> None:
     server = FakeServer()
-    exact = ExactPictures(server, WORLD, lambda: flat)
+    exact = ExactImages(server, WORLD, lambda: flat)
     client = server.connect(7)
     time.sleep(0.05)
-    assert server.pictures == []  # nobody asked for them
+    assert server.images == []  # nobody asked for them
     exact.draw("exact")
-    wait_for(lambda: len(server.pictures) == 2)
+    wait_for(lambda: len(server.images) == 2)
     client.moved()
-    wait_for(lambda: len(server.pictures) == 4)
+    wait_for(lambda: len(server.images) == 4)
     time.sleep(0.1)
-    assert [size for _, size, _ in server.pictures] == [(240, 320), (600, 800)] * 2
-    assert {depth for _, _, depth in server.pictures} == {160.0}  # as far as viser's depths reach
+    assert [size for _, size, _ in server.images] == [(240, 320), (600, 800)] * 2
+    assert {depth for _, _, depth in server.images} == {160.0}  # as far as viser's depths reach
     exact.draw(None)
-    assert server.pictures[4:] == [(7, (), 0.0)]  # taken away
+    assert server.images[4:] == [(7, (), 0.0)]  # taken away
     exact.close()
     assert exact.failure is None
 
@@ -180,7 +180,7 @@ def test_a_picture_that_cannot_be_drawn_is_not_silent() -> None:
         raise ValueError("no such picture")
 
     server = FakeServer()
-    exact = ExactPictures(server, WORLD, lambda: fail)
+    exact = ExactImages(server, WORLD, lambda: fail)
     server.connect(1)
     exact.draw("depth")
     wait_for(lambda: exact.failure is not None)
@@ -198,13 +198,13 @@ def test_a_browser_that_is_closed_while_it_is_drawn_for_stops_nobody() -> None:
             raise ConnectionError("nobody there")
         return flat(camera, _kind)
 
-    exact = ExactPictures(server, WORLD, lambda: leave)
+    exact = ExactImages(server, WORLD, lambda: leave)
     server.connect(1)
     exact.draw("exact")
     wait_for(lambda: len(drawn) == 1)
     server.connect(2)
-    wait_for(lambda: len(server.pictures) == 2)
-    assert {number for number, _, _ in server.pictures} == {2}
+    wait_for(lambda: len(server.images) == 2)
+    assert {number for number, _, _ in server.images} == {2}
     assert exact.failure is None
     exact.close()
 

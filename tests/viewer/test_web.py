@@ -25,8 +25,8 @@ from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.report.images import depth_picture, normal_picture
-from gs2d.viewer.web import MOST_SPLATS, Seen, pack, texels_of, write_page
+from gs2d.report.images import depth_image, normal_image
+from gs2d.viewer.web import MAX_SPLATS, Seen, pack, texels_of, write_page
 
 ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
 CAMERA = look_at(ORIGIN + np.array([0.3, -4.0, 0.8]), ORIGIN, np.array([0.0, 0.0, 1.0]), width=120, height=80, fx=100.0)
@@ -117,8 +117,8 @@ def test_a_few_outliers_do_not_coarsen_the_colours_of_all() -> None:
 
 
 def test_more_splats_than_a_texture_holds_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert MOST_SPLATS * 3 <= 2048 * 8192
-    monkeypatch.setattr("gs2d.viewer.web.MOST_SPLATS", 10)
+    assert MAX_SPLATS * 3 <= 2048 * 8192
+    monkeypatch.setattr("gs2d.viewer.web.MAX_SPLATS", 10)
     splats = some_splats(11)
     splats.opacity_logits[:] = 0
     with pytest.raises(DataError, match="a page holds at most 10 splats, got 11"):
@@ -224,19 +224,19 @@ def test_the_scripts_are_javascript_and_the_sorter_sorts_exactly(tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
-@pytest.mark.parametrize("crossing", ["draw", "cull", "box"])
-def test_a_browser_draws_what_the_rasterizer_draws(tmp_path: Path, crossing: str) -> None:
-    settings, splats = replace(SETTINGS, crossing=crossing), some_splats()
+@pytest.mark.parametrize("near_plane_policy", ["draw", "cull", "box"])
+def test_a_browser_draws_what_the_rasterizer_draws(tmp_path: Path, near_plane_policy: str) -> None:
+    settings, splats = replace(SETTINGS, near_plane_policy=near_plane_policy), some_splats()
     page_of(tmp_path / "scene.html", settings=settings)
     with torch.no_grad():
         output = rasterize(splats, CAMERA, settings, backend="reference")
     ours = output.color.clamp(0, 1).numpy()
     assert likeness(tmp_path, "view=0&bare", ours) > 48
-    if crossing == "draw":
+    if near_plane_policy == "draw":
         alpha = output.alpha.numpy()
-        normals = normal_picture(output.normal.numpy(), alpha)
+        normals = normal_image(output.normal.numpy(), alpha)
         assert likeness(tmp_path, "view=0&bare&kind=normals", normals) > 35  # where two faces cancel, normals are noise
-        depths = depth_picture(output.depth_mean.numpy(), alpha, (2.0, 6.0))
+        depths = depth_image(output.depth_mean.numpy(), alpha, (2.0, 6.0))
         assert likeness(tmp_path, "view=0&bare&kind=depth&depths=2,6", depths) > 35
 
 
@@ -252,7 +252,7 @@ def likeness(folder: Path, fragment: str, ours: np.ndarray) -> float:
 
 def screenshot(folder: Path, fragment: str) -> np.ndarray:
     """The page [H, W, 3] as Chromium draws it without a GPU."""
-    picture = folder / "page.png"
+    image = folder / "page.png"
     words = [
         "--headless=new",
         "--no-sandbox",
@@ -263,10 +263,10 @@ def screenshot(folder: Path, fragment: str) -> np.ndarray:
     words += ["--hide-scrollbars", f"--window-size={CAMERA.width},{CAMERA.height}", "--timeout=12000"]
     words += [
         f"--user-data-dir={folder / 'profile'}",
-        f"--screenshot={picture}",
+        f"--screenshot={image}",
         f"file://{folder / 'scene.html'}#{fragment}",
     ]
     assert CHROMIUM is not None
     subprocess.run([CHROMIUM, *words], check=True, capture_output=True, timeout=120)
-    with Image.open(picture) as file:
+    with Image.open(image) as file:
         return np.asarray(file.convert("RGB")) / 255

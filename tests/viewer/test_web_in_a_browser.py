@@ -119,8 +119,8 @@ def test_it_opens_where_a_photograph_was_taken_with_the_subject_in_the_middle(pa
     np.testing.assert_allclose(target, 0, atol=1e-9)
     np.testing.assert_allclose(ahead, -eye / np.linalg.norm(eye), atol=1e-6)
     still(page)
-    picture = page.picture()
-    assert np.abs(picture[210, 320 - 4 : 320 + 4] - [0.2, 0.5, 0.9]).max() > 0.02  # the balls, not the background alone
+    image = page.image()
+    assert np.abs(image[210, 320 - 4 : 320 + 4] - [0.2, 0.5, 0.9]).max() > 0.02  # the balls, not the background alone
     # all of the subject's ball fits into the window: 2 asin(radius / away) of the view, 10 % to spare
     needed = 2.2 * 200 * np.tan(np.arcsin(SUBJECT.radius / np.linalg.norm(eye)))
     assert values(page, "here.h")[0] == pytest.approx(min(needed, HEIGHT))
@@ -176,7 +176,7 @@ def test_the_clip_box_cuts_what_is_drawn_and_its_numbers_are_an_option(page: Pag
     page.ask("document.activeElement.blur()")
     page.ask("document.body.classList.add('bare'); $('boxpanel').hidden = true; $('lines').style.display = 'none'")
     page.until("document.body.dataset.drawn === 'still'")
-    cut = page.picture()
+    cut = page.image()
     red, green = ((cut[..., k] > 0.6) & (cut[..., 2] < 0.4) for k in (0, 1))
     assert green.sum() > 50
     assert red.sum() == 0
@@ -244,7 +244,7 @@ def test_a_photographed_view_is_drawn_as_the_rasterizer_draws_it_after_turning_a
         page.until("drawn === asked")
         with torch.no_grad():
             ours = rasterize(two_balls(), ONE_SIDE[3].camera, SETTINGS, backend="reference").color.numpy()
-        error = ((page.picture() - np.clip(ours, 0, 1)) ** 2).mean()
+        error = ((page.image() - np.clip(ours, 0, 1)) ** 2).mean()
         assert -10 * np.log10(error) > 48
     finally:
         page.ask("document.body.classList.remove('bare')")

@@ -26,7 +26,7 @@ from gs2d.cli.options import Common, TrainingCommon
 from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
 from gs2d.errors import Gs2dError
 
-OK, OURS, USERS, INCOMPLETE, NOBODY_READS = 0, 1, 2, 3, 141
+OK, EXIT_BUG, EXIT_USAGE, INCOMPLETE, NOBODY_READS = 0, 1, 2, 3, 141
 _MENDABLE = {
     errno.ENOSPC,
     errno.EDQUOT,
@@ -57,7 +57,7 @@ def run(argv: Sequence[str]) -> int:
             return OK
         command = parse(argv)
     except SystemExit as exit_:
-        return OK if exit_.code is None else exit_.code if isinstance(exit_.code, int) else USERS
+        return OK if exit_.code is None else exit_.code if isinstance(exit_.code, int) else EXIT_USAGE
     except BrokenPipeError:  # `gs2d train --help | head`
         _drop_stdout()
         return NOBODY_READS
@@ -167,7 +167,7 @@ def _one_line(box: str, argv: Sequence[str]) -> str:
 
 def _fail(message: str) -> int:
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
-    return USERS
+    return EXIT_USAGE
 
 
 def _report(error: Exception, debug: bool) -> int:
@@ -183,7 +183,7 @@ def _report(error: Exception, debug: bool) -> int:
     text = " ".join(str(error).split()) or "no message"
     hint = "" if debug else "; run again with --debug and report it with the traceback"
     print(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}", file=sys.stderr)
-    return OURS
+    return EXIT_BUG
 
 
 def _what_is_missing(console: Console, argv: Sequence[str], command: Common) -> int:

@@ -18,9 +18,9 @@ from rich.table import Table
 from gs2d.cli.bar import Bar
 from gs2d.cli.layout import records, wrapped
 from gs2d.cli.whole import WholeRun
-from gs2d.pipeline.events import Event, Expected, Missing, Notice, Phase, Plan, StageDone, Step
+from gs2d.pipeline.events import Event, Expected, MissingFile, Notice, Phase, Plan, StageDone, Step
 
-LOG_SECONDS, LOG_SHARE = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
+LOG_SECONDS, LOG_FRACTION = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
 _ANY_WIDTH = 10_000  # columns
 _NO_SCREENS = ("dumb", "unknown")  # values of TERM: no cursor that goes back
 
@@ -64,13 +64,13 @@ class Console:
         self._live: Live | None = None
         self._bar: Bar | None = None
         self._named: set[str] = set()  # phases that a log file has heard of
-        self.missing: list[Missing] = []  # what could not be made, for the end of the command
+        self.missing: list[MissingFile] = []  # what could not be made, for the end of the command
         self._logged = (0.0, 0)  # s, steps done: at the last line of a log file
 
     def on_event(self, event: Event) -> None:
         """Draw an event of the pipeline."""
         self._before_each()
-        if isinstance(event, Missing):
+        if isinstance(event, MissingFile):
             self.missing.append(event)
         if self.quiet:
             return
@@ -86,7 +86,7 @@ class Console:
             self._step(event)
         elif isinstance(event, Notice):
             self._note(event.text)
-        elif isinstance(event, Missing):
+        elif isinstance(event, MissingFile):
             self._err.print(f"[red]not made[/red] {escape(event.what)}: {escape(event.reason)}", soft_wrap=True)
         elif isinstance(event, StageDone):
             self._lines(wrapped(stage_line(event.metrics), self._err.width, rest="  "))
@@ -121,7 +121,7 @@ class Console:
         self._bar.step(step.done, step.detail)
         total, (at, done) = self._bar.phase.total, self._logged
         late = time.monotonic() - at >= LOG_SECONDS
-        if not self._interactive and total and late and LOG_SHARE * total <= step.done - done:
+        if not self._interactive and total and late and LOG_FRACTION * total <= step.done - done:
             self._logged = (time.monotonic(), step.done)
             words = [f"{self._bar.phase.name}: {step.done:,} of {total:,}, {self._bar.left()}", self._whole.line()]
             self._err.print("; ".join(filter(None, words)), markup=False, soft_wrap=True)

@@ -9,7 +9,7 @@ from gs2d.cli import commands as c
 from gs2d.cli.console import Console
 from gs2d.cli.options import values
 
-_MOST_LINES = 12  # of photographs without a place; poses.json has them all
+_MAX_LINES = 12  # of photographs without a place; poses.json has them all
 
 
 def poses(command: c.Poses, console: Console) -> None:
@@ -35,9 +35,9 @@ def poses_lines(result: dict[str, Any]) -> list[str]:
     if len(result["cameras"]) > 4:
         lines.append(f"and {len(result['cameras']) - 4} more cameras, in poses.json")
     left_out = [row for row in result["photographs"] if not row["placed"]]
-    lines += [f"no place: {row['source']}: {row['reason']}" for row in left_out[:_MOST_LINES]]
-    if len(left_out) > _MOST_LINES:
-        lines.append(f"no place: {len(left_out) - _MOST_LINES} more, in poses.json")
+    lines += [f"no place: {row['source']}: {row['reason']}" for row in left_out[:_MAX_LINES]]
+    if len(left_out) > _MAX_LINES:
+        lines.append(f"no place: {len(left_out) - _MAX_LINES} more, in poses.json")
     for other in result["other_models"]:
         lines.append(
             f"{other['folder']} holds a separate piece: {len(other['photos'])} photographs, {other['points']:,} points"

@@ -14,13 +14,13 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         e = recipe.exposure
         yield (
             f"exposures: a colour transform for each photograph after iteration {e.start:,}, "
-            f"rate {e.rate:g} to {e.rate_final:g} over {e.horizon:,} iterations, prior {e.prior:g}"
+            f"rate {e.rate:g} to {e.rate_final:g} over {e.decay_steps:,} iterations, prior {e.prior:g}"
         )
     if recipe.poses is not None:
         p = recipe.poses
         yield (
             f"poses: a motion for each training camera after iteration {p.start:,}, rate {p.rate:g} to "
-            f"{p.rate_final:g} (rad, shares of the extent) over {p.horizon:,} iterations, while all splats move"
+            f"{p.rate_final:g} (rad, shares of the extent) over {p.decay_steps:,} iterations, while all splats move"
         )
     if recipe.multiview is not None:
         m = recipe.multiview
@@ -34,7 +34,7 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
 
 
 def _describe_priors(recipe: Recipe) -> Iterator[str]:
-    falls = "weight falls to {0.final:g} of itself over {0.horizon:,} iterations"
+    falls = "weight falls to {0.final_factor:g} of itself over {0.decay_steps:,} iterations"
     if recipe.depth_prior is not None:
         d = recipe.depth_prior
         fitted = "sparse points" if d.align == "points" else "what is rendered"

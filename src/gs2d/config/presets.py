@@ -21,10 +21,10 @@ from gs2d.config.recipe import (
     CloneInPlace,
     Exposure,
     GradDensify,
+    LearningRates,
     LossTerm,
     PoseRefinement,
     RankByError,
-    Rates,
     Recipe,
     Stage,
 )
@@ -70,7 +70,7 @@ def appearance(k: float = 1.0, rows: str = "high_error") -> Stage:
         10_000,
         train=dict.fromkeys(SH, rows),
         losses=PHOTOMETRIC,
-        rates=_rates_after_surface(),
+        lr=_lr_after_surface(),
         on_enter=(RankByError(top_percent=k),),
     )
 
@@ -95,19 +95,19 @@ def refine(
         20_000,
         train={name: rows for name in ALL if name not in freeze},
         losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
-        rates=_rates_after_surface(),
+        lr=_lr_after_surface(),
         densify=densify,
         on_enter=rank if clone is None else (*rank, CloneInPlace("high_error", clone)),
     )
 
 
-def proceed(nc: float = 0.05, iterations: int = 30_000) -> Stage:
+def continue_training(nc: float = 0.05, iterations: int = 30_000) -> Stage:
     """More of the same after stage 1: its last rates, its moments, NC on, no densification."""
     return Stage(
         "continue",
         iterations,
         losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
-        rates=_rates_after_surface(),
+        lr=_lr_after_surface(),
         moments="kept",
     )
 
@@ -119,7 +119,7 @@ def two_dgs(nc: float = 0.05, distortion: float | None = 0.0, *, name: str = "2d
 
 def two_dgs_60k(nc: float = 0.05, *, name: str = "2dgs-60k") -> Recipe:
     """The fair control: 2DGS for as many iterations as 2DGS-R in total; its first stage is that of ``2dgs``."""
-    return Recipe(name, (surface(nc), proceed(nc)))
+    return Recipe(name, (surface(nc), continue_training(nc)))
 
 
 def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: Stage | None = None) -> Recipe:
@@ -232,9 +232,9 @@ def _distortion(weight: float | None, start: int) -> tuple[LossTerm, ...]:
     return (LossTerm("distortion", weight, start),) if weight is None or weight > 0 else ()
 
 
-def _rates_after_surface() -> Rates:
+def _lr_after_surface() -> LearningRates:
     """The rates at the end of stage 1: the means' final one, the others as they were."""
-    return Rates().at_end(30_000)
+    return LearningRates().at_end(30_000)
 
 
 def with_poses(recipe: Recipe, *, name: str | None = None) -> Recipe:

@@ -26,7 +26,7 @@ class DepthPrior:
         "sparse": points of the reconstruction that found the cameras; "sensor": depth maps in units of the capture
         times a factor; "relative": depth maps of unknown scale and shift, one of each a view; "auto": by what the
         capture has.
-    final, horizon : float, int
+    final_factor, horizon : float, int
         The weight of the loss falls log-linearly to this share of itself over so many iterations of the run, all
         stages counted: photographs know better in the end.
     opacity : float
@@ -38,8 +38,9 @@ class DepthPrior:
     max_error : float
         px. Largest mean reprojection error of a sparse point.
     unit : float or None
-        wu of a value 1 in a sensor's map. None: what fits the sparse points where the capture says which photographs
-        show them (COLMAP's scale is arbitrary), else what the capture says, a thousandth for whole numbers, or 1.
+        World units of a value 1 in a sensor's map. None: what fits the sparse points where the capture says which
+        photographs show them (COLMAP's scale is arbitrary), else what the capture says, a thousandth for whole
+        numbers, or 1.
     space : str
         What relative maps are linear in: "disparity" (1 / depth, larger is nearer) or "depth"; "auto": what fits the
         sparse points better.
@@ -51,8 +52,8 @@ class DepthPrior:
     """
 
     source: str = "auto"
-    final: float = 0.01
-    horizon: int = 30_000
+    final_factor: float = 0.01
+    decay_steps: int = 30_000
     opacity: float = 0.5
     noise: float = 0.05
     min_track: int = 3
@@ -62,9 +63,9 @@ class DepthPrior:
     align: str = "points"
     start: bool = True
 
-    def share_at(self, iteration: int) -> float:
+    def weight_at(self, iteration: int) -> float:
         """Share of the weight at an iteration of the run (1-based)."""
-        return _decayed(self.final, iteration / self.horizon)
+        return _decayed(self.final_factor, iteration / self.decay_steps)
 
 
 @dataclass(frozen=True)
@@ -76,22 +77,22 @@ class NormalPrior:
     axes : str
         Of the maps, in the camera's frame: "opencv" (x right, y down, z forward), "opengl" (x right, y up, z back), or
         "auto": in which a surface that is seen faces the camera.
-    final, horizon : float, int
+    final_factor, horizon : float, int
         As of :class:`DepthPrior`.
     """
 
     axes: str = "auto"
-    final: float = 0.01
-    horizon: int = 30_000
+    final_factor: float = 0.01
+    decay_steps: int = 30_000
 
-    def share_at(self, iteration: int) -> float:
+    def weight_at(self, iteration: int) -> float:
         """Share of the weight at an iteration of the run (1-based)."""
-        return _decayed(self.final, iteration / self.horizon)
+        return _decayed(self.final_factor, iteration / self.decay_steps)
 
 
-def _decayed(final: float, share: float) -> float:
-    """From 1 to ``final``, log-linear in [0, 1]."""
-    return math.exp(min(max(share, 0.0), 1.0) * math.log(final))
+def _decayed(final_factor: float, fraction: float) -> float:
+    """From 1 to ``final_factor``, log-linear in [0, 1]."""
+    return math.exp(min(max(fraction, 0.0), 1.0) * math.log(final_factor))
 
 
 def check_priors(where: str, depth: DepthPrior | None, normal: NormalPrior | None, kinds: Sequence[str]) -> None:
@@ -103,9 +104,9 @@ def check_priors(where: str, depth: DepthPrior | None, normal: NormalPrior | Non
             continue
         option = name.replace("_", "-")
         require(asked, f"{at} is set, but no loss is {name!r}; take a recipe made with --{option}")
-        share = number(f"{at}.final", value.final, low=0.0)
-        require(0 < share <= 1, f"{at}.final must be in (0, 1], got {share}")
-        integer(f"{at}.horizon", value.horizon, low=1)
+        fraction = number(f"{at}.final_factor", value.final_factor, low=0.0)
+        require(0 < fraction <= 1, f"{at}.final_factor must be in (0, 1], got {fraction}")
+        integer(f"{at}.decay_steps", value.decay_steps, low=1)
     if normal is not None:
         one_of(f"{where}: normal_prior.axes", normal.axes, AXES)
     if depth is None:

@@ -25,9 +25,9 @@ class FusionLimits:
     Attributes
     ----------
     voxel, truncation : float or None
-        wu. Voxel size, and the distance at which the signed distance saturates.
+        World units. Voxel size, and the distance at which the signed distance saturates.
     depth_limit : float or None
-        wu. Depths beyond it are ignored.
+        World units. Depths beyond it are ignored.
     clusters : int
         How many of the largest connected components are kept; 0 keeps all.
     depth : str or None
@@ -78,8 +78,8 @@ class Protocol:
     background : tuple of 3 floats
         Colour behind everything, in [0, 1].
     near : float or None
-        wu. None: 1 % of the scene's extent.
-    crossing : str
+        World units. None: 1 % of the scene's extent.
+    near_plane_policy : str
         "draw", "cull" or "box": what the rasterizer does with splats that reach the camera plane (``RasterSettings``).
     downscale : int
         Hint: what the paper divides the image size by.
@@ -100,7 +100,7 @@ class Protocol:
     distortion_weight: float
     background: tuple[float, float, float] = BLACK  # [c] unless asked for white
     near: float | None = None
-    crossing: str = "draw"
+    near_plane_policy: str = "draw"
     downscale: int = 1  # [d] full size
     test_every: int = 8  # [c] --eval
     test_on: str = "test"  # [r] novel views
@@ -116,7 +116,7 @@ class Protocol:
         return self.background == WHITE
 
     def near_for(self, extent: float) -> float:
-        """Near distance, wu, in a scene of this extent."""
+        """Near distance, world units, in a scene of this extent."""
         return RELATIVE_NEAR * extent if self.near is None else self.near
 
     @property
@@ -142,7 +142,7 @@ DTU = Protocol(
     depth="median",  # [s] depth_ratio 1
     distortion_weight=1000.0,  # [s] lambda_dist 1000
     near=0.2,  # [c] rasterizer
-    crossing="cull",  # [d] objects: no splat has business at the camera
+    near_plane_policy="cull",  # [d] objects: no splat has business at the camera
     downscale=2,  # [s] -r 2, [r]
     test_every=0,  # [s] all views train
     test_on="train",  # [r] "we evaluated PSNR on the training set"
@@ -155,7 +155,7 @@ TNT = Protocol(
     depth="median",  # [s] depth_ratio 1
     distortion_weight=100.0,  # [s] printed (not executed); [r] Table 1 "100"
     near=0.2,  # [c]
-    crossing="box",  # [c] forward.cu, compute_aabb
+    near_plane_policy="box",  # [c] forward.cu, compute_aabb
     downscale=2,  # [s] -r 2, [r]
     test_every=8,  # [c] --eval; [r] its PSNR is of novel views
     use_mask_in_training=False,  # [c]
@@ -173,7 +173,7 @@ NERF_SYNTHETIC = Protocol(
     distortion_weight=1000.0,  # [2dgs] bounded scenes; the script uses none
     background=WHITE,  # [s] --white_background
     near=0.2,  # [c]
-    crossing="cull",  # [d] else white sheets grow over the white background, also with the official box
+    near_plane_policy="cull",  # [d] else white sheets grow over the white background, also with the official box
     test_every=0,  # the data set has its own split
     use_mask_in_training=False,  # the images are composited on the background instead
     # [d] no script meshes this set: limits from the scene; some objects come in pieces; median is nearer the truth
@@ -184,7 +184,7 @@ MIP_NERF_360 = Protocol(
     depth="mean",  # [s] depth_ratio stays 0
     distortion_weight=100.0,  # [2dgs] unbounded scenes; the script uses none
     near=0.2,  # [c]
-    crossing="box",  # [c]
+    near_plane_policy="box",  # [c]
     downscale=4,  # [s] images_4 outdoors (images_2 indoors)
     test_every=8,  # [c] --eval
     use_mask_in_training=False,  # [c]

@@ -58,16 +58,16 @@ class LossTerm:
 
 
 @dataclass(frozen=True)
-class Rates:
+class LearningRates:
     """Adam learning rates (``reference/2dgs`` facts: the official 2DGS values).
 
-    ``means`` decays log-linearly from ``means`` to ``means_final`` over ``means_horizon`` iterations of the stage, and
-    both are multiplied by the scene's extent.
+    ``means`` decays log-linearly from ``means`` to ``means_final`` over ``means_decay_steps`` iterations of the
+    stage, and both are multiplied by the scene's extent.
     """
 
     means: float = 1.6e-4
     means_final: float = 1.6e-6
-    means_horizon: int = 30_000
+    means_decay_steps: int = 30_000
     quats: float = 1e-3
     log_scales: float = 5e-3
     opacity_logits: float = 5e-2
@@ -79,12 +79,12 @@ class Rates:
 
     def means_at(self, iteration: int) -> float:
         """Rate of ``means`` at an iteration (1-based), without the extent: log-linear, then constant."""
-        t = min(max(iteration / self.means_horizon, 0.0), 1.0)
+        t = min(max(iteration / self.means_decay_steps, 0.0), 1.0)
         return math.exp((1.0 - t) * math.log(self.means) + t * math.log(self.means_final))
 
-    def at_end(self, iterations: int) -> Rates:
+    def at_end(self, iterations: int) -> LearningRates:
         """Constant rates, at the values that these reach after so many iterations."""
-        means = self.means_final if iterations >= self.means_horizon else self.means_at(iterations)
+        means = self.means_final if iterations >= self.means_decay_steps else self.means_at(iterations)
         return replace(self, means=means, means_final=means)
 
 
@@ -159,7 +159,7 @@ class GradDensify:
         """Whether splats are cloned, split and pruned at the end of this iteration."""
         return self.start < iteration < self.stop and iteration % self.every == 0
 
-    def spares_faint(self, iteration: int, *, white: bool) -> bool:
+    def in_prune_grace(self, iteration: int, *, white: bool) -> bool:
         """Whether faint splats are spared because a reset is at most ``prune_grace`` iterations back."""
         first = max(1, iteration - self.prune_grace)
         return any(self.resets(earlier, white=white) for earlier in range(first, iteration))
@@ -204,7 +204,7 @@ class Stage:
     train : mapping of attribute name to "all" or a row group
         Attributes that are absent are frozen: bit-identical through the stage.
     losses : tuple of LossTerm
-    rates : Rates
+    lr : LearningRates
     densify : GradDensify or None
     on_enter : tuple of actions
         Run once, in order, before the first iteration.
@@ -218,7 +218,7 @@ class Stage:
     iterations: int
     train: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({name: "all" for name in ALL}))
     losses: tuple[LossTerm, ...] = ()
-    rates: Rates = Rates()
+    lr: LearningRates = LearningRates()
     densify: GradDensify | None = None
     on_enter: tuple[Action, ...] = ()
     sh_interval: int = 0
@@ -324,14 +324,14 @@ def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
         if rows != "all":
             group(f"{where}: train[{attribute!r}]", rows, groups)
     _check_losses(where, stage)
-    for entry in fields(Rates):
-        number(f"{where}: rates.{entry.name}", getattr(stage.rates, entry.name), low=0.0)
+    for entry in fields(LearningRates):
+        number(f"{where}: lr.{entry.name}", getattr(stage.lr, entry.name), low=0.0)
     require(
-        stage.rates.means > 0 and stage.rates.means_final > 0 and stage.rates.eps > 0,
-        f"{where}: rates.means, rates.means_final and rates.eps must be positive (to freeze, leave out of train)",
+        stage.lr.means > 0 and stage.lr.means_final > 0 and stage.lr.eps > 0,
+        f"{where}: lr.means, lr.means_final and lr.eps must be positive (to freeze, leave out of train)",
     )
-    integer(f"{where}: rates.means_horizon", stage.rates.means_horizon, low=1)
-    require(max(stage.rates.beta1, stage.rates.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
+    integer(f"{where}: rates.means_horizon", stage.lr.means_decay_steps, low=1)
+    require(max(stage.lr.beta1, stage.lr.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
     if stage.densify is not None:
         _check_densify(f"{where}: densify", stage.densify, stage)
 

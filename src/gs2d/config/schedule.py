@@ -15,7 +15,7 @@ from dataclasses import fields, replace
 from typing import TypeVar
 
 from gs2d.config.priors import DepthPrior, NormalPrior
-from gs2d.config.recipe import Exposure, GradDensify, PoseRefinement, Rates, Recipe, Stage
+from gs2d.config.recipe import Exposure, GradDensify, LearningRates, PoseRefinement, Recipe, Stage
 from gs2d.errors import RecipeError
 
 MIN_DENSIFICATIONS = 10
@@ -68,23 +68,27 @@ def longer_steps(recipe: Recipe, factor: float) -> Recipe:
     """
     if factor >= 1:
         return recipe
-    names = [entry.name for entry in fields(Rates) if entry.name not in ("means_horizon", "beta1", "beta2", "eps")]
+    names = [
+        entry.name
+        for entry in fields(LearningRates)
+        if entry.name not in ("means_decay_steps", "beta1", "beta2", "eps")
+    ]
 
-    def longer(rates: Rates) -> Rates:
-        return replace(rates, **{name: getattr(rates, name) * factor**-LONGER for name in names})
+    def longer(lr: LearningRates) -> LearningRates:
+        return replace(lr, **{name: getattr(lr, name) * factor**-LONGER for name in names})
 
-    return replace(recipe, stages=tuple(replace(stage, rates=longer(stage.rates)) for stage in recipe.stages))
+    return replace(recipe, stages=tuple(replace(stage, lr=longer(stage.lr)) for stage in recipe.stages))
 
 
 def _scale_prior(prior: Prior, factor: float) -> Prior:
-    return replace(prior, horizon=_scaled(prior.horizon, factor))
+    return replace(prior, decay_steps=_scaled(prior.decay_steps, factor))
 
 
 def _scale_views(learned: OfViews, factor: float) -> OfViews:
     """Splats become a scene, and leave the grey they start from, by the count of iterations, not by its share."""
-    horizon = _scaled(learned.horizon, factor)
-    least = min(learned.start, VIEWS_WAIT, horizon // 6)
-    return replace(learned, horizon=horizon, start=max(least, round(learned.start * factor)))
+    decay_steps = _scaled(learned.decay_steps, factor)
+    least = min(learned.start, VIEWS_WAIT, decay_steps // 6)
+    return replace(learned, decay_steps=decay_steps, start=max(least, round(learned.start * factor)))
 
 
 def _scale_poses(poses: PoseRefinement, factor: float) -> PoseRefinement:
@@ -98,7 +102,7 @@ def _scale_stage(stage: Stage, factor: float) -> Stage:
         stage,
         iterations=_scaled(stage.iterations, factor),
         losses=tuple(replace(term, start=round(term.start * factor)) for term in stage.losses),
-        rates=replace(stage.rates, means_horizon=_scaled(stage.rates.means_horizon, factor)),
+        lr=replace(stage.lr, means_decay_steps=_scaled(stage.lr.means_decay_steps, factor)),
         sh_interval=_scaled(stage.sh_interval, factor),
         densify=None if stage.densify is None else _scale_densify(stage.densify, factor),
     )

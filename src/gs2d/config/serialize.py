@@ -47,7 +47,7 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     recipe : Recipe
     overrides : sequence of str
         ``field=value`` for the recipe (``seed=3``) and ``stage.field=value`` for a stage. Deeper fields are reached by
-        more dots: ``surface.densify.grad_threshold=1e-4``, ``refine.rates.sh0=0.001``; losses by their kind,
+        more dots: ``surface.densify.grad_threshold=1e-4``, ``refine.lr.sh0=0.001``; losses by their kind,
         ``surface.losses.normal_consistency.weight=0.1``; entry actions by their name,
         ``refine.on_enter.clone_in_place.opacity=preserve``; ``refine.train.means=null`` freezes an attribute.
         Values are JSON; what is not JSON is taken as a string.

@@ -42,11 +42,11 @@ class TntSurface:
     stages : tuple of IcpStage
     max_points : int
         Of each cloud in a stage without a voxel.
-    share_change, rms_change : float
+    fraction_change, rms_change : float
         A stage ends when the share of paired points and their rms (m) change by less, both.
     score_voxel : float
         tau. Both clouds are thinned to it before they are scored.
-    min_camera_share, min_share, max_shift, max_scale_change : float
+    min_camera_fraction, min_fraction, max_shift, max_scale_change : float
         The self-check: share of inlier cameras, share of the mesh that the first stage pairs, how far the stages may
         move the mesh (tau), and by how much they may change its size.
     """
@@ -57,11 +57,13 @@ class TntSurface:
     # what runs, and only the share of paired points decides when to stop: at once where all are paired.
     stages: tuple[IcpStage, ...] = (IcpStage(1.0, 80.0, 30), IcpStage(0.5, 20.0, 30), IcpStage(None, 2.0, 30))  # [tnt]
     max_points: int = 4_000_000  # [tnt]
-    share_change: float = 1e-6  # [tnt]
+    fraction_change: float = 1e-6  # [tnt]
     rms_change: float = 20.0  # [tnt] in effect off
     score_voxel: float = 0.5  # [tnt]
-    min_camera_share: float = 0.75  # [d] all cameras of all scenes of the official logs agree when the frame is right
-    min_share: float = 0.5  # [d] at 80 tau (0.24 to 2 m) even a poor mesh lies beside the scan
+    min_camera_fraction: float = (
+        0.75  # [d] all cameras of all scenes of the official logs agree when the frame is right
+    )
+    min_fraction: float = 0.5  # [d] at 80 tau (0.24 to 2 m) even a poor mesh lies beside the scan
     max_shift: float = 20.0  # [d] the reach of the second stage
     max_scale_change: float = 0.05  # [d] pairing with scale alone shrinks a rough mesh by a few per cent
 
@@ -81,7 +83,7 @@ class DtuSurface:
     dilation : float
         px of an image ``dilation_width`` wide: the silhouettes that cull the mesh are widened by this radius.
     dilation_width : int
-    min_share : float
+    min_fraction : float
         The self-check: at least this part of the points lies within ``max_distance`` of the scan.
     """
 
@@ -91,7 +93,7 @@ class DtuSurface:
     max_distance: float = 20.0  # [dtu]
     dilation: float = 24.0  # [s] a disk of radius 24
     dilation_width: int = 1600  # [s] the hard-coded 1600 x 1200
-    min_share: float = 0.5  # [d]
+    min_fraction: float = 0.5  # [d]
 
 
 @dataclass(frozen=True)

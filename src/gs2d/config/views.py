@@ -14,8 +14,8 @@ class Exposure:
 
     Attributes
     ----------
-    rate, rate_final, horizon : float, float, int
-        Adam's rate decays log-linearly from ``rate`` to ``rate_final`` over ``horizon`` iterations of the run, all
+    rate, rate_final, decay_steps : float, float, int
+        Adam's rate decays log-linearly from ``rate`` to ``rate_final`` over ``decay_steps`` iterations of the run, all
         stages counted; a transform is updated when its photograph has its turn.
     start : int
         Learned when iteration of the run > start: colours need some to leave the grey that random points begin with.
@@ -30,7 +30,7 @@ class Exposure:
 
     rate: float = 0.05
     rate_final: float = 0.001
-    horizon: int = 30_000
+    decay_steps: int = 30_000
     start: int = 500
     prior: float = 0.001
     beta1: float = 0.9
@@ -40,7 +40,7 @@ class Exposure:
 
     def rate_at(self, iteration: int) -> float:
         """Rate at an iteration of the run (1-based): log-linear, then constant."""
-        return _decayed(self.rate, self.rate_final, iteration / self.horizon)
+        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps)
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class PoseRefinement:
 
     Attributes
     ----------
-    rate, rate_final, horizon : float, float, int
+    rate, rate_final, decay_steps : float, float, int
         Adam's rate, in rad and in shares of the scene's extent, decays log-linearly from ``rate`` to ``rate_final``
-        over ``horizon`` iterations of the run, all stages counted; a camera moves when its photograph has its turn.
+        over ``decay_steps`` iterations of the run, all stages counted; a camera moves when its photograph has its turn.
         A schedule of a tenth has a tenth of the turns, and 3.2 times the rates (``schedule``).
     start : int
         Learned when iteration of the run > start: before, the splats are no scene that could tell where cameras are.
@@ -63,7 +63,7 @@ class PoseRefinement:
 
     rate: float = 5e-4
     rate_final: float = 5e-6
-    horizon: int = 30_000
+    decay_steps: int = 30_000
     start: int = 500
     beta1: float = 0.9
     beta2: float = 0.99
@@ -71,12 +71,12 @@ class PoseRefinement:
 
     def rate_at(self, iteration: int) -> float:
         """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
-        return _decayed(self.rate, self.rate_final, iteration / self.horizon) if iteration > self.start else 0.0
+        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
 
 
-def _decayed(first: float, last: float, share: float) -> float:
+def _decayed(first: float, last: float, fraction: float) -> float:
     """Log-linear between the ends of [0, 1]."""
-    t = min(max(share, 0.0), 1.0)
+    t = min(max(fraction, 0.0), 1.0)
     return math.exp((1.0 - t) * math.log(first) + t * math.log(last))
 
 
@@ -88,7 +88,7 @@ def check_exposure(where: str, exposure: Exposure) -> None:
     for name in ("prior", "beta1", "beta2"):
         number(f"{where}.{name}", getattr(exposure, name), low=0.0)
     require(max(exposure.beta1, exposure.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
-    integer(f"{where}.horizon", exposure.horizon, low=1)
+    integer(f"{where}.decay_steps", exposure.decay_steps, low=1)
     integer(f"{where}.start", exposure.start, low=0)
     one_of(f"{where}.initial", exposure.initial, ("identity", "points"))
 
@@ -104,5 +104,5 @@ def check_poses(where: str, poses: PoseRefinement) -> None:
     for name in ("beta1", "beta2"):
         number(f"{where}.{name}", getattr(poses, name), low=0.0)
     require(max(poses.beta1, poses.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
-    integer(f"{where}.horizon", poses.horizon, low=1)
+    integer(f"{where}.decay_steps", poses.decay_steps, low=1)
     integer(f"{where}.start", poses.start, low=0)

@@ -92,7 +92,7 @@ class Camera:
 
     @property
     def center(self) -> np.ndarray:
-        """Camera centre in the world [3] wu."""
+        """Camera centre in the world [3] world units."""
         return np.asarray(-self.rotation.T @ self.T_cam_world[:3, 3])
 
     @property
@@ -126,12 +126,12 @@ class Camera:
 
         Parameters
         ----------
-        points : ndarray [P, 3] wu
+        points : ndarray [P, 3] world units
 
         Returns
         -------
         pixels : ndarray [P, 2] px
-        depth : ndarray [P] wu, along the optical axis (points behind the camera have depth <= 0)
+        depth : ndarray [P] world units, along the optical axis (points behind the camera have depth <= 0)
         """
         x = points @ self.rotation.T + self.T_cam_world[:3, 3]
         z = x[:, 2]

@@ -56,7 +56,7 @@ def check_shapes(arrays: Mapping[str, tuple[Any, str]]) -> dict[str, int]:
                 sizes[word], fixed_by[word] = size, name
         if not fits:
             names = [word for word, _ in words]
-            known = [f"{w}={sizes[w]} (from {fixed_by[w]})" for w in names if w in sizes and fixed_by[w] != name]
-            context = f" with {', '.join(known)}" if known else ""
+            valid = [f"{w}={sizes[w]} (from {fixed_by[w]})" for w in names if w in sizes and fixed_by[w] != name]
+            context = f" with {', '.join(valid)}" if valid else ""
             raise ShapeError(f"{name} must be [{', '.join(names)}]{context}, got {list(shape)}")
     return sizes

@@ -203,8 +203,8 @@ def mask_downscale(mask: np.ndarray, factor: int, *, need: float) -> np.ndarray:
     """Bool [H, W] to bool [H // n, W // n]: True where at least the share ``need`` of the n x n block is True."""
     if factor == 1:
         return mask
-    share = sum(part.astype(np.float64) for part in _block_parts(mask, factor)) / factor**2
-    return np.asarray(share >= need)
+    fraction = sum(part.astype(np.float64) for part in _block_parts(mask, factor)) / factor**2
+    return np.asarray(fraction >= need)
 
 
 def _block_parts(image: np.ndarray, factor: int) -> list[np.ndarray]:

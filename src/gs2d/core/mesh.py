@@ -15,7 +15,7 @@ class Mesh:
 
     Attributes
     ----------
-    vertices : ndarray [P, 3] float32 or float64, wu
+    vertices : ndarray [P, 3] float32 or float64, world units
     faces : ndarray [F, 3] int32
         Vertex indices, counter-clockwise seen from outside.
     colors : ndarray [P, 3] uint8 or None
@@ -37,7 +37,7 @@ class TexturedMesh:
 
     Attributes
     ----------
-    vertices : ndarray [P, 3] float, wu
+    vertices : ndarray [P, 3] float, world units
     normals : ndarray [P, 3] float32, unit
     faces : ndarray [F, 3] int32
         Vertex indices, counter-clockwise seen from outside.

@@ -19,12 +19,12 @@ class Splats:
 
     Attributes
     ----------
-    means : Tensor [N, 3] wu
+    means : Tensor [N, 3] world units
         Centres p (the paper's mu).
     quats : Tensor [N, 4]
         Rotations, (w, x, y, z), normalised where they are used. Columns of the matrix: t_u, t_v, normal t_w.
     log_scales : Tensor [N, 2]
-        log of s_u, s_v (wu), the standard deviations along t_u and t_v.
+        log of s_u, s_v (world units), the standard deviations along t_u and t_v.
     opacity_logits : Tensor [N]
         Opacity o = sigmoid(opacity_logits).
     sh0 : Tensor [N, 1, 3]
@@ -75,7 +75,7 @@ class Splats:
 
     @property
     def scales(self) -> Tensor:
-        """s_u, s_v [N, 2] wu."""
+        """s_u, s_v [N, 2] world units."""
         return self.log_scales.exp()
 
     @property

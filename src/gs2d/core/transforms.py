@@ -19,10 +19,10 @@ __all__ = [
     "camera_extent",
     "common_motion",
     "focus_point",
-    "moved",
     "nearest_distances",
+    "perturb_pose",
     "quats_to_matrices",
-    "rigid_motion",
+    "se3_exp",
     "similarity_motions",
     "up_direction",
 ]
@@ -52,14 +52,14 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
-def rigid_motion(motion: Tensor) -> Tensor:
+def se3_exp(motion: Tensor) -> Tensor:
     """The rigid motion of a twist: a rotation and a translation, exact and differentiable everywhere, 0 included.
 
     Parameters
     ----------
     motion : Tensor [6]
-        A rotation vector (axis times angle, rad), then a velocity (wu): the motion of a body that turns and moves at
-        these rates for one unit of time. Without rotation the velocity is the translation.
+        A rotation vector (axis times angle, rad), then a velocity (world units): the motion of a body that turns
+        and moves at these rates for one unit of time. Without rotation the velocity is the translation.
 
     Returns
     -------
@@ -73,8 +73,8 @@ def rigid_motion(motion: Tensor) -> Tensor:
     return torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows]))
 
 
-def moved(camera: Camera, motion: Tensor) -> Camera:
-    """The camera after a motion in its own frame: ``T_cam_world = rigid_motion(motion) @ camera.T_cam_world``.
+def perturb_pose(camera: Camera, motion: Tensor) -> Camera:
+    """The camera after a motion in its own frame: ``T_cam_world = se3_exp(motion) @ camera.T_cam_world``.
 
     The rotation is about the camera's own centre. Where ``motion`` (or the camera) requires a gradient the result
     carries it to ``gs2d.rasterize``.
@@ -83,10 +83,10 @@ def moved(camera: Camera, motion: Tensor) -> Camera:
     ----------
     camera : Camera
     motion : Tensor [6]
-        As for :func:`rigid_motion`; best float64, whose digits the camera keeps.
+        As for :func:`se3_exp`; best float64, whose digits the camera keeps.
     """
     pose = torch.as_tensor(camera.T_cam_world) if camera.pose is None else camera.pose
-    T = rigid_motion(motion)
+    T = se3_exp(motion)
     placed: Any = T @ pose.to(T)
     return replace(camera, T_cam_world=placed, pose=None)
 
@@ -99,7 +99,7 @@ def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
     poses : ndarray [V, 4, 4]
         T_cam_world.
     extent : float
-        wu.
+        World units.
 
     Returns
     -------
@@ -131,13 +131,13 @@ def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
 
     Parameters
     ----------
-    points : ndarray [P, 3] wu
+    points : ndarray [P, 3] world units
     k : int
         Neighbours; fewer are used where the set holds fewer.
 
     Returns
     -------
-    ndarray [P] float64, wu. Coincident points give 0: the caller sets a floor.
+    ndarray [P] float64, world units. Coincident points give 0: the caller sets a floor.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
 
     Returns
     -------
-    ndarray [3] wu
+    ndarray [3] world units
 
     Raises
     ------
@@ -199,7 +199,7 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera centre from the mean centre, wu (official 2DGS scene extent).
+    """1.1 x the largest distance of a camera centre from the mean centre, world units (official 2DGS scene extent).
 
     0 for a single camera: the caller chooses what stands in for it.
 

@@ -17,11 +17,11 @@ TRAINING, TESTING, NOTHING = "for training", "for testing", "distributed, but no
 FULL_SIZE = "for its folder, full size"  # photographs that are trained from a folder of smaller ones
 _DTU_2DGS = "get it from the preprocessed DTU of 2DGS (linked from github.com/hbb1/2d-gaussian-splatting)"
 _DTU_NEUS = "get it from the DTU scans of NeuS (data_DTU, linked from github.com/Totoro97/NeuS)"
-_PICTURES = {".png", ".jpg", ".jpeg"}
+_IMAGES = {".png", ".jpg", ".jpeg"}
 
 
 @dataclass(frozen=True)
-class Missing:
+class MissingFile:
     """A file that is not there.
 
     Attributes
@@ -42,7 +42,7 @@ class Missing:
         return f"{self.path} is missing ({self.purpose}): {self.source}"
 
 
-def whole_folders(pieces: Iterable[Missing]) -> tuple[Missing, ...]:
+def whole_folders(pieces: Iterable[MissingFile]) -> tuple[MissingFile, ...]:
     """The pieces, with one for a folder that is not there instead of one for each of its files."""
     named = (piece if piece.path.parent.is_dir() else replace(piece, path=piece.path.parent) for piece in pieces)
     return tuple(dict.fromkeys(named))
@@ -53,7 +53,7 @@ def has_dtu_cameras(root: Path) -> bool:
     return any((root / name).is_file() for name in CAMERA_FILES)
 
 
-def dtu_pieces(root: Path) -> list[Missing]:
+def dtu_pieces(root: Path) -> list[MissingFile]:
     """A DTU scan as 2DGS prepares it (``images``, ``mask``, ``sparse/0``, both archives) or as NeuS does (``image``).
 
     With one of the two archives the other is not needed.
@@ -64,12 +64,12 @@ def dtu_pieces(root: Path) -> list[Missing]:
     there = [path for path in archives if path.is_file()]
     missing = []
     if not there:
-        missing.append(Missing(archives[0], TRAINING, source))
+        missing.append(MissingFile(archives[0], TRAINING, source))
     elif ours:
-        missing += [Missing(path, NOTHING, source) for path in archives if path not in there]
+        missing += [MissingFile(path, NOTHING, source) for path in archives if path not in there]
     views = _archive_views(there[0]) if there else set()
-    pictures = next((root / name for name in ("image", "images") if (root / name).is_dir()), root / "images")
-    missing += _numbered(pictures, views, 6 if pictures.name == "images" else 3, TRAINING, source)
+    images = next((root / name for name in ("image", "images") if (root / name).is_dir()), root / "images")
+    missing += _numbered(images, views, 6 if images.name == "images" else 3, TRAINING, source)
     masks = next((root / name for name in ("mask", "masks") if (root / name).is_dir()), root / "mask")
     missing += _numbered(masks, views, 3, "to cull the surface", source)
     if ours:
@@ -87,25 +87,25 @@ def _archive_views(path: Path) -> set[int]:
     return {int(hit.group(1)) for name in names if (hit := re.fullmatch(r"world_mat_(\d+)\.npy", name))}
 
 
-def _numbered(folder: Path, views: set[int], digits: int, purpose: str, source: str) -> list[Missing]:
+def _numbered(folder: Path, views: set[int], digits: int, purpose: str, source: str) -> list[MissingFile]:
     """Files named by the number of their view, one for each view."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in _PICTURES] if folder.is_dir() else []
+    files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES] if folder.is_dir() else []
     numbers = {int(p.stem) for p in files if p.stem.isdigit()}
     suffix = files[0].suffix if files else ".png"
     width = len(files[0].stem) if files and files[0].stem.isdigit() else digits
     if files and not numbers:  # named otherwise: their count is all that can be said
         return []
-    return [Missing(folder / f"{n:0{width}}{suffix}", purpose, source) for n in sorted(views - numbers)]
+    return [MissingFile(folder / f"{n:0{width}}{suffix}", purpose, source) for n in sorted(views - numbers)]
 
 
-def _model_files(folder: Path, source: str, *, purpose: str = TRAINING) -> list[Missing]:
+def _model_files(folder: Path, source: str, *, purpose: str = TRAINING) -> list[MissingFile]:
     """The three files of a COLMAP model, binary unless one is text."""
     suffix = ".txt" if any(folder.glob("*.txt")) and not any(folder.glob("*.bin")) else ".bin"
     names = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
-    return [Missing(folder / name, purpose, source) for name in names if not (folder / name).is_file()]
+    return [MissingFile(folder / name, purpose, source) for name in names if not (folder / name).is_file()]
 
 
-def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[Missing]:
+def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[MissingFile]:
     """A COLMAP model in ``sparse/0`` and the photographs that it names, in each of the folders."""
     model, flat = root / "sparse" / "0", root / "sparse"
     if not model.is_dir() and any((*flat.glob("*.bin"), *flat.glob("*.txt"))):
@@ -118,17 +118,17 @@ def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[Missi
     last = tuple(folders)
     for folder in last:
         purpose = TRAINING if folder == last[-1] else FULL_SIZE
-        missing += [Missing(root / folder / n, purpose, source) for n in names if not (root / folder / n).is_file()]
+        missing += [MissingFile(root / folder / n, purpose, source) for n in names if not (root / folder / n).is_file()]
     return missing
 
 
-def blender_pieces(root: Path, source: str) -> list[Missing]:
+def blender_pieces(root: Path, source: str) -> list[MissingFile]:
     """A NeRF-Synthetic scene: three splits with the pictures that their lists name."""
     missing = []
     for split, purpose in (("train", TRAINING), ("test", TESTING), ("val", NOTHING)):
         listing = root / f"transforms_{split}.json"
         if not listing.is_file():
-            missing.append(Missing(listing, purpose, source))
+            missing.append(MissingFile(listing, purpose, source))
             continue
         data = read_json(listing)
         try:
@@ -136,7 +136,7 @@ def blender_pieces(root: Path, source: str) -> list[Missing]:
         except (KeyError, TypeError) as error:
             raise DataError(f"{listing} must hold frames with a file_path each, got another entry ({error})") from error
         for name in names:
-            path = root / (name if Path(name).suffix.lower() in _PICTURES else f"{name}.png")
+            path = root / (name if Path(name).suffix.lower() in _IMAGES else f"{name}.png")
             if not path.is_file():
-                missing.append(Missing(path, purpose, source))
+                missing.append(MissingFile(path, purpose, source))
     return missing

@@ -28,7 +28,7 @@ from gs2d.data.benchmark_pieces import (
     NOTHING,
     TESTING,
     TRAINING,
-    Missing,
+    MissingFile,
     blender_pieces,
     colmap_pieces,
     dtu_pieces,
@@ -75,7 +75,7 @@ class SceneFolder:
     facts: SceneFacts
     root: Path
     truth: Mapping[str, Path] = field(default_factory=dict)
-    missing: tuple[Missing, ...] = ()
+    missing: tuple[MissingFile, ...] = ()
 
     @property
     def can_train(self) -> bool:
@@ -117,18 +117,18 @@ def find_scenes(
     """
     if not data.is_dir():
         raise DataError(f"{data} must be a folder of {get_dataset(dataset).title}, got no such folder")
-    known = get_dataset(dataset)
-    wanted = [known.scene(name) for name in names] or list(known.scenes)
+    valid = get_dataset(dataset)
+    wanted = [valid.scene(name) for name in names] or list(valid.scenes)
     folders = list(_folders(data))
     found = []
     for facts in wanted:
-        root = next((folder for folder in folders if _is_scene(known, facts, folder)), None)
+        root = next((folder for folder in folders if _is_scene(valid, facts, folder)), None)
         if root is not None:
-            found.append(describe(known, facts, root, truth=truth))
+            found.append(describe(valid, facts, root, truth=truth))
         elif names:
             raise DataError(
-                f"{data} must hold the scene {facts.name} of {known.title}, got no such folder; "
-                f"{_capture_source(known)}"
+                f"{data} must hold the scene {facts.name} of {valid.title}, got no such folder; "
+                f"{_capture_source(valid)}"
             )
     return tuple(found)
 
@@ -176,11 +176,11 @@ def missing_lines(root: Path) -> tuple[str, ...]:
 
     Empty for anyone else's capture, and for one whose lists are broken: reading it says so.
     """
-    known = recognise(root)
-    if known is None:
+    valid = recognise(root)
+    if valid is None:
         return ()
     try:
-        pieces = describe(*known, root).missing
+        pieces = describe(*valid, root).missing
     except DataError:
         return ()
     return tuple(piece.line() for piece in pieces if piece.purpose not in (NOTHING, FULL_SIZE, SCORING))
@@ -188,7 +188,7 @@ def missing_lines(root: Path) -> tuple[str, ...]:
 
 def find_truth(
     dataset: DataSet, facts: SceneFacts, root: Path, folder: Path | None = None
-) -> tuple[dict[str, Path], tuple[Missing, ...]]:
+) -> tuple[dict[str, Path], tuple[MissingFile, ...]]:
     """The pieces of a scene's ground truth that are there, and those that are not.
 
     Parameters
@@ -226,7 +226,7 @@ def find_truth(
     else:
         return {}, ()
     lacking = tuple(
-        Missing(places[0] / name, SCORING, _TRUTH_SOURCES[dataset.name, what])
+        MissingFile(places[0] / name, SCORING, _TRUTH_SOURCES[dataset.name, what])
         for what, name in names.items()
         if what not in found
     )
@@ -241,10 +241,10 @@ def protocol_of(root: Path, scene_format: str, truth: Path | None = None) -> Pro
     ProtocolError
         Unknown format.
     """
-    known = recognise(root, truth)
-    if known is None or (known[0].name in _BY_NAME) != (scene_format == "colmap"):
+    valid = recognise(root, truth)
+    if valid is None or (valid[0].name in _BY_NAME) != (scene_format == "colmap"):
         return protocol_for(scene_format)
-    return get_protocol(known[1].protocol)
+    return get_protocol(valid[1].protocol)
 
 
 def dtu_truth_files(scan: int) -> dict[str, str]:
@@ -271,9 +271,9 @@ def published_log(root: Path, scene: str) -> Path:
     return root / tnt_truth_files(scene)["log"]
 
 
-def _published_log(facts: SceneFacts, root: Path) -> list[Missing]:
+def _published_log(facts: SceneFacts, root: Path) -> list[MissingFile]:
     path = published_log(root, facts.name)
-    return [] if path.is_file() else [Missing(path, "only to check the frame", _capture_source(TNT_SCENES))]
+    return [] if path.is_file() else [MissingFile(path, "only to check the frame", _capture_source(TNT_SCENES))]
 
 
 def _own_pieces(place: Path, names: Mapping[str, str]) -> int:

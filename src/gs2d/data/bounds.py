@@ -32,7 +32,7 @@ def scene_bounds(
 
     Returns
     -------
-    bounds : ndarray [2, 3] float64, wu
+    bounds : ndarray [2, 3] float64, world units
     notes : tuple of str
         What a user should know about a box that is a guess.
     """

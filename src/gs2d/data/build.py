@@ -16,7 +16,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.images import area_downscale, image_size, mask_downscale, read_image, read_mask
 from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
-from gs2d.data.cache import ImageCache, Picture
+from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.priors import (
     DEPTH_SUFFIXES,
     DEPTHS,
@@ -38,13 +38,13 @@ _LENSES = (0.01, 1e5)  # focal length / side: fields of view from 178.9 degrees 
 
 # Positions are float32: how far apart they may be in units of the extent. The smallest steps of training are 1e-6.
 _COARSE, _TOO_COARSE = 1e-5, 1e-3
-_FARTHEST = 1e12  # wu from the origin: cubes of it are float32 numbers still
+_FARTHEST = 1e12  # world units from the origin: cubes of it are float32 numbers still
 
 LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PosedImage:
     """What a data set says about one photograph that exists.
 
     Attributes
@@ -86,7 +86,7 @@ class Capture:
     """
 
     format: str
-    frames: tuple[Frame, ...]
+    frames: tuple[PosedImage, ...]
     points: PointCloud | None = None
     T_metric_scene: np.ndarray = field(default_factory=lambda: np.eye(4))
     default_test_every: int = 8
@@ -101,11 +101,11 @@ class Capture:
 class Decoder:
     """Reads one photograph: decode, undistort, downscale; with its masks."""
 
-    frame: Frame
+    frame: PosedImage
     downscale: int
     lens_maps: LensMaps
 
-    def __call__(self) -> Picture:
+    def __call__(self) -> DecodedImage:
         frame, k = self.frame, self.frame.intrinsics
         image = read_image(frame.path)
         if image.shape[:2] != (k.height, k.width):
@@ -118,22 +118,22 @@ class Decoder:
         if frame.alpha_is_silhouette and image.shape[2] == 4:
             object_mask = image[:, :, 3] >= 128 if object_mask is None else object_mask
             image = image[:, :, :3]
-        known = None
+        valid = None
         if k.lens is not None:
-            positions, valid = self.lens_maps(k)
-            known = valid
-            image = undistort_image(image, positions, valid)
-            mask = None if mask is None else valid & undistort_mask(mask, positions, need=1.0)
+            positions, inside = self.lens_maps(k)
+            valid = inside
+            image = undistort_image(image, positions, inside)
+            mask = None if mask is None else inside & undistort_mask(mask, positions, need=1.0)
             if object_mask is not None:
-                object_mask = valid & undistort_mask(object_mask, positions, need=0.5)
+                object_mask = inside & undistort_mask(object_mask, positions, need=0.5)
         if self.downscale > 1:
             image = area_downscale(image, self.downscale)
-            mask, known = (
-                None if pixels is None else mask_downscale(pixels, self.downscale, need=1.0) for pixels in (mask, known)
+            mask, valid = (
+                None if pixels is None else mask_downscale(pixels, self.downscale, need=1.0) for pixels in (mask, valid)
             )
             object_mask = None if object_mask is None else mask_downscale(object_mask, self.downscale, need=0.5)
-        mask, known = (None if pixels is None or pixels.all() else pixels for pixels in (mask, known))
-        return Picture(np.ascontiguousarray(image), known if mask is None else mask, object_mask, known)
+        mask, valid = (None if pixels is None or pixels.all() else pixels for pixels in (mask, valid))
+        return DecodedImage(np.ascontiguousarray(image), valid if mask is None else mask, object_mask, valid)
 
     def _read_mask(self, path: Path | None, need: float) -> np.ndarray | None:
         """A mask at the image's size: True where at least ``need`` of the pixel's area is white."""
@@ -187,7 +187,7 @@ def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np
     return T
 
 
-def fit_to_file(frame: Frame) -> Frame:
+def fit_to_file(frame: PosedImage) -> PosedImage:
     """The frame with intrinsics for the size that its file really has.
 
     Raises
@@ -261,7 +261,7 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
 
 
 def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tuple[str, ...]]:
-    """The extent, wu, and a note where 32-bit positions are coarse so far from the origin.
+    """The extent, world units, and a note where 32-bit positions are coarse so far from the origin.
 
     Raises
     ------
@@ -292,7 +292,7 @@ def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tupl
     return extent, (f"{what}: fine detail is lost; subtract an offset from the poses and points",)
 
 
-def _view(frame: Frame, factor: int, cache: ImageCache, lens_maps: LensMaps) -> View:
+def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps) -> View:
     k = frame.intrinsics
     if not all(_LENSES[0] <= f / side <= _LENSES[1] for f, side in ((k.fx, k.width), (k.fy, k.height))):
         raise DataError(
@@ -307,7 +307,7 @@ def _view(frame: Frame, factor: int, cache: ImageCache, lens_maps: LensMaps) -> 
     return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps)
 
 
-def _with_maps(frames: list[Frame], home: Path) -> tuple[list[Frame], tuple[str, ...]]:
+def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], tuple[str, ...]]:
     """The frames with the maps that lie in ``depths`` and ``normals``, and a note for each such folder."""
     found: dict[str, list[Path | None]] = {}
     for what, folder, suffixes in (("depth", DEPTHS, DEPTH_SUFFIXES), ("normal", NORMALS, NORMAL_SUFFIXES)):
@@ -328,7 +328,7 @@ def _with_maps(frames: list[Frame], home: Path) -> tuple[list[Frame], tuple[str,
 
 
 def _split(
-    frames: list[Frame], views: list[View], default_every: int, test_every: int | None, root: Path
+    frames: list[PosedImage], views: list[View], default_every: int, test_every: int | None, root: Path
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     if any(frame.split for frame in frames):
         is_test = [frame.split == "test" for frame in frames]
@@ -354,7 +354,7 @@ def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, tuple[
     return PointCloud(points.points[finite], None if points.colors is None else points.colors[finite]), (note,)
 
 
-def _lens_notes(frames: list[Frame]) -> tuple[str, ...]:
+def _lens_notes(frames: list[PosedImage]) -> tuple[str, ...]:
     lenses = {frame.intrinsics for frame in frames if frame.intrinsics.lens is not None}
     if not lenses:
         return ()

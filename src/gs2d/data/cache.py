@@ -15,7 +15,7 @@ TRIM_EVERY = 16  # pictures that are decoded between giving back what decoding l
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class DecodedImage:
     """One decoded photograph with its masks; the arrays are read-only because they are shared.
 
     Attributes
@@ -33,10 +33,10 @@ class Picture:
     image: np.ndarray
     mask: np.ndarray | None = None
     object_mask: np.ndarray | None = None
-    known: np.ndarray | None = None
+    valid: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for field in ("image", "mask", "object_mask", "known"):
+        for field in ("image", "mask", "object_mask", "valid"):
             array = getattr(self, field)
             if array is not None:
                 frozen = array.view()
@@ -46,7 +46,7 @@ class Picture:
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        arrays = [array for array in (self.image, self.mask, self.object_mask, self.known) if array is not None]
+        arrays = [array for array in (self.image, self.mask, self.object_mask, self.valid) if array is not None]
         return sum({array.ctypes.data: array.nbytes for array in arrays}.values())  # often mask is known
 
 
@@ -60,7 +60,7 @@ class ImageCache:
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = int(max_bytes)
-        self._pictures: OrderedDict[Hashable, Picture] = OrderedDict()
+        self._images: OrderedDict[Hashable, DecodedImage] = OrderedDict()
         self._nbytes = self._decoded = 0
         self._lock = threading.Lock()
 
@@ -70,31 +70,31 @@ class ImageCache:
         return self._nbytes
 
     def __len__(self) -> int:
-        return len(self._pictures)
+        return len(self._images)
 
     def clear(self) -> None:
         """Drop all pictures; they are decoded again when somebody asks."""
         with self._lock:
-            self._pictures.clear()
+            self._images.clear()
             self._nbytes = 0
 
-    def get(self, key: Hashable, decode: Callable[[], Picture]) -> Picture:
+    def get(self, key: Hashable, decode: Callable[[], DecodedImage]) -> DecodedImage:
         """The picture of ``key``, decoded if it is not held."""
         with self._lock:
-            held = self._pictures.get(key)
+            held = self._images.get(key)
             if held is not None:
-                self._pictures.move_to_end(key)
+                self._images.move_to_end(key)
                 return held
-        picture = decode()
+        image = decode()
         with self._lock:
             self._decoded += 1
             trims = self._decoded % TRIM_EVERY == 0
-            if key not in self._pictures and picture.nbytes <= self.max_bytes:
-                self._pictures[key] = picture
-                self._nbytes += picture.nbytes
+            if key not in self._images and image.nbytes <= self.max_bytes:
+                self._images[key] = image
+                self._nbytes += image.nbytes
                 while self._nbytes > self.max_bytes:
-                    _, dropped = self._pictures.popitem(last=False)
+                    _, dropped = self._images.popitem(last=False)
                     self._nbytes -= dropped.nbytes
         if trims:
             trim()
-        return picture
+        return image

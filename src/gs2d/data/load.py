@@ -70,11 +70,11 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         raise DataError(f"{root} must hold cameras that are written in the open, got {project}: {remedy}")
     lacking = missing_lines(root)
     hint = f"; as a scene of a known data set: {lacking[0]}" if lacking else ""
-    photographs = next((folder for folder in (root, root / "images") if _photographs(folder)), None)
-    if photographs is not None and not lacking:
+    images = next((folder for folder in (root, root / "images") if _images(folder)), None)
+    if images is not None and not lacking:
         raise DataError(
-            f"{root} must hold cameras, got {_photographs(photographs)} photographs without any; find them first: "
-            f"gs2d poses {shlex.quote(str(photographs))} --out CAPTURE, then train CAPTURE"
+            f"{root} must hold cameras, got {_images(images)} photographs without any; find them first: "
+            f"gs2d poses {shlex.quote(str(images))} --out CAPTURE, then train CAPTURE"
         )
     raise DataError(
         f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
@@ -84,7 +84,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     )
 
 
-def _photographs(folder: Path) -> int:
+def _images(folder: Path) -> int:
     """Files of a folder that are photographs by their names."""
     return sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) if folder.is_dir() else 0
 

@@ -31,7 +31,7 @@ LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
-class DepthMap:
+class PriorDepth:
     """Depths along the optical axis at the pixels of a photograph, as they were stored.
 
     Attributes
@@ -48,7 +48,7 @@ class DepthMap:
 
 @dataclass(frozen=True, eq=False)
 class PointsInView:
-    """Sparse points in a picture: ``pixels`` [M, 2] px and ``depth`` [M] wu along the optical axis."""
+    """Sparse points in a picture: ``pixels`` [M, 2] px and ``depth`` [M] world units along the optical axis."""
 
     pixels: np.ndarray
     depth: np.ndarray
@@ -60,7 +60,7 @@ class ObservedPoints:
 
     Attributes
     ----------
-    points : ndarray [P, 3] float64 wu
+    points : ndarray [P, 3] float64 world units
     error : ndarray [P] float64 px
         Mean reprojection error.
     track : ndarray [P] int64
@@ -111,7 +111,7 @@ class MapFiles:
     ----------
     depth, normal : Path or None
     unit : float or None
-        wu of a depth of 1 in the file, where the capture says so.
+        world units of a depth of 1 in the file, where the capture says so.
     metric : bool
         The capture says that its depths are a sensor's.
     """
@@ -142,7 +142,7 @@ class PriorMaps:
     camera: Camera
     lens_maps: LensMaps
 
-    def depth(self) -> DepthMap:
+    def depth(self) -> PriorDepth:
         """The depth map at the view's pixels.
 
         Raises
@@ -153,11 +153,11 @@ class PriorMaps:
         assert self.files.depth is not None
         values = read_depth(self.files.depth)
         whole = bool(np.issubdtype(values.dtype, np.integer))
-        known = np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
-        _check_shape("depth map", self.files.depth, known.shape, self.intrinsics)
-        factor = max(1, known.shape[1] // self.camera.width)
-        positions = self._positions(known.shape[1] / factor, known.shape[0] / factor)
-        return DepthMap(sample(shrink(known, factor), *positions), whole)
+        valid = np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+        _check_shape("depth map", self.files.depth, valid.shape, self.intrinsics)
+        factor = max(1, valid.shape[1] // self.camera.width)
+        positions = self._positions(valid.shape[1] / factor, valid.shape[0] / factor)
+        return PriorDepth(sample(shrink(valid, factor), *positions), whole)
 
     def normal(self) -> np.ndarray:
         """Normals [H, W, 3] float32 in the axes of the file, unit length; 0 where unknown.
@@ -254,10 +254,10 @@ def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
         normals = image[..., :3].astype(np.float32) / 127.5 - 1
         opaque = np.asarray(image[..., :3].any(axis=2) if image.shape[2] == 3 else image[..., 3] >= 128)
     length = np.linalg.norm(normals, axis=2)
-    known = opaque & (length > UNIT_LENGTH[0]) & (length < UNIT_LENGTH[1])
-    if not known.any():
+    valid = opaque & (length > UNIT_LENGTH[0]) & (length < UNIT_LENGTH[1])
+    if not valid.any():
         raise DataError(f"normal map {path} must hold unit vectors n as (n + 1) / 2 (or n in .npy), got none")
-    return np.asarray(np.where(known, 1 / np.maximum(length, 1e-6), 0)[..., None] * normals, dtype=np.float32)
+    return np.asarray(np.where(valid, 1 / np.maximum(length, 1e-6), 0)[..., None] * normals, dtype=np.float32)
 
 
 def _read_array(path: Path, what: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.core.images import composite
 from gs2d.core.memory import trim
-from gs2d.data.cache import ImageCache, Picture
+from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.priors import ObservedPoints, PriorMaps
 from gs2d.errors import DataError
 
@@ -40,7 +40,7 @@ class View:
 
     name: str
     camera: Camera
-    decode: Callable[[], Picture] = field(repr=False)
+    decode: Callable[[], DecodedImage] = field(repr=False)
     cache: ImageCache = field(repr=False, default_factory=lambda: ImageCache(0))
     path: Path | None = None
     maps: PriorMaps | None = None
@@ -53,18 +53,18 @@ class View:
         image: np.ndarray,
         mask: np.ndarray | None = None,
         object_mask: np.ndarray | None = None,
-        known: np.ndarray | None = None,
+        valid: np.ndarray | None = None,
     ) -> View:
         """A view of arrays in memory: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
-        if known is not None:
-            mask = known if mask is None else mask & known
-        picture = Picture(image, mask, object_mask, known)
+        if valid is not None:
+            mask = valid if mask is None else mask & valid
+        picture = DecodedImage(image, mask, object_mask, valid)
         return cls(name, camera, lambda: picture)
 
     def at(self, T_cam_world: np.ndarray) -> View:
         """The same photograph, taken from elsewhere; its picture stays in the cache of this one."""
         camera = replace(self.camera, T_cam_world=T_cam_world)
-        return View(self.name, camera, self._picture, path=self.path, maps=self.maps)
+        return View(self.name, camera, self._image, path=self.path, maps=self.maps)
 
     def image(self) -> np.ndarray:
         """The photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
@@ -74,21 +74,21 @@ class View:
         DataError
             The file does not decode, or is gone.
         """
-        return self._picture().image
+        return self._image().image
 
     def mask(self) -> np.ndarray | None:
         """Which pixels count, bool [H, W] (a fresh copy), or None if all do. False = ignore this pixel."""
-        mask = self._picture().mask
+        mask = self._image().mask
         return None if mask is None else mask.copy()
 
-    def known(self) -> np.ndarray | None:
+    def valid(self) -> np.ndarray | None:
         """Return where the photograph says anything, bool [H, W] (a fresh copy), or None if everywhere.
 
         False where undistortion reaches beyond the photograph: there ``image()`` is black, and nobody may learn it,
         score it or show it, whatever a protocol makes of masks.
         """
-        known = self._picture().known
-        return None if known is None else known.copy()
+        valid = self._image().valid
+        return None if valid is None else valid.copy()
 
     def usable(self, *, masks: bool) -> np.ndarray | None:
         """Return which pixels count where a protocol uses masks or does not, bool [H, W], or None if all do.
@@ -98,7 +98,7 @@ class View:
         masks : bool
             True: ``mask()``, which leaves out unknown pixels too; False: ``known()``.
         """
-        return self.mask() if masks else self.known()
+        return self.mask() if masks else self.valid()
 
     def object_mask(self) -> np.ndarray | None:
         """Where the object is, bool [H, W] (a fresh copy): a silhouette file (DTU), else alpha >= 0.5, else None.
@@ -106,34 +106,34 @@ class View:
         Unlike ``mask`` it says nothing about which pixels to train on: the background of DTU is trained and then
         left out of the surface.
         """
-        picture = self._picture()
-        if picture.object_mask is not None:
-            return picture.object_mask.copy()
-        return picture.image[:, :, 3] >= 128 if picture.image.shape[2] == 4 else None
+        image = self._image()
+        if image.object_mask is not None:
+            return image.object_mask.copy()
+        return image.image[:, :, 3] >= 128 if image.image.shape[2] == 4 else None
 
     def alpha(self) -> np.ndarray | None:
         """The alpha channel, float32 [H, W] in [0, 1], or None if the photograph has none."""
-        image = self._picture().image
+        image = self._image().image
         return np.divide(image[:, :, 3], np.float32(255), dtype=np.float32) if image.shape[2] == 4 else None
 
     def target(self, background: Sequence[float] | np.ndarray) -> np.ndarray:
         """What a rendering over ``background`` (3 floats in [0, 1]) should look like, float32 [H, W, 3] in [0, 1]."""
-        return composite(self._picture().image, background)
+        return composite(self._image().image, background)
 
-    def _picture(self) -> Picture:
+    def _image(self) -> DecodedImage:
         return self.cache.get(self, self._decode_checked)
 
-    def _decode_checked(self) -> Picture:
-        picture = self.decode()
+    def _decode_checked(self) -> DecodedImage:
+        image = self.decode()
         expected = (self.camera.height, self.camera.width)
-        masks = {"mask": picture.mask, "object mask": picture.object_mask, "mask of known pixels": picture.known}
-        for what, array in {"image": picture.image, **masks}.items():
+        masks = {"mask": image.mask, "object mask": image.object_mask, "mask of known pixels": image.valid}
+        for what, array in {"image": image.image, **masks}.items():
             if array is not None and array.shape[:2] != expected:
                 raise DataError(
                     f"the {what} of view {self.name} must be {expected[1]}x{expected[0]} like its camera, "
                     f"got {array.shape[1]}x{array.shape[0]}; did the file change since the scene was loaded?"
                 )
-        return picture
+        return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class PointCloud:
 
     Attributes
     ----------
-    points : ndarray [P, 3] float64 wu
+    points : ndarray [P, 3] float64 world units
     colors : ndarray [P, 3] uint8 sRGB, or None
     normals : ndarray [P, 3] or None
         Of the surface, unit, either way round; 0 where unknown.
@@ -178,9 +178,9 @@ class Scene:
         Sorted by name. ``test`` is empty where all views train.
     points : PointCloud or None
         Sparse points to start from.
-    extent : float, wu
+    extent : float, world units
         1.1 x the largest distance of a training camera from the mean of all of them (> 0).
-    bounds : ndarray [2, 3] float64, wu
+    bounds : ndarray [2, 3] float64, world units
         Smallest and largest corner of the box that the cameras look at.
     T_metric_scene : ndarray [4, 4] float64
         x_metric = T_metric_scene @ x_scene; for evaluation only (DTU: millimetres).

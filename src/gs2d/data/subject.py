@@ -29,7 +29,8 @@ SHOWN_BY = 0.5  # of the cameras that look at the object, in the pictures of whi
 FEW_INSIDE = 0.1  # of the cameras may stand within what they look at
 TAIL = 0.5  # per cent of the votes that may lie outside the box on each side
 MARGIN = 0.05  # of the box's longest side, on every side
-LARGEST = 1e12  # wu; of a box that is given: the mesh is made in 32-bit numbers, of which squares and cubes are taken
+# World units, of a box that is given: the mesh is made in 32-bit numbers, of which squares and cubes are taken.
+LARGEST = 1e12
 _STEPS = 20  # of mean shift
 _SEEDS = 16  # places that are tried
 
@@ -41,7 +42,7 @@ class Sight:
     Attributes
     ----------
     camera : Camera
-    points : ndarray [P, 3] wu
+    points : ndarray [P, 3] world units
         On the surface.
     weights : ndarray [P]
         Parts of the camera's vote; their sum is 1, or 0 where it sees nothing.
@@ -60,9 +61,9 @@ class Subject:
     ----------
     kind : str
         "object": a box that most cameras look at; "scene": no such place, the box is that of all they see.
-    low, high : ndarray [3] wu
+    low, high : ndarray [3] world units
         Corners of the box.
-    center : ndarray [3] wu
+    center : ndarray [3] world units
         The middle of the votes, which need not be that of the box.
     up : ndarray [3]
         Unit.
@@ -79,12 +80,12 @@ class Subject:
 
     @property
     def radius(self) -> float:
-        """Half the diagonal of the box, wu."""
+        """Half the diagonal of the box, world units."""
         return float(np.linalg.norm(self.high - self.low)) / 2
 
     @property
     def box(self) -> np.ndarray:
-        """Both corners [2, 3] wu."""
+        """Both corners [2, 3] world units."""
         return np.stack([self.low, self.high])
 
     def to_json(self) -> dict[str, Any]:
@@ -140,7 +141,7 @@ def read_subject(run: Path) -> Subject | None:
 
 
 def checked_box(box: Sequence[float], option: str) -> np.ndarray:
-    """Return both corners [2, 3] wu of a box x0 y0 z0 x1 y1 z1 that the user gave by an option.
+    """Return both corners [2, 3] world units of a box x0 y0 z0 x1 y1 z1 that the user gave by an option.
 
     Raises
     ------
@@ -179,7 +180,7 @@ def check_subject_box(box: Sequence[float] | None, others: Mapping[str, bool]) -
 
 
 def given_subject(box: Sequence[float], cameras: Sequence[Camera]) -> Subject:
-    """Return the object in a box (x0 y0 z0 x1 y1 z1, wu) that the user named.
+    """Return the object in a box (x0 y0 z0 x1 y1 z1, world units) that the user named.
 
     Raises
     ------
@@ -224,7 +225,7 @@ def find_subject(sights: Sequence[Sight]) -> Subject:
     size = frame_size([sight.camera for sight in voters], center)
     if not size > 0:
         return _scene(sights, up, "no place is looked at by most cameras")
-    looking = np.array([_share(sight, center, size) >= FAIR_PART for sight in voters])
+    looking = np.array([_fraction(sight, center, size) >= FAIR_PART for sight in voters])
     inside = np.mean([np.linalg.norm(camera.center - center) < 0.5 * size for camera in cameras])
     count = f"{int(looking.sum())} of {len(cameras)} cameras"
     if looking.sum() < MOST * len(cameras):
@@ -239,13 +240,13 @@ def find_subject(sights: Sequence[Sight]) -> Subject:
 
 
 def frame_size(cameras: Sequence[Camera], center: np.ndarray) -> float:
-    """Return half of what the shorter side of a picture spans at a place [3], wu: the median; 0 behind most cameras."""
+    """Return half of what an image's shorter side spans at a place [3] (world units; median; 0 behind most cameras)."""
     depths = np.array([float(camera.forward @ (center - camera.center)) for camera in cameras])
     halves = np.array([0.5 * min(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras])
     return max(float(np.median(depths * halves)), 0.0)
 
 
-def _share(sight: Sight, center: np.ndarray, radius: float) -> float:
+def _fraction(sight: Sight, center: np.ndarray, radius: float) -> float:
     """The part of a camera's votes in a ball."""
     near = ((sight.points - center) ** 2).sum(axis=1) <= radius**2
     return float(sight.weights[near].sum() / sight.weights.sum())
@@ -277,7 +278,7 @@ def _place(sights: Sequence[Sight]) -> np.ndarray:
 def _looked_at(sights: Sequence[Sight], center: np.ndarray) -> float:
     """How much cameras look at a place, from 0 to 1: the mean over cameras of their share within half the frame."""
     size = frame_size([sight.camera for sight in sights], center)
-    return float(np.mean([min(_share(sight, center, 0.7 * size), 0.5) for sight in sights])) * 2 if size > 0 else 0.0
+    return float(np.mean([min(_fraction(sight, center, 0.7 * size), 0.5) for sight in sights])) * 2 if size > 0 else 0.0
 
 
 def _weighted_median(points: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -161,9 +161,9 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
         A model that we do not undistort, another number of parameters, or values that are no camera.
     """
     if model not in _COLMAP_PINHOLE and model not in _COLMAP_LENSES:
-        known = ", ".join(sorted(_COLMAP_PINHOLE | set(_COLMAP_LENSES)))
+        valid = ", ".join(sorted(_COLMAP_PINHOLE | set(_COLMAP_LENSES)))
         raise DataError(
-            f"{camera} has the model {model}, which cannot be undistorted here (known: {known}); "
+            f"{camera} has the model {model}, which cannot be undistorted here (known: {valid}); "
             "run `colmap image_undistorter` and load its output"
         )
     single = model.startswith("SIMPLE_") or model in ("RADIAL", "RADIAL_FISHEYE")

@@ -105,7 +105,7 @@ class RobustFit:
     worst: float
 
     @property
-    def share(self) -> float:
+    def fraction(self) -> float:
         """Part of the pairs that are inliers."""
         return float(self.inliers.mean())
 
@@ -181,7 +181,7 @@ def _residuals(T: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndar
     return np.asarray(np.linalg.norm(apply(T, source) - target, axis=1))
 
 
-def _needed(share: float, sample: int, confidence: float) -> float:
+def _needed(fraction: float, sample: int, confidence: float) -> float:
     """Samples until one of inliers only has been seen with this confidence."""
-    good = float(share) ** sample
+    good = float(fraction) ** sample
     return math.inf if good <= 0 else 0 if good >= 1 else math.log(1 - confidence) / math.log1p(-good)

@@ -24,7 +24,7 @@ class SurfaceSamples:
 
 
 def face_areas(mesh: Mesh) -> np.ndarray:
-    """Area [F] of every face, wu^2."""
+    """Area [F] of every face, world units^2."""
     t = mesh.vertices.astype(np.float64)[mesh.faces]
     return np.asarray(0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1))
 
@@ -82,10 +82,10 @@ def distances_to_mesh(
     points = np.concatenate([t.mean(axis=1), spread.points])
     _, index = Cloud(points, workers=workers).nearest(queries, neighbours=_CANDIDATES)
     owner = np.concatenate([np.arange(len(t)), spread.faces, [0]])  # there may be fewer than eight points: any face
-    return _least_distances(queries, t, owner[index])
+    return _min_distances(queries, t, owner[index])
 
 
-def _least_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _min_distances(queries: np.ndarray, t: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Least distance [Q] of each query to some of the triangles [F, 3, 3], ``faces`` [Q, K]."""
     corners = _tensor(t)
     best = np.empty(len(queries))

@@ -135,7 +135,7 @@ def _score(points: np.ndarray, truth: DtuTruth, culled: float, protocol: DtuSurf
     near, back = np.isfinite(d2s), np.isfinite(s2d)
     dropped = (float(1 - near.mean()), float(1 - back.mean()))
     messages = []
-    if min(near.mean(), back.mean()) < protocol.min_share:
+    if min(near.mean(), back.mean()) < protocol.min_fraction:
         messages.append(
             f"{near.mean():.0%} of the mesh lies within {limit:g} mm of the scan and {back.mean():.0%} of the scan "
             "within it of the mesh: is scale_mat the one of these cameras, and the scan of this scene?"

@@ -24,7 +24,7 @@ class HiddenPoints:
     hidden: int
 
     @property
-    def share(self) -> float | None:
+    def fraction(self) -> float | None:
         """Hidden points as a fraction of those shown; None where no point is shown."""
         return self.hidden / self.shown if self.shown else None
 
@@ -34,7 +34,7 @@ def hidden_points(depth: np.ndarray, points: PointsInView, *, nearer: float = NE
 
     Parameters
     ----------
-    depth : ndarray [H, W] wu
+    depth : ndarray [H, W] world units
         Rendered median depth; 0 where nothing was hit, which hides nothing.
     points : PointsInView
         From :meth:`gs2d.data.priors.ObservedPoints.in_view`.

@@ -67,7 +67,7 @@ class IcpResult:
     Attributes
     ----------
     T_target_source : ndarray [4, 4]
-    share_before, share : float
+    fraction_before, share : float
         Part of the source with a target within the threshold, at the start and at the end.
     rms_before, rms : float or None
         Of the distances of those; None where there are none.
@@ -77,8 +77,8 @@ class IcpResult:
     """
 
     T_target_source: np.ndarray
-    share_before: float
-    share: float
+    fraction_before: float
+    fraction: float
     rms_before: float | None
     rms: float | None
     iterations: int
@@ -92,7 +92,7 @@ def icp(
     threshold: float,
     iterations: int,
     with_scale: bool = True,
-    share_change: float = 1e-6,
+    fraction_change: float = 1e-6,
     rms_change: float = math.inf,
     workers: int | None = None,
 ) -> IcpResult:
@@ -106,26 +106,26 @@ def icp(
         At most.
     with_scale : bool
         A similarity rather than a rigid motion.
-    share_change, rms_change : float
+    fraction_change, rms_change : float
         It has converged when the share of paired points and their rms change by less, both. The official Tanks and
         Temples script leaves the rms out in effect (it passes 20).
     """
     cloud = Cloud(target, workers=workers)
     T = np.eye(4)
     moved = np.asarray(source, np.float64)
-    share, rms, index, paired = _paired(cloud, moved, threshold)
-    first, done, converged = (share, rms), 0, False
+    fraction, rms, index, paired = _paired(cloud, moved, threshold)
+    first, done, converged = (fraction, rms), 0, False
     for done in range(1, iterations + 1):  # noqa: B007
         if paired.sum() < 3:
             break
         step = umeyama(moved[paired], cloud.points[index[paired]], with_scale=with_scale)
         T, moved = step @ T, apply(step, moved)
-        before = (share, rms)
-        share, rms, index, paired = _paired(cloud, moved, threshold)
-        if abs(before[0] - share) < share_change and abs(before[1] - rms) < rms_change:
+        before = (fraction, rms)
+        fraction, rms, index, paired = _paired(cloud, moved, threshold)
+        if abs(before[0] - fraction) < fraction_change and abs(before[1] - rms) < rms_change:
             converged = True
             break
-    return IcpResult(T, first[0], share, first[1] if first[0] else None, rms if share else None, done, converged)
+    return IcpResult(T, first[0], fraction, first[1] if first[0] else None, rms if fraction else None, done, converged)
 
 
 def _paired(cloud: Cloud, points: np.ndarray, threshold: float) -> tuple[float, float, np.ndarray, np.ndarray]:

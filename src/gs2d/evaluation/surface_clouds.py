@@ -12,7 +12,7 @@ from gs2d.core.images import write_image
 from gs2d.io.ply_format import write_ply
 
 GOOD, NEAR, FAR, OUT = (40, 150, 80), (235, 200, 60), (200, 40, 40), (150, 150, 160)
-PRECISION, RECALL, PICTURE = "precision.ply", "recall.ply", "surface.png"
+PRECISION, RECALL, IMAGE = "precision.ply", "recall.ply", "surface.png"
 _SIDE = 320  # px of one panel
 _FEW = 50_000  # points
 
@@ -62,11 +62,11 @@ def write_clouds(folder: Path, clouds: ScoredClouds) -> dict[str, str]:
             rows["xyz"[i]] = points[:, i]
             rows[("red", "green", "blue")[i]] = colors[:, i]
         write_ply(folder / name, {"vertex": rows})
-    write_image(folder / PICTURE, picture(clouds))
-    return {"precision_cloud": PRECISION, "recall_cloud": RECALL, "picture": PICTURE}
+    write_image(folder / IMAGE, draw_clouds(clouds))
+    return {"precision_cloud": PRECISION, "recall_cloud": RECALL, "picture": IMAGE}
 
 
-def picture(clouds: ScoredClouds) -> np.ndarray:
+def draw_clouds(clouds: ScoredClouds) -> np.ndarray:
     """Both clouds seen along x, y and z, uint8 [2 side, 3 side, 3]: above the reconstruction, below the truth.
 
     The frame is the truth's, a little widened: what floats far away must not shrink the rest to a dot.
@@ -82,9 +82,9 @@ def picture(clouds: ScoredClouds) -> np.ndarray:
     image = Image.fromarray(np.concatenate(rows))
     draw = ImageDraw.Draw(image)
     for row, (word, distances) in enumerate((("precision", clouds.mesh_distances), ("recall", clouds.truth_distances))):
-        share = f"{(distances < clouds.tau).mean():.3f}" if len(distances) else "nothing"
+        fraction = f"{(distances < clouds.tau).mean():.3f}" if len(distances) else "nothing"
         for column, axis in enumerate("xyz"):
-            text = f"{word} {share} within {clouds.tau:g}" if column == 0 else ""
+            text = f"{word} {fraction} within {clouds.tau:g}" if column == 0 else ""
             draw.text((column * _SIDE + 6, row * _SIDE + 4), f"along {axis}  {text}", fill=(0, 0, 0))
     return np.asarray(image)
 

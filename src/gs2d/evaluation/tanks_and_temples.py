@@ -35,8 +35,8 @@ class StageReport:
     voxel: float | None
     threshold: float
     points: int
-    share_before: float
-    share: float
+    fraction_before: float
+    fraction: float
     rms_before: float | None
     rms: float | None
     iterations: int
@@ -54,7 +54,7 @@ class Alignment:
         What is odd, one line each.
     cameras : int
         Cameras that were matched with the log.
-    camera_share : float
+    camera_fraction : float
         Part of them that agree within the protocol's threshold.
     camera_rms, camera_worst : float
         m, of those.
@@ -73,7 +73,7 @@ class Alignment:
     ok: bool
     messages: tuple[str, ...]
     cameras: int
-    camera_share: float
+    camera_fraction: float
     camera_rms: float
     camera_worst: float
     scale: float
@@ -229,7 +229,7 @@ def _stage(
         thin_target,
         threshold=stage.threshold * tau,
         iterations=stage.iterations,
-        share_change=protocol.share_change,
+        fraction_change=protocol.fraction_change,
         rms_change=protocol.rms_change,
         workers=workers,
     )
@@ -237,8 +237,8 @@ def _stage(
         None if stage.voxel is None else stage.voxel * tau,
         stage.threshold * tau,
         len(thin_source),
-        step.share_before,
-        step.share,
+        step.fraction_before,
+        step.fraction,
         step.rms_before,
         step.rms,
         step.iterations,
@@ -264,22 +264,22 @@ def _check(
     scale = similarity_scale(change)
     log, transform = f"{truth.scene}_COLMAP_SfM.log", f"{truth.scene}_trans.txt"
     wrong = []
-    if fit.share < protocol.min_camera_share:
+    if fit.fraction < protocol.min_camera_fraction:
         wrong.append(
-            f"only {fit.share:.0%} of the cameras agree with {log} within {protocol.camera_threshold:g} m: "
+            f"only {fit.fraction:.0%} of the cameras agree with {log} within {protocol.camera_threshold:g} m: "
             "is it the log of these photographs?"
         )
-    apart = not stages or stages[0].share < protocol.min_share
+    apart = not stages or stages[0].fraction < protocol.min_fraction
     if apart or shift is None or shift > protocol.max_shift or abs(scale - 1) > protocol.max_scale_change:
         what = (
-            f"{stages[0].share if stages else 0:.0%} of the mesh lies within {protocol.stages[0].threshold:g} tau "
+            f"{stages[0].fraction if stages else 0:.0%} of the mesh lies within {protocol.stages[0].threshold:g} tau "
             f"of the scan, after a shift of {'no' if shift is None else f'{shift:.1f}'} tau and a scale of {scale:.4f}"
         )
         trap = (
             f"the cameras fit {log}, the surface does not fit the scan: take {log} and {transform} from the official "
             "ground truth (TNT_GOF has a log of the same name, which for Truck is in another frame)"
         )
-        wrong.append(f"{what}; {trap if fit.share >= protocol.min_camera_share else 'the alignment failed'}")
+        wrong.append(f"{what}; {trap if fit.fraction >= protocol.min_camera_fraction else 'the alignment failed'}")
     elif alone is not None and alone > protocol.max_shift:
         messages = [
             *messages,
@@ -290,7 +290,7 @@ def _check(
         ok=not wrong,
         messages=(*wrong, *messages),
         cameras=len(fit.inliers),
-        camera_share=fit.share,
+        camera_fraction=fit.fraction,
         camera_rms=fit.rms,
         camera_worst=fit.worst,
         scale=similarity_scale(T),

@@ -13,7 +13,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.raycast import cast_camera
 
-_NEAR = 1e-9  # wu: whatever is before a camera hides, in captures of any unit
+_NEAR = 1e-9  # world units: whatever is before a camera hides, in captures of any unit
 
 
 def visible_counts(
@@ -27,8 +27,8 @@ def visible_counts(
 ) -> np.ndarray:
     """Count the views in which each point [P, 3] is visible, the mesh being the only thing that hides it.
 
-    A point is visible where it lies in the image and no deeper than ``tolerance`` wu behind the deepest of the 3x3
-    pixels around it: the neighbours spare surfaces seen at a slant, whose depth changes within a pixel.
+    A point is visible where it lies in the image and no deeper than ``tolerance`` world units behind the deepest of the
+    3x3 pixels around it: the neighbours spare surfaces seen at a slant, whose depth changes within a pixel.
 
     Parameters
     ----------

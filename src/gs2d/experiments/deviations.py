@@ -16,7 +16,7 @@ from gs2d.io.run_dir import machine, versions
 
 NERF_SYNTHETIC_SIZE = (800, 800)  # px
 SHOWN_PIECES = 5  # that a capture lacks
-EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by data set
+OFFICIAL_EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by data set
 
 
 def deviations_of(
@@ -73,12 +73,12 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
         "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
         "the low-pass filter wins: docs/decisions.md, Rasterizer"
     )
-    if any(scene.protocol.crossing == "cull" for scene in scenes):
+    if any(scene.protocol.near_plane_policy == "cull" for scene in scenes):
         yield (
             "splats that reach the camera plane are left out of that view, where the official rasterizer draws a part "
             "of them: docs/decisions.md, Rasterizer"
         )
-    if any(scene.protocol.crossing != "draw" for scene in scenes):
+    if any(scene.protocol.near_plane_policy != "draw" for scene in scenes):
         yield "splats that no training view sees are dropped at the end of a stage: docs/decisions.md, Rasterizer"
     if any(scene.data_set == DTU for scene in scenes):
         yield (
@@ -114,7 +114,7 @@ def _surfaces(results: Results) -> Iterator[str]:
     for row in results.rows:
         for cell in row.cells:
             surface = cell.details.get("surface") or {}
-            official = EVALUATORS.get(cell.data_set)
+            official = OFFICIAL_EVALUATORS.get(cell.data_set)
             if official is not None and surface.get("evaluator", official) != official:
                 yield (
                     f"{cell.scene}: its surface is scored by this project's visible-surface protocol, not by that of "

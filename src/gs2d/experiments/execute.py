@@ -24,7 +24,7 @@ from typing import Any
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import BackendError, Gs2dError
 from gs2d.io.run_dir import MESH, SPLATS, RunFolder, make_folder, now
-from gs2d.pipeline.events import Event, Missing, Notice, OnEvent, Phase, Step, ignore
+from gs2d.pipeline.events import Event, MissingFile, Notice, OnEvent, Phase, Step, ignore
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
 
 POLL_SECONDS = 0.5
@@ -142,8 +142,8 @@ def execute(
         gpus = gpu_count(backend)
         slots = min(slots or max(1, gpus), max(1, len(todo)))
         if slots > 1:
-            share = threads or max(1, available_cores() // slots)
-            todo = [replace(job, train=replace(job.train, threads=share)) for job in todo]
+            fraction = threads or max(1, available_cores() // slots)
+            todo = [replace(job, train=replace(job.train, threads=fraction)) for job in todo]
             _several_at_once(todo, on_event, slots, gpus, after_job)
             return
         for number, job in enumerate(todo, 1):
@@ -271,10 +271,10 @@ def train_and_evaluate(job: Job, on_event: OnEvent) -> dict[str, str]:
     from gs2d.pipeline.jobs import evaluate_run
     from gs2d.pipeline.train import train
 
-    missing: list[Missing] = []
+    missing: list[MissingFile] = []
 
     def listen(event: Event) -> None:
-        missing.extend([event] if isinstance(event, Missing) else [])
+        missing.extend([event] if isinstance(event, MissingFile) else [])
         on_event(event)
 
     train(job.train, listen)

@@ -23,12 +23,12 @@ from gs2d.pipeline.events import Notice, OnEvent, counted, ignore
 from gs2d.pipeline.exposure import photographed, read_exposures
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import Job, reload_job
-from gs2d.pipeline.render import choose_views, render_view, share_of_group, splatted
+from gs2d.pipeline.render import choose_views, fraction_of_group, render_view, splatted
 from gs2d.pipeline.resume import stage_end
 from gs2d.render.api import splat_errors
-from gs2d.report.images import ERROR_TOP, error_picture, error_scale, highlight_picture, known_picture
+from gs2d.report.images import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
 from gs2d.report.plots import Panel, compared, read_history
-from gs2d.training.exposure import as_photographed
+from gs2d.training.exposure import apply_exposure
 from gs2d.training.rank_clone import worst
 from gs2d.training.state import TrainState
 
@@ -182,7 +182,7 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
         seen, settings = splats, job.settings
         if view.name in transforms:  # those of the end: after stage 1 they hardly move
             transform = transforms[view.name].to(splats.means)
-            seen, settings = as_photographed(splats, view.camera, transform, settings)
+            seen, settings = apply_exposure(splats, view.camera, transform, settings)
         image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
         mask = view.usable(masks=job.protocol.use_mask_in_training)
         errors = splat_errors(
@@ -238,7 +238,7 @@ def error_positions(errors: Tensor, limits: tuple[float, float]) -> Tensor:
     return ((errors.clamp(min=1e-300) / low).log() / np.log(high / low)).clamp(0, 1)
 
 
-def map_picture(splats: Splats, positions: Tensor, view: View, job: Job, alpha: np.ndarray) -> np.ndarray:
+def map_image(splats: Splats, positions: Tensor, view: View, job: Job, alpha: np.ndarray) -> np.ndarray:
     """E_i splatted: each pixel has the colour of the mean position of its splats, over white; [H, W, 3]."""
     weighted = splatted(splats, positions, view, job.settings, job.backend)
     steps = error_scale(256)
@@ -261,27 +261,29 @@ def draw_error_maps(
     limits = map_limits(ranking.errors)
     positions = error_positions(ranking.errors, limits)
     shown = choose_views(job.scene, views)
-    shares = [share_of_group(ranking.splats, ranking.worst, v, job.settings, job.backend) for _, v in shown]
-    top = max(SMALLEST_TOP, *(float(np.percentile(share, 99.9)) for share in shares))  # these splats are often faint
+    fractions = [fraction_of_group(ranking.splats, ranking.worst, v, job.settings, job.backend) for _, v in shown]
+    top = max(
+        SMALLEST_TOP, *(float(np.percentile(fraction, 99.9)) for fraction in fractions)
+    )  # these splats are often faint
     rows: list[tuple[str, list[np.ndarray]]] = []
-    for (split, view), share in zip(shown, shares, strict=True):
+    for (split, view), fraction in zip(shown, fractions, strict=True):
         output = render_view(ranking.splats, view, job.settings, job.backend)
         own = photographed(view, output.color, transforms, job.settings.background)
         color, alpha = np.clip(own.cpu().numpy(), 0, 1), output.alpha.cpu().numpy()
         photo = view.target(job.settings.background)
-        pictures = [
-            known_picture(photo, view.known()),
+        images = [
+            valid_image(photo, view.valid()),
             color,
-            error_picture(color, photo, view.mask()),
-            map_picture(ranking.splats, positions, view, job, alpha),
-            highlight_picture(color, np.clip(share / top, 0, 1)),
+            error_image(color, photo, view.mask()),
+            map_image(ranking.splats, positions, view, job, alpha),
+            highlight_image(color, np.clip(fraction / top, 0, 1)),
         ]
-        rows.append((f"{Path(view.name).stem} ({split})", pictures))
+        rows.append((f"{Path(view.name).stem} ({split})", images))
     count = int(ranking.worst.sum())
-    share_of_all = float(ranking.errors[ranking.worst].sum() / ranking.errors.sum().clamp(min=1e-300))
+    fraction_of_all = float(ranking.errors[ranking.worst].sum() / ranking.errors.sum().clamp(min=1e-300))
     head = (
         f"{title}: $E_i$ {ranking.when}; {count:,} of {len(ranking.splats):,} splats are high-error, "
-        f"with {share_of_all:.0%} of the sum"
+        f"with {fraction_of_all:.0%} of the sum"
     )
     _write_grid(path, rows, head, limits, top)
 
@@ -309,9 +311,9 @@ def _write_grid(
     figure = Figure(figsize=(2.4 * len(COLUMNS), tall * len(rows) + 0.9), layout="constrained", dpi=110)
     FigureCanvasAgg(figure)
     grid: Any = figure.subplots(len(rows), len(COLUMNS), squeeze=False)
-    for i, (name, pictures) in enumerate(rows):
-        for j, (axes, picture) in enumerate(zip(grid[i], pictures, strict=True)):
-            axes.imshow(np.clip(picture, 0, 1), interpolation="none" if height > 100 else "nearest")
+    for i, (name, images) in enumerate(rows):
+        for j, (axes, image) in enumerate(zip(grid[i], images, strict=True)):
+            axes.imshow(np.clip(image, 0, 1), interpolation="none" if height > 100 else "nearest")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.spines[:].set_visible(False)

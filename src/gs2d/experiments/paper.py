@@ -80,7 +80,7 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
             threads=options.threads,
             backend=options.backend,
             before=lambda: write_json(options.out / ABOUT, about(plan, None, ())),
-            after_job=lambda _job: tabulate(plan, pictures=False),
+            after_job=lambda _job: tabulate(plan, images=False),
         )
     return tabulate(plan, on_event)
 
@@ -125,7 +125,7 @@ def _defining(options: PaperOptions) -> dict[str, Any]:
 
 
 # -- tabulating ------------------------------------------------------------------------------------------------------
-def tabulate(plan: Plan, on_event: OnEvent = ignore, *, pictures: bool = True) -> PaperResult:
+def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> PaperResult:
     """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
     unfinished = sum(job.outcome()["state"] not in ("done", "failed") for job in plan.jobs)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
@@ -145,7 +145,7 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, pictures: bool = True) -
         with atomic_write(out / name, "w") as file:
             file.write(text)
     files = [out / name for name in ("table.json", *texts, ABOUT)]
-    if pictures:
+    if images:
         files.append(write_page(plan.table, results, verdicts, deviations, commands, facts, out, on_event))
     return PaperResult(plan.table, tuple(files), results, verdicts, failures(plan.jobs), unfinished)
 

@@ -26,15 +26,15 @@ from gs2d.experiments.aggregate import FIGURES, Cell, Results, Row, Verdict
 from gs2d.experiments.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.io.run_dir import RENDERS
 from gs2d.pipeline.events import OnEvent, ignore
-from gs2d.report.html import drawing, page, picture
+from gs2d.report.html import drawing, image_tag, page
 
 DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 2, "seconds": 0}
 TITLES = {**METRICS, "bytes": "MB", "seconds": "s"}
 COSTS = ("bytes", "seconds")  # shown without a spread and without a best
 RUN_METRICS = ("psnr", "ssim", "lpips", "fscore", "chamfer")
 RUN_HEADS = ["row", "scene", "seed", *(METRICS[m] for m in RUN_METRICS), "splats", "PSNR at the clone", "MB", "s"]
-PICTURES = {"color": "Colour", "normal": "Normals", "error": "Error"}
-PICTURE_WIDTH = 300  # px
+IMAGES = {"color": "Colour", "normal": "Normals", "error": "Error"}
+IMAGE_WIDTH = 300  # px
 FIGURE_TITLES = {
     "traces": "Mean coverage K_a and mean opacity over the iterations",
     "changes": "How much each attribute changes an iteration",
@@ -338,11 +338,11 @@ def side_by_side(results: Results) -> list[dict[str, Any]]:
             if view is None:
                 continue
             photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view['file']}.png"
-            found[-1]["pictures"] = pictures = {}
-            for what, title in PICTURES.items():
-                first = _picture(photo, f"{scene}: photograph") if what == "color" else Markup("<div></div>")
-                others = [(name, _last_picture(run, view["file"], what)) for name, run in runs.items()]
-                pictures[title] = [first, *(_picture(p, f"{scene}, {name}: {title.lower()}") for name, p in others)]
+            found[-1]["images"] = images = {}
+            for what, title in IMAGES.items():
+                first = _image(photo, f"{scene}: photograph") if what == "color" else Markup("<div></div>")
+                others = [(name, _last_image(run, view["file"], what)) for name, run in runs.items()]
+                images[title] = [first, *(_image(p, f"{scene}, {name}: {title.lower()}") for name, p in others)]
     return found
 
 
@@ -357,14 +357,14 @@ def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
     return found
 
 
-def _last_picture(run: Path, file: str, what: str) -> Path:
+def _last_image(run: Path, file: str, what: str) -> Path:
     """A picture after the last stage that was drawn."""
     stages = read_json(run / RENDERS / "index.json")["stages"]
     return run / RENDERS / (stages[-1] if stages else "none") / f"{file}.{what}.png"
 
 
-def _picture(path: Path, alt: str) -> Markup:
-    found = picture(read_image(path), alt=alt, width=PICTURE_WIDTH) if path.exists() else '<div class="soft">none</div>'
+def _image(path: Path, alt: str) -> Markup:
+    found = image_tag(read_image(path), alt=alt, width=IMAGE_WIDTH) if path.exists() else '<div class="soft">none</div>'
     return Markup(found)
 
 
@@ -404,4 +404,4 @@ def _drawing(path: Path) -> Markup:
     title = FIGURE_TITLES.get(path.stem, MAP_TITLE)
     if path.suffix == ".svg":
         return Markup(drawing(path.read_text(encoding="utf-8"), title))
-    return Markup(picture(read_image(path), title, alt=title, width=1400))
+    return Markup(image_tag(read_image(path), title, alt=title, width=1400))

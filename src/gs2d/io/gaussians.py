@@ -12,7 +12,7 @@ import torch
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 
-FLAT_LOG_SCALE = math.log(1e-6)  # wu, the thickness that files of three scales are told
+FLAT_LOG_SCALE = math.log(1e-6)  # world units, the thickness that files of three scales are told
 _THIN = 0.25  # third scale / larger of the others: of disks that a file of few bits made thicker
 _FLAT = 0.99  # share of the Gaussians that must be disks
 
@@ -23,7 +23,7 @@ class Gaussians:
 
     Attributes
     ----------
-    means : ndarray [N, 3] wu
+    means : ndarray [N, 3] world units
     quats : ndarray [N, 4]
         (w, x, y, z).
     log_scales : ndarray [N, 3]
@@ -67,7 +67,7 @@ class Gaussians:
         thickest = self.log_scales[:, 2] - self.log_scales[:, :2].max(axis=1, initial=-np.inf)
         return bool((thickest <= math.log(_THIN)).mean() >= _FLAT) if len(self) else True
 
-    def disks(self, path: str | os.PathLike[str]) -> Splats:
+    def to_surfels(self, path: str | os.PathLike[str]) -> Splats:
         """The disks of a file ``path`` that flat splats were written to.
 
         Raises

@@ -32,7 +32,7 @@ _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987  # CLAMP_TO_EDGE, LINEAR, LINEAR_M
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """A point cloud as a file holds it: ``points`` [P, 3] float64 wu, ``colors`` and ``normals`` or None."""
+    """A point cloud as a file holds it: ``points`` [P, 3] float64 world units, ``colors`` and ``normals`` or None."""
 
     points: np.ndarray
     colors: np.ndarray | None = None  # [P, 3] uint8

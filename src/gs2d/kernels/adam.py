@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gs2d.errors import ShapeError
-from gs2d.kernels.library import Library, prepare
+from gs2d.kernels.library import Library, ready_library
 
 __all__ = ["AdamUpdate", "adam_step", "bias_corrections", "check_update", "first_not_finite"]
 
@@ -105,7 +105,7 @@ def adam_step(
     ShapeError
         If something has another shape, dtype or device.
     """
-    library = library or prepare()
+    library = library or ready_library()
     attributes = (_Attribute * len(updates))()
     alive = []  # what the pointers belong to
     for slot, update in zip(attributes, updates, strict=True):
@@ -143,7 +143,7 @@ def first_not_finite(tensors: Sequence[Tensor], *, library: Library | None = Non
     ShapeError
         If one is not of the library's dtype on the CPU.
     """
-    library = library or prepare()
+    library = library or ready_library()
     plain = [tensor.detach().contiguous() for tensor in tensors]
     for tensor in plain:
         if not tensor.is_cpu or tensor.dtype != library.dtype:

@@ -16,22 +16,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["LEAST_BYTES", "Recycler"]
+__all__ = ["MIN_BYTES", "BufferPool"]
 
-LEAST_BYTES = 32 << 20  # what glibc never keeps
+MIN_BYTES = 32 << 20  # what glibc never keeps
 LINE = 64  # bytes of a cache line
 PATIENCE = 64  # requests for which a free block is kept; an iteration makes 13 at most
 
 
-class Recycler:
+class BufferPool:
     """Hands out tensors and takes their memory back when nobody holds them, or a view of them, any more.
 
     A free block serves tensors of three quarters of its size and more. Where none fits, those of about that size are
     given up: splats were added or removed. Threads may share a recycler.
     """
 
-    def __init__(self, least_bytes: int = LEAST_BYTES) -> None:
-        self._least, self._requests = least_bytes, 0
+    def __init__(self, min_bytes: int = MIN_BYTES) -> None:
+        self._least, self._requests = min_bytes, 0
         self._lock = Lock()  # guards all but `_returned`: a block may come back in the middle of anything
         self._free: list[tuple[int, np.ndarray]] = []  # with the number of the request since when
         self._returned: deque[np.ndarray] = deque()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
-from gs2d.kernels.library import Library, prepare
+from gs2d.kernels.library import Library, ready_library
 
 __all__ = ["accumulate"]
 
@@ -33,7 +33,7 @@ def accumulate(
     ShapeError
         Shapes that differ, or another dtype or device than the library takes.
     """
-    library = library or prepare()
+    library = library or ready_library()
     columns = 4 if signal.dim() == 2 and signal.shape[1] == 4 else 2
     written = {"signed": signed, "absolute": absolute, "count": count}
     check_shapes(

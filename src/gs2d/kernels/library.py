@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from gs2d.errors import BackendError
-from gs2d.kernels.buffer_pool import Recycler
+from gs2d.kernels.buffer_pool import BufferPool
 
 ABI_VERSION = 6
 VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
@@ -54,7 +54,7 @@ class Library:
             raise BackendError(f"the CPU kernels {path.name} have version {version}, expected {ABI_VERSION}; {REMEDY}")
         self.path = path
         self.variant = variant
-        self.recycler = Recycler()
+        self.recycler = BufferPool()
         self._functions: dict[tuple[Any, ...], Any] = {}
         self.lanes = int(self._dll.gs2d_lanes())
         self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32
@@ -136,7 +136,7 @@ def _choose(folder: Path, wanted: str | None) -> Library:
     raise BackendError(f"CPU variant must be one of {', '.join(choices)}, got {wanted!r}; unset GS2D_CPU_VARIANT")
 
 
-def prepare() -> Library:
+def ready_library() -> Library:
     """``load()``, set to as many threads as torch uses: call it at the start of every native operation."""
     library = load()
     library.use_threads(torch.get_num_threads())
@@ -151,12 +151,12 @@ def library_for(tensor: torch.Tensor) -> Library | None:
     if not tensor.is_cpu or tensor.dtype != torch.float32:
         return None
     try:
-        return prepare()
+        return ready_library()
     except BackendError:
         return None
 
 
 def describe_library() -> str:
     """One line for ``gs2d doctor``: instruction set, pixels per vector, threads."""
-    library = prepare()
+    library = ready_library()
     return f"{library.instruction_set}, {library.lanes} pixels per vector, {library.threads} threads"

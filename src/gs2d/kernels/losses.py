@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
-from gs2d.kernels.library import Library, prepare
+from gs2d.kernels.library import Library, ready_library
 
 POINTER, INT64, DOUBLE, INT = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_int
 SIGNATURES: dict[str, list[Any]] = {
@@ -69,7 +69,7 @@ def blur(image: Tensor, *, library: Library | None = None) -> Tensor:
     ShapeError
         Another shape, dtype or device.
     """
-    library = library or prepare()
+    library = library or ready_library()
     sizes = check_shapes({"image": (image, "H W 3")})
     (source,) = _arrays(library, image=image)
     out = torch.empty_like(source)
@@ -157,7 +157,7 @@ def photometric(
     ShapeError
         Shapes that differ, or another dtype or device than the library takes.
     """
-    library = library or prepare()
+    library = library or ready_library()
     shapes = {"target": (target, "H W 3"), "rendered": (rendered, "H W 3")}
     if target_mean is not None:
         shapes["target_mean"] = (target_mean, "H W 3")
@@ -226,7 +226,7 @@ def normal_consistency(
     ----------
     normal : Tensor [H, W, 3]
         sum w n, world frame.
-    depth : Tensor [H, W] wu
+    depth : Tensor [H, W] world units
         0 where nothing was hit.
     alpha : Tensor [H, W]
     camera : Camera
@@ -243,7 +243,7 @@ def normal_consistency(
     ShapeError
         Shapes that differ, or another dtype or device than the library takes.
     """
-    library = library or prepare()
+    library = library or ready_library()
     shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
     if mask is not None:
         shapes["mask"] = (mask, "H W")
@@ -282,7 +282,7 @@ def masked_mean(values: Tensor, mask: Tensor | None = None, *, library: Library 
     ShapeError
         Shapes that differ, or another dtype or device than the library takes.
     """
-    library = library or prepare()
+    library = library or ready_library()
     check_shapes({"values": (values, "H W")} | ({"mask": (mask, "H W")} if mask is not None else {}))
     _arrays(library, values=values)
     mean: Tensor = _MaskedMean.apply(values.contiguous(), _mask_bytes(mask), library)

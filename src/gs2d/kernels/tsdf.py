@@ -65,9 +65,9 @@ def mark_on_cpu(
     ----------
     library : Library
     rays : ndarray [3, P] float64
-        In halves of a block for a depth of 1 wu, as all places here are.
-    depth : ndarray [P] float64 wu
-    offsets : ndarray [S] float64 wu
+        In halves of a block for a depth of 1 world unit, as all places here are.
+    depth : ndarray [P] float64 world units
+    offsets : ndarray [S] float64 world units
     start, end : ndarray [3]
         Of the rays; of the grid, which begins at 0.
     marks : ndarray [X, Y, Z] bool

@@ -28,10 +28,10 @@ from gs2d.kernels import losses as ops
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda import losses as cuda_ops
 from gs2d.losses import multiview, priors, reference
-from gs2d.losses.multiview import Neighbour, TwoViews
+from gs2d.losses.multiview import Neighbour, ViewPair
 from gs2d.losses.priors import Prior
 from gs2d.losses.reference import normals_from_depth
-from gs2d.render.pose_gradient import turning_normals
+from gs2d.render.pose_gradient import normals_without_pose_grad
 from gs2d.render.types import RenderOutput
 
 __all__ = ["LOSSES", "LossInputs", "TargetMaps", "compute_losses", "normals_from_depth", "target_maps"]
@@ -132,17 +132,17 @@ class LossInputs:
     silhouette: Tensor | None = None
     neighbour: Neighbour | None = None
     prior: Prior | None = None
-    _compared: dict[str, TwoViews] = field(default_factory=dict)
+    _compared: dict[str, ViewPair] = field(default_factory=dict)
 
-    def two_views(self, depth_kind: str) -> TwoViews:
+    def two_views(self, depth_kind: str) -> ViewPair:
         """The view beside its neighbour, by mean or median depth; shared by the losses that ask."""
         if self.neighbour is None:
             raise RecipeError("losses of two views need a neighbour, got none; pass one or take a recipe without them")
         if depth_kind not in self._compared:
-            depth, output, here = self.output.depth(depth_kind), self.output, self.neighbour.here
+            depth, output, reference = self.output.depth(depth_kind), self.output, self.neighbour.reference
             hit = (output.alpha.detach() > self.neighbour.settings.opacity) & (depth.detach() > 0)
-            self._compared[depth_kind] = TwoViews(
-                depth, output.normal, hit & here.textured, self.camera, self.neighbour, self.mask
+            self._compared[depth_kind] = ViewPair(
+                depth, output.normal, hit & reference.textured, self.camera, self.neighbour, self.mask
             )
         return self._compared[depth_kind]
 
@@ -160,7 +160,7 @@ LossFunction = Callable[[LossInputs, str], Tensor]
 def _normals(inputs: LossInputs, depth_kind: str) -> tuple[Tensor, Tensor, Tensor, Camera, Tensor | None]:
     output, pose, normal = inputs.output, inputs.camera.pose, inputs.output.normal
     if pose is not None and normal.requires_grad:
-        normal = turning_normals(output, pose)  # both normals turn with the camera, which changes nothing
+        normal = normals_without_pose_grad(output, pose)  # both normals turn with the camera, which changes nothing
     return normal, output.depth(depth_kind), output.alpha, inputs.camera, inputs.mask
 
 

@@ -24,13 +24,13 @@ from torch.autograd.function import once_differentiable
 from gs2d.config.multiview import MultiView
 from gs2d.core.camera import Camera
 
-LEAST_COSINE = 0.1  # between normal and ray: a plane seen more edge-on than this is no plane to warp by
-LEAST_SCALE = 0.1  # depth in the neighbour in that here: below, the patch comes too close to the neighbour's camera
-LEAST_NORMAL = 1e-4  # length of a rendered normal that has a direction
+MIN_COSINE = 0.1  # between normal and ray: a plane seen more edge-on than this is no plane to warp by
+MIN_SCALE = 0.1  # depth in the neighbour in that here: below, the patch comes too close to the neighbour's camera
+MIN_NORMAL = 1e-4  # length of a rendered normal that has a direction
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class PatchImage:
     """A photograph as patches see it.
 
     Attributes
@@ -53,7 +53,7 @@ class Photograph:
         return self.grey.nbytes + self.clear.nbytes + self.textured.nbytes
 
 
-def prepare(image: Tensor, usable: Tensor | None, settings: MultiView) -> Photograph:
+def prepare_image(image: Tensor, usable: Tensor | None, settings: MultiView) -> PatchImage:
     """The patches of a photograph.
 
     Parameters
@@ -69,7 +69,7 @@ def prepare(image: Tensor, usable: Tensor | None, settings: MultiView) -> Photog
     clear = torch.zeros(height, width, dtype=torch.bool, device=grey.device)
     textured = clear.clone()
     if min(height, width) < side:
-        return Photograph(grey, clear, textured)
+        return PatchImage(grey, clear, textured)
     inner = slice(settings.radius, -settings.radius)
     if usable is None:
         clear[inner, inner] = True
@@ -79,7 +79,7 @@ def prepare(image: Tensor, usable: Tensor | None, settings: MultiView) -> Photog
     centred = (grey - grey.mean())[None, None]  # the square of a mean takes fewer digits then
     mean, square = F.avg_pool2d(centred, side, stride=1), F.avg_pool2d(centred * centred, side, stride=1)
     textured[inner, inner] = (square - mean * mean)[0, 0] > settings.texture**2
-    return Photograph(grey, clear, textured & clear)
+    return PatchImage(grey, clear, textured & clear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,19 +88,19 @@ class Neighbour:
 
     Attributes
     ----------
-    here, there : Photograph
+    reference, source : Photograph
         Of the view that is learned from, and of its neighbour.
     camera : Camera
         The neighbour's.
-    depth : Tensor [h, w] wu
+    depth : Tensor [h, w] world units
         As it is rendered for the neighbour; 0 where nothing is hit. Never gets a gradient.
     draws : Tensor [P]
         Uniform in [0, 1); of P equal shares of the pixels that can be asked, the k-th draw chooses from the k-th.
     settings : MultiView
     """
 
-    here: Photograph
-    there: Photograph
+    reference: PatchImage
+    source: PatchImage
     camera: Camera
     depth: Tensor
     draws: Tensor
@@ -130,8 +130,8 @@ def choose_pixels(candidates: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
     """
     ranks_here = candidates.flatten().cumsum(0, dtype=torch.int32)
     count = ranks_here[-1]
-    share = (torch.arange(len(draws), device=draws.device) + draws.double()) / len(draws)
-    rank = torch.minimum((share * count).int(), count - 1)  # sorted, so what is there twice is there side by side
+    fraction = (torch.arange(len(draws), device=draws.device) + draws.double()) / len(draws)
+    rank = torch.minimum((fraction * count).int(), count - 1)  # sorted, so what is there twice is there side by side
     index = torch.searchsorted(ranks_here, rank + 1).clamp(max=candidates.numel() - 1)
     again = torch.zeros_like(rank, dtype=torch.bool)
     again[1:] = rank[1:] == rank[:-1]
@@ -139,12 +139,12 @@ def choose_pixels(candidates: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @dataclass(frozen=True, eq=False)
-class TwoViews:
+class ViewPair:
     """The surface of one view at P pixels, as its neighbour sees it.
 
     Parameters
     ----------
-    depth : Tensor [H, W] wu
+    depth : Tensor [H, W] world units
     normal : Tensor [H, W, 3]
         World frame, any length.
     candidates : Tensor [H, W] bool
@@ -184,12 +184,12 @@ class TwoViews:
     @cached_property
     def _motion(self) -> tuple[Tensor, Tensor]:
         """Rotation [3, 3] and translation [3] from this camera to the neighbour's; gradient to a pose that learns."""
-        there, pose = self.neighbour.camera.T_cam_world, self.camera.pose
+        source, pose = self.neighbour.camera.T_cam_world, self.camera.pose
         if pose is None:
-            T = there @ np.linalg.inv(self.camera.T_cam_world)
+            T = source @ np.linalg.inv(self.camera.T_cam_world)
             return _on(T[:3, :3], self.depth), _on(T[:3, 3], self.depth)
-        rotation = _on(there[:3, :3], pose) @ pose[:3, :3].T
-        translation = _on(there[:3, 3], pose) - rotation @ pose[:3, 3]
+        rotation = _on(source[:3, :3], pose) @ pose[:3, :3].T
+        translation = _on(source[:3, 3], pose) - rotation @ pose[:3, 3]
         return rotation.to(self.depth), translation.to(self.depth)
 
     @cached_property
@@ -205,14 +205,14 @@ class TwoViews:
         Gradient to ``depth``, by the place in the neighbour's image at which its depth is read.
         """
         rotation, translation = self._motion
-        there = self.neighbour.camera
+        source = self.neighbour.camera
         points = (self._hits[:, None] * self._rays) @ rotation.T + translation
-        front = points[:, 2] > LEAST_SCALE * self._hits.detach()
+        front = points[:, 2] > MIN_SCALE * self._hits.detach()
         z = torch.where(front, points[:, 2], torch.ones_like(points[:, 2]))
         rays = torch.stack([points[:, 0] / z, points[:, 1] / z, torch.ones_like(z)], dim=1)
-        u, v, _ = (rays @ _on(_to_unit(there).T, rays)).unbind(dim=1)
+        u, v, _ = (rays @ _on(_to_unit(source).T, rays)).unbind(dim=1)
         met = _Sampled.at(self.neighbour.depth, u, v).value
-        seen = front & (met > 0) & _inside(u, v, self.neighbour.depth) & _looked_up(self.neighbour.there.clear, u, v)
+        seen = front & (met > 0) & _inside(u, v, self.neighbour.depth) & _looked_up(self.neighbour.source.clear, u, v)
         back = (met[:, None] * rays - translation) @ rotation
         behind = back[:, 2] <= 0
         scale = torch.where(behind, torch.ones_like(met), back[:, 2])
@@ -228,20 +228,20 @@ class TwoViews:
         counts = back & (error < self.neighbour.settings.occluded)
         return torch.where(counts, torch.exp(-error), torch.zeros_like(error))
 
-    def mean_of(self, values: Tensor, known: Tensor) -> Tensor:
+    def mean_of(self, values: Tensor, valid: Tensor) -> Tensor:
         """Mean of ``weights * values`` over all pixels, from the P that were asked; 0 where nothing is known."""
-        weighted = torch.where(known & (self.weights > 0), self.weights * values, torch.zeros_like(values))
+        weighted = torch.where(valid & (self.weights > 0), self.weights * values, torch.zeros_like(values))
         pixels = self.depth.numel() if self.mask is None else self.mask.sum().clamp(min=1)
-        share = self.candidates.sum() / pixels
-        return weighted.sum() / self._pixels[1].sum().clamp(min=1) * share
+        fraction = self.candidates.sum() / pixels
+        return weighted.sum() / self._pixels[1].sum().clamp(min=1) * fraction
 
     @cached_property
     def similarity(self) -> tuple[Tensor, Tensor]:
         """NCC [P] of the patches here and there, and where it is one; gradient to depth and normal."""
         maps, planar = self._homographies
-        here, there = self.neighbour.here.grey, self.neighbour.there.grey
-        ncc, known = _PatchSimilarity.apply(maps, here, there, self._pixels[0], self.neighbour.settings)
-        return ncc, known & planar & self._pixels[1]
+        reference, source = self.neighbour.reference.grey, self.neighbour.source.grey
+        ncc, valid = _PatchSimilarity.apply(maps, reference, source, self._pixels[0], self.neighbour.settings)
+        return ncc, valid & planar & self._pixels[1]
 
     @cached_property
     def _homographies(self) -> tuple[Tensor, Tensor]:
@@ -256,8 +256,8 @@ class TwoViews:
         normal = torch.where(chosen[:, None], normal, torch.zeros_like(normal)) @ self._rotation.T
         length = normal.square().sum(dim=1)
         along = (normal * rays).sum(dim=1)  # negative: normals face the camera
-        steep = along.square() > LEAST_COSINE**2 * length * rays.square().sum(dim=1)
-        planar = steep & (along < 0) & (length > LEAST_NORMAL**2)
+        steep = along.square() > MIN_COSINE**2 * length * rays.square().sum(dim=1)
+        planar = steep & (along < 0) & (length > MIN_NORMAL**2)
         offset = torch.where(planar, self._hits * along, torch.ones_like(along))
         slope = torch.where(planar[:, None], normal, torch.zeros_like(normal)) / offset[:, None]
         # A = R + t n^T / (n . X): a ray r of this camera goes to A r of the neighbour's, for every point of the plane.
@@ -272,33 +272,33 @@ class _PatchSimilarity(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, maps: Tensor, here: Tensor, there: Tensor, index: Tensor, settings: MultiView
+        ctx: Any, maps: Tensor, reference: Tensor, source: Tensor, index: Tensor, settings: MultiView
     ) -> tuple[Tensor, Tensor]:
         """NCC [P] and bool [P] whether there is one, of maps [P, 3, 3], greys [H, W] and [h, w] and pixels [P]."""
-        offsets, jumps = _offsets(settings.radius, here.shape[1], maps)  # [3, S], [S]
+        offsets, jumps = _offsets(settings.radius, reference.shape[1], maps)  # [3, S], [S]
         side, least = settings.side, settings.texture**2 * len(jumps)
-        around = (index[:, None] + jumps).clamp_(0, here.numel() - 1)  # for pixels that are not chosen
-        mine = torch.take(here, around)  # [P, S]
+        around = (index[:, None] + jumps).clamp_(0, reference.numel() - 1)  # for pixels that are not chosen
+        mine = torch.take(reference, around)  # [P, S]
         mine -= mine.mean(dim=1, keepdim=True)
         x, y, z = (maps @ offsets).unbind(dim=1)  # [P, S] each
         corners = slice(None, None, side - 1)  # a square stays convex: all of it is where its corners are
-        front = (z.unflatten(1, (side, side))[:, corners, corners] > LEAST_SCALE).flatten(1).all(dim=1)
-        inverse = z.clamp_(min=LEAST_SCALE).reciprocal_()
+        front = (z.unflatten(1, (side, side))[:, corners, corners] > MIN_SCALE).flatten(1).all(dim=1)
+        inverse = z.clamp_(min=MIN_SCALE).reciprocal_()
         u, v = x.mul_(inverse), y.mul_(inverse)
         at_u, at_v = (place.unflatten(1, (side, side))[:, corners, corners] for place in (u, v))
-        inside = _inside(at_u, at_v, there).flatten(1).all(dim=1)
-        theirs, pull = _sample(there, u, v)
+        inside = _inside(at_u, at_v, source).flatten(1).all(dim=1)
+        theirs, pull = _sample(source, u, v)
         theirs -= theirs.mean(dim=1, keepdim=True)
         squares_mine, squares = (torch.linalg.vector_norm(grey, dim=1).square() for grey in (mine, theirs))
         scale_mine, scale = squares_mine.clamp(min=least).rsqrt(), squares.clamp(min=least / 4).rsqrt()
         ncc = (mine * theirs).sum(dim=1) * scale_mine * scale
-        known = front & inside & (squares_mine > least) & (squares > least / 4)
+        valid = front & inside & (squares_mine > least) & (squares > least / 4)
         by_grey = mine.mul_((scale_mine * scale)[:, None]).sub_(theirs.mul_((ncc * scale.square())[:, None]))
         by_x, by_y = pull(by_grey.mul_(inverse))
         by_z = u.mul_(by_x).addcmul_(v, by_y).neg_()
         ctx.save_for_backward(torch.stack([by @ offsets.T for by in (by_x, by_y, by_z)], dim=1))  # [P, 3, 3]
-        ctx.mark_non_differentiable(known)
-        return ncc, known
+        ctx.mark_non_differentiable(valid)
+        return ncc, valid
 
     @staticmethod
     @once_differentiable
@@ -314,13 +314,13 @@ def _offsets(radius: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([right, down, torch.ones_like(down)]).to(like.dtype), down * width + right
 
 
-def photometric(views: TwoViews) -> Tensor:
+def photometric(views: ViewPair) -> Tensor:
     """Mean of ``weight * (1 - NCC)``; pixels that cannot be asked or do not count are 0 there."""
-    ncc, known = views.similarity
-    return views.mean_of(1 - ncc, known)
+    ncc, valid = views.similarity
+    return views.mean_of(1 - ncc, valid)
 
 
-def geometric(views: TwoViews) -> Tensor:
+def geometric(views: ViewPair) -> Tensor:
     """Mean of ``weight * error`` of the round trip, px; pixels that cannot be asked or do not count are 0 there."""
     return views.mean_of(*views.round_trip)
 

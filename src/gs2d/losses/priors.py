@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gs2d.losses.reference import fill_ignored, masked_mean
 
-LEAST_POINTS = 100  # fewer points than these do not weigh as much as a whole picture
+MIN_POINTS = 100  # fewer points than these do not weigh as much as a whole picture
 FIT_PIXELS = 4_000  # of a relative map, about, that its scale and shift are fitted by
 FIT_ROUNDS = 4
 
@@ -28,7 +28,7 @@ class PointDepths:
         The four pixels around each point, as places in the flattened picture.
     weights : Tensor [M, 4]
         Of their disparities: bilinear, which is exact on a plane.
-    depth : Tensor [M] wu
+    depth : Tensor [M] world units
     """
 
     pixels: Tensor
@@ -42,22 +42,22 @@ class PointDepths:
 
 
 @dataclass(frozen=True, eq=False)
-class KnownDepths:
+class MetricDepth:
     """A depth map in units of the scene.
 
     Attributes
     ----------
-    disparity : Tensor [H, W], 1 / wu
+    disparity : Tensor [H, W], 1 / world unit
     known : Tensor [H, W] bool
     """
 
     disparity: Tensor
-    known: Tensor
+    valid: Tensor
 
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        return self.disparity.nbytes + self.known.nbytes
+        return self.disparity.nbytes + self.valid.nbytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,17 +74,17 @@ class RelativeDepths:
     """
 
     values: Tensor
-    known: Tensor
+    valid: Tensor
     space: str
 
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        return self.values.nbytes + self.known.nbytes
+        return self.values.nbytes + self.valid.nbytes
 
 
 @dataclass(frozen=True, eq=False)
-class KnownNormals:
+class NormalTarget:
     """Unit normals in the world.
 
     Attributes
@@ -96,15 +96,15 @@ class KnownNormals:
     """
 
     directions: Tensor
-    known: Tensor
+    valid: Tensor
 
     @property
     def nbytes(self) -> int:
         """Bytes of all tensors."""
-        return self.directions.nbytes + self.known.nbytes
+        return self.directions.nbytes + self.valid.nbytes
 
 
-Depths = PointDepths | KnownDepths | RelativeDepths
+Depths = PointDepths | MetricDepth | RelativeDepths
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,41 +113,41 @@ class Prior:
 
     Attributes
     ----------
-    depth : PointDepths, KnownDepths, RelativeDepths or None
-    normal : KnownNormals or None
+    depth : PointDepths, MetricDepth, RelativeDepths or None
+    normal : NormalTarget or None
     opacity : float
         Least rendered alpha of a pixel whose depth is asked.
     noise : float
         Relative error of a known depth that is to be expected.
-    depth_share, normal_share : float
+    depth_weight, normal_weight : float
         What is left of the weights of the losses.
     """
 
     depth: Depths | None = None
-    normal: KnownNormals | None = None
+    normal: NormalTarget | None = None
     opacity: float = 0.5
     noise: float = 0.05
-    depth_share: float = 1.0
-    normal_share: float = 1.0
+    depth_weight: float = 1.0
+    normal_weight: float = 1.0
 
 
 def depth_prior(prior: Prior, depth: Tensor, alpha: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean relative error of a rendered depth [H, W], where something is known and something was hit.
 
-    Over all valid pixels for a map, unknown ones counting 0; over the points for points, as if there were LEAST_POINTS
+    Over all valid pixels for a map, unknown ones counting 0; over the points for points, as if there were MIN_POINTS
     at least. ``mask`` [H, W] bool: False = ignore this pixel.
     """
-    known = prior.depth
-    assert known is not None
+    valid = prior.depth
+    assert valid is not None
     hit = (alpha.detach() > prior.opacity) & (depth.detach() > 0)
     hit = hit if mask is None else hit & mask
-    if isinstance(known, PointDepths):
-        error = _of_points(known, depth, hit, prior.noise)
+    if isinstance(valid, PointDepths):
+        error = _of_points(valid, depth, hit, prior.noise)
     else:
-        if isinstance(known, RelativeDepths):
-            known = aligned(known, depth.detach(), hit)
-        error = masked_mean(_robust(torch.where(hit & known.known, depth * known.disparity - 1, 0), prior.noise), mask)
-    return prior.depth_share * error
+        if isinstance(valid, RelativeDepths):
+            valid = aligned(valid, depth.detach(), hit)
+        error = masked_mean(_robust(torch.where(hit & valid.valid, depth * valid.disparity - 1, 0), prior.noise), mask)
+    return prior.depth_weight * error
 
 
 def _robust(error: Tensor, noise: float) -> Tensor:
@@ -162,24 +162,24 @@ def _of_points(points: PointDepths, depth: Tensor, hit: Tensor, noise: float) ->
     seen = hit.reshape(-1)[points.pixels].all(dim=1)
     # Disparity is linear in the picture of a plane, depth is not.
     z = 1 / (points.weights / torch.where(seen[:, None], at_points, 1)).sum(dim=1)
-    return _robust(torch.where(seen, z / points.depth - 1, 0), noise).sum() / max(len(points.depth), LEAST_POINTS)
+    return _robust(torch.where(seen, z / points.depth - 1, 0), noise).sum() / max(len(points.depth), MIN_POINTS)
 
 
 @torch.no_grad()
-def aligned(map_: RelativeDepths, depth: Tensor, hit: Tensor) -> KnownDepths:
+def aligned(map_: RelativeDepths, depth: Tensor, hit: Tensor) -> MetricDepth:
     """A relative map in units of the scene, by a robust fit to a rendered depth [H, W] where that was ``hit``.
 
     Nothing is known where the fit runs the other way, or where it gives no depth in front of the camera.
     """
     stride = max(1, round((depth.numel() / FIT_PIXELS) ** 0.5))
-    usable = (map_.known & hit)[::stride, ::stride].reshape(-1)
+    usable = (map_.valid & hit)[::stride, ::stride].reshape(-1)
     values, z = map_.values[::stride, ::stride].reshape(-1), depth[::stride, ::stride].reshape(-1)
     z = torch.where(usable, z, 1)
     scale, shift = fit_line(values, 1 / z if map_.space == "disparity" else z, usable.to(z.dtype))
     line = torch.addcmul(shift, scale, map_.values)
-    good = map_.known & (line > 1e-3 * shift.abs()) & (scale > 0)  # the shift is the value in the middle of the map
+    good = map_.valid & (line > 1e-3 * shift.abs()) & (scale > 0)  # the shift is the value in the middle of the map
     line = torch.where(good, line, 1)
-    return KnownDepths(line if map_.space == "disparity" else 1 / line, good)
+    return MetricDepth(line if map_.space == "disparity" else 1 / line, good)
 
 
 def fit_line(x: Tensor, y: Tensor, weights: Tensor, rounds: int = FIT_ROUNDS) -> tuple[Tensor, Tensor]:
@@ -211,10 +211,10 @@ def normal_prior(prior: Prior, normal: Tensor, alpha: Tensor, mask: Tensor | Non
     With rendered normals [H, W, 3] = sum w n this is the mean of sum w (1 - <n, N>): 1 - cosine, by blending weight.
     """
     assert prior.normal is not None
-    directions, known, alpha = prior.normal.directions, prior.normal.known, alpha.detach()
+    directions, valid, alpha = prior.normal.directions, prior.normal.valid, alpha.detach()
     if mask is not None:
-        normal, alpha, known = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha, known))
+        normal, alpha, valid = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha, valid))
     count = alpha.numel() if mask is None else mask.sum().clamp(min=1)
     # Two products of vectors: a third of the time of a picture of cosines.
-    total = alpha.reshape(-1) @ known.reshape(-1) - normal.reshape(-1) @ directions.reshape(-1)
-    return prior.normal_share * total / count
+    total = alpha.reshape(-1) @ valid.reshape(-1) - normal.reshape(-1) @ directions.reshape(-1)
+    return prior.normal_weight * total / count

@@ -84,7 +84,7 @@ def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None
 
     Parameters
     ----------
-    depth : Tensor [H, W] wu
+    depth : Tensor [H, W] world units
         Depth along the optical axis; 0 where nothing was hit.
     camera : Camera
     mask : Tensor [H, W] bool, optional

@@ -30,7 +30,7 @@ from gs2d.meshing.raycast import cast_camera
 
 BEST = 4  # photographs in the mean
 FEATHER = 4.0  # px
-LEAST_FEATHER = 0.01
+MIN_FEATHER = 0.01
 GRAZING = 0.1  # cosine below which a surface is not seen
 JUMP = 3.0  # bend of the depth between pixels that is an outline, in footprints of a pixel
 MAX_SIDE = 1600  # px, of the depth maps that decide what is hidden
@@ -42,7 +42,7 @@ _SAMPLES = 5000  # faces that choose the size
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class ColorSource:
     """A picture to take colours from.
 
     Attributes
@@ -89,15 +89,15 @@ def texture_size(mesh: Mesh, cameras: list[Camera]) -> int:
         q = camera.fx * camera.fy * facing[ahead] / z[ahead] ** 3
         density[ahead] = np.maximum(density[ahead], q)
     ranked = np.argsort(density)
-    share = np.cumsum(area[some][ranked])
-    median = density[ranked[min(np.searchsorted(share, share[-1] / 2), len(ranked) - 1)]]
+    fraction = np.cumsum(area[some][ranked])
+    median = density[ranked[min(np.searchsorted(fraction, fraction[-1] / 2), len(ranked) - 1)]]
     side = _FINER * np.sqrt(max(float(area.sum() * median) / _TYPICAL_USE, 1.0))
     return int(np.clip(2 ** np.ceil(np.log2(side)), 4 * MIN_SIZE, MAX_AUTO_SIZE))
 
 
 def bake(
     atlas: Atlas,
-    photographs: Iterable[Photograph],
+    images: Iterable[ColorSource],
     size: int,
     *,
     best: int = BEST,
@@ -125,8 +125,8 @@ def bake(
         raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {size}")
     texels = texels_of(atlas, size)
     chooser = _Chooser(atlas, texels, best, threads or os.cpu_count() or 1)
-    for photograph in photographs:
-        chooser.add(photograph)
+    for image in images:
+        chooser.add(image)
     colors, seen = chooser.colors()
     if not seen.any():
         raise ProtocolError(
@@ -164,10 +164,10 @@ class _Chooser:
         self._least = np.zeros(n, np.float32)  # of the scores
         self._colors = np.zeros((n, best + 1, 3), np.uint8)
 
-    def add(self, photograph: Photograph) -> None:
+    def add(self, image: ColorSource) -> None:
         """Let every texel choose whether it wants this photograph."""
         self.count += 1
-        looked = _Looked(self._mesh, photograph, self._origin)
+        looked = _Looked(self._mesh, image, self._origin)
         with ThreadPoolExecutor(self._threads) as pool:
             for _ in pool.map(lambda part: self._choose(looked, part), self._parts):
                 pass
@@ -195,18 +195,18 @@ class _Chooser:
 class _Looked:
     """A photograph, with what of the mesh it sees and how near to an outline."""
 
-    def __init__(self, mesh: Mesh, photograph: Photograph, origin: np.ndarray) -> None:
-        camera = photograph.camera
+    def __init__(self, mesh: Mesh, image: ColorSource, origin: np.ndarray) -> None:
+        camera = image.camera
         shrink = max(camera.width, camera.height) / MAX_SIDE
         small = camera
         if shrink > 1:
             small = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
-        self._camera, self._small, self._image = camera, small, photograph.image
+        self._camera, self._small, self._image = camera, small, image.image
         self._rotation = camera.rotation.astype(np.float32)
         self._shift = (camera.T_cam_world[:3, 3] + camera.rotation @ origin).astype(np.float32)
         self._center = (camera.center - origin).astype(np.float32)
         self._depth = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, small).depth
-        self._feather = feather(self._depth, small.fx, _shown(photograph, small))
+        self._feather = feather(self._depth, small.fx, _shown(image, small))
 
     def before(
         self, places: np.ndarray, normals: np.ndarray, heights: np.ndarray, least: np.ndarray
@@ -242,7 +242,7 @@ class _Looked:
         return rows, score, bilinear(self._image, x[rows], y[rows])
 
 
-def _shown(photograph: Photograph, small: Camera) -> np.ndarray:
+def _shown(photograph: ColorSource, small: Camera) -> np.ndarray:
     """Which pixels [H, W] of the smaller camera's image may be used."""
     image, valid = photograph.image, photograph.valid
     height, width = image.shape[:2]
@@ -260,7 +260,7 @@ def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:
     """How far pixels are from what must not bleed into them, float32 [H, W]; 0 where nothing may be taken.
 
     1 at ``FEATHER`` pixels or more from an outline, the border of the image and pixels that are not ``shown``, falling
-    to ``LEAST_FEATHER`` beside them. An outline is where 1 / depth, which is linear on a plane, bends.
+    to ``MIN_FEATHER`` beside them. An outline is where 1 / depth, which is linear on a plane, bends.
     """
     inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
     bend = np.zeros_like(inverse)
@@ -271,7 +271,7 @@ def feather(depth: np.ndarray, focal: float, shown: np.ndarray) -> np.ndarray:
     usable = (depth > 0) & shown
     clear = np.pad(usable & (bend * depth * focal <= JUMP), 1)  # nothing is known beyond the border
     distance = distance_transform_edt(clear)[1:-1, 1:-1]
-    return np.where(usable, np.clip(distance / FEATHER, LEAST_FEATHER, 1), 0).astype(np.float32)
+    return np.where(usable, np.clip(distance / FEATHER, MIN_FEATHER, 1), 0).astype(np.float32)
 
 
 def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -299,13 +299,13 @@ def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarr
     faces, count = atlas.mesh.faces, len(atlas.mesh.vertices)
     face, w = texels.face[seen], texels.weights[seen].astype(np.float64)
     weights = [w[:, 0], w[:, 1], 1 - w[:, 0] - w[:, 1]]
-    total, known = np.zeros((count, 3)), np.zeros(count)
+    total, valid = np.zeros((count, 3)), np.zeros(count)
     for k, weight in enumerate(weights):
-        known += np.bincount(faces[face, k], weight, count)
+        valid += np.bincount(faces[face, k], weight, count)
         for channel in range(3):
             total[:, channel] += np.bincount(faces[face, k], weight * colors[seen, channel], count)
-    done = known > 1e-6
-    values = np.where(done[:, None], total / np.maximum(known, 1e-6)[:, None], 0)
+    done = valid > 1e-6
+    values = np.where(done[:, None], total / np.maximum(valid, 1e-6)[:, None], 0)
     ends = faces.reshape(-1), np.roll(faces, 1, axis=1).reshape(-1)
     half = coo_array((np.ones(faces.size), ends), shape=(count, count)).tocsr()
     edges = half + half.T

@@ -26,24 +26,24 @@ NOISE_PER_TRUNCATION = 20.0  # times the depth noise: maps that disagree need a 
 
 
 @dataclass(frozen=True)
-class FusionLimits:
+class FusionBounds:
     """Limits of one fusion, with the numbers that they come from. Plain numbers, ready for JSON.
 
     Attributes
     ----------
-    lower, upper : tuple of 3 floats, wu
+    lower, upper : tuple of 3 floats, world units
         Box outside which nothing is fused.
-    side : float, wu
+    side : float, world units
         Longest side of the box that holds the 1st to 99th percentile of the points (or of the given bbox).
-    voxel, truncation, depth_limit : float, wu
+    voxel, truncation, depth_limit : float, world units
         Depths beyond ``depth_limit`` carry nothing.
-    depth_median, depth_high : float, wu
+    depth_median, depth_high : float, world units
         Median and 99.5th percentile of all depths.
-    pixel_footprint : float, wu
+    pixel_footprint : float, world units
         Median width of a pixel on the surface.
     cut_fraction : float
         Part of the seen pixels that depth limit or box leave out. Large: the scene has a background that is not fused.
-    depth_noise : float or None, wu
+    depth_noise : float or None, world units
         How far views look through what their neighbours see (``consistency.depth_noise``), where it was measured.
     """
 
@@ -64,10 +64,10 @@ class FusionLimits:
 class DepthSample:
     """Some pixels of one view."""
 
-    points: np.ndarray  # [P, 3] float64 wu
-    depths: np.ndarray  # [P] wu
-    footprints: np.ndarray  # [P] wu, depth / focal length
-    center: np.ndarray  # [3] wu, of the camera
+    points: np.ndarray  # [P, 3] float64 world units
+    depths: np.ndarray  # [P] world units
+    footprints: np.ndarray  # [P] world units, depth / focal length
+    center: np.ndarray  # [3] world units, of the camera
 
 
 def backproject(camera: Camera, depth: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -98,7 +98,7 @@ def derive_limits(
     truncation: float | None = None,
     depth_limit: float | None = None,
     points: np.ndarray | None = None,
-) -> FusionLimits:
+) -> FusionBounds:
     """Limits from samples of all views; every named limit overrides the derived one.
 
     Parameters
@@ -109,10 +109,10 @@ def derive_limits(
     resolution : int
         Voxels along the longest side of the box that holds the 1st to 99th percentile of the points. The voxel is
         never finer than half the median width of a pixel on the surface: finer ones hold nothing but interpolation.
-    bbox : array [2, 3] wu, optional
+    bbox : array [2, 3] world units, optional
         Fuse this box, whole: it also sets the voxel and lifts the depth limit to its farthest corner.
-    voxel, truncation, depth_limit : float wu, optional
-    points : array [P, 3] wu, optional
+    voxel, truncation, depth_limit : float world units, optional
+    points : array [P, 3] world units, optional
         Splat centres or points of structure from motion: the derived box is cut to their extent (with the margin).
 
     Raises
@@ -138,7 +138,9 @@ def derive_limits(
         limit = min(high * 1.25, FAR_FACTOR * median) if depth_limit is None else depth_limit
         near = xyz[depths <= limit]
         if not len(near):
-            raise ProtocolError(f"depth_limit must exceed the nearest depth, {depths.min():.4g} wu, got {limit:g}")
+            raise ProtocolError(
+                f"depth_limit must exceed the nearest depth, {depths.min():.4g} world units, got {limit:g}"
+            )
         lower, upper = np.percentile(near, BOX_PERCENTILES, axis=0)
         side = float((upper - lower).max())
         lower, upper = _widened(lower, upper, side, points)
@@ -147,7 +149,7 @@ def derive_limits(
     footprint = float(np.median(near_footprints if len(near_footprints) else footprints))
     size = voxel if voxel is not None else max(side / resolution, 0.5 * footprint)
     kept = (depths <= limit) & ((xyz >= lower) & (xyz <= upper)).all(axis=1)
-    return FusionLimits(
+    return FusionBounds(
         lower=_triple(lower),
         upper=_triple(upper),
         side=side,
@@ -161,7 +163,7 @@ def derive_limits(
     )
 
 
-def widen_truncation(limits: FusionLimits, noise: float | None) -> FusionLimits:
+def widen_truncation(limits: FusionBounds, noise: float | None) -> FusionBounds:
     """The limits with a truncation of 20 times the depth noise, if that is more: up to 20 voxels, a 40th of the box."""
     if noise is None:
         return limits

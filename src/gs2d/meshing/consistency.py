@@ -12,17 +12,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from gs2d.meshing.bounds import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionLimits
+from gs2d.meshing.bounds import MAX_VOXELS_PER_TRUNCATION, DepthSample, FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
-from gs2d.meshing.sampling import UNSEEN, prepare
+from gs2d.meshing.sampling import UNSEEN, make_sampler
 
 NEIGHBOURS = 8  # views compared with each
 PERCENTILE = 75.0  # of the positive residuals
 _ENOUGH = 100  # residuals, below which there is no estimate
 
 
-def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits: FusionLimits) -> float | None:
-    """75th percentile, wu, of how far views look through points that their neighbours see.
+def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits: FusionBounds) -> float | None:
+    """75th percentile, world units, of how far views look through points that their neighbours see.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits
     neighbours = np.argsort(distance, axis=1, kind="stable")[:, : min(NEIGHBOURS, len(samples) - 1)]
     residuals: list[np.ndarray] = [np.zeros(0)]
     for j, item in enumerate(maps):
-        view = prepare(item, edge)
+        view = make_sampler(item, edge)
         for i in np.flatnonzero((neighbours == j).any(axis=1)).tolist():
             projected = samples[i].points @ view.projection[:, :3].T + view.projection[:, 3]
             projected = projected[projected[:, 2] > 0]

@@ -21,13 +21,13 @@ from gs2d.errors import DiskError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class RenderedView:
     """What one camera saw.
 
     Attributes
     ----------
     camera : Camera
-    depth : ndarray or Tensor [H, W] wu
+    depth : ndarray or Tensor [H, W] world units
         Depth along the optical axis at pixel centres; 0, negative, NaN and infinity carry nothing.
     color : ndarray or Tensor [H, W, 3] or None
         uint8, or float in [0, 1].
@@ -46,12 +46,12 @@ class DepthMap:
     """A frame as fusion reads it: numpy, cleaned."""
 
     camera: Camera
-    depth: np.ndarray  # [H, W] float32 wu, 0 where nothing was seen
+    depth: np.ndarray  # [H, W] float32 world units, 0 where nothing was seen
     color: np.ndarray | None  # [H, W, 3] uint8
     weight: np.ndarray | None  # [H, W] float32, None: 1 wherever depth > 0
 
 
-def depth_map(frame: Frame) -> DepthMap:
+def depth_map(frame: RenderedView) -> DepthMap:
     """Clean a frame.
 
     Raises
@@ -136,7 +136,7 @@ class Spool:
         self._slots.append(_Slot(item.camera, offset, item.color is not None, item.weight is not None))
 
     @classmethod
-    def of(cls, frames: Iterable[Frame] | Spool, folder: str | os.PathLike[str] | None = None) -> Spool:
+    def of(cls, frames: Iterable[RenderedView] | Spool, folder: str | os.PathLike[str] | None = None) -> Spool:
         """The frames in a file of their own, cleaned one by one; a spool as it is."""
         if isinstance(frames, Spool):
             return frames
@@ -148,7 +148,7 @@ class Spool:
             raise
         return spool
 
-    def extend(self, frames: Iterable[Frame]) -> None:
+    def extend(self, frames: Iterable[RenderedView]) -> None:
         """Clean and write frames one by one."""
         for frame in frames:
             self.append(depth_map(frame))

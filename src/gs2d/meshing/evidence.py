@@ -37,7 +37,7 @@ class Evidence:
     against : ndarray [P] int32
         Views that see farther at its place.
     density : ndarray [P] float32
-        Pixels per wu^2 of surface in the view that saw it best.
+        Pixels per world unit^2 of surface in the view that saw it best.
     """
 
     support: np.ndarray
@@ -45,7 +45,7 @@ class Evidence:
     density: np.ndarray
 
 
-def least_views(count: int) -> int:
+def min_views(count: int) -> int:
     """Return how many of ``count`` views must have seen a surface."""
     return min(int(VIEWS), count) if count >= FEW_VIEWS else min(2, count)
 
@@ -58,7 +58,7 @@ def gather(mesh: Mesh, maps: Iterable[DepthMap], tolerance: float) -> Evidence:
     mesh : Mesh
     maps : iterable of DepthMap
     tolerance : float
-        wu. Depths that differ by less are of one surface.
+        World units. Depths that differ by less are of one surface.
     """
     places, normals = mesh.vertices.T, _normals(mesh).T
     parts = [slice(start, start + VERTICES_AT_ONCE) for start in range(0, len(mesh.vertices), VERTICES_AT_ONCE)]
@@ -121,7 +121,7 @@ def _normals(mesh: Mesh) -> np.ndarray:
 
 
 def areas(mesh: Mesh) -> np.ndarray:
-    """Return the areas [F] of the faces, wu^2."""
+    """Return the areas [F] of the faces, world units^2."""
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     return np.asarray(
         0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -163,7 +163,7 @@ def clean(mesh: Mesh, maps: Iterable[DepthMap], count: int, tolerance: float) ->
         As for ``gather``.
     """
     evidence = gather(mesh, maps, tolerance)
-    seen, of_seen = supported(mesh, evidence, least_views(count))
+    seen, of_seen = supported(mesh, evidence, min_views(count))
     whole, of_whole = large_components(seen, of_seen)
     found = pixels(whole, of_whole)
     total = max(float(areas(mesh).sum()), 1e-300)
@@ -179,13 +179,13 @@ def supported(mesh: Mesh, evidence: Evidence, views: int) -> tuple[Mesh, Evidenc
     return _selected(mesh, evidence, kept)
 
 
-def large_components(mesh: Mesh, evidence: Evidence, share: float = SMALL) -> tuple[Mesh, Evidence]:
+def large_components(mesh: Mesh, evidence: Evidence, fraction: float = SMALL) -> tuple[Mesh, Evidence]:
     """Return a mesh without components of less than ``share`` of the area of the largest."""
     if not len(mesh.faces):
         return mesh, evidence
     of_face = components(mesh)
     area = np.bincount(of_face, areas(mesh))
-    return _selected(mesh, evidence, (area >= share * area.max())[of_face])
+    return _selected(mesh, evidence, (area >= fraction * area.max())[of_face])
 
 
 def _selected(mesh: Mesh, evidence: Evidence, faces: np.ndarray) -> tuple[Mesh, Evidence]:

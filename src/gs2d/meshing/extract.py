@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import FusionLimits, derive_limits, sample_depths, widen_truncation
+from gs2d.meshing.bounds import FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
-from gs2d.meshing.depth_maps import Frame, Spool
+from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import Cleaned, clean
 from gs2d.meshing.integrate import fusion_backend
 from gs2d.meshing.marching_cubes import components, inside_box, keep_components
 from gs2d.meshing.slabs import fused_surface
 from gs2d.meshing.tsdf import find_blocks
-from gs2d.meshing.unbounded import FAR_VIEWS, fuse_nested, nested_marching_cubes
-from gs2d.meshing.unbounded_bounds import derive_nest
+from gs2d.meshing.unbounded import FAR_VIEWS, cascade_marching_cubes, fuse_cascade
+from gs2d.meshing.unbounded_bounds import derive_cascade
 from gs2d.meshing.volume import Volume
 
 
@@ -27,7 +27,7 @@ class Extraction:
     """A mesh and how it came about."""
 
     mesh: Mesh
-    limits: FusionLimits
+    limits: FusionBounds
     frames: int
     blocks: int
     volume_bytes: int
@@ -39,9 +39,9 @@ class Extraction:
 
 
 def extract(
-    frames: Iterable[Frame] | Spool,
+    frames: Iterable[RenderedView] | Spool,
     *,
-    limits: FusionLimits | None = None,
+    limits: FusionBounds | None = None,
     resolution: int = 512,
     bbox: np.ndarray | None = None,
     voxel: float | None = None,
@@ -124,7 +124,7 @@ def extract(
 
 
 def extract_unbounded(
-    frames: Iterable[Frame] | Spool,
+    frames: Iterable[RenderedView] | Spool,
     *,
     resolution: int = 512,
     bbox: np.ndarray | None = None,
@@ -169,7 +169,7 @@ def extract_unbounded(
     backend = fusion_backend(backend)
     with Spool.of(frames, folder) as spool:
         samples = [sample_depths(item) for item in spool]
-        nest = derive_nest(
+        cascade = derive_cascade(
             samples,
             spool.cameras,
             resolution=resolution,
@@ -179,16 +179,16 @@ def extract_unbounded(
             depth_limit=depth_limit,
         )
         if truncation is None:
-            inner = nest.levels[0]
+            inner = cascade.levels[0]
             # far depths contradict each other more, but their levels have wider bands
             noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
-            nest = nest.with_truncation(widen_truncation(inner, noise).truncation, noise)
-        volumes = fuse_nested(spool, nest, max_bytes=max_bytes, threads=threads, backend=backend)
+            cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
+        volumes = fuse_cascade(spool, cascade, max_bytes=max_bytes, threads=threads, backend=backend)
     far_weight = min(far_views, volumes[0].frames / 2)
     fused = _Fused.of(volumes)
-    whole = nested_marching_cubes(volumes, nest, min_weight=min_weight, far_weight=far_weight)
+    whole = cascade_marching_cubes(volumes, cascade, min_weight=min_weight, far_weight=far_weight)
     del volumes
-    limits = replace(nest.levels[0], lower=nest.levels[-1].lower, upper=nest.levels[-1].upper)
+    limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
     return _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
 
 
@@ -208,7 +208,7 @@ class _Fused:
 
 
 def _extraction(
-    whole: Mesh, limits: FusionLimits, fused: _Fused, *, min_faces: int, keep: int | None, backend: str
+    whole: Mesh, limits: FusionBounds, fused: _Fused, *, min_faces: int, keep: int | None, backend: str
 ) -> Extraction:
     """Without small pieces, with the figures."""
     mesh = keep_components(whole, min_faces=min_faces, keep=keep)

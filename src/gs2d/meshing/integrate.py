@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.errors import BackendError
-from gs2d.meshing.sampling import View, block_visibility
+from gs2d.meshing.sampling import DepthSampler, block_visibility
 from gs2d.meshing.volume import BLOCK, VOXELS, Volume
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ FULL_WEIGHT_BEHIND = 0.75  # of the truncation: the weight falls from 1 here to 
 BACKENDS = ("cpu", "cuda", "reference")
 _CHUNK = 48  # blocks at a time in numpy: the temporaries of a chunk fit the second-level cache
 
-Add = Callable[[View], None]
+Add = Callable[[DepthSampler], None]
 
 
 def fusion_backend(name: str) -> str:
@@ -90,8 +90,8 @@ class _Grid:
     """Where the blocks of a volume lie."""
 
     volume: Volume
-    origins: np.ndarray  # [M, 3] wu, of each block's first voxel
-    local: np.ndarray  # [512, 3] wu, of a voxel from there
+    origins: np.ndarray  # [M, 3] world units, of each block's first voxel
+    local: np.ndarray  # [512, 3] world units, of a voxel from there
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ def _grids(volumes: Sequence[Volume]) -> list[_Grid]:
     return found
 
 
-def _change(grid: _Grid, view: View) -> _Change:
+def _change(grid: _Grid, view: DepthSampler) -> _Change:
     limits = grid.volume.limits
     size = BLOCK * limits.voxel
     radius = 0.5 * np.sqrt(3.0) * size
@@ -131,7 +131,7 @@ def add_in_numpy(volumes: Sequence[Volume], threads: int) -> Iterator[Add]:
     grids = _grids(volumes)
     with ThreadPoolExecutor(threads) as pool:
 
-        def add(view: View) -> None:
+        def add(view: DepthSampler) -> None:
             for grid in grids:
                 change = _change(grid, view)
                 starts = range(0, len(change.rows), _CHUNK)
@@ -145,7 +145,7 @@ def add_in_numpy(volumes: Sequence[Volume], threads: int) -> Iterator[Add]:
         yield add
 
 
-def _add_chunk(volume: Volume, view: View, chunk: _Change) -> None:
+def _add_chunk(volume: Volume, view: DepthSampler, chunk: _Change) -> None:
     """Add one view to some blocks; chunks share no block, so threads do not meet."""
     rows, bases, offsets = chunk.rows, chunk.bases, chunk.offsets
     truncation = np.float32(volume.limits.truncation)
@@ -175,7 +175,7 @@ def _add_chunk(volume: Volume, view: View, chunk: _Change) -> None:
 def _blend_colors(
     color: np.ndarray,
     color_weight: np.ndarray,
-    view: View,
+    view: DepthSampler,
     rows: np.ndarray,
     distance: np.ndarray,
     weight: np.ndarray,
@@ -201,7 +201,7 @@ def add_natively(volumes: Sequence[Volume], library: Library, threads: int) -> I
 
     grids = _grids(volumes)
 
-    def add(view: View) -> None:
+    def add(view: DepthSampler) -> None:
         library.use_threads(threads)
         for grid in grids:
             volume, change = grid.volume, _change(grid, view)
@@ -226,7 +226,7 @@ def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.devi
     grids = _grids(volumes)
     held = [to_device(_volume_arrays(grid.volume)) for grid in grids]
 
-    def add(view: View) -> None:
+    def add(view: DepthSampler) -> None:
         colored = any(grid.volume.color is not None for grid in grids)
         image = to_device(_view_arrays(view, colored=colored))
         for grid, volume in zip(grids, held, strict=True):
@@ -243,7 +243,7 @@ def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.devi
                 array[...] = tensor.cpu().numpy()
 
 
-def _view_arrays(view: View, *, colored: bool) -> dict[str, np.ndarray | None]:
+def _view_arrays(view: DepthSampler, *, colored: bool) -> dict[str, np.ndarray | None]:
     """The pixels of a view, by the names of the kernels' arguments."""
     arrays = {"depth": view.depth, "slope_x": view.slope_x, "slope_y": view.slope_y}
     return arrays | {"pixel_weight": view.weight, "pixel_color": view.color if colored else None}

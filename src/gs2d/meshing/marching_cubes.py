@@ -123,13 +123,13 @@ def _padded(values: np.ndarray, shifted: np.ndarray, fill: float) -> np.ndarray:
 def _chunk_triangles(volume: Volume, shifted: np.ndarray, chunk: np.ndarray, min_weight: float) -> np.ndarray:
     """Triangles [T, 3] of some blocks, as global edge numbers."""
     inside = _padded(volume.tsdf, shifted[chunk], 0.0) < 0
-    known = _padded(volume.weight, shifted[chunk], 0.0) >= max(min_weight, 1e-12)
+    valid = _padded(volume.weight, shifted[chunk], 0.0) >= max(min_weight, 1e-12)
     case = np.zeros((len(chunk), BLOCK, BLOCK, BLOCK), np.uint8)
     full = np.ones_like(case, dtype=bool)
     for corner, (x, y, z) in enumerate(CORNERS):
         window = (slice(None), slice(x, x + BLOCK), slice(y, y + BLOCK), slice(z, z + BLOCK))
         case |= inside[window].astype(np.uint8) << np.uint8(corner)
-        full &= known[window]
+        full &= valid[window]
     cells = np.flatnonzero(full.reshape(-1) & (case.reshape(-1) != 0) & (case.reshape(-1) != 255))
     table = case_table()
     cases = case.reshape(-1)[cells].astype(np.int64)
@@ -177,7 +177,7 @@ def edge_vertices(volume: Volume, edges: np.ndarray, high: np.ndarray) -> tuple[
     step = np.eye(3, dtype=np.int64)[edges % 3]
     tsdf = volume.tsdf.reshape(-1)
     a, b = tsdf[low], tsdf[high]
-    t = crossing(a, b)
+    t = near_plane_policy(a, b)
     grid = volume.blocks[row] * BLOCK + at + t[:, None].astype(np.float64) * step
     vertices = (np.asarray(volume.limits.lower) + grid * volume.limits.voxel).astype(np.float32)
     if volume.color is None or volume.color_weight is None:
@@ -186,7 +186,7 @@ def edge_vertices(volume: Volume, edges: np.ndarray, high: np.ndarray) -> tuple[
     return vertices, mixed_colors(t, colors[low], colors[high], weights[low] > 0, weights[high] > 0)
 
 
-def crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def near_plane_policy(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Where the field is 0 between ends with values of different sign: 0 at a, 1 at b, and kept off both."""
     t = a / np.where(a == b, 1, a - b)  # signs differ, so a != b
     return np.asarray(np.clip(t, _EDGE_GUARD, 1 - _EDGE_GUARD))

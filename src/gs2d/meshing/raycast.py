@@ -16,7 +16,7 @@ import numpy as np
 from gs2d.core.camera import Camera
 
 _PAIRS_PER_CHUNK = 60_000  # a step of one chunk stays in the cache of a core
-NEAR = 1e-3  # wu
+NEAR = 1e-3  # world units
 _MARGIN = 1e-6  # samples around the box of a triangle, for rounding
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
 
@@ -29,14 +29,14 @@ class Hits:
     ----------
     face : ndarray [H, W] int32
         Index of the triangle, -1 where the ray hits nothing.
-    depth : ndarray [H, W] float32 wu
+    depth : ndarray [H, W] float32 world units
         Along the optical axis (not along the ray); 0 where the ray hits nothing.
     weights : ndarray [H, W, 3] float32
         Barycentric coordinates of the hit on its triangle; 0 where the ray hits nothing.
     """
 
     face: np.ndarray  # [H, W]
-    depth: np.ndarray  # [H, W] wu
+    depth: np.ndarray  # [H, W] world units
     weights: np.ndarray  # [H, W, 3]
 
 
@@ -52,13 +52,13 @@ def cast_camera(
 
     Parameters
     ----------
-    vertices : ndarray [P, 3] wu
+    vertices : ndarray [P, 3] world units
     faces : ndarray [F, 3] int
     camera : Camera
     samples : int
         Rays per pixel along each axis, at the centres of equal sub-pixels.
     near : float
-        Hits at a smaller depth, wu, do not count.
+        Hits at a smaller depth, world units, do not count.
 
     Returns
     -------
@@ -111,10 +111,10 @@ def _sample_boxes(
     safe = np.where(ahead, local[:, 2], 1.0)
     size = camera.width * samples, camera.height * samples
     focal, center = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    met, crossing = np.arange(len(faces)), np.zeros(0, np.int64)
+    met, near_plane_policy = np.arange(len(faces)), np.zeros(0, np.int64)
     if not ahead.all():
         corners = sum(ahead[faces[:, k]].astype(np.int8) for k in range(3))
-        met, crossing = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
+        met, near_plane_policy = np.flatnonzero(corners == 3), np.flatnonzero((corners == 1) | (corners == 2))
     bounds: list[np.ndarray] = []
     parts: list[np.ndarray] = []  # the same of the faces that cross the camera plane
     for axis in range(2):
@@ -127,13 +127,13 @@ def _sample_boxes(
         some = high > low
         met, bounds = met[some], [*(bound[some] for bound in bounds), low[some], high[some]]
     for axis in range(2):
-        low, high = _reach(local[faces[crossing]], axis, focal[axis], center[axis], near)
+        low, high = _reach(local[faces[near_plane_policy]], axis, focal[axis], center[axis], near)
         first = np.clip(np.ceil(low * samples - 0.5 - _MARGIN), 0, size[axis]).astype(np.int32)
         end = np.clip(np.floor(high * samples - 0.5 + _MARGIN) + 1, 0, size[axis]).astype(np.int32)
         some = end > first
-        crossing = crossing[some]
+        near_plane_policy = near_plane_policy[some]
         parts = [bound[some] for bound in parts] + [first[some], end[some]]
-    every = np.concatenate([met, crossing])
+    every = np.concatenate([met, near_plane_policy])
     order = np.argsort(every, kind="stable")
     x0, x1, y0, y1 = (np.concatenate([bound, part])[order] for bound, part in zip(bounds, parts, strict=True))
     return every[order], np.stack([x0, y0], axis=1), np.stack([x1, y1], axis=1)
@@ -150,8 +150,8 @@ def _reach(corners: np.ndarray, axis: int, focal: float, center: float, near: fl
     pixels = [np.where(ahead, corners[:, :, axis] / np.where(ahead, z, 1.0), np.nan)]  # [n, 3]
     for i, j in ((0, 1), (1, 2), (2, 0)):
         cut = ahead[:, i] != ahead[:, j]
-        share = (near - z[:, i]) / np.where(cut, z[:, j] - z[:, i], 1.0)
-        at = corners[:, i, axis] + share * (corners[:, j, axis] - corners[:, i, axis])
+        fraction = (near - z[:, i]) / np.where(cut, z[:, j] - z[:, i], 1.0)
+        at = corners[:, i, axis] + fraction * (corners[:, j, axis] - corners[:, i, axis])
         pixels.append(np.where(cut, at / near, np.nan)[:, None])
     places = np.concatenate(pixels, axis=1) * focal + center  # [n, 6], three or four of them numbers
     return np.fmin.reduce(places, axis=1), np.fmax.reduce(places, axis=1)
@@ -202,9 +202,9 @@ def occluded(
 
     Parameters
     ----------
-    vertices : ndarray [P, 3] wu
+    vertices : ndarray [P, 3] world units
     faces : ndarray [F, 3] int
-    points : ndarray [Q, 3] wu
+    points : ndarray [Q, 3] world units
         Origins; move them off their surface first.
     direction : ndarray [3]
         Unit vector towards the light.

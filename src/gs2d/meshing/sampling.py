@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gs2d.meshing.bounds import FusionLimits
+from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
 
 UNSEEN = np.float32(-1e30)  # a depth so near that nothing lies before it: the weight comes out as 0, without NaN
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DepthSampler:
     """One depth map, ready to be looked up. Pixel arrays are flat, with a border of one unseen pixel all round."""
 
     projection: np.ndarray  # [3, 4] float64: (x z, y z, z), x and y in px shifted by the border
@@ -28,7 +28,7 @@ class View:
     focal: float  # px, the larger of the two
     principal: tuple[float, float]  # px, with the border
     depth: np.ndarray  # [P] float32, UNSEEN where nothing was seen
-    slope_x: np.ndarray  # [P] float32 wu/px
+    slope_x: np.ndarray  # [P] float32 world units/px
     slope_y: np.ndarray
     color: np.ndarray | None  # [P, 3] float32
     weight: np.ndarray | None  # [P] float32
@@ -55,10 +55,10 @@ class View:
         return depth, pixel
 
 
-def prepare(item: DepthMap, limits: FusionLimits, truncation: np.ndarray | None = None) -> View:
+def make_sampler(item: DepthMap, limits: FusionBounds, truncation: np.ndarray | None = None) -> DepthSampler:
     """Make a depth map ready: cut at the depth limit, pad, take slopes, build the pyramid of farthest depths.
 
-    ``truncation`` [H, W] wu is that of each pixel, where it is not the same everywhere.
+    ``truncation`` [H, W] world units is that of each pixel, where it is not the same everywhere.
     """
     camera = item.camera
     K = camera.K.copy()
@@ -70,7 +70,7 @@ def prepare(item: DepthMap, limits: FusionLimits, truncation: np.ndarray | None 
     slope_x = _minmod(seen, axis=1, largest=largest)
     slope_y = _minmod(seen, axis=0, largest=largest)
     color = None if item.color is None else np.pad(item.color, ((1, 1), (1, 1), (0, 0))).astype(np.float32)
-    return View(
+    return DepthSampler(
         projection=K @ camera.T_cam_world[:3],
         width=camera.width + 2,
         height=camera.height + 2,
@@ -116,7 +116,7 @@ def _pyramid(depth: np.ndarray) -> tuple[np.ndarray, ...]:
         size *= 2
 
 
-def block_visibility(view: View, centers: np.ndarray, radius: float, truncation: float) -> np.ndarray:
+def block_visibility(view: DepthSampler, centers: np.ndarray, radius: float, truncation: float) -> np.ndarray:
     """Rows [n] of the blocks that a view may change: spheres (centers [M, 3], radius) in front of the camera, in the
     image, over some seen pixel, and not wholly behind the surface by more than the truncation."""
     projected = centers @ view.projection[:, :3].T + view.projection[:, 3]

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import FusionLimits
+from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import EDGES_OF_BLOCK, cell_surface, edge_vertices
 from gs2d.meshing.tsdf import Blocks, fuse_blocks
@@ -23,7 +23,7 @@ SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared to
 
 def fused_surface(
     frames: Iterable[DepthMap],
-    limits: FusionLimits,
+    limits: FusionBounds,
     blocks: Blocks,
     *,
     min_weight: float = 1.0,

@@ -17,22 +17,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gs2d.errors import ProtocolError
-from gs2d.meshing.bounds import FusionLimits, backproject
+from gs2d.meshing.bounds import FusionBounds, backproject
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.integrate import fusion_backend, integrator
-from gs2d.meshing.sampling import prepare
-from gs2d.meshing.volume import BLOCK, Budget, Volume, block_bytes, block_grid, check_truncation, unknown_volume
+from gs2d.meshing.sampling import make_sampler
+from gs2d.meshing.volume import BLOCK, Budget, Volume, block_bytes, block_grid, check_truncation, invalid_volume
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
 
-_MOST_MARKS = 1 << 27  # bytes
+_MAX_MARKS = 1 << 27  # bytes
 _FEW_SAMPLES = 1e8  # of one depth map: seconds
 
 
 def fuse(
     frames: Iterable[DepthMap],
-    limits: FusionLimits,
+    limits: FusionBounds,
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
@@ -96,7 +96,7 @@ class Blocks:
 
 def find_blocks(
     frames: Iterable[DepthMap],
-    limits: FusionLimits,
+    limits: FusionBounds,
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
@@ -112,7 +112,7 @@ def find_blocks(
     colored, count, library = False, 0, block_finder(backend, threads)
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
-        budget.check_least(least_blocks(item, limits), colored)
+        budget.check_least(min_blocks(item, limits), colored)
         keys = merged(keys, touched_blocks(item, limits, dims, library))
         budget.check(len(keys), colored, partial=True)
     budget.check(len(keys), colored, partial=False)
@@ -123,21 +123,21 @@ def find_blocks(
 
 def fuse_blocks(
     frames: Iterable[DepthMap],
-    limits: FusionLimits,
+    limits: FusionBounds,
     blocks: Blocks,
     *,
     threads: int | None = None,
     backend: str = "auto",
 ) -> Volume:
     """Fuse depth maps into these blocks; parameters as of ``fuse``."""
-    volume = unknown_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
+    volume = invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
     with integrator([volume], backend, threads) as add:
         for item in frames:
-            add(prepare(item, limits))
+            add(make_sampler(item, limits))
     return volume
 
 
-def least_blocks(item: DepthMap, limits: FusionLimits) -> int:
+def min_blocks(item: DepthMap, limits: FusionBounds) -> int:
     """A number below which ``touched_blocks`` cannot stay, without its work, which grows as voxels shrink.
 
     0 where that work is small. The bands of the pixels, one truncation before and behind what they saw, cut to the box,
@@ -160,7 +160,7 @@ def least_blocks(item: DepthMap, limits: FusionLimits) -> int:
     return int(max(volume / block**3, area / (3**0.5 * block**2)))
 
 
-def _samples(item: DepthMap, depth: np.ndarray, limits: FusionLimits) -> tuple[int, int]:
+def _samples(item: DepthMap, depth: np.ndarray, limits: FusionBounds) -> tuple[int, int]:
     """At how many places along a side of each pixel, and along each ray, a depth map is sampled."""
     half = 0.5 * BLOCK * limits.voxel
     width = float(depth.max(initial=0.0)) / min(item.camera.fx, item.camera.fy)
@@ -168,7 +168,7 @@ def _samples(item: DepthMap, depth: np.ndarray, limits: FusionLimits) -> tuple[i
 
 
 def touched_blocks(
-    item: DepthMap, limits: FusionLimits, dims: tuple[int, int, int], library: Library | None = None
+    item: DepthMap, limits: FusionBounds, dims: tuple[int, int, int], library: Library | None = None
 ) -> np.ndarray:
     """Keys [K] of the blocks near what one depth map saw: sorted, each once.
 
@@ -194,7 +194,7 @@ def touched_blocks(
         for dx in shifts
         for dy in shifts
     )
-    if library is not None and padded[0] * padded[1] * padded[2] <= _MOST_MARKS:
+    if library is not None and padded[0] * padded[1] * padded[2] <= _MAX_MARKS:
         from gs2d.kernels.tsdf import mark_on_cpu
 
         marks = np.zeros(padded, bool)
@@ -240,7 +240,7 @@ def block_finder(backend: str, threads: int | None) -> Library | None:
 def _distinct(numbers: list[np.ndarray], dims: tuple[int, int, int]) -> np.ndarray:
     """Numbers of a grid's places, sorted, each once: by marking them, or, where the grid is too large, by sorting."""
     places = dims[0] * dims[1] * dims[2]
-    if places > _MOST_MARKS:
+    if places > _MAX_MARKS:
         return np.unique(np.concatenate(numbers))
     marks = np.zeros(places, bool)
     for some in numbers:

@@ -20,12 +20,12 @@ from gs2d.errors import ProtocolError
 from gs2d.meshing.bounds import backproject
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.integrate import integrator
-from gs2d.meshing.marching_cubes import cell_surface, crossing, mixed_colors
+from gs2d.meshing.marching_cubes import cell_surface, mixed_colors, near_plane_policy
 from gs2d.meshing.marching_cubes_cases import CORNERS, EDGES, case_table
-from gs2d.meshing.sampling import prepare
-from gs2d.meshing.tsdf import block_finder, least_blocks, merged, touched_blocks
-from gs2d.meshing.unbounded_bounds import STEP, Nest
-from gs2d.meshing.volume import BLOCK, VOXELS, Budget, Volume, check_truncation, unknown_volume
+from gs2d.meshing.sampling import make_sampler
+from gs2d.meshing.tsdf import block_finder, merged, min_blocks, touched_blocks
+from gs2d.meshing.unbounded_bounds import STEP, TsdfCascade
+from gs2d.meshing.volume import BLOCK, VOXELS, Budget, Volume, check_truncation, invalid_volume
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 FAR_VIEWS = 5.0  # weight from which a voxel outside the innermost level is known: so many views seldom agree on a sky
 
 
-def fuse_nested(
+def fuse_cascade(
     frames: Iterable[DepthMap],
-    nest: Nest,
+    cascade: TsdfCascade,
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
@@ -67,65 +67,65 @@ def fuse_nested(
     """
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
-    check_truncation(nest.levels[0])
-    budget = Budget(nest.levels[0], max_bytes, side=2 * nest.half, step=STEP)
-    keys = [np.zeros(0, dtype=np.int64) for _ in nest.levels]
+    check_truncation(cascade.levels[0])
+    budget = Budget(cascade.levels[0], max_bytes, side=2 * cascade.half, step=STEP)
+    keys = [np.zeros(0, dtype=np.int64) for _ in cascade.levels]
     colored, count, library = False, 0, block_finder(backend, threads)
     for item in frames:
         colored, count = colored or item.color is not None, count + 1
-        budget.check_least(least_blocks(item, nest.levels[0]), colored)
-        for k, found in enumerate(_touched(item, nest, library)):
+        budget.check_least(min_blocks(item, cascade.levels[0]), colored)
+        for k, found in enumerate(_touched(item, cascade, library)):
             keys[k] = merged(keys[k], found)
         budget.check(sum(map(len, keys)), colored, partial=True)
     budget.check(sum(map(len, keys)), colored, partial=False)
     if not any(map(len, keys)):
         raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
     volumes = tuple(
-        unknown_volume(limits, nest.dims, found, colored=colored, frames=count)
-        for limits, found in zip(nest.levels, keys, strict=True)
+        invalid_volume(limits, cascade.dims, found, colored=colored, frames=count)
+        for limits, found in zip(cascade.levels, keys, strict=True)
     )
     with integrator(volumes, backend, threads) as add:
         for item in frames:
-            add(prepare(item, nest.levels[0], truncation=_truncations(item, nest)))
+            add(make_sampler(item, cascade.levels[0], truncation=_truncations(item, cascade)))
     return volumes
 
 
-def _distances(item: DepthMap, nest: Nest) -> np.ndarray:
+def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
     """Distance [H, W] of what each pixel saw from the centre, along the farthest axis, in halves; 0 where nothing."""
     rows, columns = np.nonzero(item.depth > 0)
     points = backproject(item.camera, item.depth[rows, columns].astype(np.float64), rows, columns)
     distance = np.zeros(item.depth.shape)
-    distance[rows, columns] = np.abs(points - np.asarray(nest.center)).max(axis=1) / nest.half
+    distance[rows, columns] = np.abs(points - np.asarray(cascade.center)).max(axis=1) / cascade.half
     return distance
 
 
-def _truncations(item: DepthMap, nest: Nest) -> np.ndarray:
-    """Truncation [H, W] wu of the level that owns what each pixel saw."""
-    level = np.ceil(np.log2(np.maximum(_distances(item, nest), 1.0)))
-    return nest.levels[0].truncation * np.exp2(np.minimum(level, len(nest.levels) - 1))
+def _truncations(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
+    """Truncation [H, W] world units of the level that owns what each pixel saw."""
+    level = np.ceil(np.log2(np.maximum(_distances(item, cascade), 1.0)))
+    return cascade.levels[0].truncation * np.exp2(np.minimum(level, len(cascade.levels) - 1))
 
 
-def _touched(item: DepthMap, nest: Nest, library: Library | None) -> list[np.ndarray]:
+def _touched(item: DepthMap, cascade: TsdfCascade, library: Library | None) -> list[np.ndarray]:
     """Keys of each level's own blocks near what a depth map saw."""
-    distance = _distances(item, nest)
-    first, last = nest.hole
+    distance = _distances(item, cascade)
+    first, last = cascade.hole
     found = []
-    for k, limits in enumerate(nest.levels):
+    for k, limits in enumerate(cascade.levels):
         # what lies so near the level that a band round it, slanted, may reach in
-        margin = (3 * limits.truncation + 2 * BLOCK * limits.voxel) / nest.half
+        margin = (3 * limits.truncation + 2 * BLOCK * limits.voxel) / cascade.half
         inner = 2.0 ** (k - 1) if k else 0.0
         near = (distance > inner - margin) & (distance < 2.0**k + margin)
         part = replace(item, depth=np.where(near, item.depth, 0).astype(np.float32))
         # a block more on every side: what lies just outside the level touches its border too
         step = BLOCK * limits.voxel
         lower = (limits.lower[0] - step, limits.lower[1] - step, limits.lower[2] - step)
-        dims = (nest.dims[0] + 2,) * 3
+        dims = (cascade.dims[0] + 2,) * 3
         keys = touched_blocks(part, replace(limits, lower=lower), dims, library)
         blocks = np.stack(np.unravel_index(keys, dims), axis=1) - 1
-        blocks = blocks[((blocks >= 0) & (blocks < nest.dims[0])).all(axis=1)]
+        blocks = blocks[((blocks >= 0) & (blocks < cascade.dims[0])).all(axis=1)]
         if k:
             blocks = blocks[~((blocks >= first) & (blocks < last)).all(axis=1)]
-        found.append((blocks[:, 0] * nest.dims[1] + blocks[:, 1]) * nest.dims[2] + blocks[:, 2])
+        found.append((blocks[:, 0] * cascade.dims[1] + blocks[:, 1]) * cascade.dims[2] + blocks[:, 2])
     return found
 
 
@@ -151,7 +151,7 @@ class _Nodes:
         return out
 
     def distances(self, ids: np.ndarray) -> np.ndarray:
-        """Signed distance, wu: truncations differ between levels."""
+        """Signed distance, world units: truncations differ between levels."""
         out = np.zeros(ids.shape, np.float32)
         offsets = self.offsets
         for k, volume in enumerate(self.volumes):
@@ -159,7 +159,7 @@ class _Nodes:
             out[here] = volume.tsdf.reshape(-1)[ids[here] - offsets[k]] * np.float32(volume.limits.truncation)
         return out
 
-    def known(self, ids: np.ndarray) -> np.ndarray:
+    def valid(self, ids: np.ndarray) -> np.ndarray:
         """Whether enough views saw the voxel."""
         out = np.zeros(ids.shape, bool)
         offsets = self.offsets
@@ -181,13 +181,15 @@ class _Nodes:
         return out
 
 
-def nested_marching_cubes(volumes: Sequence[Volume], nest: Nest, *, min_weight: float = 1.0, far_weight: float) -> Mesh:
+def cascade_marching_cubes(
+    volumes: Sequence[Volume], cascade: TsdfCascade, *, min_weight: float = 1.0, far_weight: float
+) -> Mesh:
     """The zero set of all levels as one mesh.
 
     Parameters
     ----------
     volumes : sequence of Volume
-        Of ``fuse_nested``.
+        Of ``fuse_cascade``.
     nest : Nest
     min_weight, far_weight : float
         A voxel of the innermost level, and of all others, is known from this weight on.
@@ -207,7 +209,7 @@ def nested_marching_cubes(volumes: Sequence[Volume], nest: Nest, *, min_weight: 
         triangles.append(faces + count)
         count += len(edges)
     for k in range(len(volumes) - 1):
-        ends = _join_triangles(nodes, _join_cells(volumes[k], volumes[k + 1], nest, offsets[k], offsets[k + 1]))
+        ends = _join_triangles(nodes, _join_cells(volumes[k], volumes[k + 1], cascade, offsets[k], offsets[k + 1]))
         pairs.append(ends.reshape(-1, 2))
         triangles.append(count + np.arange(3 * len(ends)).reshape(-1, 3))
         count += 3 * len(ends)
@@ -224,7 +226,7 @@ def nested_marching_cubes(volumes: Sequence[Volume], nest: Nest, *, min_weight: 
 
 def _vertices(nodes: _Nodes, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Positions [P, 3] of the zero crossings between nodes, and their colours."""
-    t = crossing(nodes.distances(low), nodes.distances(high))
+    t = near_plane_policy(nodes.distances(low), nodes.distances(high))
     start = nodes.positions(low)
     vertices = (start + t[:, None].astype(np.float64) * (nodes.positions(high) - start)).astype(np.float32)
     colors = [volume.color for volume in nodes.volumes if volume.color is not None]
@@ -235,9 +237,9 @@ def _vertices(nodes: _Nodes, low: np.ndarray, high: np.ndarray) -> tuple[np.ndar
     return vertices, mixed_colors(t, nodes.gather(colors, low), nodes.gather(colors, high), *has)
 
 
-def _join_cells(inner: Volume, outer: Volume, nest: Nest, inner_offset: int, outer_offset: int) -> np.ndarray:
+def _join_cells(inner: Volume, outer: Volume, cascade: TsdfCascade, inner_offset: int, outer_offset: int) -> np.ndarray:
     """Nodes [C, 8] of the cells across the border of a level, where all eight voxels exist."""
-    n = nest.voxels
+    n = cascade.voxels
     local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
     corners = [np.zeros(0, np.int64)]
     for axis in range(3):
@@ -273,7 +275,7 @@ def _find(volume: Volume, voxels: np.ndarray) -> np.ndarray:
 
 def _join_triangles(nodes: _Nodes, cells: np.ndarray) -> np.ndarray:
     """Triangles [T, 3, 2] of cells [C, 8], each vertex by the two nodes that it lies between, the smaller first."""
-    cells = cells[nodes.known(cells).all(axis=1)]
+    cells = cells[nodes.valid(cells).all(axis=1)]
     case = ((nodes.distances(cells) < 0) << np.arange(8)).sum(axis=1)
     table = case_table()
     counts = table.starts[case + 1] - table.starts[case]

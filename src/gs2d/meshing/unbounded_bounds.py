@@ -20,7 +20,7 @@ from gs2d.meshing.bounds import (
     FAR_FACTOR,
     MIN_VOXELS_PER_TRUNCATION,
     DepthSample,
-    FusionLimits,
+    FusionBounds,
     check_positive,
     checked_box,
 )
@@ -32,7 +32,7 @@ PIXEL_ERROR = 0.5  # px, of matching between views: decides how far away depth i
 
 
 @dataclass(frozen=True)
-class Nest:
+class TsdfCascade:
     """Levels of an unbounded fusion, finest first.
 
     Attributes
@@ -41,12 +41,12 @@ class Nest:
         ``lower`` of a level is its first voxel, half a voxel inside its cube.
     voxels : int
         Along a side of every level, a multiple of ``STEP``.
-    center : tuple of 3 floats, wu
-    half : float, wu
+    center : tuple of 3 floats, world units
+    half : float, world units
         Half the side of the innermost cube.
     """
 
-    levels: tuple[FusionLimits, ...]
+    levels: tuple[FusionBounds, ...]
     voxels: int
     center: tuple[float, float, float]
     half: float
@@ -66,7 +66,7 @@ class Nest:
         distance = np.abs(points - np.asarray(self.center)).max(axis=1) / self.half
         return np.clip(np.ceil(np.log2(np.maximum(distance, 1.0))), 0, len(self.levels)).astype(np.int64)
 
-    def with_truncation(self, truncation: float, noise: float | None) -> Nest:
+    def with_truncation(self, truncation: float, noise: float | None) -> TsdfCascade:
         """Another truncation of the innermost level; the others follow."""
         levels = tuple(
             replace(level, truncation=truncation * 2**k, depth_noise=noise) for k, level in enumerate(self.levels)
@@ -74,7 +74,7 @@ class Nest:
         return replace(self, levels=levels)
 
 
-def derive_nest(
+def derive_cascade(
     samples: Sequence[DepthSample],
     cameras: Sequence[Camera],
     *,
@@ -83,12 +83,12 @@ def derive_nest(
     voxel: float | None = None,
     truncation: float | None = None,
     depth_limit: float | None = None,
-) -> Nest:
+) -> TsdfCascade:
     """The nest of a scene, from samples of all views; every named limit overrides the derived one.
 
     The innermost cube holds the 1st to 99th percentile of the nearer half of all that was seen. The outermost holds
     what is nearer than the depth limit: 1.25 times the 99.5th percentile of depth, but no farther than depth is known
-    to within the truncation (``known_depth``); beyond it the sky and bare walls make surfaces of their own.
+    to within the truncation (``valid_depth``); beyond it the sky and bare walls make surfaces of their own.
 
     Parameters
     ----------
@@ -96,11 +96,11 @@ def derive_nest(
     cameras : sequence of Camera
     resolution : int
         Voxels along the side of the innermost cube, not finer than half the median pixel on the nearer half.
-    bbox : array [2, 3] wu, optional
+    bbox : array [2, 3] world units, optional
         The innermost cube is the cube around it.
-    voxel, truncation : float wu, optional
+    voxel, truncation : float world units, optional
         Of the innermost level.
-    depth_limit : float wu, optional
+    depth_limit : float world units, optional
 
     Raises
     ------
@@ -126,10 +126,10 @@ def derive_nest(
     band = truncation if truncation is not None else MIN_VOXELS_PER_TRUNCATION * size
     limit = depth_limit
     if limit is None:
-        limit = min(high * 1.25, max(known_depth(cameras, band / half), FAR_FACTOR * median))
+        limit = min(high * 1.25, max(valid_depth(cameras, band / half), FAR_FACTOR * median))
     kept = depths <= limit
     if not kept.any():
-        raise ProtocolError(f"depth_limit must exceed the nearest depth, {depths.min():.4g} wu, got {limit:g}")
+        raise ProtocolError(f"depth_limit must exceed the nearest depth, {depths.min():.4g} world units, got {limit:g}")
     reach = float(np.abs(xyz[kept] - center).max()) / half
     count = min(MAX_LEVELS, 1 + int(np.ceil(np.log2(max(reach, 1.0)))))
     levels = []
@@ -137,7 +137,7 @@ def derive_nest(
         first = center - half * 2**k + 0.5 * size * 2**k
         last = center + half * 2**k
         levels.append(
-            FusionLimits(
+            FusionBounds(
                 lower=(float(first[0]), float(first[1]), float(first[2])),
                 upper=(float(last[0]), float(last[1]), float(last[2])),
                 side=2 * half * 2**k,
@@ -151,11 +151,11 @@ def derive_nest(
             )
         )
     middle = (float(center[0]), float(center[1]), float(center[2]))
-    return Nest(tuple(levels), voxels, middle, float(half))
+    return TsdfCascade(tuple(levels), voxels, middle, float(half))
 
 
-def known_depth(cameras: Sequence[Camera], band: float) -> float:
-    """Depth, wu, at which half a pixel of parallax moves a point by as much as the truncation there.
+def valid_depth(cameras: Sequence[Camera], band: float) -> float:
+    """Depth, world units, at which half a pixel of parallax moves a point by as much as the truncation there.
 
     A point at depth z seen from a baseline b with a focal length f has a depth uncertainty of e z^2 / (b f), with e the
     error of matching in px; the truncation is ``band`` z. So z = band b f / e. The baseline is twice the median

@@ -8,7 +8,7 @@ from typing import NoReturn
 import numpy as np
 
 from gs2d.errors import ProtocolError
-from gs2d.meshing.bounds import FusionLimits
+from gs2d.meshing.bounds import FusionBounds
 
 BLOCK = 8  # voxels along the side of a block
 VOXELS = BLOCK**3
@@ -36,7 +36,7 @@ class Volume:
         How many depth maps were fused.
     """
 
-    limits: FusionLimits
+    limits: FusionBounds
     dims: tuple[int, int, int]
     keys: np.ndarray
     tsdf: np.ndarray
@@ -62,8 +62,8 @@ def block_bytes(colored: bool) -> int:
     return 8 + VOXELS * 4 * (6 if colored else 2)
 
 
-def unknown_volume(
-    limits: FusionLimits, dims: tuple[int, int, int], keys: np.ndarray, *, colored: bool, frames: int
+def invalid_volume(
+    limits: FusionBounds, dims: tuple[int, int, int], keys: np.ndarray, *, colored: bool, frames: int
 ) -> Volume:
     """Blocks of which nothing is known yet."""
     m = len(keys)
@@ -79,16 +79,16 @@ def unknown_volume(
     )
 
 
-def check_truncation(limits: FusionLimits) -> None:
+def check_truncation(limits: FusionBounds) -> None:
     """Raise ProtocolError for a truncation beyond the box and many voxels: all of it would be near a surface."""
     if not limits.truncation <= max(limits.side, 20 * limits.voxel):
         raise ProtocolError(
-            f"a truncation of at most the side of the box, {limits.side:.4g} wu, was expected, "
+            f"a truncation of at most the side of the box, {limits.side:.4g} world units, was expected, "
             f"got {limits.truncation:.4g}; leave it out, or give a larger bbox"
         )
 
 
-def block_grid(limits: FusionLimits) -> tuple[int, int, int]:
+def block_grid(limits: FusionBounds) -> tuple[int, int, int]:
     """How many blocks the box holds along x, y, z.
 
     Raises
@@ -99,7 +99,9 @@ def block_grid(limits: FusionLimits) -> tuple[int, int, int]:
     size = np.subtract(limits.upper, limits.lower)
     dims = np.ceil(size / (BLOCK * limits.voxel)) + 1
     if not np.isfinite(dims).all() or np.prod(dims) > 2**60:
-        raise ProtocolError(f"a voxel that fits the box of {size.max():.4g} wu was expected, got {limits.voxel:.4g} wu")
+        raise ProtocolError(
+            f"a voxel that fits the box of {size.max():.4g} world units was expected, got {limits.voxel:.4g}"
+        )
     return int(dims[0]), int(dims[1]), int(dims[2])
 
 
@@ -107,9 +109,9 @@ def block_grid(limits: FusionLimits) -> tuple[int, int, int]:
 class Budget:
     """The bound on memory, and the advice when it is reached."""
 
-    limits: FusionLimits
+    limits: FusionBounds
     max_bytes: int
-    side: float | None = None  # wu, of a cube that is made of whole steps of blocks
+    side: float | None = None  # world units, of a cube that is made of whole steps of blocks
     step: int = 1  # voxels
 
     def check(self, blocks: int, colored: bool, *, partial: bool) -> None:
@@ -133,6 +135,8 @@ class Budget:
         if self.side is not None:
             voxel = 1.005 * self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
         raise ProtocolError(
-            f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} wu "
-            f"need {least}{need / 2**30:.3g} GiB; use a voxel of about {voxel:.3g} wu, a smaller bbox, or more memory"
+            f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} "
+            "world units "
+            f"need {least}{need / 2**30:.3g} GiB; use a voxel of about {voxel:.3g} or more, a smaller bbox, or "
+            "more memory"
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gs2d.core.files import is_full
 from gs2d.errors import Gs2dError
-from gs2d.pipeline.events import Missing, OnEvent
+from gs2d.pipeline.events import MissingFile, OnEvent
 
 LONGEST = 500  # characters of a message that is not ours
 
@@ -35,7 +35,7 @@ def attempted(what: str, command: str | None, on_event: OnEvent) -> Iterator[Non
     except Exception as error:
         if is_full(error) or isinstance(error, BrokenPipeError):
             raise
-        on_event(Missing(what, reason_of(error), command, error))
+        on_event(MissingFile(what, reason_of(error), command, error))
 
 
 def again(verb: str, path: Path, *more: object) -> str:

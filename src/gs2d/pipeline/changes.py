@@ -40,7 +40,7 @@ def mean_changes(snapshot: Snapshot, splats: Splats, *, iterations: int, extent:
         The same splats (no row came or went) after so many iterations more.
     iterations : int
     extent : float
-        Of the scene, wu.
+        Of the scene, world units.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def mean_changes(snapshot: Snapshot, splats: Splats, *, iterations: int, extent:
 
 
 def _covariances(splats: Splats) -> Tensor:
-    """Sigma [N, 3, 3] wu^2, in double: its changes are small."""
+    """Sigma [N, 3, 3] world units^2, in double: its changes are small."""
     axes = quats_to_matrices(splats.quats.double())[:, :, :2] * splats.scales.double()[:, None]
     # No matrix product: on a GPU torch refuses it where deterministic algorithms are asked for.
     return (axes[:, :, None] * axes[:, None]).sum(dim=3)

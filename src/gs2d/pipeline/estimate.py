@@ -15,7 +15,7 @@ from gs2d.training.trainer import Trainer
 WARM_UP, FEWEST, MOST = 2, 3, 30  # iterations
 MEASURED_SECONDS = 3.0
 # Seconds of a whole training over iterations x seconds of its first ones: docs/decisions.md has the captures.
-LEAST_GROWTH, MOST_GROWTH = 1.0, 4.0
+MIN_GROWTH, MAX_GROWTH = 1.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def estimate(job: Job) -> Estimate | None:
     if iteration is None:
         return None
     whole = iteration * job.recipe.iterations
-    return Estimate(iteration, LEAST_GROWTH * whole, MOST_GROWTH * whole)
+    return Estimate(iteration, MIN_GROWTH * whole, MAX_GROWTH * whole)
 
 
 def _seconds(trainer: Trainer, iterations: int) -> float | None:

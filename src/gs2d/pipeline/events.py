@@ -68,7 +68,7 @@ class StageDone:
 
 
 @dataclass(frozen=True)
-class Missing:
+class MissingFile:
     """Something that belongs to the result could not be made; all else is there.
 
     Attributes
@@ -121,7 +121,7 @@ class Expected:
     most: float
 
 
-Event = Phase | Step | Notice | StageDone | Missing | Plan | Expected
+Event = Phase | Step | Notice | StageDone | MissingFile | Plan | Expected
 OnEvent = Callable[[Event], None]
 
 

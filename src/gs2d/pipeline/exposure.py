@@ -47,12 +47,12 @@ def write_exposures(run: RunFolder, transforms: Transforms, on_event: OnEvent) -
     """
     if not transforms:
         return
-    photographs = []
+    images = []
     for name, transform in transforms.items():
         grey = GREY * transform[:, :3].sum(dim=1) + transform[:, 3]
-        photographs.append({"name": name, "transform": transform.tolist(), "grey": grey.tolist()})
-    write_json(run.file(EXPOSURE), {"format": 1, "about": ABOUT, "photographs": photographs})
-    gains = {entry["name"]: sum(entry["grey"]) / (3 * GREY) for entry in photographs}
+        images.append({"name": name, "transform": transform.tolist(), "grey": grey.tolist()})
+    write_json(run.file(EXPOSURE), {"format": 1, "about": ABOUT, "photographs": images})
+    gains = {entry["name"]: sum(entry["grey"]) / (3 * GREY) for entry in images}
     low, high = min(gains, key=gains.__getitem__), max(gains, key=gains.__getitem__)
     on_event(Notice(f"exposures: {gains[low]:.2f} ({low}) to {gains[high]:.2f} ({high}) times the mean: {EXPOSURE}"))
 

@@ -43,7 +43,7 @@ from gs2d.training.trainer import raster_settings
 
 DECODE_THREADS = 2
 SHOWN_SKIPS = 3
-MOST_VIEWS = 1_000_000
+MAX_VIEWS = 1_000_000
 ROBUST = ("auto", "on", "off")
 DIFFERS = 0.03  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
 LATER_FIELDS = (  # of recipes, that run folders of before there were such lack
@@ -61,7 +61,7 @@ class Job:
     recipe, protocol, scene, backend, settings
         Values, not names.
     downscale : int
-    pictures_digest : str
+    images_digest : str
         Of every decoded photograph, mask and camera, and of the points: the scene as training sees it.
     stage2_cache_bytes : int
         For cached views; see ``Trainer``.
@@ -73,7 +73,7 @@ class Job:
     backend: Backend
     settings: RasterSettings
     downscale: int
-    pictures_digest: str
+    images_digest: str
     stage2_cache_bytes: int
 
     def definition(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class Job:
                 "test": len(self.scene.test),
                 "extent": self.scene.extent,
                 "skipped": list(self.scene.skipped),
-                "digest": self.pictures_digest,
+                "digest": self.images_digest,
             },
             "raster": asdict(self.settings),
             "seed": self.recipe.seed,
@@ -102,7 +102,7 @@ class Job:
         """Hash of all that decides the state at the end of stage ``index``: equal keys, equal bytes."""
         recipe = to_json(self.recipe)
         facts = {
-            "scene": self.pictures_digest,
+            "scene": self.images_digest,
             "protocol": _training_facts(asdict(self.protocol)),
             "raster": asdict(self.settings),
             "seed": self.recipe.seed,
@@ -184,7 +184,7 @@ def check_train_options(options: TrainOptions) -> Recipe:
         raise RecipeError(f"--checkpoint-seconds must be a positive number, got {options.checkpoint_seconds}")
     if options.stage2_cache_mb < 0:
         raise RecipeError(f"--stage2-cache-mb must be a whole number >= 0, got {options.stage2_cache_mb}")
-    if options.test_every is not None and options.test_every not in (0, *range(2, MOST_VIEWS)):
+    if options.test_every is not None and options.test_every not in (0, *range(2, MAX_VIEWS)):
         raise ProtocolError(
             f"--test-every must be 0 (all views train) or a whole number >= 2 (every n-th is a test view), got "
             f"{options.test_every}"
@@ -257,7 +257,7 @@ def with_backdrop(protocol: Protocol, recipe: Recipe, scene: Scene, on_event: On
     return replace(protocol, background=color)
 
 
-def prepare(options: TrainOptions, on_event: OnEvent) -> Job:
+def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     """Check the options, cheapest first, then read the capture.
 
     Raises
@@ -478,4 +478,4 @@ def _difference(old: Any, new: Any, where: str = "") -> str:
     return f" ({where + ': ' if where else ''}{str(old)[:60]}, now {str(new)[:60]})"
 
 
-__all__ = ["FORMATS", "Job", "build_recipe", "check_same_run", "prepare", "reload_job"]
+__all__ = ["FORMATS", "Job", "build_recipe", "check_same_run", "prepare_job", "reload_job"]

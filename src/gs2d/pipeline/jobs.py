@@ -37,7 +37,7 @@ from gs2d.io.run_dir import (
 )
 from gs2d.pipeline.attempts import again, attempted, reason_of
 from gs2d.pipeline.evaluate import score_views, split_metrics
-from gs2d.pipeline.events import Missing, Notice, OnEvent, Phase, Step, counted, ignore
+from gs2d.pipeline.events import MissingFile, Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import exposed, exposure_named, read_exposures
 from gs2d.pipeline.finished import finished_splats, open_job
 from gs2d.pipeline.job import Job
@@ -51,7 +51,7 @@ from gs2d.pipeline.subject import meshed_subject, within
 from gs2d.pipeline.verdict.file import write_verdict
 from gs2d.pipeline.verdict.measures import Collector
 
-MOST_FRAMES = 100_000  # of an orbit or a flight
+MAX_FRAMES = 100_000  # of an orbit or a flight
 FPS = 30.0
 
 
@@ -154,9 +154,9 @@ def render_run(
     if not views:
         raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
     if out is not None:
-        _spare_photographs([out / f"{name}.png" for name, _ in views], "--out", job)
+        _spare_images([out / f"{name}.png" for name, _ in views], "--out", job)
     if video is not None:
-        _spare_photographs([video], "--video", job)
+        _spare_images([video], "--video", job)
     folder = out or run.file(RENDERS) / (moving or split)
     made = make_folder(folder)
     with _alone_in(folder) if out is None else contextlib.nullcontext():
@@ -213,8 +213,8 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tup
     from gs2d.io.video import check_video
 
     for name, frames in (("--orbit", orbit), ("--flight", flight)):
-        if not (isinstance(frames, int) and 0 <= frames <= MOST_FRAMES):
-            raise RunError(f"{name} must be a number of frames from 1 to {MOST_FRAMES}, got {frames}")
+        if not (isinstance(frames, int) and 0 <= frames <= MAX_FRAMES):
+            raise RunError(f"{name} must be a number of frames from 1 to {MAX_FRAMES}, got {frames}")
     if orbit and flight:
         raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; give one")
     if video is None and fps != FPS:
@@ -227,11 +227,11 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tup
     return "orbit" if orbit else "flight" if flight else "", video
 
 
-def _spare_photographs(files: Sequence[Path], option: str, job: Job) -> None:
+def _spare_images(files: Sequence[Path], option: str, job: Job) -> None:
     """Raise rather than write a rendering over a photograph of the capture."""
-    photographs = {view.path.resolve() for view in job.scene.views if view.path is not None}
+    images = {view.path.resolve() for view in job.scene.views if view.path is not None}
     for file in files:
-        if file.resolve() in photographs:
+        if file.resolve() in images:
             raise RunError(f"{option} would write over the capture's photograph {file}; choose another name")
 
 
@@ -304,7 +304,7 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
     layout : str or None
         A name of ``io.formats.registry.LAYOUTS``; None: by the ending of ``out``.
     bbox : six floats, optional
-        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, wu.
+        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units.
 
     Raises
     ------
@@ -340,7 +340,7 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
     command = again("report", run.path)
 
     def failed(section: str, error: Exception) -> None:
-        on_event(Missing(f"{section} in {REPORT}", reason_of(error), command, error))
+        on_event(MissingFile(f"{section} in {REPORT}", reason_of(error), command, error))
 
     cameras: list[Camera] = []
     with attempted(f"cameras of the pictures in {REPORT}", command, on_event):

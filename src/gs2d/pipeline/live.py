@@ -21,26 +21,26 @@ from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.pipeline.job import Job
+from gs2d.pipeline.observer import TrainingObserver
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.view import drawn, frame_around, shots
-from gs2d.pipeline.watch import Watch
 from gs2d.training import events as train_events
 from gs2d.training.state import TrainState
 from gs2d.viewer.exact import Drawn, Render
-from gs2d.viewer.server import Stage, Viewer
+from gs2d.viewer.server import Viewer, ViewerStage
 from gs2d.viewer.splats import Preview, preview
 
 HOST = "127.0.0.1"  # from another machine: ssh -L
 NOW = "now"
-LEAST_SECONDS = 2.0  # between two refreshes
-MOST_SHARE = 0.03  # of one thread's time may go into refreshes
+MIN_SECONDS = 2.0  # between two refreshes
+MAX_FRACTION = 0.03  # of one thread's time may go into refreshes
 COLOUR_CAMERAS = 2  # from which a splat's colour is averaged: fewer than for a finished run, it is done again and again
 STATUS_SECONDS = 0.5
 LAST_WORDS_SECONDS = 0.3  # until the page has what is said at the end
 _NOTHING = Preview(1.0, *(np.zeros((0, *shape), np.float32) for shape in ((3,), (3, 3), (3,), (1,))))
 
 
-class Live(Watch):
+class Live(TrainingObserver):
     """Shows a training; open it with :func:`open_live`."""
 
     def __init__(self, viewer: Viewer, job: Job, tell: OnEvent) -> None:
@@ -54,7 +54,7 @@ class Live(Watch):
         self._refresh_at, self._copied, self._status_at = 0.0, 0.0, 0.0
         self._phase, self._total, self._psnr = "", 0, ""
         self._say = viewer.add_status("training begins")
-        viewer.add_stages({NOW: Stage(lambda: _NOTHING, lambda: self._renderer(None))})
+        viewer.add_stages({NOW: ViewerStage(lambda: _NOTHING, lambda: self._renderer(None))})
         viewer.add_switch("pause training", self._pause)
         self._thread = threading.Thread(target=self._refresh, name="gs2d live", daemon=True)
         self._thread.start()
@@ -102,11 +102,11 @@ class Live(Watch):
         """Draw what browsers ask for; return when nothing is asked for, and nobody who looks wants a pause."""
         while True:
             while self._asked:
-                draw, picture = self._asked.popleft()
+                draw, image = self._asked.popleft()
                 try:
-                    picture.set_result(draw())
+                    image.set_result(draw())
                 except BaseException as error:
-                    picture.set_exception(error)
+                    image.set_exception(error)
                     if not isinstance(error, Exception):
                         raise
             if not (self._paused and self._viewer.watchers):
@@ -135,12 +135,12 @@ class Live(Watch):
         return render
 
     def _in_turn(self, draw: Callable[[], Drawn]) -> Drawn:
-        picture: Future[Drawn] = Future()
+        image: Future[Drawn] = Future()
         with self._changed:
             if self._closed:
                 raise RuntimeError("training has ended")
-            self._asked.append((draw, picture))
-        return picture.result()
+            self._asked.append((draw, image))
+        return image.result()
 
     # -- the preview thread --------------------------------------------------------------------------------------------
     def _refresh(self) -> None:
@@ -159,12 +159,12 @@ class Live(Watch):
                 self._failure = error  # told by the training thread
                 return
             taken = self._copied + time.thread_time() - begun
-            self._refresh_at = time.perf_counter() + max(LEAST_SECONDS, taken / MOST_SHARE)
+            self._refresh_at = time.perf_counter() + max(MIN_SECONDS, taken / MAX_FRACTION)
 
     def _show(self, splats: Splats | None, cameras: Sequence[Camera]) -> None:
         if splats is not None:
             found = preview(splats, cameras)
-            self._viewer.replace_stage(NOW, Stage(lambda: found, lambda: self._renderer(splats)))
+            self._viewer.replace_stage(NOW, ViewerStage(lambda: found, lambda: self._renderer(splats)))
 
     # -- the end -------------------------------------------------------------------------------------------------------
     def close(self, text: str) -> None:

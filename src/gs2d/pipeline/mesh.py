@@ -21,7 +21,7 @@ from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError
 from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.meshes import write_mesh
-from gs2d.meshing.depth_maps import Frame, Spool, depth_map
+from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.pipeline.evaluate import SeenView
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
@@ -146,7 +146,9 @@ def _cut_text(result: Extraction, options: MeshOptions) -> str:
     part = f"{result.limits.cut_fraction:.0%} of the depth lies"
     if options.unbounded:
         limit = result.limits.depth_limit
-        return f"{part} beyond {limit:.4g} wu, where these cameras no longer tell depth; --depth-limit widens it"
+        return (
+            f"{part} beyond {limit:.4g} world units, where these cameras no longer tell depth; --depth-limit widens it"
+        )
     return (
         f"{part} outside the fused box: the scene has a background that is not in the mesh; --unbounded takes all of "
         "it, --bbox or --depth-limit widen the box"
@@ -175,7 +177,7 @@ def check_mesh_options(options: MeshOptions) -> None:
 
 
 def _extract(
-    job: Job, frames: Iterable[Frame] | Spool, options: MeshOptions, on_event: OnEvent, subject: Subject | None
+    job: Job, frames: Iterable[RenderedView] | Spool, options: MeshOptions, on_event: OnEvent, subject: Subject | None
 ) -> Extraction:
     fusion = job.protocol.fusion
     keep = fusion.clusters if options.keep_components is None else options.keep_components
@@ -203,7 +205,7 @@ def _extract(
     return result
 
 
-def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[Frame]:
+def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:
     views, settings = job.scene.train, replace(job.settings, with_distortion=False)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
@@ -213,16 +215,16 @@ def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator
     on_event(Phase("fusing", 0))
 
 
-def fusion_frame(job: Job, view: View, output: RenderOutput, depth: str) -> Frame:
+def fusion_frame(job: Job, view: View, output: RenderOutput, depth: str) -> RenderedView:
     """What fusion takes of a rendered view: depth ("mean" or "median") and colour where it is covered well enough."""
     valid = (output.alpha >= OPAQUE).cpu().numpy()
     mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
-    for pixels in (mask, view.known()):  # beyond the photograph nothing has said how far the surface is
+    for pixels in (mask, view.valid()):  # beyond the photograph nothing has said how far the surface is
         if pixels is not None:
             valid = valid & pixels
     if job.protocol.fusion.subject:
         valid = valid & one_surface(output)
-    return Frame(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
+    return RenderedView(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
 
 
 def one_surface(output: RenderOutput) -> np.ndarray:

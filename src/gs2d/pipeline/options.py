@@ -8,7 +8,7 @@ from pathlib import Path
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
 
-Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, wu
+Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
 
 
 def paths_of(options: object, *names: str) -> None:
@@ -80,7 +80,7 @@ class TrainOptions:
     estimate : bool
         Tell before training how long it will take and what is held out.
     subject_box : six floats or None
-        The box of the subject, wu (``MeshOptions``); None: it is found.
+        The box of the subject, world units (``MeshOptions``); None: it is found.
     whole_scene : bool
         Mesh everything, not the subject.
     page : bool
@@ -132,9 +132,9 @@ class MeshOptions:
     Attributes
     ----------
     voxel, truncation, depth_limit : float or None
-        wu.
+        World units.
     bbox : six floats or None
-        Smallest and largest corner of the box that is kept, wu; with ``unbounded`` of the box with the finest voxels.
+        Smallest and largest corner of the box that is kept, world units; with ``unbounded`` that of the finest voxels.
     unbounded : bool
         Fuse what lies far away too, in voxels that grow with the distance.
     max_gib : float
@@ -144,7 +144,7 @@ class MeshOptions:
     keep_components : int or None
         The so many largest connected pieces; 0 = all; None = the protocol's.
     subject_box : six floats or None
-        The box of the subject from now on, wu; None: what the run says, or what is found.
+        The box of the subject from now on, world units; None: what the run says, or what is found.
     whole_scene : bool
         Everything, not the subject, also where the protocol meshes the subject.
     """
@@ -193,7 +193,7 @@ class EvaluateOptions:
         A PLY or OBJ file of the true surface (a mesh or points), or the folder of the official ground truth of DTU or
         Tanks and Temples; None: what lies beside the capture, if anything does.
     thresholds : tuple of float
-        Distances at which precision and recall are taken, wu; empty = 0.25, 0.5 and 1 % of the true diagonal.
+        Distances at which precision and recall are taken, world units; empty = 0.25, 0.5 and 1 % of the true diagonal.
     lpips_weights : Path or None
     match_exposure : bool
         Score the test views once more, each half of a rendering matched in colour to the other half of its photograph.

@@ -19,7 +19,7 @@ from gs2d.pipeline.job import Job, reload_job
 from gs2d.pipeline.view import frame_around, from_aside, settings_without_run
 from gs2d.viewer.web import Seen, write_page
 
-MOST_VIEWS = 100  # photographs that one can step through
+MAX_VIEWS = 100  # photographs that one can step through
 SUFFIXES = (".html", ".htm")
 LARGE = 50_000_000  # bytes, from which phones take long, and mail refuses
 
@@ -107,5 +107,5 @@ def _subject(folder: Path, on_event: OnEvent) -> Subject | None:
 
 def _some(views: tuple[View, ...]) -> list[View]:
     """At most so many, evenly."""
-    count = min(len(views), MOST_VIEWS)
+    count = min(len(views), MAX_VIEWS)
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]

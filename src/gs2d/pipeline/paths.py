@@ -13,10 +13,10 @@ from gs2d.core.transforms import focus_point, up_direction
 
 _UNSEEN_ARC = np.radians(100.0)  # without a camera: nobody photographed that side; orbits have gaps of up to 60
 _FADE = 0.15  # of the arc: over so much of it distances and heights of photographs are averaged
-_MOST_IN_TOUR = 300  # cameras; more are passed by without being looked at
+_MAX_IN_TOUR = 300  # cameras; more are passed by without being looked at
 _DETOUR = 1.6  # a way in the order of names may be so many times longer than a short one
 _FRAMES_A_STOP = 15  # of a flight: half a second from one photograph to the next
-_LEAST_STOPS = 4
+_MIN_STOPS = 4
 _AIMED = 0.5  # cosine between the axis of each camera and the way to what they look at
 _LEVEL = 0.1  # a level camera's x axis rises no more than this
 _STEEP = 0.98  # how far down a camera may look and still be kept level
@@ -34,7 +34,7 @@ def orbit_cameras(cameras: Sequence[Camera], frames: int, focus: np.ndarray | No
     cameras : sequence of Camera
     frames : int
     focus : ndarray [3], optional
-        What is looked at, wu (default: the point nearest to the optical axes).
+        What is looked at, world units (default: the point nearest to the optical axes).
     """
     focus = focus_point(cameras) if focus is None else np.asarray(focus, np.float64)
     up = up_direction(cameras)
@@ -105,7 +105,7 @@ def flight_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         return [cameras[0]] * frames
     frame = _FlightFrame.of(cameras)
     poses = frame.poses(cameras)
-    count = max(_LEAST_STOPS, frames // _FRAMES_A_STOP)
+    count = max(_MIN_STOPS, frames // _FRAMES_A_STOP)
     order = stops(poses, count)
     steps = np.linalg.norm(np.diff(poses[order], axis=0), axis=1)
     closed = len(order) > 3 and float(np.linalg.norm(poses[order[-1]] - poses[order[0]])) <= 1.5 * np.median(steps)
@@ -133,7 +133,7 @@ class _FlightFrame:
     Attributes
     ----------
     unit : float
-        The length that counts as much as a turn by a radian: the median distance to the focus, wu.
+        The length that counts as much as a turn by a radian: the median distance to the focus, world units.
     focus : ndarray [3] or None
         What the flight goes round, in units; None if the cameras do not look at one point.
     up : ndarray [3] or None
@@ -210,7 +210,7 @@ def stops(poses: np.ndarray, count: int) -> np.ndarray:
     Evenly along the way from the first to the last where that is hardly longer than a tour (a walk, a film); else those
     that are farthest from all chosen before, on a short tour from the first.
     """
-    some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MOST_IN_TOUR)).round().astype(np.int64))
+    some = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _MAX_IN_TOUR)).round().astype(np.int64))
     steps = np.linalg.norm(np.diff(poses[some], axis=0), axis=1)
     short = tour(poses[some])
     if steps.sum() <= _DETOUR * np.linalg.norm(np.diff(poses[some[short]], axis=0), axis=1).sum():

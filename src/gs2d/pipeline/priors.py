@@ -11,7 +11,7 @@ import torch
 from gs2d.config.recipe import Recipe
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
-from gs2d.losses.priors import Depths, KnownDepths, KnownNormals, PointDepths
+from gs2d.losses.priors import Depths, MetricDepth, NormalTarget, PointDepths
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.training.priors import DepthPlan, Priors, has_priors
 
@@ -34,7 +34,7 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
     depths: list[Depths] = []
     normals = 0
     for done, view in enumerate(scene.train, start=1):
-        depth, normal = priors.known(done - 1, torch.float32)
+        depth, normal = priors.at(done - 1, torch.float32)
         depths += [] if depth is None else [depth]
         normals += normal is not None
         for array in _arrays(view, priors.plan, normal):
@@ -50,7 +50,7 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
     return whole.hexdigest()
 
 
-def _arrays(view: View, plan: DepthPlan | None, normal: KnownNormals | None) -> Sequence[np.ndarray]:
+def _arrays(view: View, plan: DepthPlan | None, normal: NormalTarget | None) -> Sequence[np.ndarray]:
     """What decides the known depths and normals of a view."""
     arrays = [] if normal is None else [normal.directions.numpy()]
     if plan is not None and plan.source != "sparse" and view.maps is not None and view.maps.files.depth is not None:
@@ -67,12 +67,12 @@ def depth_text(plan: DepthPlan, depths: Sequence[Depths], views: int) -> str:
     points = [len(depth.depth) for depth in depths if isinstance(depth, PointDepths)]
     if points:
         return f"known depths: {int(np.median(points)):,} sparse points in the middle one of {of_views}"
-    shares = [float(depth.known.float().mean()) for depth in depths if not isinstance(depth, PointDepths)]
-    pixels = f"{of_views}, {np.mean(shares):.0%} of their pixels"
+    fractions = [float(depth.valid.float().mean()) for depth in depths if not isinstance(depth, PointDepths)]
+    pixels = f"{of_views}, {np.mean(fractions):.0%} of their pixels"
     if plan.source == "sensor":
         unit = "" if plan.unit is None else f"; a value of 1 is {plan.unit:.4g} units of the capture"
         return f"known depths: maps of a sensor in {pixels}{unit}"
-    fitted = sum(isinstance(depth, KnownDepths) for depth in depths)
+    fitted = sum(isinstance(depth, MetricDepth) for depth in depths)
     rest = len(depths) - fitted
     to = [f"sparse points in {fitted} views"] * (fitted > 0) + [f"what is rendered in {rest}"] * (rest > 0)
     return f"known depths: relative maps ({plan.space}) in {pixels}; scale and shift by {', by '.join(to)}"

@@ -30,7 +30,7 @@ from gs2d.render.backends import get_backend
 from gs2d.sfm.colmap import check_installed
 from gs2d.sfm.images import find_photos
 from gs2d.sfm.video_frames import is_video, look_into
-from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workplace
+from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace
 
 CAPTURE = "capture"
 FEW = 24  # photographs, below which each is needed for the surface and none is held out
@@ -119,7 +119,7 @@ class ReconstructOptions:
             resume=self.resume,
             overwrite=self.overwrite,
             title=_title(self.photos.resolve()),
-            allowed=(CAPTURE, hidden_workplace(capture).name),
+            allowed=(CAPTURE, hidden_workspace(capture).name),
             estimate=True,
             **self.training,
         )
@@ -148,7 +148,7 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
                 RunFolder(options.out).clear()
         _tell(poses, capture, on_event)
     training = replace(options.train_options, overwrite=False)
-    run = train(_by_the_photographs(training, options, quality, on_event), on_event)
+    run = train(_by_the_images(training, options, quality, on_event), on_event)
     if options.texture and not run.file(TEXTURED).exists():
         with attempted(TEXTURED, again("mesh", run.path, "--texture"), on_event):
             if not run.file(MESH).exists():
@@ -281,7 +281,7 @@ def _tell(poses: dict[str, Any], capture: Path, on_event: OnEvent) -> None:
         on_event(Notice(f"... and {len(lost) - SHOWN_LOST} more without a place, in {capture / POSES_JSON}"))
 
 
-def _by_the_photographs(
+def _by_the_images(
     training: TrainOptions, options: ReconstructOptions, quality: Quality, on_event: OnEvent
 ) -> TrainOptions:
     """What depends on the photographs that have a place: the size of the pictures, and whether some are held out."""

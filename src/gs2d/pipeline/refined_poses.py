@@ -14,7 +14,7 @@ from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.splats import Splats
-from gs2d.core.transforms import focus_point, moved
+from gs2d.core.transforms import focus_point, perturb_pose
 from gs2d.data import Scene, View
 from gs2d.errors import DataError, RunError, ShapeError
 from gs2d.io.run_dir import POSES, SPLATS, RunFolder
@@ -174,7 +174,7 @@ def aligned(
         optimizer = torch.optim.Adam([motion], lr=RATE)
         decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATE_FINAL / RATE) ** (1 / STEPS))
         for step in range(1, STEPS + 1):
-            camera = moved(view.camera, motion * unit)
+            camera = perturb_pose(view.camera, motion * unit)
             output = rasterize(splats, camera, settings, backend=backend)
             options: dict[str, Any] = {"iteration": step, "depth_kind": "mean", "backend_name": backend.name}
             loss = sum(compute_losses(output, target, mask, camera, PHOTOMETRIC, **options).values())
@@ -183,4 +183,4 @@ def aligned(
                 loss.backward()
             optimizer.step()
             decay.step()
-        yield view.at(moved(view.camera, motion.detach() * unit).T_cam_world)
+        yield view.at(perturb_pose(view.camera, motion.detach() * unit).T_cam_world)

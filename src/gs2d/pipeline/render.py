@@ -29,12 +29,12 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.report.images import (
+    depth_image,
     depth_limits,
-    depth_picture,
-    error_picture,
-    highlight_picture,
-    known_picture,
-    normal_picture,
+    error_image,
+    highlight_image,
+    normal_image,
+    valid_image,
 )
 from gs2d.report.sections.pictures import read_index
 
@@ -112,18 +112,18 @@ def draw_stage(
         near_far = limits.get(view.name) or list(depth_limits(depth, alpha))  # of the first stage: stages compare
         photo = view.target(job.settings.background)
         color = photographed(view, output.color, exposures, job.settings.background).cpu().numpy()
-        pictures = {
+        images = {
             "color": np.clip(color, 0, 1),
-            "normal": normal_picture(output.normal.cpu().numpy(), alpha),
-            "depth": depth_picture(depth, alpha, (near_far[0], near_far[1])),
-            "error": error_picture(color, photo, view.mask()),
+            "normal": normal_image(output.normal.cpu().numpy(), alpha),
+            "depth": depth_image(depth, alpha, (near_far[0], near_far[1])),
+            "error": error_image(color, photo, view.mask()),
         }
         if group is not None:
-            share = share_of_group(splats, group, view, job.settings, job.backend)
-            pictures["high_error"] = highlight_picture(color, share)
-        for what, picture in pictures.items():
-            write_image(folder / stage / f"{file}.{what}.png", picture)
-        write_image(folder / "photos" / f"{file}.png", known_picture(photo, view.known()))
+            fraction = fraction_of_group(splats, group, view, job.settings, job.backend)
+            images["high_error"] = highlight_image(color, fraction)
+        for what, image in images.items():
+            write_image(folder / stage / f"{file}.{what}.png", image)
+        write_image(folder / "photos" / f"{file}.png", valid_image(photo, view.valid()))
         shown_as = {"name": view.name, "file": file, "split": split, "depth_limits": near_far}
         views.append({**shown_as, "camera": camera_json(view.camera)})
     stages = [*(name for name in index["stages"] if name != stage), stage]
@@ -160,7 +160,9 @@ def render_view(splats: Splats, view: View, settings: RasterSettings, backend: B
         return rasterize(splats, view.camera, settings, backend=backend)
 
 
-def share_of_group(splats: Splats, group: Tensor, view: View, settings: RasterSettings, backend: Backend) -> np.ndarray:
+def fraction_of_group(
+    splats: Splats, group: Tensor, view: View, settings: RasterSettings, backend: Backend
+) -> np.ndarray:
     """How much of each pixel the splats of a row group make up: their blending weights, summed; [H, W] in [0, 1]."""
     return splatted(splats, group, view, settings, backend)
 

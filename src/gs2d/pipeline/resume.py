@@ -17,7 +17,7 @@ from gs2d.training.state import TrainState
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class ResumePoint:
     """Where training starts.
 
     Attributes
@@ -49,7 +49,7 @@ class FinishedStage:
     source: str
 
 
-def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Start:
+def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> ResumePoint:
     """The furthest valid start; the log and the metrics are cut to it.
 
     Raises
@@ -70,7 +70,7 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
     ]
     if not found:
         run.write_metrics({"stages": [], "surface": None})
-        return Start()
+        return ResumePoint()
     return _adopt(run, job, max(found, key=lambda stage: stage.index), on_event)
 
 
@@ -89,7 +89,7 @@ def check_sources(job: Job, options: TrainOptions) -> None:
         remove_made(make_folder(options.cache))
 
 
-def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> Start:
+def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> ResumePoint:
     checkpoints = run.checkpoints()
     for checkpoint in reversed(checkpoints):
         try:
@@ -106,11 +106,11 @@ def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> Start:
         run.write_metrics({"stages": metrics["stages"][:finished], "surface": surface})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
         extra = json.loads(payload["extra"])
-        return Start(state, extra["seconds"], extra["peak_memory"], extra["at_entry"])
+        return ResumePoint(state, extra["seconds"], extra["peak_memory"], extra["at_entry"])
     raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
 
 
-def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) -> Start:
+def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
     """Make another run's finished stages this run's own."""
     name = job.recipe.stages[stage.index].name
     run.events.append_text(stage.log)
@@ -118,7 +118,7 @@ def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) ->
     payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
     run.save_checkpoint(stage.index, name, None, payload)
     on_event(Notice(f"stages up to {name!r} are taken from {stage.source}"))
-    return Start(TrainState.from_state_dict(stage.payload["state"]))
+    return ResumePoint(TrainState.from_state_dict(stage.payload["state"]))
 
 
 def _from_run(job: Job, path: Path) -> FinishedStage:

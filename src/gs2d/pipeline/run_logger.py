@@ -39,7 +39,7 @@ from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.prior_scores import score_priors
 from gs2d.pipeline.render import choose_views, draw_stage
-from gs2d.pipeline.resume import Start, put_in_cache
+from gs2d.pipeline.resume import ResumePoint, put_in_cache
 from gs2d.render.types import RenderOutput
 from gs2d.training import events as train_events
 from gs2d.training.per_image import scene_now
@@ -53,7 +53,7 @@ EARLY_VIEWS = 16  # training views that score a stage before the last; of test v
 REPORTS = {"cpu": 10, "cuda": 50}  # iterations between progress events, by device: for each the host waits for a GPU
 
 
-class Recorder:
+class RunLogger:
     """The memory of a training run. Nothing it does changes what is trained.
 
     ``visitors`` see every view of the finished splats, while they are scored.
@@ -64,7 +64,7 @@ class Recorder:
         run: RunFolder,
         job: Job,
         options: TrainOptions,
-        start: Start,
+        start: ResumePoint,
         on_event: OnEvent,
         visitors: Sequence[Visitor] = (),
     ) -> None:
@@ -137,7 +137,7 @@ class Recorder:
             self._signals.forget()
 
     @contextmanager
-    def off_the_clock(self) -> Iterator[None]:
+    def timer_paused(self) -> Iterator[None]:
         """What is done meanwhile is no training time, and may take long: signals act at once, after a checkpoint."""
         self._stop_clock()
         try:

@@ -23,13 +23,13 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, Plan, Step, counted, ig
 from gs2d.pipeline.options import paths_of
 from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, read_facts, solve
-from gs2d.sfm.image_copies import stage_photos
+from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, read_photos
 from gs2d.sfm.lens import START, lens_line
-from gs2d.sfm.model import Piece, camera_line, check_any, focal_length, read_piece, why_not_placed
-from gs2d.sfm.picture import write_picture
-from gs2d.sfm.video_frames import MOST_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
-from gs2d.sfm.workspace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workplace
+from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
+from gs2d.sfm.plot import write_image_of
+from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
+from gs2d.sfm.workspace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workspace
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar")
@@ -39,8 +39,8 @@ ASKED_FOR = (  # what poses.json remembers of the options: with another of these
 )  # fmt: skip
 _GROWTH = {"placing cameras": 1.5}  # each is adjusted with those that have a place, but not with all of them every time
 FRAMES = "frames"  # of a video, in the workplace, until they are in the capture
-SMALLEST_SIDE, MOST_THREADS = 64, 1024
-_DOUBTFUL_SHARE, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
+SMALLEST_SIDE, MAX_THREADS = 64, 1024
+_DOUBTFUL_FRACTION, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     threads = options.threads or _cores()
     made = make_folder(out.parent)
     try:
-        with workplace(out) as work:
+        with workspace(out) as work:
             check_out(options.out, options.photos, overwrite=options.overwrite)  # a killed command's capture is back
             root = work / FRAMES if video else options.photos
             paths = _frames_of(video, root, options.frames, on_event) if video else paths
@@ -124,14 +124,14 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
             request = _request(options, work, photos, sizes, groups, threads)
             solved = solve(request, _progress(on_event))
-            pieces = [read_piece(capture / SPARSE / str(i), done) for i, done in enumerate(solved.models)]
+            pieces = [read_model(capture / SPARSE / str(i), done) for i, done in enumerate(solved.models)]
             facts = read_facts(Path(request.database))
             check_any(pieces, facts, options.photos)
             result = _result(options, request, photos, staged, pieces, facts, solved)
             result["seconds"] = round(time.monotonic() - started, 1)
             on_event(Phase("checking the capture", 0))
             with attempted(POSES_PNG, "", on_event):
-                write_picture(capture / POSES_PNG, pieces[0], _title(result))
+                write_image_of(capture / POSES_PNG, pieces[0], _title(result))
             write_json(capture / POSES_JSON, result)
             load_scene(capture, format="colmap")
             check_out(options.out, options.photos, overwrite=options.overwrite)  # hours later it may hold something
@@ -187,10 +187,10 @@ def check_poses_options(options: PosesOptions) -> None:
     numbers = (
         ("max_size", SMALLEST_SIDE, 1 << 16),
         ("feature_size", SMALLEST_SIDE, 1 << 16),
-        ("frames", FEWEST, MOST_FRAMES),
+        ("frames", FEWEST, MAX_FRAMES),
         ("overlap", 1, 1000),
         ("neighbours", 1, 10_000),
-        ("threads", 1, MOST_THREADS),
+        ("threads", 1, MAX_THREADS),
         ("seed", 0, (1 << 31) - 1),
     )
     for name, least, most in numbers:
@@ -208,7 +208,7 @@ def _stage(
 ) -> list[str]:
     """Put the photographs into the capture; what was done to each. Those that are ``ours`` need no second copy."""
     link = options.link or ours
-    copying = stage_photos(photos, folder, max_size=options.max_size, link=link, threads=threads)
+    copying = copy_images(photos, folder, max_size=options.max_size, link=link, threads=threads)
     with contextlib.closing(copying):  # after Ctrl-C nothing is written any more
         staged = list(counted(copying, "copying photographs", len(photos), on_event))
     counts = Counter(staged)
@@ -271,7 +271,7 @@ def _result(
     request: Request,
     photos: Sequence[Photo],
     staged: Sequence[str],
-    pieces: Sequence[Piece],
+    pieces: Sequence[SfmModel],
     facts: Facts,
     solved: Solved,
 ) -> dict[str, Any]:
@@ -343,7 +343,7 @@ def _title(result: dict[str, Any]) -> str:
 def _doubts(result: dict[str, Any]) -> list[str]:
     """What a person should look at before training."""
     doubts = []
-    if result["placed"] < _DOUBTFUL_SHARE * result["count"]:
+    if result["placed"] < _DOUBTFUL_FRACTION * result["count"]:
         doubts.append(
             f"only {result['placed']} of {result['count']} photographs have a place: look at {POSES_PNG}, and take "
             "more between those that are missing and the others"

@@ -28,15 +28,15 @@ from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import MeshOptions
 from gs2d.render.api import rasterize
-from gs2d.report.sections.subject import PICTURE, write_subject_picture
+from gs2d.report.sections.subject import IMAGE, write_subject_image
 
-MOST_VIEWS = 64  # cameras, evenly chosen, that vote
+MAX_VIEWS = 64  # cameras, evenly chosen, that vote
 SIDE = 56  # px, the shorter side of the depth maps that are looked at
 OPAQUE = 0.5  # as for the mesh
 BEHIND = 1.1  # times the rendered depth, beyond which a sparse point is hidden
 POINTS_PART = 0.5  # of a camera's vote is that of the sparse points it sees, where there are enough of them
 ENOUGH_POINTS = 20
-MOST_POINTS = 2000  # sparse points of a camera, evenly from the list
+MAX_POINTS = 2000  # sparse points of a camera, evenly from the list
 
 
 def subject_of(
@@ -47,7 +47,7 @@ def subject_of(
     Parameters
     ----------
     box : sequence of 6 floats, optional
-        x0 y0 z0 x1 y1 z1, wu: the user's own.
+        x0 y0 z0 x1 y1 z1, world units: the user's own.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def _draw(run: RunFolder, job: Job, subject: Subject, on_event: OnEvent) -> None
     try:
         make_folder(run.file(RENDERS))
         cameras = [view.camera for view in job.scene.train]
-        write_subject_picture(run.file(RENDERS) / PICTURE, subject, cameras, points)
+        write_subject_image(run.file(RENDERS) / IMAGE, subject, cameras, points)
     except DiskError as error:
         on_event(Notice(f"no picture of the subject: {error}"))
 
@@ -102,7 +102,7 @@ def meshed_subject(run: RunFolder, job: Job, splats: Splats, options: MeshOption
 
 
 def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Splats:
-    """Return the splats whose centres lie in a box, x0 y0 z0 x1 y1 z1, wu, which the user gave by an option.
+    """Return the splats whose centres lie in a box, x0 y0 z0 x1 y1 z1, world units, which the user gave by an option.
 
     Raises
     ------
@@ -130,13 +130,13 @@ def subject_line(subject: Subject, *, meshed: bool) -> str:
         return f"subject: the whole scene ({subject.why}); --subject-box x0 y0 z0 x1 y1 z1 names a part of it"
     end = "--scene takes everything" if meshed else "the mesh is of everything, --subject-box limits it"
     size = " x ".join(f"{side:.3g}" for side in subject.high - subject.low)
-    return f"subject: {size} wu, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
+    return f"subject: {size} world units, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
 def sights(job: Job, splats: Splats) -> list[Sight]:
     """Return what some of the training cameras see: rendered depth, and the sparse points that it does not hide."""
     views = job.scene.train
-    count = min(len(views), MOST_VIEWS)
+    count = min(len(views), MAX_VIEWS)
     cameras = [views[i].camera for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
     points = np.zeros((0, 3)) if job.scene.points is None else np.asarray(job.scene.points.points, np.float64)
     return [_sight(camera, _depth(job, splats, camera), points) for camera in map(_small, cameras)]
@@ -163,12 +163,12 @@ def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray) -> Sight:
     surface = (rays * z[:, None] - camera.T_cam_world[:3, 3]) @ camera.rotation
     visible = _visible(camera, depth, points)
     parts = [(surface, middle_weights(camera, pixels)), (visible, middle_weights(camera, camera.project(visible)[0]))]
-    shares = [1.0, 0.0]
+    fractions = [1.0, 0.0]
     if len(visible) >= ENOUGH_POINTS:
-        shares = [1 - POINTS_PART, POINTS_PART] if len(surface) else [0.0, 1.0]
+        fractions = [1 - POINTS_PART, POINTS_PART] if len(surface) else [0.0, 1.0]
     weights = [
-        weight * (share / weight.sum() if weight.sum() > 0 else 0)
-        for (_, weight), share in zip(parts, shares, strict=True)
+        weight * (fraction / weight.sum() if weight.sum() > 0 else 0)
+        for (_, weight), fraction in zip(parts, fractions, strict=True)
     ]
     return Sight(camera, np.concatenate([surface, visible]), np.concatenate(weights))
 
@@ -176,7 +176,7 @@ def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray) -> Sight:
 def _visible(camera: Camera, depth: np.ndarray, points: np.ndarray) -> np.ndarray:
     """The sparse points in a camera's picture that no rendered surface hides."""
     points = points[shown(camera, points)]
-    points = points[:: max(1, -(-len(points) // MOST_POINTS))]
+    points = points[:: max(1, -(-len(points) // MAX_POINTS))]
     pixels, z = camera.project(points)
     column = np.minimum(pixels[:, 0].astype(np.int64), camera.width - 1)
     row = np.minimum(pixels[:, 1].astype(np.int64), camera.height - 1)

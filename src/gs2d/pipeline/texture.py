@@ -20,7 +20,7 @@ from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh, write_textured, written_files
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
 from gs2d.meshing.atlas import required, simplified, unwrap
-from gs2d.meshing.bake import MAX_SIZE, MIN_SIZE, Baked, Photograph, bake, texture_size
+from gs2d.meshing.bake import MAX_SIZE, MIN_SIZE, Baked, ColorSource, bake, texture_size
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.finished import open_job
@@ -30,7 +30,7 @@ from gs2d.pipeline.mesh import OPAQUE, extract_mesh
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import meshed_subject
-from gs2d.render.exposure import take_back
+from gs2d.render.exposure import remove_exposure
 
 PACKAGES = ("xatlas",)  # of the extra `texture`
 
@@ -112,8 +112,8 @@ def textured_mesh(
             Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
         )
     size = options.size or texture_size(small, [view.camera for view in views])
-    photographs = _photographs(job, views, splats, options, exposures, on_event)
-    return bake(unwrap(small, size), photographs, size, threads=torch.get_num_threads())
+    images = _images(job, views, splats, options, exposures, on_event)
+    return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
 
 
 def check_texture_options(options: TextureOptions) -> None:
@@ -149,25 +149,25 @@ def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[Vie
     return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}).train
 
 
-def _photographs(
+def _images(
     job: Job,
     views: Sequence[View],
     splats: Splats,
     options: TextureOptions,
     exposures: Transforms,
     on_event: OnEvent,
-) -> Iterator[Photograph]:
+) -> Iterator[ColorSource]:
     """The views, or what the splats look like from them."""
     for view in counted(views, "colouring the texture", len(views), on_event):
         if options.source == "renders":
             output = render_view(splats, view, job.settings, job.backend)
             shown = (output.alpha >= OPAQUE).cpu().numpy()
-            yield Photograph(view.camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
+            yield ColorSource(view.camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
         else:
             image = view.image()
             if view.name in exposures:
-                image = take_back(image, exposures[view.name].numpy())
-            yield Photograph(view.camera, image, _usable(view, job))
+                image = remove_exposure(image, exposures[view.name].numpy())
+            yield ColorSource(view.camera, image, _usable(view, job))
 
 
 def _usable(view: View, job: Job) -> np.ndarray | None:

@@ -6,7 +6,7 @@ import torch
 
 from gs2d.errors import RecipeError
 
-MOST_THREADS = 1024  # each has a stack: far more of them end in errors that name anything but the cause
+MAX_THREADS = 1024  # each has a stack: far more of them end in errors that name anything but the cause
 
 
 def use_threads(threads: int | None) -> None:
@@ -15,9 +15,9 @@ def use_threads(threads: int | None) -> None:
     Raises
     ------
     RecipeError
-        Not a number from 1 to ``MOST_THREADS``.
+        Not a number from 1 to ``MAX_THREADS``.
     """
     if threads is not None:
-        if not 1 <= threads <= MOST_THREADS:
-            raise RecipeError(f"--threads must be a whole number from 1 to {MOST_THREADS}, got {threads}")
+        if not 1 <= threads <= MAX_THREADS:
+            raise RecipeError(f"--threads must be a whole number from 1 to {MAX_THREADS}, got {threads}")
         torch.set_num_threads(threads)

@@ -30,22 +30,22 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.evaluate import Visitor
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
-from gs2d.pipeline.job import Job, check_same_run, check_train_options, prepare
+from gs2d.pipeline.job import Job, check_same_run, check_train_options, prepare_job
 from gs2d.pipeline.jobs import report_run
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.mesh import MeshFrames, extract_mesh
+from gs2d.pipeline.observer import TrainingObserver
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.refined_poses import FoundPoses, found_poses, write_poses
-from gs2d.pipeline.resume import Start, check_sources, choose_start
-from gs2d.pipeline.run_logger import Recorder
+from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
+from gs2d.pipeline.run_logger import RunLogger
 from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.verdict.file import write_verdict
 from gs2d.pipeline.verdict.measures import Collector
-from gs2d.pipeline.watch import Watch
 from gs2d.training import events
 from gs2d.viewer.server import free_port, required_viser
 
@@ -81,11 +81,11 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     check_claim(options.out, **claim)  # type: ignore[arg-type]
     use_threads(options.threads)
     on_event(Plan(TRAINED))
-    job = prepare(options, on_event)
+    job = prepare_job(options, on_event)
     if options.overwrite:
         check_sources(job, options)
     run = claim_run(options.out, **claim)  # type: ignore[arg-type]
-    with run.locked(), undone_if_worthless(run), watched(run, job, options, on_event) as watch:
+    with run.locked(), discard_on_failure(run), watched(run, job, options, on_event) as watch:
         on_event = watch.on_event
         if options.cache is not None:  # now, not when the first stage has been trained
             run.made += make_folder(options.cache)
@@ -101,7 +101,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         start = choose_start(run, job, options, on_event)
         if options.estimate and start.state is None:
-            for event in foretold(job):
+            for event in pretraining_notices(job):
                 on_event(event)
         collected = Collector(job.scene, job.settings.background)
         hold()
@@ -135,10 +135,10 @@ def _train_archive(options: TrainOptions, on_event: OnEvent) -> RunFolder:
 
 
 @contextmanager
-def watched(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[Watch]:
+def watched(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[TrainingObserver]:
     """The page of a training while it lasts, if one is asked for."""
     if not options.viewer:
-        yield Watch(on_event)
+        yield TrainingObserver(on_event)
         return
     live = open_live(job, options, on_event)
     try:
@@ -165,7 +165,7 @@ def check_viewer(options: TrainOptions) -> None:
 
 
 @contextmanager
-def undone_if_worthless(run: RunFolder) -> Iterator[None]:
+def discard_on_failure(run: RunFolder) -> Iterator[None]:
     """Delete a run that fails before it has a checkpoint or a result: there is nothing in it to go on from."""
     try:
         yield
@@ -176,7 +176,12 @@ def undone_if_worthless(run: RunFolder) -> Iterator[None]:
 
 
 def train_stages(
-    run: RunFolder, job: Job, options: TrainOptions, start: Start, watch: Watch, visitors: Sequence[Visitor] = ()
+    run: RunFolder,
+    job: Job,
+    options: TrainOptions,
+    start: ResumePoint,
+    watch: TrainingObserver,
+    visitors: Sequence[Visitor] = (),
 ) -> tuple[Splats, Transforms, FoundPoses]:
     """Train from where ``start`` is to the end of the last stage; splats, exposures and poses of the photographs.
 
@@ -185,7 +190,7 @@ def train_stages(
     from gs2d.training.per_image import scene_now
     from gs2d.training.trainer import Trainer
 
-    recorder = Recorder(run, job, options, start, watch.on_event, visitors)
+    recorder = RunLogger(run, job, options, start, watch.on_event, visitors)
 
     def listen(event: events.Event) -> None:
         recorder.on_training_event(event)
@@ -197,7 +202,7 @@ def train_stages(
     def between() -> None:
         recorder.stop_if_asked()
         if watch.waiting:
-            with recorder.off_the_clock():
+            with recorder.timer_paused():
                 watch.turn()
 
     trainer = Trainer(
@@ -219,7 +224,7 @@ def train_stages(
     return state.splats, named(job.scene.train, state.exposures), poses
 
 
-def foretold(job: Job) -> list[Event]:
+def pretraining_notices(job: Job) -> list[Event]:
     """What a person wants to know before hours of training: which photographs do not train, and how long it takes."""
     from gs2d.pipeline.estimate import estimate, estimate_text
 

@@ -31,13 +31,13 @@ from gs2d.pipeline.threads import use_threads
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.report.images import depth_picture, known_picture, normal_picture
+from gs2d.report.images import depth_image, normal_image, valid_image
 from gs2d.training.state import TrainState
-from gs2d.viewer.exact import Drawn, Frame, Render
-from gs2d.viewer.server import Shot, Stage, Viewer, middle_of, required_viser, thumbnail
+from gs2d.viewer.exact import Drawn, Render, ViewerFrame
+from gs2d.viewer.server import Shot, Viewer, ViewerStage, middle_of, required_viser, thumbnail
 from gs2d.viewer.splats import preview
 
-MOST_CAMERAS = 200
+MAX_CAMERAS = 200
 FINAL = "final"
 _TICK = 0.2  # s between looks at Ctrl-C
 
@@ -124,15 +124,15 @@ def serve(viewer: Viewer, on_event: OnEvent = ignore) -> None:
     raise viewer.failure
 
 
-def frame_around(cameras: Sequence[Camera], centers: np.ndarray) -> Frame:
+def frame_around(cameras: Sequence[Camera], centers: np.ndarray) -> ViewerFrame:
     """Around what is looked at; its unit is the distance from which it is, or the spread of the splats."""
     middle = middle_of(cameras, centers)
     points = np.array([camera.center for camera in cameras]) if cameras else centers[np.isfinite(centers).all(axis=1)]
     unit = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 1.0
-    return Frame(middle, unit if unit > 1e-12 and math.isfinite(unit) else 1.0)
+    return ViewerFrame(middle, unit if unit > 1e-12 and math.isfinite(unit) else 1.0)
 
 
-def from_aside(frame: Frame, up: np.ndarray) -> Camera:
+def from_aside(frame: ViewerFrame, up: np.ndarray) -> Camera:
     """Where to look from where nobody stood."""
     aside = np.array([2.0, -2.5, 1.5]) * frame.unit
     return look_at(frame.origin + aside, frame.origin, up, width=4, height=3, fx=4.0)
@@ -190,12 +190,12 @@ def _mesh_of(run: RunFolder, on_event: OnEvent) -> tuple[bytes, list[float]] | N
     return (glb_bytes(mesh), [0.0, 0.0, 0.0, 1.0]) if len(mesh.faces) else None
 
 
-def _stage(content: _Content, load: Callable[[str], Splats], name: str) -> Stage:
+def _stage(content: _Content, load: Callable[[str], Splats], name: str) -> ViewerStage:
     def render() -> Render:
         splats = load(name).to(content.backend.device)
         return lambda camera, kind: drawn(splats, camera, kind, content.settings, content.backend, content.depth)
 
-    return Stage(lambda: preview(load(name), content.cameras), render)
+    return ViewerStage(lambda: preview(load(name), content.cameras), render)
 
 
 def drawn(
@@ -206,9 +206,9 @@ def drawn(
         output = rasterize(splats, camera, replace(settings, with_distortion=False), backend=backend)
     alpha, depth = output.alpha.cpu().numpy(), output.depth(depth_kind).cpu().numpy()
     if kind == "normals":
-        image = normal_picture(output.normal.cpu().numpy(), alpha)
+        image = normal_image(output.normal.cpu().numpy(), alpha)
     elif kind == "depth":
-        image = depth_picture(depth, alpha)
+        image = depth_image(depth, alpha)
     else:
         image = output.color.clamp(0, 1).cpu().numpy()
     return Drawn(to_uint8(image), np.where((alpha >= OPAQUE) & (depth > 0), depth, np.inf).astype(np.float32))
@@ -217,10 +217,10 @@ def drawn(
 def shots(views: Sequence[View], settings: RasterSettings, on_event: OnEvent) -> list[Shot]:
     """Some of the photographs, small."""
     some: list[Any] = list(views)
-    if len(some) > MOST_CAMERAS:
-        on_event(Notice(f"{MOST_CAMERAS} of {len(some)} cameras are shown"))
-        some = [some[i] for i in np.linspace(0, len(some) - 1, MOST_CAMERAS).round().astype(int)]
+    if len(some) > MAX_CAMERAS:
+        on_event(Notice(f"{MAX_CAMERAS} of {len(some)} cameras are shown"))
+        some = [some[i] for i in np.linspace(0, len(some) - 1, MAX_CAMERAS).round().astype(int)]
     return [
-        Shot(view.name, view.camera, thumbnail(known_picture(view.image(), view.known()), settings.background))
+        Shot(view.name, view.camera, thumbnail(valid_image(view.image(), view.valid()), settings.background))
         for view in counted(some, "thumbnails", len(some), on_event)
     ]

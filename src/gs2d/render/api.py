@@ -50,11 +50,11 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
 18. *Gradient rows.* With ``gradient_rows`` (bool [N]) the gradients of every other splat, and of its row of
     screen_probe, are zero; images, and the gradients of these rows, are the same bit for bit as without it.
 19. *Crossing.* A splat whose disc rho3d <= k^2, k = error_cutoff, reaches the camera plane (z_c <= k |(s_u t_u.z,
-    s_v t_v.z)|) is drawn like any other with ``crossing="draw"``. With "cull" it is culled whole, for images and splat
-    errors alike. With "box" it is seen, and counts in splat errors, only in the 16x16 tiles that the square of the
-    official rasterizer touches: centre b and half side h = ceil(max(|b^2 - a|_+^1/2, lowpass_px k)) of the line that
-    touches an ellipse (docs/math.md, "Footprint"), although the disc's image is a hyperbola; its radius is half the
-    longer side of these tiles, clipped to the image.
+    s_v t_v.z)|) is drawn like any other with ``near_plane_policy="draw"``. With "cull" it is culled whole, for images
+    and splat errors alike. With "box" it is seen, and counts in splat errors, only in the 16x16 tiles that the square
+    of the official rasterizer touches: centre b and half side h = ceil(max(|b^2 - a|_+^1/2, lowpass_px k)) of the
+    line that touches an ellipse (docs/math.md, "Footprint"), although the disc's image is a hyperbola; its radius is
+    half the longer side of these tiles, clipped to the image.
 20. *Camera.* Where T_cam_world was given as a tensor that requires a gradient it gets one, [4, 4]: its inner product
     with a change of T_cam_world along a rigid motion is the derivative of the loss. Of other changes (of scale, of
     shear) it says nothing. Images and all other gradients are the same bit for bit. ``gradient_rows`` (18) would leave
@@ -75,8 +75,8 @@ from gs2d.core.sh import MAX_DEGREE, sh_degree_of
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.backends import Backend, get_backend
-from gs2d.render.pose_gradient import carried, with_world_normals
-from gs2d.render.types import CROSSING, RasterSettings, RenderOutput
+from gs2d.render.pose_gradient import attach_pose_grad, with_world_normals
+from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "splat_errors"]
 
@@ -141,7 +141,7 @@ def rasterize(
                 "gradient_rows must be None for a camera that learns, whose gradient is a sum over all splats, got "
                 "rows; leave one of the two away"
             )
-        splats = carried(splats, camera.pose, settings.sh_degree)
+        splats = attach_pose_grad(splats, camera.pose, settings.sh_degree)
         output = chosen.rasterize(splats, camera, settings, screen_probe)
         return with_world_normals(output, camera.pose)
     if gradient_rows is None:
@@ -275,4 +275,4 @@ def _check_settings(s: RasterSettings) -> None:
     require(len(s.background) == 3 and all(0 <= b <= 1 for b in s.background), "background", "3 numbers in [0, 1]")
     require(0 <= s.sh_degree <= MAX_DEGREE, "sh_degree", f"0 to {MAX_DEGREE}")
     require(s.lowpass_depth in ("center", "plane"), "lowpass_depth", "'center' or 'plane'")
-    require(s.crossing in CROSSING, "crossing", "'draw', 'cull' or 'box'")
+    require(s.near_plane_policy in NEAR_PLANE_POLICIES, "near_plane_policy", "'draw', 'cull' or 'box'")

@@ -159,10 +159,10 @@ def _auto(device: str | None) -> Backend:
 def backend_report() -> tuple[BackendStatus, ...]:
     """What this machine can run and why not, in the order in which "auto" prefers it."""
     from gs2d.kernels.cuda import diagnose
-    from gs2d.kernels.library import REMEDY, available_variants, prepare
+    from gs2d.kernels.library import REMEDY, available_variants, ready_library
 
     try:
-        library = prepare()
+        library = ready_library()
         details = f"{library.instruction_set}; {library.threads} threads; built: {', '.join(available_variants())}"
         cpu = BackendStatus("cpu", True, "", "", details)
     except BackendError as error:

@@ -18,8 +18,8 @@ from torch.autograd.function import once_differentiable
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels.library import Library, prepare
-from gs2d.render.types import CROSSING, RasterSettings, RenderOutput
+from gs2d.kernels.library import Library, ready_library
+from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
@@ -91,7 +91,13 @@ def _view(camera: Camera, settings: RasterSettings, exact_masks: bool) -> _View:
     center = (-(a[i] * a[3] + b[i] * b[3] + c[i] * c[3]) for i in range(3))  # camera.center without numpy: 40 us less
     doubles = (*a[:3], *b[:3], *c[:3], a[3], b[3], c[3], *center)
     doubles += (camera.fx, camera.fy, camera.cx, camera.cy, *_constants(settings), *settings.background)
-    integers = (camera.width, camera.height, settings.sh_degree, exact_masks, CROSSING.index(settings.crossing))
+    integers = (
+        camera.width,
+        camera.height,
+        settings.sh_degree,
+        exact_masks,
+        NEAR_PLANE_POLICIES.index(settings.near_plane_policy),
+    )
     return _View.from_buffer_copy(VIEW_LAYOUT.pack(*doubles, *integers))  # a field at a time takes four times as long
 
 
@@ -237,7 +243,7 @@ def rasterize(
     BackendError
         If the native library is missing, memory runs out, or a setting is one of the reference backend only.
     """
-    return rasterize_with(prepare(), splats, camera, settings, screen_probe, gradient_rows)
+    return rasterize_with(ready_library(), splats, camera, settings, screen_probe, gradient_rows)
 
 
 def splat_errors_with(
@@ -289,4 +295,4 @@ def splat_errors(
     ShapeError, BackendError
         As for :func:`rasterize`.
     """
-    return splat_errors_with(prepare(), splats, camera, image, settings, mask, occlusion)
+    return splat_errors_with(ready_library(), splats, camera, image, settings, mask, occlusion)

@@ -19,7 +19,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
-from gs2d.kernels.library import Library, prepare
+from gs2d.kernels.library import Library, ready_library
 from gs2d.render.cpu import _address, _check_tensors, _forward, _ParameterGradients, _parameters, _view
 from gs2d.render.types import RasterSettings
 
@@ -166,7 +166,7 @@ def cache_view(
     ShapeError, BackendError
         As for :func:`gs2d.render.cpu.rasterize`.
     """
-    library = library or prepare()
+    library = library or ready_library()
     _check_tensors(splats, settings, library.dtype)
     height, width, count = camera.height, camera.width, len(rows)
     view = _view(camera, settings, True)

@@ -19,7 +19,7 @@ from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_passes import IMAGES, PARAMETERS, Frame, Wanted, backward, errors, forward
+from gs2d.render.cuda_passes import IMAGES, PARAMETERS, ForwardState, Wanted, backward, errors, forward
 from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -54,7 +54,7 @@ class _Options:
     budget: PairBudget | None
 
 
-SAVED = tuple(field.name for field in fields(Frame) if field.name not in ("view", "images"))
+SAVED = tuple(field.name for field in fields(ForwardState) if field.name not in ("view", "images"))
 
 
 class _Rasterize(torch.autograd.Function):
@@ -84,7 +84,7 @@ class _Rasterize(torch.autograd.Function):
         tensors = saved[-len(PARAMETERS) :]
         images = dict(zip((*IMAGES, "final_T", "moments"), saved[len(SAVED) : -len(PARAMETERS)], strict=True))
         hidden = dict(zip(SAVED, saved[: len(SAVED)], strict=True))
-        frame = Frame(view=options.view, images=images, **hidden)
+        frame = ForwardState(view=options.view, images=images, **hidden)
         given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[: len(IMAGES)]]
         if not options.distortion:
             given[IMAGES.index("distortion")] = None  # a constant

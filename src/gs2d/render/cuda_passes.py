@@ -32,22 +32,22 @@ from gs2d.kernels.cuda.arguments import (
     View,
 )
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.pair_budget import MOST_PAIRS, PairBudget, room_for
-from gs2d.render.types import CROSSING, RasterSettings
+from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, room_for
+from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 
-__all__ = ["IMAGES", "PARAMETERS", "Frame", "Wanted", "backward", "errors", "forward", "view_of"]
+__all__ = ["IMAGES", "PARAMETERS", "ForwardState", "Wanted", "backward", "errors", "forward", "view_of"]
 
 TILE = 16
 THREADS = 128
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
-MOST_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
-MOST_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
+MAX_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
+MAX_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ForwardState:
     """What the forward pass leaves for the backward pass.
 
     Attributes
@@ -125,7 +125,7 @@ def view_of(camera: Camera, settings: RasterSettings) -> View:
         setattr(view, name, getattr(settings, name))
     view.inv_lowpass2 = 1 / settings.lowpass_px**2
     view.log2_alpha_min = math.log2(settings.alpha_min)
-    view.error_k2, view.crossing = settings.error_cutoff**2, CROSSING.index(settings.crossing)
+    view.error_k2, view.crossing = settings.error_cutoff**2, NEAR_PLANE_POLICIES.index(settings.near_plane_policy)
     view.distortion_scale = (settings.far * settings.near / (settings.far - settings.near)) ** 2
     view.tiles_x, view.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     return view
@@ -161,8 +161,8 @@ def _project(
 ) -> _Projected:
     """Records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
     count, device = parameters[0].shape[0], parameters[0].device
-    if count >= MOST_SPLATS:
-        raise BackendError(f"the cuda backend takes fewer than {MOST_SPLATS} splats, got {count}")
+    if count >= MAX_SPLATS:
+        raise BackendError(f"the cuda backend takes fewer than {MAX_SPLATS} splats, got {count}")
     shapes = {"records": (count, 16), "cull": (count, 8), "rects": (count, 4)}
     types = {"rects": torch.int16, "depth_keys": torch.int32, "tile_counts": torch.int32}
     arrays = {
@@ -186,7 +186,7 @@ def forward(
     exact: bool = True,
     distortion: bool = True,
     budget: PairBudget | None = None,
-) -> Frame:
+) -> ForwardState:
     """Render one view; ``exact=False`` turns off culling inside tiles, and all of what has no ellipse (tests).
 
     The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device. Without
@@ -210,7 +210,7 @@ def forward(
     _fill(blend, {"records": projected.records, "seen": seen, **images})
     _fill(blend, {name: getattr(lists, name) for name in ("entries", "ranges", "tiles")})
     launcher.launch(f"blend_forward{'_distortion' if distortion else ''}", len(lists.tiles), THREADS, blend)
-    return Frame(
+    return ForwardState(
         view=view,
         records=projected.records,
         tile_counts=projected.tile_counts,
@@ -235,7 +235,7 @@ def _bin(
     order = torch.sort(projected.depth_keys, stable=True).indices
     ends = torch.cumsum(projected.tile_counts[order], 0, dtype=torch.int64)
     candidates = room_for(ends[-1], tiles, budget) if len(ends) else 0
-    if candidates > MOST_PAIRS:
+    if candidates > MAX_PAIRS:
         raise BackendError(
             f"{candidates} pairs of splat and tile, expected fewer than 2^31: use fewer splats or pixels"
         )
@@ -288,7 +288,7 @@ class Wanted:
 
 def backward(
     launcher: Launcher,
-    frame: Frame,
+    frame: ForwardState,
     parameters: Sequence[Tensor],
     upstream: dict[str, Tensor | None],
     wanted: Wanted,
@@ -324,7 +324,7 @@ def backward(
 
 
 def _backward_colors(
-    launcher: Launcher, frame: Frame, parameters: Sequence[Tensor], g_color: Tensor | None, wanted: Wanted
+    launcher: Launcher, frame: ForwardState, parameters: Sequence[Tensor], g_color: Tensor | None, wanted: Wanted
 ) -> None:
     """Of sh0 and shN alone: no geometry, and no work behind the last splat that learns."""
     means, *_, sh0, shN = parameters
@@ -349,8 +349,8 @@ def _backward_colors(
 class _Sums:
     """Where the blending's gradients are added up: rows of the splats, or a slot for each (entry, warp)."""
 
-    def __init__(self, frame: Frame, deterministic: bool, *, columns: int) -> None:
-        if deterministic and len(frame.permutation) >= MOST_SLOTTED:
+    def __init__(self, frame: ForwardState, deterministic: bool, *, columns: int) -> None:
+        if deterministic and len(frame.permutation) >= MAX_SLOTTED:
             raise BackendError(
                 f"{len(frame.permutation)} pairs of splat and tile, expected fewer than 2^30 for deterministic "
                 "gradients: use fewer splats or pixels, or torch.use_deterministic_algorithms(False)"

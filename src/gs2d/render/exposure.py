@@ -164,7 +164,7 @@ def fit_exposure(
     return (identity(rows) + torch.linalg.solve(normal, rows.T @ missing).T).to(color.dtype)
 
 
-def take_back(image: np.ndarray, transform: np.ndarray) -> np.ndarray:
+def remove_exposure(image: np.ndarray, transform: np.ndarray) -> np.ndarray:
     """A photograph uint8 [H, W, 3 or 4] in the exposure of the scene: A^-1 (P - b), rounded; alpha stays."""
     back = np.linalg.inv(transform[:, :3].astype(np.float64))
     color = (image[..., :3] / 255.0 - transform[:, 3]) @ back.T

@@ -13,7 +13,7 @@ from gs2d.kernels.library import Library
 __all__ = ["exposed", "gradients"]
 
 
-class _Picture(ctypes.Structure):
+class _Image(ctypes.Structure):
     """``struct Picture`` of kernels/cpu/exposure.cpp."""
 
     _fields_ = (
@@ -34,9 +34,9 @@ def _plain(library: Library, **tensors: Tensor | None) -> list[Tensor | None]:
     return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors.values()]
 
 
-def _picture(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> _Picture:
+def _image(color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None) -> _Image:
     behind = (0.0, 0.0, 0.0) if coverage is None or background is None else tuple(background.tolist())
-    return _Picture(
+    return _Image(
         color.data_ptr(),
         None if coverage is None else coverage.data_ptr(),
         color.numel() // 3,
@@ -64,10 +64,10 @@ def exposed(
     assert plain is not None
     out = torch.empty_like(plain)
     over = None if ceiling is None else torch.empty_like(ceiling)
-    picture = _picture(plain, transform, cover, background)
+    image = _image(plain, transform, cover, background)
     function = library.function("gs2d_expose", None, (ctypes.c_void_p,) * 4)
     pointers = [None if tensor is None else tensor.data_ptr() for tensor in (ceiling, out, over)]
-    function(ctypes.byref(picture), *pointers)
+    function(ctypes.byref(image), *pointers)
     return out, over
 
 
@@ -85,9 +85,9 @@ def gradients(
     assert given is not None
     assert plain is not None
     to_color, sums = torch.empty_like(plain), (ctypes.c_double * 12)()
-    picture = _picture(plain, transform, cover, background)
+    image = _image(plain, transform, cover, background)
     function = library.function("gs2d_expose_vjp", ctypes.c_int, (ctypes.c_void_p,) * 5)
     pointers = [None if tensor is None else tensor.data_ptr() for tensor in (cut, given, to_color)]
-    if function(ctypes.byref(picture), *pointers, sums) != 0:
+    if function(ctypes.byref(image), *pointers, sums) != 0:
         raise MemoryError("no memory for the sums of an exposure's gradient")
     return to_color, torch.tensor(list(sums), dtype=torch.float64).reshape(3, 4).to(transform.dtype)

@@ -7,12 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["MOST_PAIRS", "PairBudget", "room_for"]
+__all__ = ["MAX_PAIRS", "PairBudget", "room_for"]
 
 SLACK = 1.25  # room, in the largest number seen
 STEP = 1 << 16  # room is a multiple of it, so that torch's allocator sees few sizes
 FORGET = 1 / 1024  # share of the largest number that goes with each rendering: room that is not used is sorted too
-MOST_PAIRS = (1 << 31) - 1
+MAX_PAIRS = (1 << 31) - 1
 
 
 class PairBudget:
@@ -20,9 +20,9 @@ class PairBudget:
 
     The first rendering of a size waits for the number of pairs. Later ones take SLACK times the largest number so far,
     which is slowly forgotten, and wait for nothing; if that is too little, the pairs farthest away are left out, which
-    ``overflow`` says on the device at once, and ``cut_short`` on the host afterwards. So an update that reads
+    ``overflow`` says on the device at once, and ``overflowed`` on the host afterwards. So an update that reads
     ``overflow`` does nothing, and the caller renders again with ``exact`` set. Both speak of all renderings since the
-    last ``cut_short``: an iteration may render two views.
+    last ``overflowed``: an iteration may render two views.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class PairBudget:
         largest = self._largest.get(tiles)
         if self.exact or largest is None:
             return None
-        return min(-(-int(SLACK * largest) // STEP) * STEP, MOST_PAIRS)
+        return min(-(-int(SLACK * largest) // STEP) * STEP, MAX_PAIRS)
 
     def learn(self, tiles: int, pairs: int) -> None:
         """The number of pairs of a rendering, once it is known."""
@@ -63,7 +63,7 @@ class PairBudget:
             self._event = self._event or torch.cuda.Event()
             self._event.record(torch.cuda.current_stream(pairs.device))
 
-    def cut_short(self) -> bool:
+    def overflowed(self) -> bool:
         """Whether a rendering lacked pairs; waits until their numbers are known, not until they are done."""
         asked, self._asked, self.overflow = self._asked, [], None
         if asked and self._event is not None:

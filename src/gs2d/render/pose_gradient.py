@@ -21,10 +21,10 @@ from gs2d.kernels.library import library_for
 from gs2d.render import pose_gradient_native as native
 from gs2d.render.types import RenderOutput
 
-__all__ = ["carried", "turning_normals", "with_world_normals"]
+__all__ = ["attach_pose_grad", "normals_without_pose_grad", "with_world_normals"]
 
 
-def carried(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
+def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
     """The same splats; what reaches their gradients also reaches that of the camera.
 
     Parameters
@@ -43,12 +43,12 @@ def carried(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
 def with_world_normals(output: RenderOutput, pose: Tensor) -> RenderOutput:
     """The same images; the camera's gradient knows that normals stay in the world where splats would be turned."""
     normal = _TurnNormals.apply(pose, output.normal, -1.0)
-    return replace(output, normal=normal, turning_normal=output.normal)
+    return replace(output, normal=normal, normal_without_pose_grad=output.normal)
 
 
-def turning_normals(output: RenderOutput, pose: Tensor) -> Tensor:
+def normals_without_pose_grad(output: RenderOutput, pose: Tensor) -> Tensor:
     """:func:`with_world_normals` undone: for a loss that compares them with other normals that turn with them."""
-    before, now = output.turning_normal, output.normal
+    before, now = output.normal_without_pose_grad, output.normal
     if before is not None and before.data_ptr() == now.data_ptr():
         return before
     return _TurnNormals.apply(pose, now, 1.0)  # somebody has changed them since

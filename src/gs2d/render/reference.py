@@ -74,7 +74,7 @@ class Pairs:
     """n splats x P pixels, in blending order along dimension 0."""
 
     rho: Tensor  # [n, P]
-    depth: Tensor  # [n, P] wu; z_c where the pair does not use the plane, so always finite
+    depth: Tensor  # [n, P] world units; z_c where the pair does not use the plane, so always finite
     near_enough: Tensor  # [n, P] bool: passes the near test of rule 5
 
 

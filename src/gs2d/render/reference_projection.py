@@ -33,7 +33,7 @@ class ScreenSplats:
     center: Tensor  # [M, 2] px, c
     Au: Tensor  # [M, 3]
     Av: Tensor  # [M, 3]
-    Tw: Tensor  # [M, 3] wu; depth z = Tw . (u, v, 1), so Tw.z = z_c
+    Tw: Tensor  # [M, 3] world units; depth z = Tw . (u, v, 1), so Tw.z = z_c
     opacity: Tensor  # [M]
     color: Tensor  # [M, 3]
     normal: Tensor  # [M, 3] world, facing the camera
@@ -66,7 +66,7 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
         keep &= tensor.isfinite().flatten(1).all(dim=1) if tensor.dim() > 1 else tensor.isfinite()
     depth = _to_camera(used.means, camera)[:, 2]
     keep &= depth > settings.near
-    if settings.crossing == "cull":
+    if settings.near_plane_policy == "cull":
         keep &= depth**2 > settings.error_cutoff**2 * _slant_squared(used, camera)
     if not for_errors:
         keep &= used.opacities >= settings.alpha_min
@@ -75,7 +75,7 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
 
 
 def _slant_squared(splats: Splats, camera: Camera) -> Tensor:
-    """(s_u t_u.z)^2 + (s_v t_v.z)^2 in the camera frame [N], wu^2: how far one sigma of the disc reaches in depth."""
+    """(s_u t_u.z)^2 + (s_v t_v.z)^2 in the camera frame [N], squared world units: one sigma's reach in depth."""
     tangents = quats_to_matrices(splats.quats)[:, :, :2] * splats.scales[:, None, :]  # [N, 3, 2]
     forward = torch.as_tensor(camera.rotation[2].copy(), dtype=tangents.dtype, device=tangents.device)
     return torch.einsum("j,njk->nk", forward, tangents).square().sum(dim=1)
@@ -92,10 +92,10 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
     """
     means = splats.means[rows]
     frames = quats_to_matrices(splats.quats[rows])  # [M, 3, 3], columns t_u, t_v, t_w in the world
-    scales = splats.log_scales[rows].exp()  # [M, 2] wu
+    scales = splats.log_scales[rows].exp()  # [M, 2] world units
     R = torch.as_tensor(camera.rotation, dtype=means.dtype, device=means.device)
 
-    p = _to_camera(means, camera)  # [M, 3] wu
+    p = _to_camera(means, camera)  # [M, 3] world units
     tangents = torch.einsum("ij,mjk->mik", R, frames[:, :, :2] * scales[:, None, :])  # [M, 3, 2], s_u t_u and s_v t_v
     H = torch.cat([tangents, p[:, :, None]], dim=2)  # [M, 3, 3]: x_cam = H (u, v, 1)
     Tw = H[:, 2]
@@ -139,7 +139,7 @@ def screen_boxes(screen: ScreenSplats, cutoff_squared: Tensor, camera: Camera, s
     """
     k2 = cutoff_squared.detach().double()
     exact = _boxes(screen, k2, camera, settings)
-    if settings.crossing != "box":
+    if settings.near_plane_policy != "box":
         return exact
     k2 = torch.full_like(k2, settings.error_cutoff**2)
     crosses = _dot(k2, screen.Tw.detach().double(), screen.Tw.detach().double()) >= 0
@@ -225,6 +225,6 @@ def cutoff_squared(opacity: Tensor, settings: RasterSettings) -> Tensor:
 
 
 def _to_camera(points: Tensor, camera: Camera) -> Tensor:
-    """World points [N, 3] in the camera frame [N, 3] wu."""
+    """World points [N, 3] in the camera frame [N, 3] world units."""
     T = torch.as_tensor(camera.T_cam_world, dtype=points.dtype, device=points.device)
     return points @ T[:3, :3].T + T[:3, 3]

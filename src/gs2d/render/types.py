@@ -7,7 +7,11 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-CROSSING = ("draw", "cull", "box")  # the values of RasterSettings.crossing; the kernels know them by their place
+NEAR_PLANE_POLICIES = (
+    "draw",
+    "cull",
+    "box",
+)  # the values of RasterSettings.near_plane_policy; the kernels know them by their place
 
 
 @dataclass(frozen=True)
@@ -17,9 +21,9 @@ class RasterSettings:
     Attributes
     ----------
     near : float
-        wu. Splats whose centre is at or before it are culled; pairs with a smaller depth are skipped.
+        World units. Splats whose centre is at or before it are culled; pairs with a smaller depth are skipped.
     far : float
-        wu. Only maps depth for the distortion.
+        World units. Only maps depth for the distortion.
     alpha_min, alpha_max : float
         Pairs below alpha_min are skipped, above alpha_max clamped.
     transmittance_min : float
@@ -35,7 +39,7 @@ class RasterSettings:
     lowpass_depth : str
         Depth of a pair where the low-pass filter wins: "center" (the splat centre's), or "plane" (the ray-plane depth
         of the current official code; reference backend only).
-    crossing : str
+    near_plane_policy : str
         Splats whose disc of ``error_cutoff`` standard deviations reaches the camera plane: "draw" like any other, or
         "cull", or "box": only in the tiles of the official rasterizer's box, which has no meaning for them (rule 19).
     with_distortion : bool
@@ -52,7 +56,7 @@ class RasterSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sh_degree: int = 3
     lowpass_depth: str = "center"
-    crossing: str = "draw"
+    near_plane_policy: str = "draw"
     with_distortion: bool = True
 
 
@@ -68,15 +72,15 @@ class RenderOutput:
         sum w = 1 - T_final.
     normal : Tensor [H, W, 3]
         sum w n, world frame, each n facing the camera; not normalised.
-    depth_mean : Tensor [H, W] wu
+    depth_mean : Tensor [H, W] world units
         sum w z / alpha; 0 where nothing was hit.
-    depth_median : Tensor [H, W] wu
+    depth_median : Tensor [H, W] world units
         Depth of the last pair whose incoming transmittance exceeds 0.5; 0 where nothing was hit.
     distortion : Tensor [H, W]
         Sum over pairs i > j of w_i w_j (m_i - m_j)^2, m the mapped depth.
     radii : Tensor [N] px
         Half the longer side of each splat's screen box; 0 for splats that touch no pixel.
-    turning_normal : Tensor [H, W, 3] or None
+    normal_without_pose_grad : Tensor [H, W, 3] or None
         Where a camera learns: ``normal`` as if the world turned with the camera. For losses that compare normals.
     """
 
@@ -87,7 +91,7 @@ class RenderOutput:
     depth_median: Tensor
     distortion: Tensor
     radii: Tensor
-    turning_normal: Tensor | None = None
+    normal_without_pose_grad: Tensor | None = None
 
     def depth(self, kind: str) -> Tensor:
         """``depth_mean`` or ``depth_median`` by the name a recipe or protocol uses."""

@@ -91,7 +91,7 @@ def table(
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def picture(image: np.ndarray, caption: str = "", *, alt: str, width: int = 360, full: str | None = None) -> str:
+def image_tag(image: np.ndarray, caption: str = "", *, alt: str, width: int = 360, full: str | None = None) -> str:
     """Return an image [H, W, 3 or 4] inline as JPEG, at most ``width`` px wide, over white.
 
     Parameters

@@ -36,7 +36,7 @@ def depth_scale(steps: int) -> np.ndarray:
     return _scale(_DEPTH_SCALE, np.linspace(0, 1, steps))
 
 
-def normal_picture(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+def normal_image(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """World normals as colours, (n + 1) / 2, over white.
 
     Parameters
@@ -61,7 +61,7 @@ def normal_picture(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
-    """Nearest and farthest depth worth a colour, wu: the 1st and 99th percentile where alpha is at least 0.5.
+    """Nearest and farthest depth worth a colour, world units: the 1st and 99th percentile where alpha is at least 0.5.
 
     Use the limits of one stage for the pictures of all, so that they compare. (0, 1) where nothing was hit.
     """
@@ -73,15 +73,15 @@ def depth_limits(depth: np.ndarray, alpha: np.ndarray) -> tuple[float, float]:
     return near, max(far, near * (1 + 1e-6) + 1e-12)
 
 
-def depth_picture(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
+def depth_image(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, float] | None = None) -> np.ndarray:
     """Depth from near (light) to far (dark) over white.
 
     Parameters
     ----------
-    depth : ndarray [H, W] wu
+    depth : ndarray [H, W] world units
         0 where nothing was hit.
     alpha : ndarray [H, W]
-    limits : (near, far) wu, optional
+    limits : (near, far) world units, optional
         Default: :func:`depth_limits` of this picture.
 
     Returns
@@ -94,7 +94,7 @@ def depth_picture(depth: np.ndarray, alpha: np.ndarray, limits: tuple[float, flo
     return np.asarray(cover * _scale(_DEPTH_SCALE, position) + (1 - cover), dtype=np.float32)
 
 
-def error_picture(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+def error_image(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Mean absolute error over channels, from black at 0 to pale yellow at :data:`ERROR_TOP` and above.
 
     Parameters
@@ -110,14 +110,14 @@ def error_picture(color: np.ndarray, photo: np.ndarray, mask: np.ndarray | None 
     """
     check_shapes({"photo": (photo, "H W 3"), "color": (color, "H W 3")})
     error = np.abs(np.clip(color, 0, 1) - photo).mean(axis=2)
-    picture = _scale(_ERROR_SCALE, error / ERROR_TOP)
+    image = _scale(_ERROR_SCALE, error / ERROR_TOP)
     if mask is not None:
         check_shapes({"photo": (photo, "H W 3"), "mask": (mask, "H W")})
-        picture[~mask] = IGNORED
-    return picture
+        image[~mask] = IGNORED
+    return image
 
 
-def known_picture(photo: np.ndarray, known: np.ndarray | None) -> np.ndarray:
+def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     """Return a photograph hatched where it says nothing (``known`` is False), which undistortion left black.
 
     Parameters
@@ -127,17 +127,17 @@ def known_picture(photo: np.ndarray, known: np.ndarray | None) -> np.ndarray:
     known : ndarray bool [H, W] or None
         None: all of it.
     """
-    if known is None:
+    if valid is None:
         return photo
-    check_shapes({"photo": (photo, "H W C"), "known": (known, "H W")})
-    rows, columns = np.indices(known.shape)
+    check_shapes({"photo": (photo, "H W C"), "known": (valid, "H W")})
+    rows, columns = np.indices(valid.shape)
     stripes = ((rows + columns) // HATCH % 2 == 0)[..., None]
     opaque = np.where(stripes, (*IGNORED, 1.0), (*HATCHED, 1.0))[..., : photo.shape[2]]
     tones = np.rint(255 * opaque) if photo.dtype == np.uint8 else opaque
-    return np.where(known[..., None], photo, tones.astype(photo.dtype))
+    return np.where(valid[..., None], photo, tones.astype(photo.dtype))
 
 
-def highlight_picture(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def highlight_image(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """The high-error splats in magenta over the faded grey picture.
 
     Parameters
@@ -154,5 +154,5 @@ def highlight_picture(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
     check_shapes({"color": (color, "H W 3"), "weight": (weight, "H W")})
     grey = np.clip(color, 0, 1) @ np.array([0.2126, 0.7152, 0.0722])
     base = (0.30 + 0.70 * grey)[..., None]
-    share = np.clip(weight, 0, 1)[..., None]
-    return np.asarray(share * np.array(HIGHLIGHT) * (0.55 + 0.45 * base) + (1 - share) * base, dtype=np.float32)
+    fraction = np.clip(weight, 0, 1)[..., None]
+    return np.asarray(fraction * np.array(HIGHLIGHT) * (0.55 + 0.45 * base) + (1 - fraction) * base, dtype=np.float32)

@@ -17,7 +17,7 @@ _SAMPLES = 2  # rays per pixel along each axis
 
 
 @dataclass(frozen=True, eq=False)
-class MeshPicture:
+class MeshImage:
     """A mesh from one camera, over white.
 
     Attributes
@@ -47,16 +47,16 @@ def orbit_cameras(mesh: Mesh, *, count: int = 2, size: int = 420) -> tuple[Camer
     return tuple(cameras)
 
 
-def mesh_pictures(mesh: Mesh, cameras: Sequence[Camera], *, width: int = 420) -> list[MeshPicture]:
+def mesh_images(mesh: Mesh, cameras: Sequence[Camera], *, width: int = 420) -> list[MeshImage]:
     """Render a mesh from each camera, resized to ``width`` px."""
-    pictures = []
+    images = []
     for camera in cameras:
         resized = camera.resized(width, max(round(width * camera.height / camera.width), 1))
         hits = cast_camera(mesh.vertices.astype(np.float64), mesh.faces, resized, samples=_SAMPLES)
         shape = _average(_clay(mesh, hits, resized), hits)
         color = None if mesh.colors is None else _average(_vertex_colors(mesh, hits), hits)
-        pictures.append(MeshPicture(shape, color))
-    return pictures
+        images.append(MeshImage(shape, color))
+    return images
 
 
 def _clay(mesh: Mesh, hits: Hits, camera: Camera) -> np.ndarray:

@@ -234,7 +234,7 @@ def _figure(
     return svg_text(figure)
 
 
-def plot_by_photograph(height: float) -> tuple[Any, Any]:
+def plot_by_image(height: float) -> tuple[Any, Any]:
     """Figure and plain axes for something of each training photograph, in their order."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

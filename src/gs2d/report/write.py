@@ -348,12 +348,16 @@ def story(events: Sequence[Mapping[str, Any]]) -> str:
             counts = densified.setdefault(stage, [0, 0, 0])
             counts[0] += int(event.get("cloned", 0))
             counts[1] += int(event.get("split", 0))
-            counts[2] += sum(int(event.get(name, 0)) for name in ("pruned", "pruned_faint", "pruned_large"))
+            counts[2] += sum(
+                int(event.get(name, 0)) for name in ("pruned", "pruned_faint", "pruned_by_opacity", "pruned_large")
+            )
         elif kind == "opacity_limited" and event.get("reset"):
             resets[stage] = resets.get(stage, 0) + 1
         elif kind == "ranked":
-            share = event.get("share")
-            held = f", which hold {100 * share:.1f} % of the summed colour error" if isinstance(share, float) else ""
+            fraction = event.get("fraction", event.get("share"))
+            held = (
+                f", which hold {100 * fraction:.1f} % of the summed colour error" if isinstance(fraction, float) else ""
+            )
             lines.append(f"{stage}: ranked by colour error; the worst {figure(event.get('count'), 0)} splats{held}.")
         elif kind == "cloned":
             lines.append(

@@ -19,7 +19,7 @@ from gs2d.sfm.images import DAMAGED_EXIF, JPEG, Photo, turn
 QUALITY = 95  # of JPEG files that had to be written again, without chroma subsampling
 
 
-def stage_photos(
+def copy_images(
     photos: Sequence[Photo], folder: Path, *, max_size: int | None, link: bool, threads: int
 ) -> Generator[str, None, None]:
     """Put the photographs into ``folder``; yields for each what was done: "copied", "linked", "turned", "resized".

@@ -22,7 +22,7 @@ HELD_OUT = 0.2  # of the points that are long enough lose one observation each
 LONG = 4  # observations of a point, of which one can be held out
 FARTHEST = 4.0  # px; COLMAP's own limit: an error beyond it is a wrong match
 NARROWEST = 1.5  # degrees between the rays to a point; COLMAP's own limit
-MOST_PHOTOGRAPHS = 100  # that are compared on: more cost time and change nothing
+MAX_PHOTOGRAPHS = 100  # that are compared on: more cost time and change nothing
 ITERATIONS = 30  # of a bundle adjustment that compares: it starts from cameras that fit
 
 
@@ -168,12 +168,12 @@ def try_lenses(
     base = _part(pycolmap, piece)
     held = _hold_out(base, seed)
     before = {number: _plain(camera) for number, camera in base.cameras.items()}
-    photographs = _photographs(piece)
+    images = _images(piece)
     trials = []
     for done, model in enumerate(models_to_try(asked), start=1):
         copy = pycolmap.Reconstruction(base)
         for number, camera in copy.cameras.items():
-            rich = photographs.get(number, 0) >= ENOUGH or PARAMETERS.get(model, 0) <= PARAMETERS[START]
+            rich = images.get(number, 0) >= ENOUGH or PARAMETERS.get(model, 0) <= PARAMETERS[START]
             if model != asked:
                 _set_model(pycolmap, camera, model if rich else START, before[number])
         adjust(pycolmap, copy, tied=model == "OPENCV" and model != asked, threads=threads)
@@ -210,16 +210,16 @@ def drop_outliers(pycolmap: Any, piece: Any) -> None:
 
 
 def _part(pycolmap: Any, piece: Any) -> Any:
-    """A copy of a model with at most ``MOST_PHOTOGRAPHS``, which follow each other by name."""
+    """A copy of a model with at most ``MAX_PHOTOGRAPHS``, which follow each other by name."""
     copy = pycolmap.Reconstruction(piece)
     placed = sorted((image for image in copy.images.values() if image.has_pose), key=lambda image: image.name)
-    first = (len(placed) - MOST_PHOTOGRAPHS) // 2
-    for image in placed[: max(first, 0)] + placed[max(first, 0) + MOST_PHOTOGRAPHS :]:
+    first = (len(placed) - MAX_PHOTOGRAPHS) // 2
+    for image in placed[: max(first, 0)] + placed[max(first, 0) + MAX_PHOTOGRAPHS :]:
         copy.deregister_frame(image.frame_id)
     return copy
 
 
-def _photographs(piece: Any) -> dict[int, int]:
+def _images(piece: Any) -> dict[int, int]:
     counts: dict[int, int] = {}
     for image in piece.images.values():
         if image.has_pose:

@@ -21,14 +21,14 @@ from gs2d.data.readers.colmap_model import (
 from gs2d.errors import DataError
 from gs2d.sfm.colmap import Facts
 
-_MOST_ANGLES = 2000
+_MAX_ANGLES = 2000
 FEW_FEATURES = 50  # of a photograph: fewer verify nothing
 _NONE: Mapping[str, str] = MappingProxyType({})
 _SHOOTING = "take photographs a step apart, each showing two thirds of what the one before shows"
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class SfmModel:
     """One model: photographs that are connected with each other.
 
     Attributes
@@ -60,12 +60,12 @@ class Piece:
         return {image.name for image in self.images}
 
 
-def read_piece(folder: Path, done: Mapping[str, Any]) -> Piece:
+def read_model(folder: Path, done: Mapping[str, Any]) -> SfmModel:
     """Read a model that the worker wrote, by our own reader."""
     points = read_points(folder, "bin")
     images = sorted(read_images(folder, "bin", observations=True), key=lambda image: image.name)
     assert points is not None  # the worker writes no model without points
-    return Piece(
+    return SfmModel(
         tuple(images),
         read_cameras(folder, "bin"),
         points,
@@ -77,8 +77,8 @@ def read_piece(folder: Path, done: Mapping[str, Any]) -> Piece:
 
 
 def _median_angle(images: Sequence[ColmapImage], points: ColmapPoints) -> float:
-    """See ``Piece``; over at most ``_MOST_ANGLES`` points."""
-    step = -(-len(points.ids) // _MOST_ANGLES)
+    """See ``Piece``; over at most ``_MAX_ANGLES`` points."""
+    step = -(-len(points.ids) // _MAX_ANGLES)
     rays: dict[int, list[np.ndarray]] = {int(number): [] for number in points.ids[::step]}
     places = dict(zip(rays, points.xyz[::step], strict=True))
     for image in images:
@@ -91,7 +91,7 @@ def _median_angle(images: Sequence[ColmapImage], points: ColmapPoints) -> float:
     return float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))) if cosines else 0.0
 
 
-def check_any(pieces: Sequence[Piece], facts: Facts, root: Path) -> None:
+def check_any(pieces: Sequence[SfmModel], facts: Facts, root: Path) -> None:
     """Raise DataError where there is no model at all; says at which step it ended, and what to do."""
     if pieces:
         return
@@ -114,7 +114,7 @@ def check_any(pieces: Sequence[Piece], facts: Facts, root: Path) -> None:
     )
 
 
-def why_not_placed(name: str, pieces: Sequence[Piece], facts: Facts, refused: Mapping[str, str] = _NONE) -> str:
+def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: Facts, refused: Mapping[str, str] = _NONE) -> str:
     """The reason, as far as it is known, why a photograph has no camera in the first piece.
 
     ``refused`` are those that found a place in the second round and lost it again, with what is known of them.
@@ -142,12 +142,12 @@ def _first(names: Mapping[str, int]) -> str:
     return ", ".join(listed[:2]) + (" ..." if len(listed) > 2 else "")
 
 
-def camera_line(camera: ColmapCamera, photographs: int) -> str:
+def camera_line(camera: ColmapCamera, images: int) -> str:
     """One line about an estimated camera: model, focal length, field of view."""
     focal = focal_length(camera)
     angle = np.degrees(2 * np.arctan(camera.width / (2 * focal)))
     return (
-        f"{camera.model} of {photographs} photographs, {camera.width}x{camera.height}, f = {focal:.0f} px "
+        f"{camera.model} of {images} photographs, {camera.width}x{camera.height}, f = {focal:.0f} px "
         f"({angle:.0f} degrees wide)"
     )
 

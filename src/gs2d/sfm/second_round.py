@@ -16,11 +16,11 @@ import numpy as np
 PARTNERS = 12  # placed photographs that one without a place is compared with again: those that look most like it
 NEXT = 3  # photographs before and after it in the order of names are partners too
 RATIO = 0.9  # of the distances to the nearest and the second nearest feature; the first round's is 0.8
-LEAST_MATCHES = 12  # of a pair, once they agree with one motion; the first round's is 15
-LEAST_POINTS = 15  # of known place that agree on where a photograph was taken; the first round's is 30
-LEAST_SHARE = 0.12  # of the candidates, likewise; the first round's is 0.25
+MIN_MATCHES = 12  # of a pair, once they agree with one motion; the first round's is 15
+MIN_POINTS = 15  # of known place that agree on where a photograph was taken; the first round's is 30
+MIN_FRACTION = 0.12  # of the candidates, likewise; the first round's is 0.25
 TRIALS = 6  # how often a photograph is tried
-LEAST_SEEN, WORST = 20, 2.0  # points that it must see in the end, and how far off, of the median of the others
+MIN_SEEN, WORST = 20, 2.0  # points that it must see in the end, and how far off, of the median of the others
 
 
 def partners(
@@ -73,7 +73,7 @@ def match_again(
     matching.guided_matching = True
     matching.sift.max_ratio = RATIO
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = LEAST_MATCHES
+    verification.min_num_inliers = MIN_MATCHES
     verification.ransac.random_seed = request["seed"]
     listed = Path(path).with_name("pairs_again.txt")
     listed.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
@@ -85,9 +85,9 @@ def match_again(
 def relax(options: Any) -> Any:
     """Change options of the first round's mapping into those of the second, and return them."""
     options.multiple_models = False
-    options.min_num_matches = LEAST_MATCHES
-    options.mapper.abs_pose_min_num_inliers = LEAST_POINTS
-    options.mapper.abs_pose_min_inlier_ratio = LEAST_SHARE
+    options.min_num_matches = MIN_MATCHES
+    options.mapper.abs_pose_min_num_inliers = MIN_POINTS
+    options.mapper.abs_pose_min_inlier_ratio = MIN_FRACTION
     options.mapper.max_reg_trials = TRIALS
     return options
 
@@ -122,8 +122,8 @@ def refuse_unsupported(piece: Any, newcomers: Iterable[str]) -> dict[str, str]:
 def _objection(piece: Any, image: Any, settled: set[int], usual: float) -> str:
     """Why a photograph has no place; empty where it may have it."""
     errors = _errors(piece, image, settled)
-    if len(errors) < LEAST_SEEN:
-        return f"only {len(errors)} points of known place agree on where it was taken (expected {LEAST_SEEN} or more)"
+    if len(errors) < MIN_SEEN:
+        return f"only {len(errors)} points of known place agree on where it was taken (expected {MIN_SEEN} or more)"
     if (error := float(np.median(errors))) > WORST * usual:
         return f"points are {error:.1f} px off where it fits best ({usual:.1f} px are usual here)"
     return ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-LEAST_AGREEMENT = 0.3  # length of the mean of the cameras' up vectors
+MIN_AGREEMENT = 0.3  # length of the mean of the cameras' up vectors
 _TOWARDS_MEAN = 0.01  # decides where all right-hand vectors are parallel, negligible where they are not
 
 
@@ -20,7 +20,7 @@ def up_direction(rotations: np.ndarray) -> np.ndarray | None:
         World to camera, OpenCV axes: rows are the camera's right, down and forward in the world.
     """
     right, mean_up = rotations[:, 0], -rotations[:, 1].mean(axis=0)
-    if np.linalg.norm(mean_up) < LEAST_AGREEMENT:
+    if np.linalg.norm(mean_up) < MIN_AGREEMENT:
         return None
     spread = right.T @ right / len(right) - _TOWARDS_MEAN * np.outer(mean_up, mean_up)
     up = np.linalg.eigh(spread)[1][:, 0]

@@ -25,7 +25,7 @@ from gs2d.core.extras import FFMPEG
 from gs2d.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv")
-MOST_FRAMES = 2000
+MAX_FRAMES = 2000
 SIDE = 640  # px at which frames are judged, whatever their shape: smear of a pixel or two at full size still shows
 QUALITY = 2  # of ffmpeg's JPEG, 1 to 31: its best but one
 HDR = {"smpte2084": "PQ", "arib-std-b67": "HLG"}

@@ -18,20 +18,20 @@ from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_made
 
 IMAGES, SPARSE, POSES_JSON, POSES_PNG = "images", "sparse", "poses.json", "poses.png"
 OLD = "old"  # an earlier capture, until the new one has its name
-OURS = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
+EXIT_BUG = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
 
 
-def check_out(given: Path, photographs: Path, *, overwrite: bool) -> None:
+def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
     """Raise before anything slow begins, where the capture cannot or must not be put.
 
     Raises
     ------
     RunError, DiskError
     """
-    out, photos = given.resolve(), photographs.resolve()
+    out, photos = given.resolve(), images.resolve()
     if out == photos or photos in out.parents or out in photos.parents:
         raise RunError(
-            f"--out {given} must lie beside the photographs, not in their folder or above it ({photographs}): "
+            f"--out {given} must lie beside the photographs, not in their folder or above it ({images}): "
             "that folder is only read"
         )
     try:
@@ -44,7 +44,7 @@ def check_out(given: Path, photographs: Path, *, overwrite: bool) -> None:
         raise disk_error(out, error) from error
     if out.is_mount():
         raise RunError(f"--out {given} is where a disk is mounted, and cannot be renamed; choose a folder in it")
-    others = sorted(entries - set(OURS))
+    others = sorted(entries - set(EXIT_BUG))
     if POSES_JSON in entries and not others:
         if not overwrite:
             raise RunError(f"{given} already holds a capture; replace it with --overwrite")
@@ -57,13 +57,13 @@ def check_out(given: Path, photographs: Path, *, overwrite: bool) -> None:
         raise RunError(f"--out {given} is the folder that you are in, and is replaced as a whole; go elsewhere")
 
 
-def hidden_workplace(out: Path) -> Path:
+def hidden_workspace(out: Path) -> Path:
     """Where the capture ``out`` is made."""
     return out.with_name(f".{out.name[:200]}.poses")
 
 
 @contextlib.contextmanager
-def workplace(out: Path) -> Iterator[Path]:
+def workspace(out: Path) -> Iterator[Path]:
     """The hidden folder beside the capture, empty and held against other processes; removed at the end.
 
     Raises
@@ -71,7 +71,7 @@ def workplace(out: Path) -> Iterator[Path]:
     RunError
         Another process makes the same capture.
     """
-    work = hidden_workplace(out)
+    work = hidden_workspace(out)
     made = make_folder(work)
     with contextlib.ExitStack() as held:
         try:

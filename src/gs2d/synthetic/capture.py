@@ -31,7 +31,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes (y down, z forward) t
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class SyntheticImage:
     """One rendered view.
 
     Attributes
@@ -106,16 +106,16 @@ def write_demo_capture(
 
     gains = random_gains(train_views, seed)
 
-    def picture(job: tuple[str, int, Camera]) -> np.ndarray:
+    def image(job: tuple[str, int, Camera]) -> np.ndarray:
         split, k, camera = job
-        result = render_picture(scene, light, camera)
+        result = render_image(scene, light, camera)
         varied = vary_exposure and split == "train"
         write_image(root / split / f"r_{k}.png", with_gains(result.rgba, gains[k]) if varied else result.rgba)
         return result.seen
 
     counts = np.zeros(len(scene.patch.faces), dtype=np.int64)
     with ThreadPoolExecutor(workers) as pool:
-        for done, ((split, _, _), seen) in enumerate(zip(jobs, pool.map(picture, jobs), strict=True)):
+        for done, ((split, _, _), seen) in enumerate(zip(jobs, pool.map(image, jobs), strict=True)):
             counts += seen & (split == "train")
             if on_progress is not None:
                 on_progress(done + 1, len(jobs))
@@ -187,7 +187,7 @@ def _transforms(split: str, cameras: list[Camera]) -> dict[str, object]:
     return {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
 
 
-def render_picture(scene: ToyScene, light: BakedLight, camera: Camera) -> Picture:
+def render_image(scene: ToyScene, light: BakedLight, camera: Camera) -> SyntheticImage:
     """Render one view: the mean of premultiplied linear colour over the rays of each pixel, stored as sRGB."""
     hits = cast_camera(scene.patch.vertices, scene.patch.faces, camera, samples=_SAMPLES)
     seen = np.zeros(len(scene.patch.faces), dtype=bool)
@@ -195,7 +195,7 @@ def render_picture(scene: ToyScene, light: BakedLight, camera: Camera) -> Pictur
     alpha = _pixel_means((hits.face >= 0).astype(np.float64)[..., None])
     color = _pixel_means(np.minimum(shade(scene, light, hits, camera.center), 1.0).astype(np.float64))
     rgba = np.concatenate([linear_to_srgb(color / np.maximum(alpha, 1e-12)) * (alpha > 0), alpha], axis=2)
-    return Picture(np.round(rgba * 255).astype(np.uint8), seen)
+    return SyntheticImage(np.round(rgba * 255).astype(np.uint8), seen)
 
 
 def _pixel_means(rays: np.ndarray) -> np.ndarray:

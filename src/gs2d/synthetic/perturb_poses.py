@@ -8,13 +8,15 @@ import numpy as np
 import torch
 
 from gs2d.core.camera import Camera
-from gs2d.core.transforms import camera_extent, common_motion, focus_point, moved, similarity_motions
+from gs2d.core.transforms import camera_extent, common_motion, focus_point, perturb_pose, similarity_motions
 
 TRUTH = "poses_gt.json"  # the true cameras of the training photographs, in the layout of transforms_train.json
-DEGREES, SHARE = 0.5, 0.005  # root mean square of the rotations, and of the shifts as shares of the distance
+DEGREES, FRACTION = 0.5, 0.005  # root mean square of the rotations, and of the shifts as shares of the distance
 
 
-def disturbed(cameras: Sequence[Camera], seed: int, *, degrees: float = DEGREES, share: float = SHARE) -> list[Camera]:
+def disturbed(
+    cameras: Sequence[Camera], seed: int, *, degrees: float = DEGREES, fraction: float = FRACTION
+) -> list[Camera]:
     """The cameras after random small motions, normally distributed.
 
     What a similarity of the whole scene would do is taken out of them, since no photograph could show it: so the truth
@@ -25,8 +27,8 @@ def disturbed(cameras: Sequence[Camera], seed: int, *, degrees: float = DEGREES,
     middle = focus_point(cameras)
     distance = np.array([np.linalg.norm(camera.center - middle) for camera in cameras])[:, None]
     noise = rng.normal(size=(views, 6)) / np.sqrt(3)
-    motions = np.concatenate([noise[:, :3] * np.radians(degrees), noise[:, 3:] * share * distance / extent], axis=1)
+    motions = np.concatenate([noise[:, :3] * np.radians(degrees), noise[:, 3:] * fraction * distance / extent], axis=1)
     J = similarity_motions(np.stack([camera.T_cam_world for camera in cameras]), extent)
     motions -= J @ common_motion(motions, J)
     motions[:, 3:] *= extent
-    return [moved(camera, torch.from_numpy(motion)) for camera, motion in zip(cameras, motions, strict=True)]
+    return [perturb_pose(camera, torch.from_numpy(motion)) for camera, motion in zip(cameras, motions, strict=True)]

@@ -9,8 +9,8 @@ import numpy as np
 
 from gs2d.synthetic import shapes, textures
 
-FLOOR = -0.60  # wu, height of the plinth's upper face
-RADIUS = 1.08  # wu, of the plinth
+FLOOR = -0.60  # world units, height of the plinth's upper face
+RADIUS = 1.08  # world units, of the plinth
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from gs2d.synthetic.scene import ToyScene
 _LAMP = np.array([-0.70, -0.55, 1.0]) / np.linalg.norm([-0.70, -0.55, 1.0])  # unit, towards the lamp
 _LAMP_COLOR = np.array([1.80, 1.62, 1.36])
 _LAMP_SPREAD = 0.16  # half-angle of the lamp, radians
-_LIFT = 2e-3  # wu, shadow rays start this far above the surface
+_LIFT = 2e-3  # world units, shadow rays start this far above the surface
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-_SAME_POINT = 1e-7  # wu, vertices nearer than this are one
+_SAME_POINT = 1e-7  # world units, vertices nearer than this are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,7 @@ class Patch:
 
     Attributes
     ----------
-    vertices : ndarray [P, 3] wu
+    vertices : ndarray [P, 3] world units
     normals : ndarray [P, 3] unit, outwards
     uvs : ndarray [P, 2]
     faces : ndarray [F, 3] int64, counter-clockwise seen from outside
@@ -29,7 +29,7 @@ class Patch:
     faces: np.ndarray
 
     def moved(self, *, offset: Sequence[float] | np.ndarray = (0, 0, 0), turn: float = 0.0) -> Patch:
-        """The patch turned about z by ``turn`` radians, then moved by ``offset`` wu."""
+        """The patch turned about z by ``turn`` radians, then moved by ``offset`` world units."""
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
         return Patch(self.vertices @ R.T + np.asarray(offset), self.normals @ R.T, self.uvs, self.faces)

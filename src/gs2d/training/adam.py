@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from gs2d.config.recipe import Rates, Stage
+from gs2d.config.recipe import LearningRates, Stage
 from gs2d.core.splats import ATTRIBUTES
 from gs2d.training.state import Moments, TrainState
 
@@ -26,10 +26,10 @@ def begin_stage(state: TrainState, stage: Stage) -> None:
     state.moments = kept | trained
 
 
-def rates_at(rates: Rates, iteration: int, extent: float) -> dict[str, float]:
-    """Learning rate of each attribute at an iteration (1-based); that of the means is in wu, times the extent."""
-    fixed = {name: float(getattr(rates, name)) for name in ATTRIBUTES}
-    return fixed | {"means": rates.means_at(iteration) * extent}
+def lr_at(lr: LearningRates, iteration: int, extent: float) -> dict[str, float]:
+    """Learning rates at an iteration (1-based), by attribute; that of the means is in world units: times the extent."""
+    fixed = {name: float(getattr(lr, name)) for name in ATTRIBUTES}
+    return fixed | {"means": lr.means_at(iteration) * extent}
 
 
 @torch.no_grad()
@@ -37,7 +37,7 @@ def adam_step(
     state: TrainState,
     stage: Stage,
     gradients: Mapping[str, Tensor],
-    rates: Mapping[str, float],
+    lr: Mapping[str, float],
     *,
     skip: Collection[str] = (),
     rows: Tensor | None = None,
@@ -61,7 +61,7 @@ def adam_step(
         moments, group = state.moments[name], stage.train[name]
         moments.steps += 1
         if group == "all":
-            _update(parameter, gradients[name], moments.mean, moments.square, moments.steps, rates[name], stage.rates)
+            _update(parameter, gradients[name], moments.mean, moments.square, moments.steps, lr[name], stage.lr)
             continue
         trained = state.groups[group].nonzero().squeeze(1) if rows is None else rows  # [M]
         if len(trained) == 0:
@@ -69,13 +69,13 @@ def adam_step(
         gradient = gradients[name][trained] if rows is None else gradients[name]
         whole = (parameter, moments.mean, moments.square)
         parts = [tensor[trained] for tensor in whole]
-        _update(parts[0], gradient, parts[1], parts[2], moments.steps, rates[name], stage.rates)
+        _update(parts[0], gradient, parts[1], parts[2], moments.steps, lr[name], stage.lr)
         for tensor, part in zip(whole, parts, strict=True):
             tensor[trained] = part
 
 
 def _update(
-    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, steps: int, rate: float, settings: Rates
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, steps: int, rate: float, settings: LearningRates
 ) -> None:
     """Adam with bias correction, in place (``steps`` counts this update)."""
     step = torch.tensor(float(steps - 1), device=parameter.device)  # adam() adds one

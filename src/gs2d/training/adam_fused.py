@@ -17,21 +17,21 @@ def native_adam_step(
     state: TrainState,
     stage: Stage,
     gradients: Mapping[str, Tensor],
-    rates: Mapping[str, float],
+    lr: Mapping[str, float],
     *,
     skip: Collection[str] = (),
     rows: Tensor | None = None,
 ) -> None:
     """``optimizer.adam_step`` by the native CPU library."""
-    updates = _updates(state, stage, gradients, rates, skip, rows)
-    native.adam_step(updates, beta1=stage.rates.beta1, beta2=stage.rates.beta2, eps=stage.rates.eps)
+    updates = _updates(state, stage, gradients, lr, skip, rows)
+    native.adam_step(updates, beta1=stage.lr.beta1, beta2=stage.lr.beta2, eps=stage.lr.eps)
 
 
 def fused_adam_step(
     state: TrainState,
     stage: Stage,
     gradients: Mapping[str, Tensor],
-    rates: Mapping[str, float],
+    lr: Mapping[str, float],
     *,
     skip: Collection[str] = (),
     rows: Tensor | None = None,
@@ -46,8 +46,8 @@ def fused_adam_step(
     cancel : Tensor [] int32, optional
         On the device: where it is not 0 nothing is changed (but the step counts, which are the host's).
     """
-    updates = _updates(state, stage, gradients, rates, skip, rows)
-    settings = {"beta1": stage.rates.beta1, "beta2": stage.rates.beta2, "eps": stage.rates.eps}
+    updates = _updates(state, stage, gradients, lr, skip, rows)
+    settings = {"beta1": stage.lr.beta1, "beta2": stage.lr.beta2, "eps": stage.lr.eps}
     adam.adam_step(updates, **settings, launcher=launch.launcher_for(state.splats.device), skip=cancel)
 
 
@@ -55,7 +55,7 @@ def _updates(
     state: TrainState,
     stage: Stage,
     gradients: Mapping[str, Tensor],
-    rates: Mapping[str, float],
+    lr: Mapping[str, float],
     skip: Collection[str],
     rows: Tensor | None,
 ) -> list[AdamUpdate]:
@@ -72,7 +72,7 @@ def _updates(
                 moments.mean,
                 moments.square,
                 gradients[name],
-                rates[name],
+                lr[name],
                 moments.steps,
                 trained=None if group == "all" or rows is not None else state.groups[group],
                 rows=None if group == "all" else rows,

@@ -12,12 +12,12 @@ from torch import Tensor
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.render.cpu_cached import CachedView, cache_view
 from gs2d.render.types import RenderOutput
-from gs2d.training.objective import Evaluated, Evaluator, WholeViews
+from gs2d.training.objective import FullRender, Objective, StepResult
 from gs2d.training.state import TrainState
 
 COLORS = frozenset({"sh0", "shN"})
 OF_COLOR = frozenset({"l1", "ssim"})  # losses that see nothing but the colour image
-LEAST_SHARE = 0.5  # of the views: a cache for fewer saves little of a stage, and takes its memory all the same
+MIN_FRACTION = 0.5  # of the views: a cache for fewer saves little of a stage, and takes its memory all the same
 WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
 
 
@@ -39,11 +39,11 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend_name: str, views: int)
     )
 
 
-def choose_evaluator(whole: WholeViews, state: TrainState, stage: Stage, limit_bytes: int) -> Evaluator:
+def choose_objective(whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int) -> Objective:
     """Cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
     name, views = whole.backend.name, len(whole.scene.train)
     if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend_name=name, views=views):
-        cached = CachedViews(whole, state, stage, limit_bytes, least=LEAST_SHARE * views)
+        cached = CachedViews(whole, state, stage, limit_bytes, least=MIN_FRACTION * views)
         return cached if cached.views else whole
     return whole
 
@@ -53,7 +53,7 @@ class CachedViews:
 
     Parameters
     ----------
-    whole : WholeViews
+    whole : FullRender
     state : TrainState
         The geometry, the opacity and the colours outside the group stay as they are here.
     stage : Stage
@@ -72,7 +72,7 @@ class CachedViews:
     """
 
     def __init__(
-        self, whole: WholeViews, state: TrainState, stage: Stage, limit_bytes: int, *, least: float = 0.0
+        self, whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int, *, least: float = 0.0
     ) -> None:
         self._whole = whole
         (group,) = set(stage.train.values())
@@ -86,7 +86,7 @@ class CachedViews:
             room -= cached.nbytes
             self.views.append(cached)
 
-    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
+    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> StepResult:
         """Loss and gradients of training view ``index``, checked to be finite (DivergedError)."""
         if index >= len(self.views):
             return self._whole.evaluate(state, stage, iteration, index)
@@ -97,4 +97,4 @@ class CachedViews:
         output = RenderOutput(color, unseen, unseen, unseen, unseen, unseen, unseen)
         camera = self._whole.camera(state, index)  # of a stage that moves no splats: it stands still
         losses, gradients = self._whole.differentiate(state, stage, iteration, index, camera, output, leaves)
-        return Evaluated(losses, gradients, None, None, self.rows)
+        return StepResult(losses, gradients, None, None, self.rows)

@@ -25,7 +25,7 @@ class DensifyCounts:
 
     cloned: int
     split: int
-    pruned_faint: int
+    pruned_by_opacity: int
     pruned_large: int
 
 
@@ -67,7 +67,7 @@ def densify_and_prune(
     densify : GradDensify
     iteration : int
         1-based, of the stage.
-    extent : float, wu
+    extent : float, world units
         Scale of the scene: sizes are compared with it.
     white : bool
         Whether the background is white (there is one more reset then, with its grace).
@@ -92,7 +92,8 @@ def densify_and_prune(
     counts = _counts(clone, split, (faint, large), ends)
     if not bool(keep.any()) and not len(cloned) and not bool(living.any()):
         raise DivergedError(
-            f"all {counts.pruned_faint + counts.pruned_large} splats were pruned at iteration {iteration}: none has "
+            f"all {counts.pruned_by_opacity + counts.pruned_large} splats were pruned at iteration {iteration}: "
+            "none has "
             f"opacity >= {densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or "
             "opacity_cull"
         )
@@ -141,18 +142,18 @@ def _select(state: TrainState, densify: GradDensify, sizes: Tensor, extent: floa
 
 
 def _scattered(state: TrainState, rows: Tensor) -> Tensor:
-    """A point [M, 3] wu drawn from the Gaussian of each of these splats, in its plane."""
+    """A point [M, 3] world units drawn from the Gaussian of each of these splats, in its plane."""
     splats = state.splats
     if len(rows) == 0:
         return splats.means[rows]
     draws = torch.randn(len(rows), 2, generator=state.generator, dtype=splats.dtype).to(splats.device)
-    in_plane = draws * splats.log_scales[rows].exp()  # [M, 2] wu
+    in_plane = draws * splats.log_scales[rows].exp()  # [M, 2] world units
     frames = quats_to_matrices(splats.quats[rows])[:, :, :2]  # [M, 3, 2] columns t_u, t_v
     return splats.means[rows] + (frames * in_plane[:, None, :]).sum(dim=2)
 
 
 def _largest(scales: Tensor) -> Tensor:
-    """The larger of s_u and s_v, [M] wu."""
+    """The larger of s_u and s_v, [M] world units."""
     return torch.maximum(scales[:, 0], scales[:, 1])
 
 
@@ -161,7 +162,7 @@ def _prunable(
 ) -> tuple[Tensor, Tensor]:
     """Splats that are too faint, and splats that are too large, bool [M] each."""
     faint = opacities < densify.opacity_cull
-    if densify.spares_faint(iteration, white=white):
+    if densify.in_prune_grace(iteration, white=white):
         faint = torch.zeros_like(faint)
     large = sizes > densify.scale_cull * extent
     if iteration <= densify.reset_every:

@@ -33,7 +33,7 @@ class Ranked:
     group: str
     count: int
     threshold: float
-    share: float
+    fraction: float
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Progress:
     losses : weighted value of each active term
     loss : their sum
     mean_opacity : mean of o
-    mean_k_a : mean of K_a = s_u s_v (the paper's Eq. 7), wu^2
-    rates : learning rate of each trained attribute (means: wu)
+    mean_k_a : mean of K_a = s_u s_v (the paper's Eq. 7), world units^2
+    rates : learning rate of each trained attribute (means: world units)
     sh_degree : degree in training
     """
 
@@ -80,7 +80,7 @@ class Progress:
     splats: int
     mean_opacity: float
     mean_k_a: float
-    rates: Mapping[str, float]
+    lr: Mapping[str, float]
     sh_degree: int
 
 
@@ -92,7 +92,7 @@ class Densified:
     iteration: int
     cloned: int
     split: int
-    pruned_faint: int
+    pruned_by_opacity: int
     pruned_large: int
     splats: int
 

@@ -151,7 +151,7 @@ def uncount(exposures: Exposures, index: int, recipe: Recipe, stage: int, iterat
     exposures.steps[index] -= int(_rate(recipe, stage, iteration) > 0)
 
 
-def as_photographed(
+def apply_exposure(
     splats: Splats, camera: Camera, transform: Tensor, settings: RasterSettings
 ) -> tuple[Splats, RasterSettings]:
     """The splats in the colours that a photograph of this transform shows, and settings to draw them with.

@@ -24,9 +24,9 @@ _UNKNOWN = float("inf")
 
 @dataclass(frozen=True, eq=False)
 class FreeView:
-    """One photograph: everything before ``limit`` [H, W] wu is free, and a ball of ``radius`` wu around the camera.
+    """One image: what is before ``limit`` [H, W] (world units) is free, and a ball of ``radius`` around the camera.
 
-    ``known`` [H, W] wu is the depth of what it shows, infinite where that is not known.
+    ``known`` [H, W] world units is the depth of what it shows, infinite where that is not known.
     """
 
     limit: Tensor

@@ -16,7 +16,7 @@ from gs2d.data.scene import Scene
 from gs2d.errors import DataError, ProtocolError
 
 INITIAL_OPACITY = 0.1
-SCALE_FLOOR = math.sqrt(1e-7)  # wu; the official floor of the squared distance is 1e-7
+SCALE_FLOOR = math.sqrt(1e-7)  # world units; the official floor of the squared distance is 1e-7
 RELATIVE_SCALE_FLOOR = 1e-4  # of the extent, where that is smaller: a scene may be small
 
 
@@ -46,7 +46,7 @@ def initial_splats(
     sh_degree : int
     random_points : int
         How many where the scene has no points.
-    near : float, wu
+    near : float, world units
         Points that no training camera sees beyond this depth, or that lie within this distance of one, are dropped.
     generator : torch.Generator
         On the CPU; random points and rotations come from it.
@@ -91,9 +91,9 @@ def usable_points(points: np.ndarray, scene: Scene, near: float) -> np.ndarray:
 
     Parameters
     ----------
-    points : ndarray [P, 3] wu
+    points : ndarray [P, 3] world units
     scene : Scene
-    near : float, wu
+    near : float, world units
 
     Returns
     -------
@@ -117,10 +117,10 @@ def random_rotations(count: int, generator: torch.Generator) -> Tensor:
 
 def turned_to(normals: Tensor, others: Tensor) -> Tensor:
     """Unit quaternions [P, 4] that turn the z axis, a splat's own normal, to normals; ``others`` where those are 0."""
-    known = (normals != 0).any(dim=1)
+    valid = (normals != 0).any(dim=1)
     n = torch.where(normals[:, 2:] < 0, -normals, normals)  # either way round: the nearer one
     quats = torch.stack([1 + n[:, 2], -n[:, 1], n[:, 0], torch.zeros_like(n[:, 0])], dim=1)
-    return torch.where(known[:, None], quats / quats.norm(dim=1, keepdim=True), others)
+    return torch.where(valid[:, None], quats / quats.norm(dim=1, keepdim=True), others)
 
 
 def _no_points(points: np.ndarray, scene: Scene, near: float) -> Exception:

@@ -16,7 +16,7 @@ from gs2d.config.recipe import Recipe, Stage
 from gs2d.core.camera import Camera
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
-from gs2d.losses.multiview import Photograph, prepare
+from gs2d.losses.multiview import PatchImage, prepare_image
 from gs2d.training.targets import Target
 
 SAMPLES = 2000  # points that say how far away is what a camera looks at
@@ -39,13 +39,13 @@ def find_neighbours(scene: Scene, settings: MultiView) -> tuple[tuple[int, ...],
     points = _sample_points(scene)
     centers = np.stack([camera.center for camera in cameras])
     forwards = np.stack([camera.forward for camera in cameras])
-    least_cosine = np.cos(np.radians(settings.max_angle))
+    min_cosine = np.cos(np.radians(settings.max_angle))
     found = []
     for camera in cameras:
         reach = _distance_of(camera, points, scene.extent)
         baselines = np.linalg.norm(centers - camera.center, axis=1) / reach
         fits = (baselines >= settings.min_baseline) & (baselines <= settings.max_baseline) & (baselines > 0)
-        fits &= forwards @ camera.forward >= least_cosine - 1e-9
+        fits &= forwards @ camera.forward >= min_cosine - 1e-9
         order = np.argsort(baselines, kind="stable")
         found.append(tuple(int(i) for i in order[fits[order]][: settings.neighbours]))
     if not any(found):
@@ -68,7 +68,7 @@ def _sample_points(scene: Scene) -> np.ndarray:
 
 
 def _distance_of(camera: Camera, points: np.ndarray, extent: float) -> float:
-    """Median depth of the points in a camera's picture, wu; the scene's extent where there are none."""
+    """Median depth of the points in a camera's picture, world units; the scene's extent where there are none."""
     pixels, depth = camera.project(points)
     inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels <= (camera.width, camera.height)).all(axis=1)
     return float(np.median(depth[inside])) if inside.any() else extent
@@ -93,14 +93,14 @@ def draw_turn(
     return Turn(neighbour, torch.from_numpy(generator.random(settings.patches)))
 
 
-class Photographs:
+class ImageFiles:
     """Photographs of the training views as patches; the first that fit in ``limit_bytes`` are kept."""
 
     def __init__(self, views: tuple[View, ...], settings: MultiView, *, limit_bytes: int = 1 << 29) -> None:
         self._views, self._settings, self._room = views, settings, limit_bytes
-        self._kept: dict[int, Photograph] = {}
+        self._kept: dict[int, PatchImage] = {}
 
-    def of(self, index: int, target: Target) -> Photograph:
+    def of(self, index: int, target: Target) -> PatchImage:
         """That of view ``index``, whose target is given."""
         kept = self._kept.get(index)
         if kept is not None:
@@ -109,7 +109,7 @@ class Photographs:
         if alpha is not None:
             opaque = torch.as_tensor(alpha >= 1).to(target.image.device, non_blocking=True)
             usable = opaque if usable is None else usable & opaque
-        made = prepare(target.image, usable, self._settings)
+        made = prepare_image(target.image, usable, self._settings)
         if made.nbytes <= self._room:
             self._kept[index] = made
             self._room -= made.nbytes

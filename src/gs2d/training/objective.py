@@ -27,7 +27,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.exposure import expose, identity
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.training.multiview import Photographs, draw_turn, find_neighbours, is_compared
+from gs2d.training.multiview import ImageFiles, draw_turn, find_neighbours, is_compared
 from gs2d.training.poses import pose_rate
 from gs2d.training.priors import Priors, has_priors
 from gs2d.training.state import TrainState
@@ -35,17 +35,21 @@ from gs2d.training.targets import Target, TargetSource
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
-    """The rasterizer's constants for a scene of this extent (wu) under a protocol."""
+    """The rasterizer's constants for a scene of this extent (world units) under a protocol."""
     near = protocol.near_for(extent)
     # far only scales the distortion; in a large frame it keeps the ratio to near that 0.2 and 100 have.
     far = max(RasterSettings.far, near * RasterSettings.far / RasterSettings.near)
     return RasterSettings(
-        near=near, far=far, background=protocol.background, sh_degree=sh_degree, crossing=protocol.crossing
+        near=near,
+        far=far,
+        background=protocol.background,
+        sh_degree=sh_degree,
+        near_plane_policy=protocol.near_plane_policy,
     )
 
 
 @torch.no_grad()
-def seen_rows(splats: Splats, scene: Scene, settings: RasterSettings, backend: Backend) -> Tensor:
+def visible_mask(splats: Splats, scene: Scene, settings: RasterSettings, backend: Backend) -> Tensor:
     """Splats [N] bool whose footprint reaches a pixel of some training view, hidden there or not."""
     bare = replace(settings, sh_degree=0, with_distortion=False)
     seen = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
@@ -55,7 +59,7 @@ def seen_rows(splats: Splats, scene: Scene, settings: RasterSettings, backend: B
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluated:
+class StepResult:
     """Loss terms of one iteration with the gradients of the trained attributes and, if gathered, screen gradients.
 
     Attributes
@@ -78,14 +82,14 @@ class Evaluated:
     rows: Tensor | None = None
 
 
-class Evaluator(Interface):
+class Objective(Interface):
     """How a stage gets the loss and the gradients of a view."""
 
-    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
+    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> StepResult:
         """Loss and gradients of training view ``index``, checked to be finite (DivergedError)."""
 
 
-class WholeViews:
+class FullRender:
     """Every splat is rendered each time."""
 
     def __init__(
@@ -96,7 +100,7 @@ class WholeViews:
         self._background = torch.tensor(protocol.background, device=backend.device)
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
-            self._photographs = Photographs(scene.train, recipe.multiview)
+            self._images = ImageFiles(scene.train, recipe.multiview)
         self._priors = Priors(scene, recipe, device=backend.device) if has_priors(recipe) else None
 
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
@@ -110,7 +114,7 @@ class WholeViews:
         given = self.scene.train[index].camera
         return given if state.poses is None else state.poses.camera(index, given, learns=learns)
 
-    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Evaluated:
+    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> StepResult:
         """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
         splats, densify = state.splats, stage.densify
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
@@ -126,7 +130,7 @@ class WholeViews:
         neighbour = self._neighbour_of(state, stage, iteration, index)
         given = (index, camera, output, dict(leaves.items()), neighbour)
         losses, gradients = self.differentiate(state, stage, iteration, *given)
-        return Evaluated(losses, gradients, None if probe is None else _gradient(probe), output.radii)
+        return StepResult(losses, gradients, None if probe is None else _gradient(probe), output.radii)
 
     @torch.no_grad()
     def _neighbour_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Neighbour | None:
@@ -140,7 +144,7 @@ class WholeViews:
         camera, other = self.camera(state, turn.neighbour), turn.neighbour
         bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False)
         depth = rasterize(state.splats, camera, bare, backend=self.backend).depth(self.protocol.depth)
-        here, there = (self._photographs.of(i, self._targets[i]) for i in (index, other))
+        here, there = (self._images.of(i, self._targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 
     def differentiate(
@@ -190,7 +194,7 @@ class WholeViews:
             assert self.recipe.exposure is not None
             terms["exposure"] = self.recipe.exposure.prior * (transform - identity(transform)).square().sum()
         loss = torch.stack(list(terms.values())).sum()
-        watched = not waits(loss.device)
+        watched = not is_async(loss.device)
         values: dict[str, float | Tensor] = {
             kind: float(value.detach()) if watched else value.detach() for kind, value in terms.items()
         }
@@ -223,7 +227,7 @@ def clipped_pixels(target: Target) -> Tensor:
     return clipped if target.silhouette is None else clipped & (target.silhouette[..., None] > 0)
 
 
-def waits(device: torch.device) -> bool:
+def is_async(device: torch.device) -> bool:
     """Whether the host would wait to look at a tensor there."""
     return device.type != "cpu"
 
@@ -254,7 +258,7 @@ def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
     """The error for something that is not finite."""
     return DivergedError(
         f"training diverged at iteration {iteration} of stage {stage.name!r}: {what} is NaN or infinite; "
-        f"lower a rate (--set {stage.name}.rates.means=...) or check the cameras and photographs"
+        f"lower a rate (--set {stage.name}.lr.means=...) or check the cameras and photographs"
     )
 
 

@@ -33,7 +33,7 @@ def check(state: TrainState, recipe: Recipe, views: int) -> None:
     check_poses(state.poses, views if recipe.poses else 0)
 
 
-def learn(
+def update(
     state: TrainState,
     recipe: Recipe,
     iteration: int,
@@ -49,13 +49,13 @@ def learn(
         pose_step(state.poses, index, gradients["pose"], recipe, pose_rate(recipe, state.stage, iteration))
 
 
-def take_back(state: TrainState, recipe: Recipe, iteration: int, index: int) -> None:
+def rollback(state: TrainState, recipe: Recipe, iteration: int, index: int) -> None:
     """Take back what the host has counted of an update that was cancelled on the device."""
     if state.exposures is not None:
         uncount(state.exposures, index, recipe, state.stage, iteration)
 
 
-def broken(state: TrainState) -> str:
+def find_nonfinite(state: TrainState) -> str:
     """What is not finite, in words; "" if all is."""
     if state.exposures is not None and not finite(state.exposures.offsets):
         return "an exposure"

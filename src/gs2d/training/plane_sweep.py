@@ -48,11 +48,11 @@ class SmallView:
         Pixels that the photograph's mask and alpha leave in.
     K, T : ndarray [3, 3], [4, 4] float64
         Intrinsics at this size; T_cam_world.
-    near, far : float, wu
+    near, far : float, world units
         Where the sweep begins and ends; 0 where the view shows too few points.
-    pixels, depth : ndarray [M, 2] px, [M] wu
+    pixels, depth : ndarray [M, 2] px, [M] world units
         The sparse points that it shows.
-    nearest : float, wu
+    nearest : float, world units
         Nearest depth of all sparse points in its picture, whether it was found to show them or not (2nd percentile).
     """
 
@@ -83,7 +83,7 @@ class Sweep:
         Of the training views, in their order.
     neighbours : tuple of tuple of int
         Of each view, best first; empty for views that were not swept.
-    depths : tuple of ndarray [H, W] float64 wu
+    depths : tuple of ndarray [H, W] float64 world units
         Along the optical axis; 0 where unknown.
     scores : tuple of ndarray [H, W] float32
         NCC of those depths.
@@ -135,7 +135,7 @@ def _trimming(results: Iterable[T]) -> Iterator[T]:
 
 
 def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
-    """Return the places [H, W, 3] wu of the pixels of a shrunk view at depths [H, W]."""
+    """Return the places [H, W, 3] world units of the pixels of a shrunk view at depths [H, W]."""
     height, width = depth.shape
     y, x = np.mgrid[0:height, 0:width] + 0.5
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(view.K).T
@@ -156,10 +156,10 @@ def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    places: np.ndarray  # [M, 3] wu
+    places: np.ndarray  # [M, 3] world units
     colors: np.ndarray  # [M, 3] in [0, 1]
     normals: np.ndarray  # [M, 3]
-    pixel: np.ndarray  # [M] wu: the size of a pixel there
+    pixel: np.ndarray  # [M] world units: the size of a pixel there
     score: np.ndarray  # [M]
 
 
@@ -256,7 +256,7 @@ def _neighbours(
 def _depths(
     views: Sequence[SmallView], index: int, neighbours: Sequence[int], settings: DenseStart
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [H, W] wu of a view, 0 where unknown, and its NCC."""
+    """Depth [H, W] world units of a view, 0 where unknown, and its NCC."""
     view = views[index]
     height, width = view.size
     if not neighbours:
@@ -272,9 +272,9 @@ def _depths(
     bend = left - 2 * middle + right
     shift = torch.where(bend < -1e-6, 0.5 * (left - right) / bend, torch.zeros_like(bend)).clamp(-0.5, 0.5)
     depth = 1 / (1 / view.far + step * (inner + shift).double())
-    known = (best >= settings.min_ncc) & (plane > 0) & (plane < settings.planes - 1)
-    known &= (variance[0, 0] >= MIN_TEXTURE) & torch.from_numpy(view.usable)
-    return torch.where(known, depth, torch.zeros_like(depth)).numpy(), best.numpy()
+    valid = (best >= settings.min_ncc) & (plane > 0) & (plane < settings.planes - 1)
+    valid &= (variance[0, 0] >= MIN_TEXTURE) & torch.from_numpy(view.usable)
+    return torch.where(valid, depth, torch.zeros_like(depth)).numpy(), best.numpy()
 
 
 def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, radius: int) -> Tensor:

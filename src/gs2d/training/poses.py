@@ -1,6 +1,6 @@
 """One rigid motion for each training camera, learned with the splats (docs/math.md, "Poses").
 
-Camera k stands at rigid_motion(xi_k) T_k, T_k its given pose, xi_k in the camera's own frame. xi = P theta: P takes out
+Camera k stands at se3_exp(xi_k) T_k, T_k its given pose, xi_k in the camera's own frame. xi = P theta: P takes out
 of the free numbers theta of all cameras what one similarity of the whole scene (a motion, a scale) would do to all of
 them, which no photograph could see. So the scene stays in the frame of the capture. Adam moves theta_k when view k has
 its turn, and only then, with a memory and a count of its own. All of it is in the host's memory, in float64.
@@ -20,7 +20,7 @@ from torch import Tensor
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
-from gs2d.core.transforms import common_motion, rigid_motion, similarity_motions
+from gs2d.core.transforms import common_motion, se3_exp, similarity_motions
 from gs2d.errors import RunError
 
 
@@ -33,7 +33,7 @@ class Poses:
     given : Tensor [V, 4, 4] float64
         T_cam_world of the capture.
     extent : float
-        Of the scene, wu: the unit of shifts.
+        Of the scene, world units: the unit of shifts.
     offsets : Tensor [V, 6] float64
         theta: rotation vectors, rad, then shifts in extents.
     mean, square : Tensor [V, 6] float64
@@ -64,7 +64,7 @@ class Poses:
         return similarity_motions(self.given.numpy(), self.extent)
 
     def motions(self) -> Tensor:
-        """All motions [V, 6]: rotation vectors, rad, and shifts, wu."""
+        """All motions [V, 6]: rotation vectors, rad, and shifts, world units."""
         return torch.stack([self.motion(index) for index in range(len(self))])
 
     def motion(self, index: int) -> Tensor:
@@ -75,7 +75,7 @@ class Poses:
 
     def pose(self, index: int) -> Tensor:
         """T_cam_world of one camera [4, 4] float64, a tensor of its own."""
-        return rigid_motion(self.motion(index)) @ self.given[index]
+        return se3_exp(self.motion(index)) @ self.given[index]
 
     def camera(self, index: int, given: Camera, *, learns: bool = False) -> Camera:
         """The camera of a view as it stands now; with ``learns`` its pose gets a gradient."""

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import Recipe
-from gs2d.data.priors import DepthMap, ObservedPoints, PointsInView
+from gs2d.data.priors import ObservedPoints, PointsInView, PriorDepth
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
-from gs2d.losses.priors import Depths, KnownDepths, KnownNormals, PointDepths, Prior, RelativeDepths, fit_line
+from gs2d.losses.priors import Depths, MetricDepth, NormalTarget, PointDepths, Prior, RelativeDepths, fit_line
 
 FIT_POINTS = 10  # in a map, at least, for its scale and shift
 ASKED_VIEWS = 20  # that say what a capture's maps are: their unit, their space
@@ -38,7 +38,7 @@ class DepthPlan:
     observed : ObservedPoints or None
         None where they are not needed, or unknown.
     unit : float or None
-        wu of a value 1 of all sensor maps; None: each file's own.
+        world units of a value 1 of all sensor maps; None: each file's own.
     space : "disparity" or "depth"
         What relative maps are linear in.
     """
@@ -137,7 +137,7 @@ def _pairs(view: View, observed: ObservedPoints, settings: DepthPrior) -> tuple[
     return _values_at(points_in(view, observed, settings), view.maps.depth())
 
 
-def _values_at(points: PointsInView, map_: DepthMap) -> tuple[np.ndarray, np.ndarray]:
+def _values_at(points: PointsInView, map_: PriorDepth) -> tuple[np.ndarray, np.ndarray]:
     columns, rows = np.floor(points.pixels).astype(np.int64).T
     values = map_.values[rows, columns].astype(np.float64)
     return points.depth[values > 0], values[values > 0]
@@ -182,25 +182,25 @@ class Priors:
         self._views, self._recipe, self._device = scene.train, recipe, device
         by_place = 1 << 30 if torch.device(device).type == "cpu" else 1 << 32
         self._room = by_place if limit_bytes is None else limit_bytes
-        self._kept: dict[int, tuple[Depths | None, KnownNormals | None]] = {}
+        self._kept: dict[int, tuple[Depths | None, NormalTarget | None]] = {}
         self.plan = None if recipe.depth_prior is None else plan_depths(scene, recipe.depth_prior)
         self.axes = None if recipe.normal_prior is None else plan_normals(scene, recipe.normal_prior)
 
     def of(self, index: int, stage: int, iteration: int, dtype: torch.dtype) -> Prior:
         """What is known of view ``index`` in an iteration (from 1) of a stage."""
         recipe = self._recipe
-        depth, normal = self.known(index, dtype)
+        depth, normal = self.at(index, dtype)
         of_run = sum(earlier.iterations for earlier in recipe.stages[:stage]) + iteration
         return Prior(
             depth,
             normal,
             opacity=0.0 if recipe.depth_prior is None else recipe.depth_prior.opacity,
             noise=1.0 if recipe.depth_prior is None else recipe.depth_prior.noise,
-            depth_share=0.0 if recipe.depth_prior is None else recipe.depth_prior.share_at(of_run),
-            normal_share=0.0 if recipe.normal_prior is None else recipe.normal_prior.share_at(of_run),
+            depth_weight=0.0 if recipe.depth_prior is None else recipe.depth_prior.weight_at(of_run),
+            normal_weight=0.0 if recipe.normal_prior is None else recipe.normal_prior.weight_at(of_run),
         )
 
-    def known(self, index: int, dtype: torch.dtype) -> tuple[Depths | None, KnownNormals | None]:
+    def at(self, index: int, dtype: torch.dtype) -> tuple[Depths | None, NormalTarget | None]:
         """Depths and normals that are known of view ``index``, kept where there is room."""
         kept = self._kept.get(index)
         if kept is not None:
@@ -209,7 +209,7 @@ class Priors:
         depth = normal = None
         if self.plan is not None:
             assert self._recipe.depth_prior is not None
-            depth = known_depths(view, self.plan, self._recipe.depth_prior, dtype, self._device)
+            depth = metric_depths(view, self.plan, self._recipe.depth_prior, dtype, self._device)
         if self.axes is not None and view.maps is not None and view.maps.files.normal is not None:
             normal = world_normals(view, self.axes, dtype, self._device)
         nbytes = (0 if depth is None else depth.nbytes) + (0 if normal is None else normal.nbytes)
@@ -237,14 +237,14 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
     rng = np.random.Generator(np.random.Philox(key=recipe.seed))
     points, colors, normals = [], [], []
     for index, view in enumerate(scene.train):
-        depths = priors.known(index, torch.float64)[0]
-        if not isinstance(depths, KnownDepths):
+        depths = priors.at(index, torch.float64)[0]
+        if not isinstance(depths, MetricDepth):
             continue
         mask, alpha = view.mask(), view.alpha()
-        usable = depths.known.numpy() & (True if mask is None else mask) & (True if alpha is None else alpha >= 0.5)
+        usable = depths.valid.numpy() & (True if mask is None else mask) & (True if alpha is None else alpha >= 0.5)
         pixels = np.flatnonzero(usable)
-        share = recipe.init_points // len(scene.train) + 1
-        pixels = np.sort(rng.choice(pixels, min(share, len(pixels)), replace=False))
+        fraction = recipe.init_points // len(scene.train) + 1
+        pixels = np.sort(rng.choice(pixels, min(fraction, len(pixels)), replace=False))
         rows, columns = np.unravel_index(pixels, usable.shape)
         local = rays(view)[rows, columns] / depths.disparity.numpy()[rows, columns, None]
         points.append((local - view.camera.T_cam_world[:3, 3]) @ view.camera.rotation)
@@ -269,7 +269,7 @@ def plane_normals(points: np.ndarray, neighbours: int = 16) -> np.ndarray:
     return np.asarray(np.linalg.eigh(near.swapaxes(1, 2) @ near)[1][:, :, 0])
 
 
-def known_depths(
+def metric_depths(
     view: View,
     plan: DepthPlan,
     settings: DepthPrior,
@@ -293,25 +293,25 @@ def known_depths(
         return None
     map_ = view.maps.depth()
     values = map_.values.astype(np.float64)
-    known = values > 0
-    if not known.any():
+    valid = values > 0
+    if not valid.any():
         return None
-    safe = np.where(known, values, 1)
+    safe = np.where(valid, values, 1)
     if plan.source == "sensor":
         unit = plan.unit or view.maps.files.unit or (1e-3 if map_.whole else 1.0)
-        return KnownDepths(tensor(known / (safe * unit)), there(known))
+        return MetricDepth(tensor(valid / (safe * unit)), there(valid))
     line = None
     if plan.observed is not None:
         depth, at_points = _values_at(points_in(view, plan.observed, settings), map_)
         line = line_of(at_points, depth, plan.space)
     if line is None:
-        middle, spread = values[known].mean(), values[known].std()
-        centred = np.where(known, (values - middle) / (spread if spread > 1e-9 * middle else 1), 0)
-        return RelativeDepths(tensor(centred), there(known), plan.space)
+        middle, spread = values[valid].mean(), values[valid].std()
+        centred = np.where(valid, (values - middle) / (spread if spread > 1e-9 * middle else 1), 0)
+        return RelativeDepths(tensor(centred), there(valid), plan.space)
     on_line = line[0] * safe + line[1]
-    good = known & (on_line > 1e-3 * np.median(on_line[known]))  # what is not has no depth in front of the camera
+    good = valid & (on_line > 1e-3 * np.median(on_line[valid]))  # what is not has no depth in front of the camera
     safe = np.where(good, on_line, 1)
-    return KnownDepths(tensor(good * (safe if plan.space == "disparity" else 1 / safe)), there(good))
+    return MetricDepth(tensor(good * (safe if plan.space == "disparity" else 1 / safe)), there(good))
 
 
 def _around(points: PointsInView, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -340,14 +340,14 @@ def plan_normals(scene: Scene, settings: NormalPrior) -> str:
             f"no training view of {scene.name} has a normal map; put them in {scene.root}/normals under the names of "
             "the photographs (RGB of (n + 1) / 2, in the camera's frame), or leave out --normal-prior"
         )
-    shares = {"opencv": [], "opengl": []}  # type: dict[str, list[float]]
+    fractions = {"opencv": [], "opengl": []}  # type: dict[str, list[float]]
     for view in _asked(mapped):
         assert view.maps is not None
         normals = view.maps.normal()
-        for axes, found in shares.items():
+        for axes, found in fractions.items():
             facing = (_in_opencv(normals, axes) * rays(view)).sum(axis=2)[(normals != 0).any(axis=2)] < 0
             found.append(float(facing.mean()) if facing.size else 1.0)
-    means = {axes: float(np.mean(found)) for axes, found in shares.items()}
+    means = {axes: float(np.mean(found)) for axes, found in fractions.items()}
     chosen = max(means, key=means.__getitem__) if settings.axes == "auto" else settings.axes
     if means[chosen] < FACING:
         raise DataError(
@@ -371,10 +371,10 @@ def _in_opencv(normals: np.ndarray, axes: str) -> np.ndarray:
 
 def world_normals(
     view: View, axes: str, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> KnownNormals:
+) -> NormalTarget:
     """Known normals of a view."""
     assert view.maps is not None
     normals = view.maps.normal()
-    known = (normals != 0).any(axis=2)
+    valid = (normals != 0).any(axis=2)
     directions = torch.as_tensor(_in_opencv(normals, axes) @ view.camera.rotation)
-    return KnownNormals(directions.to(device, dtype), torch.as_tensor(known).to(device, dtype))
+    return NormalTarget(directions.to(device, dtype), torch.as_tensor(valid).to(device, dtype))

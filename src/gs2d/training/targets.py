@@ -101,7 +101,7 @@ class Targets:
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
+class _DecodedImage:
     """A photograph as it was decoded."""
 
     image: Tensor  # [H, W, 3 or 4] uint8
@@ -112,8 +112,8 @@ class _Picture:
         sizes = [self.image.nbytes, 0 if self.mask is None else self.mask.nbytes]
         return sum(1 << (size - 1).bit_length() if place == "pinned" and size else size for size in sizes)
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> _Picture:
-        return _Picture(change(self.image), None if self.mask is None else change(self.mask))
+    def map(self, change: Callable[[Tensor], Tensor]) -> _DecodedImage:
+        return _DecodedImage(change(self.image), None if self.mask is None else change(self.mask))
 
 
 class DeviceTargets:
@@ -151,13 +151,13 @@ class DeviceTargets:
         self._background = torch.tensor(background, dtype=dtype, device=device)
         self._dtype, self._device, self._pin = dtype, device, pin
         self._room = {"device": limit_bytes, "pinned": pinned_bytes}
-        self._kept: dict[int, _Picture] = {}
+        self._kept: dict[int, _DecodedImage] = {}
 
     def __getitem__(self, index: int) -> Target:
-        picture = self._kept.get(index)
-        if picture is None:
-            picture = self._take_in(index)
-        there = picture.map(lambda tensor: tensor.to(self._device, non_blocking=True))
+        image = self._kept.get(index)
+        if image is None:
+            image = self._take_in(index)
+        there = image.map(lambda tensor: tensor.to(self._device, non_blocking=True))
         color = there.image[..., :3].to(self._dtype) / 255
         alpha = None
         if there.image.shape[2] == 4:  # as images.composite
@@ -165,22 +165,22 @@ class DeviceTargets:
             color = (color - self._background) * alpha[..., None] + self._background
         return Target(color, there.mask, None, alpha)
 
-    def _take_in(self, index: int) -> _Picture:
+    def _take_in(self, index: int) -> _DecodedImage:
         """Decode a photograph, and keep it where there is room."""
         view = self._views[index]
         mask = view.usable(masks=self._use_masks)
-        picture = _Picture(torch.tensor(view.image()), None if mask is None else torch.tensor(mask))
+        image = _DecodedImage(torch.tensor(view.image()), None if mask is None else torch.tensor(mask))
         for place in ("device", "pinned"):
-            if picture.nbytes(place) > self._room[place]:
+            if image.nbytes(place) > self._room[place]:
                 continue
             change = self._pin if place == "pinned" else lambda tensor: tensor.to(self._device)
             try:
-                self._kept[index] = picture.map(change)
+                self._kept[index] = image.map(change)
             except RuntimeError:
                 if place == "device":
                     raise
                 self._room[place] = 0  # the system locks no more memory: slower, but no reason to stop
                 break
-            self._room[place] -= picture.nbytes(place)
+            self._room[place] -= image.nbytes(place)
             return self._kept[index]
-        return picture
+        return image

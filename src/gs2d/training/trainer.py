@@ -24,24 +24,23 @@ from gs2d.render.api import splat_errors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import RasterSettings
-from gs2d.training import events
-from gs2d.training import per_image as per_view
-from gs2d.training.adam import adam_step, begin_stage, rates_at
+from gs2d.training import events, per_image
+from gs2d.training.adam import adam_step, begin_stage, lr_at
 from gs2d.training.adam_fused import fused_adam_step, native_adam_step
-from gs2d.training.cached_objective import choose_evaluator
+from gs2d.training.cached_objective import choose_objective
 from gs2d.training.densify import accumulate, densify_and_prune, limit_opacity
-from gs2d.training.exposure import as_photographed
+from gs2d.training.exposure import apply_exposure
 from gs2d.training.initialize import initial_splats
 from gs2d.training.objective import (
-    Evaluated,
-    Evaluator,
-    WholeViews,
+    FullRender,
+    Objective,
+    StepResult,
     check_losses,
     diverged,
     first_not_finite,
+    is_async,
     raster_settings,
-    seen_rows,
-    waits,
+    visible_mask,
 )
 from gs2d.training.priors import with_known_points
 from gs2d.training.rank_clone import clone_in_place, rank_by_error
@@ -117,9 +116,9 @@ class Trainer:
         self._adam_step = {"cpu": native_adam_step, "cuda": fused_adam_step}.get(self.backend.name, adam_step)
         self._budget = PairBudget()  # used by the cuda backend alone
         self._last: tuple[int, int] | None = None  # iteration and view that settle() may have to do again
-        self._whole = WholeViews(scene, self.recipe, protocol, self._with_budget(self.backend), self._targets)
+        self._whole = FullRender(scene, self.recipe, protocol, self._with_budget(self.backend), self._targets)
         self._stage2_cache_bytes = stage2_cache_bytes
-        self._evaluator: Evaluator | None = None  # of the stage under way, from its first iteration here
+        self._objective: Objective | None = None  # of the stage under way, from its first iteration here
 
     @property
     def splats(self) -> Splats:
@@ -144,7 +143,7 @@ class Trainer:
             stage = self.recipe.stages[self.state.stage]
             while self.state.step < stage.iterations:
                 self.step()
-                if not waits(self.state.splats.device):
+                if not is_async(self.state.splats.device):
                     self._between()
             self._finish(stage)
         return self.state.splats
@@ -153,7 +152,7 @@ class Trainer:
         """Run the entry actions of a stage and prepare its first iteration."""
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
-        self._evaluator = self._last = None
+        self._objective = self._last = None
         while self._pending:
             self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
@@ -179,12 +178,12 @@ class Trainer:
             NaN or infinity in the loss, a gradient or a parameter; names the iteration, the stage and the attribute. On
             a GPU, whose host does not wait for it, at the next Progress event, before anything could be saved.
         """
-        self._settle()
+        self._replay_on_overflow()
         state = self.state
         stage, iteration = self.recipe.stages[state.stage], state.step + 1
         index = state.next_view(len(self.scene.train))
-        if self._evaluator is None:
-            self._evaluator = choose_evaluator(self._whole, state, stage, self._stage2_cache_bytes)
+        if self._objective is None:
+            self._objective = choose_objective(self._whole, state, stage, self._stage2_cache_bytes)
         reports = iteration % self._progress_every == 0 or iteration == stage.iterations
         changes_rows = self._densifies_or_limits(stage, iteration) or self._robust.prunes(stage, iteration)
         self._budget.exact = reports or changes_rows  # those wait for the device anyway
@@ -197,13 +196,13 @@ class Trainer:
         if reports:
             losses = check_losses(stage, iteration, result.losses)
             self._check_parameters(stage, tuple(stage.train))  # on a CPU gradients are checked each time
-            rates = rates_at(stage.rates, iteration, self.scene.extent)
-            self._on_event(self._progress(stage, iteration, losses, rates))
+            lr = lr_at(stage.lr, iteration, self.scene.extent)
+            self._on_event(self._progress(stage, iteration, losses, lr))
 
-    def _learn(self, stage: Stage, iteration: int, index: int) -> tuple[Evaluated, list[events.Event]]:
+    def _learn(self, stage: Stage, iteration: int, index: int) -> tuple[StepResult, list[events.Event]]:
         """Gradients of a view, statistics and densification, Adam; on the device nothing if the image was cut short."""
-        assert self._evaluator is not None
-        result = self._evaluator.evaluate(self.state, stage, iteration, index)
+        assert self._objective is not None
+        result = self._objective.evaluate(self.state, stage, iteration, index)
         cancel = self._budget.overflow
         happened = self._densify(stage, iteration, result, cancel)
         if not any(isinstance(event, events.Densified) for event in happened):
@@ -211,21 +210,21 @@ class Trainer:
             options = {"skip": ("opacity_logits",) if limited else (), "rows": result.rows}
             if cancel is not None:
                 options["cancel"] = cancel
-            rates = rates_at(stage.rates, iteration, self.scene.extent)
-            self._adam_step(self.state, stage, result.gradients, rates, **options)  # type: ignore[arg-type]
+            lr = lr_at(stage.lr, iteration, self.scene.extent)
+            self._adam_step(self.state, stage, result.gradients, lr, **options)  # type: ignore[arg-type]
         self._robust.decay(self.state, stage, iteration, cancel)
-        per_view.learn(self.state, self.recipe, iteration, index, result.gradients, cancel)
+        per_image.update(self.state, self.recipe, iteration, index, result.gradients, cancel)
         return result, happened
 
-    def _settle(self) -> None:
+    def _replay_on_overflow(self) -> None:
         """Do the last iteration again if there was no room for its pairs."""
-        if self._last is None or not self._budget.cut_short():
+        if self._last is None or not self._budget.overflowed():
             return
         stage = self.recipe.stages[self.state.stage]
         for name, parameter in self.state.splats.items():
             if name in stage.train and parameter.numel() > 0:
                 self.state.moments[name].steps -= 1  # counted on the host
-        per_view.take_back(self.state, self.recipe, *self._last)
+        per_image.rollback(self.state, self.recipe, *self._last)
         self._budget.exact = True
         self._learn(stage, *self._last)
 
@@ -248,7 +247,7 @@ class Trainer:
         """The photographs, where the splats are."""
         views, background, splats = self.scene.train, self.protocol.background, self.state.splats
         use_masks, dtype, device = self.protocol.use_mask_in_training, splats.dtype, splats.device
-        if waits(device):
+        if is_async(device):
             limit = 1 << 31 if limit_bytes is None else limit_bytes
             return DeviceTargets(views, background, use_masks=use_masks, device=device, dtype=dtype, limit_bytes=limit)
         return Targets(
@@ -277,7 +276,7 @@ class Trainer:
         source = initial.source if start is self._robust.scene else "depths"
         source = "sweep" if source == "points" and self.recipe.dense_start is not None else source
         self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped))
-        return per_view.start(TrainState(initial.splats, generator), self.recipe, self.scene)
+        return per_image.start(TrainState(initial.splats, generator), self.recipe, self.scene)
 
     def _checked(self, state: TrainState) -> TrainState:
         """A state from outside, if it is of this recipe."""
@@ -300,10 +299,10 @@ class Trainer:
                 f"the checkpoint waits for training view {last}, but the scene has {len(self.scene.train)}; "
                 "is it of another scene?"
             )
-        per_view.check(state, self.recipe, len(self.scene.train))
+        per_image.check(state, self.recipe, len(self.scene.train))
         return state
 
-    def _densify(self, stage: Stage, iteration: int, result: Evaluated, cancel: Tensor | None) -> list[events.Event]:
+    def _densify(self, stage: Stage, iteration: int, result: StepResult, cancel: Tensor | None) -> list[events.Event]:
         """Statistics, densification and opacity resets of one iteration."""
         state, densify, white = self.state, stage.densify, self.protocol.white
         happened: list[events.Event] = []
@@ -334,8 +333,8 @@ class Trainer:
             return events.Cloned(stage.name, action.writes, count, action.opacity, len(self.state.splats))
         errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion))
         group = self.state.groups[action.writes]
-        share = float(errors[group].sum() / errors.sum().clamp(min=1e-300))
-        return events.Ranked(stage.name, action.writes, int(group.sum()), float(errors[group].min()), share)
+        fraction = float(errors[group].sum() / errors.sum().clamp(min=1e-300))
+        return events.Ranked(stage.name, action.writes, int(group.sum()), float(errors[group].min()), fraction)
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """The inner sum of E_i [N] for each training view."""
@@ -344,7 +343,7 @@ class Trainer:
             camera = self._whole.camera(self.state, index)
             if self.state.exposures is not None:
                 transform = self.state.exposures.transform(index)
-                splats, settings = as_photographed(splats, camera, transform, settings)
+                splats, settings = apply_exposure(splats, camera, transform, settings)
             yield splat_errors(
                 splats,
                 camera,
@@ -360,7 +359,7 @@ class Trainer:
         state, index = self.state, self.state.stage
         unseen = self._drop_unseen(stage)
         state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
-        self._evaluator = None
+        self._objective = None
         self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats), unseen))
 
     def _drop_unseen(self, stage: Stage) -> int:
@@ -370,10 +369,10 @@ class Trainer:
         No pixel of a training view changes.
         """
         frozen = {"means", "quats", "log_scales", "opacity_logits"}.isdisjoint(stage.train)
-        if frozen or self.protocol.crossing == "draw":
+        if frozen or self.protocol.near_plane_policy == "draw":
             return 0
-        scene = per_view.scene_now(self.state, self.scene)
-        seen = seen_rows(self.state.splats, scene, self.settings, self.backend)
+        scene = per_image.scene_now(self.state, self.scene)
+        seen = visible_mask(self.state.splats, scene, self.settings, self.backend)
         unseen = int((~seen).sum())
         if unseen == len(seen):
             return 0  # nothing is left to say what the scene is; evaluation will show it
@@ -382,7 +381,7 @@ class Trainer:
         return unseen
 
     def _progress(
-        self, stage: Stage, iteration: int, losses: Mapping[str, float], rates: Mapping[str, float]
+        self, stage: Stage, iteration: int, losses: Mapping[str, float], lr: Mapping[str, float]
     ) -> events.Progress:
         splats = self.state.splats
         return events.Progress(
@@ -395,7 +394,7 @@ class Trainer:
             splats=len(splats),
             mean_opacity=float(splats.opacities.mean()),
             mean_k_a=float(splats.scales.prod(dim=1).mean()),
-            rates={name: rates[name] for name in stage.train},
+            lr={name: lr[name] for name in stage.train},
             sh_degree=stage.active_sh_degree(iteration, self.recipe.sh_degree),
         )
 
@@ -405,5 +404,5 @@ class Trainer:
         broken = first_not_finite(parameters, self.backend.name)
         if broken is not None:
             raise diverged(stage, self.state.step, broken)
-        if what := per_view.broken(self.state):
+        if what := per_image.find_nonfinite(self.state):
             raise diverged(stage, self.state.step, what)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.viewer.exact import Frame
+from gs2d.viewer.exact import ViewerFrame
 from gs2d.viewer.splats import Preview
 
 AXES = "xyz"
@@ -26,7 +26,7 @@ class ClipBox:
     ----------
     server : viser.ViserServer
     frame : Frame
-    box : ndarray [2, 3] wu
+    box : ndarray [2, 3] world units
         At first.
     source : str
         What the commands cut: the run folder or the file.
@@ -37,7 +37,14 @@ class ClipBox:
     """
 
     def __init__(
-        self, server: Any, frame: Frame, box: np.ndarray, source: str, on_change: Callable[[], None], *, of_run: bool
+        self,
+        server: Any,
+        frame: ViewerFrame,
+        box: np.ndarray,
+        source: str,
+        on_change: Callable[[], None],
+        *,
+        of_run: bool,
     ) -> None:
         self._server, self._frame, self._source, self._of_run = server, frame, source, of_run
         self._on_change = on_change
@@ -63,7 +70,7 @@ class ClipBox:
 
     @property
     def box(self) -> np.ndarray:
-        """Corners [2, 3] wu."""
+        """Corners [2, 3] world units."""
         return np.array([sorted(slider.value) for slider in self._sliders], np.float64).T
 
     @property

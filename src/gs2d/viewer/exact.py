@@ -14,20 +14,20 @@ from gs2d.core.camera import Camera
 
 Render = Callable[[Camera, str], "Drawn"]
 
-MOST_PIXELS, MOVING_PIXELS = 1280 * 960, 320 * 240
+MAX_PIXELS, MOVING_PIXELS = 1280 * 960, 320 * 240
 FARTHEST = 160.0  # viewer units, of what has no depth
 SETTLED = 0.15  # s without a movement, after which the picture gets sharp
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ViewerFrame:
     """The viewer's frame: that of the capture, moved and scaled (viser's depths end at 168 and have steps of 1e-5).
 
     Attributes
     ----------
-    origin : ndarray [3] wu
+    origin : ndarray [3] world units
     unit : float
-        wu.
+        World units.
     """
 
     origin: np.ndarray
@@ -49,7 +49,7 @@ class Drawn:
     Attributes
     ----------
     image : ndarray [H, W, 3] uint8
-    depth : ndarray [H, W] float32, wu
+    depth : ndarray [H, W] float32, world units
         Along the optical axis, so that mesh and cameras stand behind or before it; infinity where there is nothing.
     """
 
@@ -67,10 +67,10 @@ class _Wish:
     sharp: bool = False
 
 
-class ExactPictures:
+class ExactImages:
     """Draws the background of every connected browser in a thread of its own: the newest wish of each counts."""
 
-    def __init__(self, server: Any, frame: Frame, render: Callable[[], Render]) -> None:
+    def __init__(self, server: Any, frame: ViewerFrame, render: Callable[[], Render]) -> None:
         self._server, self._frame, self._render = server, frame, render
         self._kind: str | None = None
         self._wishes: dict[int, _Wish] = {}
@@ -141,7 +141,7 @@ class ExactPictures:
         while (found := self._next()) is not None:
             wish, sharp, kind, render = found
             try:
-                camera = camera_of(wish.client.camera, self._frame, MOST_PIXELS if sharp else MOVING_PIXELS)
+                camera = camera_of(wish.client.camera, self._frame, MAX_PIXELS if sharp else MOVING_PIXELS)
                 drawn = render()(camera, kind)
                 depth = np.minimum(drawn.depth / self._frame.unit, FARTHEST)
                 wish.client.scene.set_background_image(
@@ -154,7 +154,7 @@ class ExactPictures:
                 return
 
 
-def camera_of(view: Any, frame: Frame, most_pixels: int) -> Camera:
+def camera_of(view: Any, frame: ViewerFrame, most_pixels: int) -> Camera:
     """The camera of a browser, with as many pixels as allowed; viser's cameras look along +z with y down, as ours.
 
     ``view`` has ``wxyz``, ``position``, ``fov`` (vertical, radians), ``image_width`` and ``image_height``.

@@ -22,11 +22,11 @@ from gs2d.core.extras import install
 from gs2d.core.transforms import focus_point
 from gs2d.errors import BackendError, Gs2dError
 from gs2d.viewer.clip import ClipBox
-from gs2d.viewer.exact import ExactPictures, Frame, Render
+from gs2d.viewer.exact import ExactImages, Render, ViewerFrame
 from gs2d.viewer.splats import Preview
 
 DEFAULT_PORT = 8080
-PICTURES = ("preview", "exact", "normals", "depth")  # what is drawn of the splats
+IMAGES = ("preview", "exact", "normals", "depth")  # what is drawn of the splats
 THUMBNAIL = 160  # px, longer side
 NEAREST = 1e-3  # of the scene's size: what is nearer to the eye is not drawn
 STEP_BACK = 2.0  # times as far from the middle as a photograph
@@ -50,7 +50,7 @@ class Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class ViewerStage:
     """Splats at some point of training, made when they are asked for."""
 
     preview: Callable[[], Preview]
@@ -68,9 +68,7 @@ def required_viser() -> Any:
     try:
         return importlib.import_module("viser")
     except ModuleNotFoundError as error:
-        raise BackendError(
-            f"the viewer needs {error.name}, which is not installed; {install('view')}"
-        ) from error
+        raise BackendError(f"the viewer needs {error.name}, which is not installed; {install('view')}") from error
 
 
 def free_port(host: str, port: int | None, *, option: str = "--port") -> int:
@@ -122,7 +120,7 @@ class Viewer:
     up : ndarray [3]
     """
 
-    def __init__(self, *, title: str, host: str, port: int | None, frame: Frame, up: np.ndarray) -> None:
+    def __init__(self, *, title: str, host: str, port: int | None, frame: ViewerFrame, up: np.ndarray) -> None:
         viser = required_viser()
         self._frame = frame
         self.host, self.port = host, free_port(host, port)
@@ -132,8 +130,8 @@ class Viewer:
         self._server.scene.set_up_direction(tuple(up))
         self._nodes: dict[str, list[Any]] = {}
         self._splats: Any = None
-        self._exact: ExactPictures | None = None
-        self._stages: dict[str, Stage] = {}
+        self._exact: ExactImages | None = None
+        self._stages: dict[str, ViewerStage] = {}
         self._preview: Preview | None = None
         self.clip: ClipBox | None = None
         self._showing = (
@@ -158,13 +156,13 @@ class Viewer:
         start.fov = field_of_view(camera)
         start.near = NEAREST
 
-    def add_stages(self, stages: Mapping[str, Stage]) -> None:
+    def add_stages(self, stages: Mapping[str, ViewerStage]) -> None:
         """Splats to choose from; the last ones are shown first."""
         gui, names = self._server.gui, list(stages)
         self._stages = dict(stages)
         self._chosen = gui.add_dropdown("stage", names, initial_value=names[-1], visible=len(names) > 1)
-        self._drawn = gui.add_dropdown("splats", [*PICTURES, "none"], initial_value="preview")
-        self._exact = ExactPictures(self._server, self._frame, stages[names[-1]].render)
+        self._drawn = gui.add_dropdown("splats", [*IMAGES, "none"], initial_value="preview")
+        self._exact = ExactImages(self._server, self._frame, stages[names[-1]].render)
 
         def choose(_: Any) -> None:
             try:
@@ -177,7 +175,7 @@ class Viewer:
         self._chosen.on_update(choose)
         self._drawn.on_update(lambda _: self._show(load=False))
 
-    def replace_stage(self, name: str, stage: Stage) -> None:
+    def replace_stage(self, name: str, stage: ViewerStage) -> None:
         """Other splats under a name that there is; shown at once where it is the one that is looked at."""
         self._stages[name] = stage
         if self._chosen.value == name:
@@ -193,7 +191,7 @@ class Viewer:
                 self._exact.scene(stage.render)
             elif self._splats is not None:
                 self._splats.visible = drawn == "preview"
-            self._exact.draw(drawn if drawn in PICTURES[1:] else None)
+            self._exact.draw(drawn if drawn in IMAGES[1:] else None)
 
     def _show_splats(self, splats: Preview, *, visible: bool) -> None:
         splats = splats if self.clip is None else self.clip.clipped(splats)
@@ -212,7 +210,7 @@ class Viewer:
             )
 
     def add_clip_box(self, box: np.ndarray, source: str, *, of_run: bool) -> None:
-        """Sliders for a box [2, 3] wu that clips the preview, and the commands that cut ``source`` to it."""
+        """Sliders for a box [2, 3] world units that clips the preview, and the commands that cut ``source`` to it."""
 
         def show() -> None:
             with self._showing:

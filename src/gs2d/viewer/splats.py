@@ -13,7 +13,7 @@ from gs2d.core.sh import sh_to_rgb
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 
-MOST_DIRECTIONS = 8  # cameras from which a splat's colour is averaged
+MAX_DIRECTIONS = 8  # cameras from which a splat's colour is averaged
 _LARGEST = 6e4  # covariances are sent as 16-bit floats
 
 
@@ -24,7 +24,7 @@ class Preview:
     Attributes
     ----------
     scale : float
-        One unit of the numbers below, wu: such that a typical splat has a size of 1, for 16-bit covariances.
+        One unit of the numbers below, world units: such that a typical splat has a size of 1, for 16-bit covariances.
     centers : ndarray [N, 3] float32
     covariances : ndarray [N, 3, 3] float32
     colors : ndarray [N, 3] float32 in [0, 1]
@@ -69,7 +69,7 @@ def _by_row(splats: Splats) -> list[tuple[str, torch.Tensor]]:
 
 
 def _colors(splats: Splats, cameras: Sequence[Camera]) -> torch.Tensor:
-    some = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MOST_DIRECTIONS)).round().astype(int))
+    some = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_DIRECTIONS)).round().astype(int))
     if not len(some):
         ahead = torch.tensor([0.0, 0.0, 1.0]).expand(len(splats), 3)
         return sh_to_rgb(splats.sh0, splats.shN, ahead, 0).clamp(0, 1)

@@ -28,7 +28,7 @@ from gs2d.core.files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.data.subject import OBJECT, Subject
 from gs2d.errors import DataError
-from gs2d.render.types import CROSSING, RasterSettings
+from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 from gs2d.viewer.web_start import guessed_subject, home_camera, photographed_arc
 
 PARTS = {  # script elements: id -> file, type
@@ -43,7 +43,7 @@ HINT = (
     '<span class="mouse">Drag to turn, wheel to come closer, ? for more.</span>'
     '<span class="finger">One finger turns, two fingers come closer and shift.</span>'
 )
-MOST_SPLATS = 5_000_000  # rows of 2048 texels, 3 a splat: what a texture of 8192 rows, which any GPU has, can hold
+MAX_SPLATS = 5_000_000  # rows of 2048 texels, 3 a splat: what a texture of 8192 rows, which any GPU has, can hold
 CLIPPED = 1e-4  # of the SH coefficients of one place may be cut off: the steps of the others are smaller then
 WORD_BYTES = 32  # of a splat, without its SH coefficients above degree 0
 
@@ -108,8 +108,8 @@ def pack(splats: Splats, origin: np.ndarray, degree: int, alpha_min: float) -> P
     seen &= splats.quats.norm(dim=1) > 0
     splats = splats.rows(seen)
     count, degree = len(splats), min(degree, splats.sh_degree)
-    if count > MOST_SPLATS:
-        raise DataError(f"a page holds at most {MOST_SPLATS:,} splats, got {count:,}; train with a smaller max_splats")
+    if count > MAX_SPLATS:
+        raise DataError(f"a page holds at most {MAX_SPLATS:,} splats, got {count:,}; train with a smaller max_splats")
     words = np.zeros((count, WORD_BYTES // 4), np.uint32)
     words[:, :3] = (splats.means.numpy() - origin).astype(np.float32).view(np.uint32)
     words[:, 3] = _halves(splats.log_scales)
@@ -164,9 +164,9 @@ def write_page(
     settings : RasterSettings
         As they were trained with.
     title : str
-    focus : ndarray [3] wu
+    focus : ndarray [3] world units
         What the views look at; places are stored relative to it.
-    unit : float, wu
+    unit : float, world units
         About how far away it is seen from.
     up : ndarray [3]
         Unit.
@@ -252,7 +252,7 @@ def _facts(
         "alphaMin": settings.alpha_min,
         "alphaMax": settings.alpha_max,
         "lowpass": settings.lowpass_px,
-        "crossing": CROSSING.index(settings.crossing),
+        "near_plane_policy": NEAR_PLANE_POLICIES.index(settings.near_plane_policy),
         "crossingCutoff": settings.error_cutoff,
         "background": list(settings.background),
         "origin": packed.origin.tolist(),

@@ -45,9 +45,9 @@ def guessed_subject(cameras: Sequence[Camera], center: np.ndarray, unit: float, 
 
     Parameters
     ----------
-    center : ndarray [3] wu
+    center : ndarray [3] world units
         What the cameras look at.
-    unit : float, wu
+    unit : float, world units
         About how far away it is seen from.
     up : ndarray [3]
         Unit.

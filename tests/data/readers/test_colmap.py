@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture_writers import ColmapModel, ring, small_colmap, write_picture
+from capture_writers import ColmapModel, ring, small_colmap, write_image_of
 from gs2d.core.images import read_image
 from gs2d.data import load_scene
 from gs2d.data.readers.colmap_model import read_cameras, read_images, read_points
@@ -71,7 +71,7 @@ def test_images_in_sub_folders_keep_their_whole_name(tmp_path: Path) -> None:
     names = ["left/a.png", "left/b c.png", "right/a.png", "right/b c.png"]
     for index, name in enumerate(names):
         model.images.append((index + 1, cameras[index].T_cam_world, 1, name, []))
-        write_picture(tmp_path / "images" / name, seed=index)
+        write_image_of(tmp_path / "images" / name, seed=index)
     for kind in ("bin", "txt"):
         model.write(tmp_path / kind / "sparse", kind)
         (tmp_path / kind / "images").symlink_to(tmp_path / "images")
@@ -111,10 +111,10 @@ def test_downscale_filters_the_picture_and_keeps_rays(tmp_path: Path) -> None:
 def test_images_n_is_used_for_downscale_n_with_its_own_size(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     # 30 / 4 = 7.5: whoever made images_4 rounded up, so fy scales by 8/30 while fx scales by 10/40.
-    pictures = [write_picture(tmp_path / "images_4" / f"{i}.png", 10, 8, seed=50 + i) for i in range(9)]
+    images = [write_image_of(tmp_path / "images_4" / f"{i}.png", 10, 8, seed=50 + i) for i in range(9)]
     scene = load_scene(tmp_path, downscale=4, test_every=0)
     view = scene.train[3]
-    np.testing.assert_array_equal(view.image(), pictures[3])
+    np.testing.assert_array_equal(view.image(), images[3])
     c = view.camera
     np.testing.assert_allclose((c.width, c.height, c.fx, c.fy), (10, 8, 35 / 4, 36 * 8 / 30))
     np.testing.assert_allclose((c.cx, c.cy), (18.5 / 4, 16.25 * 8 / 30))
@@ -124,17 +124,17 @@ def test_images_n_is_used_for_downscale_n_with_its_own_size(tmp_path: Path) -> N
 def test_images_n_of_a_wrong_size_is_an_error(tmp_path: Path) -> None:
     small_colmap(tmp_path)
     for i in range(9):
-        write_picture(tmp_path / "images_4" / f"{i}.png", 20, 15)
+        write_image_of(tmp_path / "images_4" / f"{i}.png", 20, 15)
     with pytest.raises(DataError, match=r"must be 1/4 of its camera's 40x30, got 20x15"):
         load_scene(tmp_path, downscale=4)
 
 
 def test_a_picture_of_another_size_rescales_the_camera_and_of_another_shape_is_an_error(tmp_path: Path) -> None:
     small_colmap(tmp_path)
-    write_picture(tmp_path / "images/2.png", 80, 60)
+    write_image_of(tmp_path / "images/2.png", 80, 60)
     c = load_scene(tmp_path, test_every=0).train[2].camera
     assert (c.width, c.height, c.fx, c.fy, c.cx, c.cy) == (80, 60, 70.0, 72.0, 37.0, 32.5)
-    write_picture(tmp_path / "images/2.png", 30, 40)
+    write_image_of(tmp_path / "images/2.png", 30, 40)
     with pytest.raises(DataError, match=r"2\.png.*40x30, got 30x40; was it rotated"):
         load_scene(tmp_path)
 
@@ -171,7 +171,7 @@ def test_masks_beside_the_images_say_which_pixels_count(tmp_path: Path) -> None:
 
 def test_a_mask_of_another_shape_is_an_error(tmp_path: Path) -> None:
     small_colmap(tmp_path)
-    write_picture(tmp_path / "masks/1.png", 30, 40)
+    write_image_of(tmp_path / "masks/1.png", 30, 40)
     with pytest.raises(DataError, match="mask .*1.png must have the size"):
         load_scene(tmp_path)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture_writers import SCALE_MAT, ColmapModel, ring, small_dtu, write_picture
+from capture_writers import SCALE_MAT, ColmapModel, ring, small_dtu, write_image_of
 from gs2d.data import load_scene
 from gs2d.data.readers.dtu import decompose_projection, dtu_silhouettes
 from gs2d.errors import DataError
@@ -112,14 +112,14 @@ def test_wrong_archives_are_errors(tmp_path: Path) -> None:
 
 def test_another_number_of_images_than_cameras_without_numbers_is_an_error(tmp_path: Path) -> None:
     small_dtu(tmp_path)
-    write_picture(tmp_path / "image/extra.png")
+    write_image_of(tmp_path / "image/extra.png")
     with pytest.raises(DataError, match=r"as many images as cameras_sphere\.npz has views, 5, or be numbered; got 6"):
         load_scene(tmp_path)
 
 
 def test_an_alpha_channel_is_a_silhouette_and_the_background_stays(tmp_path: Path) -> None:
     small_dtu(tmp_path)
-    pixels = write_picture(tmp_path / "image/000000.png", alpha=True)
+    pixels = write_image_of(tmp_path / "image/000000.png", alpha=True)
     for path in (tmp_path / "mask").iterdir():
         path.unlink()
     view = load_scene(tmp_path).train[0]
@@ -136,7 +136,7 @@ def preprocessed(root: Path) -> list:
     model.points = [(1, (0.1, 0.2, 0.3), (1, 2, 3), 0.1, [])]
     model.write(root / "sparse/0")
     for i in range(len(cameras)):
-        write_picture(root / f"images/{i:06d}.png", 38, 28, seed=i, alpha=True)
+        write_image_of(root / f"images/{i:06d}.png", 38, 28, seed=i, alpha=True)
     return cameras
 
 

@@ -30,7 +30,7 @@ from foreign_writers import (
     small_alicevision,
     small_metashape,
     small_opensfm,
-    write_photographs,
+    write_images,
     write_points,
 )
 from gs2d.data import Scene, detect_format, load_scene
@@ -127,7 +127,7 @@ def test_opendronemap_keeps_its_reconstruction_in_a_folder_beside_the_photograph
 
 
 def test_of_several_reconstructions_the_largest_is_read_and_the_others_are_named(tmp_path: Path) -> None:
-    write_photographs(tmp_path / "images", poses())
+    write_images(tmp_path / "images", poses())
     every = list(poses().items())
     parts = [dict(every[:2]), dict(every[2:8]), dict(every[8:])]
     value = [opensfm_reconstruction(opensfm_camera(OFF_CENTRE), part) for part in parts]
@@ -177,7 +177,7 @@ def test_cameras_of_metashape_without_a_place_are_skipped_and_named(tmp_path: Pa
 
 
 def test_the_similarity_of_a_component_wins_and_other_components_are_left_out(tmp_path: Path) -> None:
-    write_photographs(tmp_path / "images", poses())
+    write_images(tmp_path / "images", poses())
     every = list(poses().items())
     away = (1.0, np.eye(3), np.array([100.0, 0.0, 0.0]))
     cameras = "".join(
@@ -200,7 +200,7 @@ def test_the_similarity_of_a_component_wins_and_other_components_are_left_out(tm
 
 
 def test_without_a_transform_the_frame_is_that_of_the_chunk(tmp_path: Path) -> None:
-    write_photographs(tmp_path / "images", poses())
+    write_images(tmp_path / "images", poses())
     same = (1.0, np.eye(3), np.zeros(3))
     cameras = "".join(
         f"<camera id='{i}' sensor_id='0' label='{name}'><transform>{metashape_transform(T, same)}</transform></camera>"
@@ -213,7 +213,7 @@ def test_without_a_transform_the_frame_is_that_of_the_chunk(tmp_path: Path) -> N
 
 def test_a_geocentric_chunk_becomes_metres_east_north_and_up(tmp_path: Path) -> None:
     """The ring stands upright at 60 N, 0 E: there east is +y, north (-sin 60, 0, cos 60), up (cos 60, 0, sin 60)."""
-    write_photographs(tmp_path / "images", poses())
+    write_images(tmp_path / "images", poses())
     sine = math.sin(math.pi / 3)
     north, east, up = np.array([-sine, 0.0, 0.5]), np.array([0.0, 1.0, 0.0]), np.array([0.5, 0.0, sine])
     a, e2 = 6378137.0, 0.00669437999014
@@ -307,7 +307,7 @@ def test_views_that_meshroom_did_not_place_are_skipped_and_named(tmp_path: Path)
 
 
 def test_meshroom_s_photographs_are_found_where_the_file_says_they_are(tmp_path: Path) -> None:
-    write_photographs(tmp_path / "elsewhere", poses())
+    write_images(tmp_path / "elsewhere", poses())
     data = alicevision_scene(OFF_CENTRE, (1, 2, 8), structure=False)
     for view in data["views"]:
         view["path"] = str(tmp_path / "elsewhere" / view["path"].rsplit("\\", 1)[-1])

@@ -17,7 +17,7 @@ from foreign_writers import (
     small_alicevision,
     small_metashape,
     small_opensfm,
-    write_photographs,
+    write_images,
 )
 from gs2d.data import load_scene
 from gs2d.errors import DataError
@@ -64,7 +64,7 @@ def cut(writer: Callable[[Path], Any], name: str) -> Callable[[Path], None]:
     return write
 
 
-def without_photographs(writer: Callable[[Path], Any]) -> Callable[[Path], None]:
+def without_images(writer: Callable[[Path], Any]) -> Callable[[Path], None]:
     def write(root: Path) -> None:
         writer(root)
         for path in (root / "images").iterdir():
@@ -92,7 +92,7 @@ def without_photographs(writer: Callable[[Path], Any]) -> Callable[[Path], None]
         (opensfm_with(lambda d: d["cameras"]["v2 a b"].update(width=40.5)), "width must be a whole number"),
         (opensfm_with(lambda d: d["points"]["0"].pop("coordinates")), "points must have 3 coordinates"),
         (opensfm_with(lambda d: d["points"]["0"].update(coordinates=[1, 2])), "points must have 3 coordinates"),
-        (without_photographs(small_opensfm), r"at least one view, got none \(9 skipped, first: a_0.jpg: listed in"),
+        (without_images(small_opensfm), r"at least one view, got none \(9 skipped, first: a_0.jpg: listed in"),
         (cut(small_metashape, "cameras.xml"), r"cameras\.xml must be XML, got: .*is the file complete"),
         (metashape_with("<cameras", "<!DOCTYPE x><cameras"), "got one with definitions of its own"),
         (metashape_with("chunk", "chunky"), "must be XML, got: mismatched tag"),
@@ -103,7 +103,7 @@ def without_photographs(writer: Callable[[Path], Any]) -> Callable[[Path], None]
         (metashape_with("sensor_id='0'", "sensor_id='5'"), "must hold sensor '5' of camera a_0, got"),
         (metashape_with("<transform>", "<transform>1 "), "camera a_0: transform must be 16 numbers, got 17"),
         (metashape_with("<scale locked='true'>2.5", "<scale locked='true'>-1"), "scale must be positive, got -1"),
-        (without_photographs(small_metashape), "at least one view, got none"),
+        (without_images(small_metashape), "at least one view, got none"),
         (cut(small_alicevision, "cameras.sfm"), r"cameras\.sfm must be JSON, got: .*is the file complete"),
         (alicevision_with(lambda d: d.pop("poses")), "must hold poses, got none; take the file of the node Structure"),
         (alicevision_with(lambda d: d.update(version=["1", "2"])), "version must be 3 numbers"),
@@ -118,7 +118,7 @@ def without_photographs(writer: Callable[[Path], Any]) -> Callable[[Path], None]
             "must hold a rotation, got columns of length",
         ),
         (alicevision_with(lambda d: d["structure"][0].pop("X")), "structure must have X and color"),
-        (without_photographs(small_alicevision), "at least one view, got none"),
+        (without_images(small_alicevision), "at least one view, got none"),
     ],
 )
 def test_a_broken_file_is_one_line_that_names_it(tmp_path: Path, write: Callable[[Path], Any], words: str) -> None:
@@ -139,7 +139,7 @@ def test_a_broken_file_is_one_line_that_names_it(tmp_path: Path, write: Callable
     ],
 )
 def test_a_project_of_another_tool_says_what_to_export(tmp_path: Path, name: str, words: str) -> None:
-    write_photographs(tmp_path, poses())
+    write_images(tmp_path, poses())
     (tmp_path / name).write_bytes(b"x")
     with pytest.raises(DataError, match=words):
         load_scene(tmp_path)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture_writers import opengl_camera_to_world, ring, small_blender, small_nerfstudio, write_picture
+from capture_writers import opengl_camera_to_world, ring, small_blender, small_nerfstudio, write_image_of
 from gs2d.data import load_scene
 from gs2d.errors import DataError
 
@@ -46,7 +46,7 @@ def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
     first[2, 3] = 4
     frames = []
     for name, M in (("a", first), ("b", second)):
-        write_picture(tmp_path / f"{name}.png")
+        write_image_of(tmp_path / f"{name}.png")
         frames.append({"file_path": name, "transform_matrix": M.tolist()})
     meta = {"camera_angle_x": 2 * math.atan(20 / 35), "frames": frames}
     (tmp_path / "transforms_train.json").write_text(json.dumps(meta))
@@ -60,7 +60,7 @@ def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
 def test_camera_angle_x_fits_an_image_of_any_size(tmp_path: Path) -> None:
     small_blender(tmp_path)
     for path in (tmp_path / "train").iterdir():
-        write_picture(path, 80, 60, alpha=True)
+        write_image_of(path, 80, 60, alpha=True)
     np.testing.assert_allclose([v.camera.fx for v in load_scene(tmp_path).train], 70.0)
 
 
@@ -228,7 +228,7 @@ def test_a_wrong_json_is_one_line_that_names_frame_and_key(tmp_path: Path, chang
 
 def test_a_photograph_of_another_folder_keeps_its_whole_path_as_its_name(tmp_path: Path) -> None:
     small_nerfstudio(tmp_path / "capture")
-    write_picture(tmp_path / "elsewhere" / "x.png")
+    write_image_of(tmp_path / "elsewhere" / "x.png")
     there = tmp_path / "elsewhere" / "x.png"
     edit(tmp_path / "capture" / "transforms.json", lambda m: m["frames"][1].update(file_path=str(there)))
     names = {view.name for view in load_scene(tmp_path / "capture").views}

@@ -12,9 +12,9 @@ import emulate
 from depth_waves import waves
 from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.integrate import add_in_numpy, add_on_gpu
-from gs2d.meshing.sampling import prepare
+from gs2d.meshing.sampling import make_sampler
 from gs2d.meshing.tsdf import touched_blocks
-from gs2d.meshing.volume import Volume, block_grid, unknown_volume
+from gs2d.meshing.volume import Volume, block_grid, invalid_volume
 
 pytestmark = pytest.mark.timeout(120)
 
@@ -29,13 +29,13 @@ def test_the_kernel_leaves_the_field_of_numpy_in_every_bit(emulator: emulate.Emu
     assert 4 < len(keys) < 500
 
     def empty() -> Volume:
-        return unknown_volume(limits, dims, keys, colored=colored, frames=4)
+        return invalid_volume(limits, dims, keys, colored=colored, frames=4)
 
     found, expected = empty(), empty()
     with add_on_gpu([found], emulator, torch.device("cpu")) as add, add_in_numpy([expected], 1) as add_too:
         for view in views:
-            add(prepare(view, limits))
-            add_too(prepare(view, limits))
+            add(make_sampler(view, limits))
+            add_too(make_sampler(view, limits))
     assert (expected.weight > 0).mean() > 0.1
     for name in ("tsdf", "weight", "color", "color_weight"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)

@@ -60,8 +60,8 @@ def cpu_backend() -> Backend:
 
 VARIANTS = {
     "plain": train_toys.short(),
-    "exposure": replace(train_toys.short(), exposure=Exposure(start=2, horizon=10)),
-    "poses": replace(train_toys.short(), poses=PoseRefinement(start=2, horizon=10)),
+    "exposure": replace(train_toys.short(), exposure=Exposure(start=2, decay_steps=10)),
+    "poses": replace(train_toys.short(), poses=PoseRefinement(start=2, decay_steps=10)),
     "multiview": train_toys.compared(),
 }
 
@@ -109,7 +109,7 @@ WAITS = {
 }
 
 
-class Watch(TorchDispatchMode):
+class TrainingObserver(TorchDispatchMode):
     """Counts operations that make the host wait for a GPU."""
 
     def __init__(self) -> None:
@@ -129,7 +129,7 @@ class Watch(TorchDispatchMode):
 @contextmanager
 def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counter[str]]:
     """Operations that wait, and tensors made of Python numbers (a copy that the host waits for)."""
-    with monkeypatch.context() as patch, Watch() as watch:
+    with monkeypatch.context() as patch, TrainingObserver() as watch:
         for where, name in ((torch, "tensor"), (torch, "as_tensor"), (torch.Tensor, "new_tensor")):
             original = getattr(where, name)
 
@@ -167,8 +167,8 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
     emulated: Backend, scene: Scene, stage: int, variant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recipe = quiet(VARIANTS[variant]) if stage == 0 else VARIANTS[variant]
-    monkeypatch.setattr(loop, "waits", lambda device: True)
-    monkeypatch.setattr(views, "waits", lambda device: True)
+    monkeypatch.setattr(loop, "is_async", lambda device: True)
+    monkeypatch.setattr(views, "is_async", lambda device: True)
     trainer = Trainer(scene, recipe, GENERIC, backend=emulated, progress_every=1000, target_bytes=1 << 20)
     in_stage(trainer, stage)
     trainer.step()
@@ -176,7 +176,7 @@ def test_an_iteration_waits_for_nothing_once_it_knows_how_many_pairs_to_expect(
         target = trainer._targets[index]  # each photograph is taken in once
         if variant == "multiview":
             trainer.state.step = 6  # the next iteration compares
-            trainer._whole._photographs.of(index, target)
+            trainer._whole._images.of(index, target)
     with watched(monkeypatch) as seen:
         trainer.step()
         trainer.step()
@@ -189,8 +189,8 @@ def test_a_loss_that_is_not_finite_stops_training_at_the_next_report(
 ) -> None:
     from gs2d.errors import DivergedError
 
-    monkeypatch.setattr(loop, "waits", lambda device: True)
-    monkeypatch.setattr(views, "waits", lambda device: True)
+    monkeypatch.setattr(loop, "is_async", lambda device: True)
+    monkeypatch.setattr(views, "is_async", lambda device: True)
     trainer = Trainer(scene, train_toys.short(), GENERIC, backend=emulated, progress_every=2)
     trainer.enter(0)
     trainer.step()
@@ -209,8 +209,10 @@ def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     monkeypatch.setattr(cuda_budget, "SLACK", slack)
     monkeypatch.setattr(cuda_budget, "STEP", 1)
     outcomes = []
-    settle = cuda_budget.PairBudget.cut_short
-    monkeypatch.setattr(cuda_budget.PairBudget, "cut_short", lambda self: outcomes.append(settle(self)) or outcomes[-1])
+    settle = cuda_budget.PairBudget.overflowed
+    monkeypatch.setattr(
+        cuda_budget.PairBudget, "overflowed", lambda self: outcomes.append(settle(self)) or outcomes[-1]
+    )
     trainer = Trainer(scene, recipe, GENERIC, backend=emulated, progress_every=5)
     trainer.run()
     assert any(outcomes) == (slack < 1)
@@ -233,7 +235,7 @@ def test_room_that_is_not_needed_holds_nothing_and_too_little_room_is_said(
     budget = cuda_budget.PairBudget()
     exact = cuda_passes.forward(emulator, view, parameters, exact=False, budget=budget)
     assert budget.overflow is None
-    assert not budget.cut_short()
+    assert not budget.overflowed()
     pairs = len(exact.entries)
     assert pairs > 6
     for slack, short in ((3.0, False), (0.5, True)):
@@ -241,8 +243,8 @@ def test_room_that_is_not_needed_holds_nothing_and_too_little_room_is_said(
         frame = cuda_passes.forward(emulator, view, parameters, exact=False, budget=budget)
         assert len(frame.entries) == int(slack * pairs)
         assert bool(budget.overflow) == short
-        assert budget.cut_short() == short
-        assert not budget.cut_short()  # settled
+        assert budget.overflowed() == short
+        assert not budget.overflowed()  # settled
         same = [torch.equal(frame.images[name], exact.images[name]) for name in ("color", "alpha", "depth_median")]
         assert all(same) != short
         if not short:
@@ -260,11 +262,11 @@ def test_room_follows_the_number_of_pairs_up_at_once_and_down_slowly(monkeypatch
     for _ in range(10_000):
         budget.learn(7, 100_000)
     assert budget.room(7) == 125_000
-    budget.learn(7, cuda_budget.MOST_PAIRS)
-    assert budget.room(7) == cuda_budget.MOST_PAIRS  # 1.25 times as many would not fit in an index
+    budget.learn(7, cuda_budget.MAX_PAIRS)
+    assert budget.room(7) == cuda_budget.MAX_PAIRS  # 1.25 times as many would not fit in an index
 
 
-def picture_scene() -> tuple[View, ...]:
+def image_scene() -> tuple[View, ...]:
     """Four views of 6 x 4 px: opaque, with alpha, with a mask, opaque."""
     rng = np.random.default_rng(0)
     camera = front_camera(6, 4)
@@ -281,7 +283,7 @@ def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
 
     Pinned, the third takes 128 + 32 bytes.
     """
-    scene_views, pinned = picture_scene(), []
+    scene_views, pinned = image_scene(), []
 
     def pin(tensor: Tensor) -> Tensor:
         pinned.append(tensor.nbytes)
@@ -309,7 +311,7 @@ def test_memory_that_the_system_does_not_lock_is_done_without() -> None:
         raise RuntimeError("CUDA error: out of memory")
 
     options: dict[str, Any] = {"use_masks": False, "device": torch.device("cpu"), "limit_bytes": 0, "pin": refuse}
-    targets = DeviceTargets(picture_scene(), (0.0, 0.0, 0.0), **options)
+    targets = DeviceTargets(image_scene(), (0.0, 0.0, 0.0), **options)
     for index in range(4):
         assert targets[index].image.shape == (4, 6, 3)
     assert asked == [72]  # not asked again

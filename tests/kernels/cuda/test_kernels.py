@@ -43,9 +43,11 @@ def test_images_and_radii_agree_with_the_reference_on_random_scenes(emulator: Em
     assert float((torch.cat(radii) > 1e-3).double().mean()) <= 2e-3
 
 
-@pytest.mark.parametrize("crossing", ["cull", "box"])
-def test_crossing_splats_are_culled_or_boxed_as_by_the_reference_if_wanted(emulator: Emulator, crossing: str) -> None:
-    settings = replace(SETTINGS, crossing=crossing)
+@pytest.mark.parametrize("near_plane_policy", ["cull", "box"])
+def test_crossing_splats_are_culled_or_boxed_as_by_the_reference_if_wanted(
+    emulator: Emulator, near_plane_policy: str
+) -> None:
+    settings = replace(SETTINGS, near_plane_policy=near_plane_policy)
     differences, culled, smaller = [], 0, 0
     for case in cases(12, ("crossing", "huge", "plain")):
         low = render(emulator, case.splats, case.camera, settings)
@@ -56,8 +58,8 @@ def test_crossing_splats_are_culled_or_boxed_as_by_the_reference_if_wanted(emula
         culled += int(((drawn.radii > 0) & (high.radii == 0)).sum())
         smaller += int(((drawn.radii > high.radii) & (high.radii > 0)).sum())
     assert quantile(torch.cat(differences), 0.998) < 1e-4
-    assert culled > (20 if crossing == "cull" else 0)
-    assert (smaller > 20) is (crossing == "box")
+    assert culled > (20 if near_plane_policy == "cull" else 0)
+    assert (smaller > 20) is (near_plane_policy == "box")
 
 
 @pytest.mark.parametrize("columns", [2, 4])

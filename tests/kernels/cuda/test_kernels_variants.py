@@ -171,8 +171,8 @@ def test_culling_splats_without_an_ellipse_changes_no_bit(emulator: Emulator, se
     )
     for name, gradient in b.items():
         assert torch.equal(a[name], gradient), name
-    crossing = full.radii == 45
-    assert int((b["sh0"][crossing] != 0).any(2).sum()) > 5
+    near_plane_policy = full.radii == 45
+    assert int((b["sh0"][near_plane_policy] != 0).any(2).sum()) > 5
 
 
 def test_torchs_switch_asks_for_deterministic_gradients(emulator: Emulator) -> None:

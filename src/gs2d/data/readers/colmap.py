@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.core.images import image_size
-from gs2d.data.build import Capture, Frame
+from gs2d.data.build import Capture, PosedImage
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.readers.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images, read_points
 from gs2d.data.scene import PointCloud
@@ -71,7 +71,7 @@ def read_colmap(root: Path, downscale: int) -> Capture:
         if factor > 1:
             _check_factor(path, k, factor)
         mask = find_mask(home / "masks", name)
-        frames.append(Frame(name, path, k, image.T_cam_world, mask=mask))
+        frames.append(PosedImage(name, path, k, image.T_cam_world, mask=mask))
     masked = sum(frame.mask is not None for frame in frames)
     if (home / "masks").is_dir():
         notes.append(f"masks: {masked} of {len(frames)} views have one in {(home / 'masks').name} (white = keep)")

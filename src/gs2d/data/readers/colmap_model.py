@@ -68,7 +68,7 @@ class ColmapImage:
 
 @dataclass(frozen=True, eq=False)
 class ColmapPoints:
-    """ids [P] int64, xyz [P, 3] float64 wu, rgb [P, 3] uint8, error [P] px."""
+    """ids [P] int64, xyz [P, 3] float64 world units, rgb [P, 3] uint8, error [P] px."""
 
     ids: np.ndarray
     xyz: np.ndarray

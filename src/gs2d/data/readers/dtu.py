@@ -14,7 +14,7 @@ from scipy.linalg import rq
 
 from gs2d.core.camera import Camera
 from gs2d.core.images import image_size, natural_key
-from gs2d.data.build import Capture, Frame
+from gs2d.data.build import Capture, PosedImage
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.readers.colmap import model_points, observed_points
 from gs2d.data.readers.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images
@@ -59,7 +59,7 @@ def read_dtu(root: Path) -> Capture:
         width, height = image_size(image)
         fx, fy, cx, cy, T = decompose_projection(world[index] @ scale[index], where)
         frames.append(
-            Frame(
+            PosedImage(
                 image.name,
                 image,
                 Intrinsics(width, height, fx, fy, cx + 0.5, cy + 0.5),
@@ -85,7 +85,7 @@ def read_dtu(root: Path) -> Capture:
     )
 
 
-def _observed(model: _Model, frames: Sequence[Frame]) -> ObservedPoints:
+def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:
     """The model's points by the photographs of the scan, which may have another suffix there."""
     found = observed_points(model.folder, model.kind)
     by_stem = {Path(frame.name).stem: frame.name for frame in frames}
@@ -253,7 +253,9 @@ def _same_places(centers: dict[str, np.ndarray], model: _Model) -> bool:
     return bool(np.linalg.norm(a - b, axis=1).max() < 0.02 * spread)
 
 
-def _with_model(frames: list[Frame], model: _Model | None) -> tuple[list[Frame], PointCloud | None, tuple[str, ...]]:
+def _with_model(
+    frames: list[PosedImage], model: _Model | None
+) -> tuple[list[PosedImage], PointCloud | None, tuple[str, ...]]:
     """The frames with the model's cameras where those were made for the photographs; its points; what was decided."""
     if model is None or (model.points is None and not model.images):
         return frames, None, ()
@@ -270,7 +272,7 @@ def _with_model(frames: list[Frame], model: _Model | None) -> tuple[list[Frame],
     return fitted, model.points, notes
 
 
-def _of_model(frame: Frame, image: ColmapImage | None, model: _Model) -> Frame:
+def _of_model(frame: PosedImage, image: ColmapImage | None, model: _Model) -> PosedImage:
     """The frame, or one with the model's camera if that has the photograph's size and another focal length or centre.
 
     A mask of another size than such a photograph is of the original one: the photograph's alpha channel replaces it.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gs2d.data.build import Frame
+from gs2d.data.build import PosedImage
 from gs2d.data.scene import PointCloud
 from gs2d.io.meshes import read_points
 from gs2d.io.splat_ply import ply_kind
@@ -20,7 +20,7 @@ _LOOKED_AT = 2000  # points and
 _LOOKED_FROM = 100  # cameras that are asked
 
 
-def points_beside(root: Path, frames: Sequence[Frame]) -> tuple[PointCloud | None, list[str]]:
+def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud | None, list[str]]:
     """The points of a PLY file in ``root``, and a note where there is one that is not used.
 
     One of a usual name (``points3D.ply``, ``points.ply``, ``sparse.ply``, ``sparse_points.ply``, ``tie_points.ply``,
@@ -44,16 +44,16 @@ def points_beside(root: Path, frames: Sequence[Frame]) -> tuple[PointCloud | Non
         return None, [f"no sparse points: {path.name} is no point cloud"]
     cloud = read_points(path)
     points = PointCloud(np.asarray(cloud.points, dtype=np.float64), cloud.colors)
-    share = _seen(points.points, frames)
-    if share < _FEWEST:
+    fraction = _seen(points.points, frames)
+    if fraction < _FEWEST:
         return None, [
-            f"no sparse points: two cameras see {share:.0%} of those of {path.name}, which are in another frame; "
+            f"no sparse points: two cameras see {fraction:.0%} of those of {path.name}, which are in another frame; "
             "export them in the coordinates of the cameras"
         ]
     return points, []
 
 
-def _seen(points: np.ndarray, frames: Sequence[Frame]) -> float:
+def _seen(points: np.ndarray, frames: Sequence[PosedImage]) -> float:
     """The share of points that are in the pictures of two cameras (lenses that bend count as straight), and near."""
     some = points[np.linspace(0, len(points) - 1, min(len(points), _LOOKED_AT)).astype(int)]
     some = some[np.isfinite(some).all(axis=1)]

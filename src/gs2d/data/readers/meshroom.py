@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
 from gs2d.data.readers.colmap import find_mask
 from gs2d.data.readers.fields import entries, head, real, reals, required, whole
 from gs2d.data.readers.foreign_points import points_beside
-from gs2d.data.readers.photographs import Photographs
+from gs2d.data.readers.photographs import ImageFiles
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
@@ -79,8 +79,8 @@ def read_alicevision(root: Path) -> Capture:
             f"{path} must hold poses, got none; take the file of the node StructureFromMotion (cameras.sfm), or of "
             "ConvertSfMFormat with SfM File Format json"
         )
-    photographs, masks = Photographs([root / "images", root]), root / "masks"
-    frames: list[Frame] = []
+    images, masks = ImageFiles([root / "images", root]), root / "masks"
+    frames: list[PosedImage] = []
     skipped: list[str] = []
     for index, view in enumerate(_list(data, "views", path)):
         written = str(required(view, "path", f"{path}: view {index}"))
@@ -89,7 +89,7 @@ def read_alicevision(root: Path) -> Capture:
         if pose is None or "rigId" in view:
             skipped.append(f"{label}: " + ("of a rig, which is not read" if pose else "not placed by Meshroom"))
             continue
-        found = _photograph(written, photographs, where)
+        found = _image(written, images, where)
         if found is None:
             skipped.append(f"{label}: listed in {path.name}, but there is no such file")
             continue
@@ -97,7 +97,7 @@ def read_alicevision(root: Path) -> Capture:
         if key not in cameras:
             raise DataError(f"{path}: intrinsics must hold {key} of view {label}, got {sorted(cameras)[:9]}")
         k = _intrinsics(cameras[key], version, f"{path}: intrinsic {key}")
-        frames.append(Frame(found[0], found[1], k, _pose(pose, where), mask=find_mask(masks, found[0])))
+        frames.append(PosedImage(found[0], found[1], k, _pose(pose, where), mask=find_mask(masks, found[0])))
     points, notes = _points(data, path), list[str]()
     if points is None:
         points, notes = points_beside(root, frames)
@@ -119,9 +119,9 @@ def _list(data: Mapping[str, Any], key: str, path: Path) -> Sequence[Mapping[str
     return [entries(item, f"{path}: {key} {index}") for index, item in enumerate(value)]
 
 
-def _photograph(written: str, photographs: Photographs, where: str) -> tuple[str, Path] | None:
+def _image(written: str, images: ImageFiles, where: str) -> tuple[str, Path] | None:
     """By its name below the capture, else where the file says it is: the same machine."""
-    found = photographs.find(written, where)
+    found = images.find(written, where)
     if found is None and Path(written).is_absolute() and Path(written).is_file():
         return Path(written).name, Path(written)
     return found

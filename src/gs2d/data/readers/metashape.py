@@ -20,11 +20,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gs2d.data.build import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
 from gs2d.data.readers.colmap import find_mask
 from gs2d.data.readers.fields import head, real, reals, whole
 from gs2d.data.readers.foreign_points import points_beside
-from gs2d.data.readers.photographs import Photographs
+from gs2d.data.readers.photographs import ImageFiles
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 
@@ -67,7 +67,7 @@ def read_metashape(root: Path) -> Capture:
         raise DataError(f"{root} must hold cameras.xml of Metashape (File > Export > Export Cameras), got no such file")
     chunk, notes = _chunk(path)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    photographs, masks = Photographs([root / "images", root]), root / "masks"
+    images, masks = ImageFiles([root / "images", root]), root / "masks"
     listed = [camera for group in chunk.iterfind("cameras") for camera in group.iter("camera")]
     placed, skipped = _placed(listed)
     component, more = _component(placed)
@@ -81,7 +81,7 @@ def read_metashape(root: Path) -> Capture:
     poses, moved = _off_the_globe(poses)
     for camera, label, M in poses:
         where = f"{path}: camera {label}"
-        found = photographs.find(label, where)
+        found = images.find(label, where)
         if found is None:
             lost.append(f"{label}: listed in {path.name}, but there is no such file")
             continue
@@ -90,7 +90,7 @@ def read_metashape(root: Path) -> Capture:
             raise DataError(f"{path} must hold sensor {key!r} of camera {label}, got {sorted(sensors)[:9]}")
         k = _intrinsics(sensors[key], f"{path}: sensor {key}")
         T = pose_from_camera_to_world(M, f"{where}: transform", opengl=False)
-        frames.append(Frame(found[0], found[1], k, T, mask=find_mask(masks, found[0])))
+        frames.append(PosedImage(found[0], found[1], k, T, mask=find_mask(masks, found[0])))
     points, said = points_beside(root, frames)
     return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *said))
 

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, Frame
+from gs2d.data.build import Capture, PosedImage
 from gs2d.data.readers.colmap import find_mask
 from gs2d.data.readers.fields import entries, real, reals, required, whole
-from gs2d.data.readers.photographs import Photographs
+from gs2d.data.readers.photographs import ImageFiles
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
@@ -59,17 +59,17 @@ def read_opensfm(root: Path) -> Capture:
         raise DataError(f"{root} must hold {' or '.join(FILES)} (OpenSfM), got neither")
     reconstruction, notes = _largest(path)
     homes = dict.fromkeys((path.parent, root, root.parent if root.name == "opensfm" else root))
-    photographs = Photographs([*(home / "images" for home in homes), root])
+    images = ImageFiles([*(home / "images" for home in homes), root])
     masks = next((home / "masks" for home in homes if (home / "masks").is_dir()), None)
     cameras = entries(required(reconstruction, "cameras", str(path)), f"{path}: cameras")
     shots = entries(required(reconstruction, "shots", str(path)), f"{path}: shots")
-    frames: list[Frame] = []
+    frames: list[PosedImage] = []
     skipped: list[str] = []
     for name, shot in shots.items():
         where = f"{path}: shot {name}"
         shot = entries(shot, where)
         T = _pose(shot, where)
-        found = photographs.find(name, where)
+        found = images.find(name, where)
         if found is None:
             skipped.append(f"{name}: listed in {path.name}, but there is no such file")
             continue
@@ -77,7 +77,7 @@ def read_opensfm(root: Path) -> Capture:
         if key not in cameras:
             raise DataError(f"{path}: cameras must hold {key!r} of shot {name}, got {sorted(cameras)[:9]}")
         k = _intrinsics(entries(cameras[key], f"{path}: camera {key}"), found[1], f"{path}: camera {key}")
-        frames.append(Frame(found[0], found[1], k, T, mask=None if masks is None else find_mask(masks, found[0])))
+        frames.append(PosedImage(found[0], found[1], k, T, mask=None if masks is None else find_mask(masks, found[0])))
     if masks is not None:
         masked = sum(frame.mask is not None for frame in frames)
         notes.append(f"masks: {masked} of {len(frames)} views have one in {masks.name} (white = keep)")

@@ -9,10 +9,10 @@ from pathlib import Path
 from gs2d.errors import DataError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic")
-_NO_PHOTOGRAPHS = {"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"}  # of the same names
+_NO_IMAGES = {"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"}  # of the same names
 
 
-class Photographs:
+class ImageFiles:
     """Finds photographs by what a camera file calls them: a path of another machine, a name, a name without its ending.
 
     Parameters
@@ -65,7 +65,7 @@ class Photographs:
 
 def _below(folder: Path) -> Iterator[Path]:
     for at, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in _NO_PHOTOGRAPHS]
+        folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in _NO_IMAGES]
         yield from (Path(at, name) for name in files if os.path.splitext(name)[1].lower() in SUFFIXES)
 
 

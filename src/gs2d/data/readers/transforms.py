@@ -12,7 +12,7 @@ import numpy as np
 
 from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
-from gs2d.data.build import Capture, Frame, pose_from_camera_to_world
+from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
 from gs2d.data.priors import MapFiles
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
@@ -84,11 +84,11 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 def _read_frames(
     path: Path, split: str | None, meta: dict[str, Any] | None = None
-) -> tuple[list[Frame], list[str], list[str]]:
+) -> tuple[list[PosedImage], list[str], list[str]]:
     """(frames whose file exists, sentences about those whose does not, notes)."""
     meta = _read_meta(path) if meta is None else meta
     root = path.parent
-    frames: list[Frame] = []
+    frames: list[PosedImage] = []
     skipped: list[str] = []
     missing_masks = 0
     for index, entry in enumerate(meta["frames"]):
@@ -111,7 +111,7 @@ def _read_frames(
         intrinsics = frame_intrinsics({**meta, **entry}, image, f"{where} ({name})")
         maps = _maps_of({**meta, **entry}, entry, root, where)
         inside = image.relative_to(root) if image.is_relative_to(root) else Path(*image.parts[1:])  # of another folder
-        frames.append(Frame(inside.as_posix(), image, intrinsics, pose, split, mask=mask, maps=maps))
+        frames.append(PosedImage(inside.as_posix(), image, intrinsics, pose, split, mask=mask, maps=maps))
     notes = [f"{missing_masks} masks named in {path.name} do not exist"] if missing_masks else []
     return frames, skipped, notes
 
@@ -218,7 +218,7 @@ def _lens(entry: Mapping[str, Any], value: Mapping[str, float], where: str) -> L
     return None if lens.is_identity or "PINHOLE" in model else lens
 
 
-def _named_split(path: Path, meta: dict[str, Any], frames: list[Frame]) -> tuple[list[Frame], list[str]]:
+def _named_split(path: Path, meta: dict[str, Any], frames: list[PosedImage]) -> tuple[list[PosedImage], list[str]]:
     """The frames with the split that the file names, and sentences about frames that it does not name."""
     lists: dict[str, set[str]] = {}
     for key in ("train", "val", "test"):

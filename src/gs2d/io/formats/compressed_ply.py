@@ -51,17 +51,17 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
     }
     ends = [f"{end}_{x}" for names in _SPAN.values() for end in ("min", "max") for x in names]
     chunk = np.zeros(chunks, dtype=[(end, "<f4") for end in ends])
-    shares = {}
+    fractions = {}
     for what, names in _SPAN.items():
-        low, high, shares[what] = _shares(values[what], chunks)
+        low, high, fractions[what] = _fractions(values[what], chunks)
         for axis, x in enumerate(names):
             chunk[f"min_{x}"], chunk[f"max_{x}"] = low[:, axis], high[:, axis]
     vertex = np.zeros(n, dtype=[(name, "<u4") for name in _PACKED])
-    vertex["packed_position"] = _pack(shares["position"], _BITS)
+    vertex["packed_position"] = _pack(fractions["position"], _BITS)
     vertex["packed_rotation"] = _packed_quats(g.quats)
-    vertex["packed_scale"] = _pack(shares["scale"], _BITS)
+    vertex["packed_scale"] = _pack(fractions["scale"], _BITS)
     opacity = sigmoid(g.opacity_logits)[:, None]
-    vertex["packed_color"] = _pack(np.concatenate([shares["color"], opacity], axis=1), (8, 8, 8, 8))
+    vertex["packed_color"] = _pack(np.concatenate([fractions["color"], opacity], axis=1), (8, 8, 8, 8))
     elements = {"chunk": chunk, "vertex": vertex}
     if g.shN.shape[1]:
         rest = g.shN.transpose(0, 2, 1).reshape(n, 3 * g.shN.shape[1])  # by channel, as in a plain PLY
@@ -87,7 +87,7 @@ def _morton_order(means: np.ndarray) -> np.ndarray:
     return np.argsort(code, kind="stable")
 
 
-def _shares(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fractions(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(smallest [C, 3], largest [C, 3], shares of the way [N, 3] in [0, 1])."""
     starts = np.arange(chunks) * _CHUNK
     if not chunks:
@@ -96,14 +96,14 @@ def _shares(values: np.ndarray, chunks: int) -> tuple[np.ndarray, np.ndarray, np
     high = np.maximum.reduceat(values, starts).astype(np.float32).astype(np.float64)
     at = np.arange(len(values)) // _CHUNK
     span = (high - low)[at]
-    share = np.where(span < _SMALLEST, 0.0, (values - low[at]) / np.where(span < _SMALLEST, 1.0, span))
-    return low, high, np.clip(share, 0.0, 1.0)
+    fraction = np.where(span < _SMALLEST, 0.0, (values - low[at]) / np.where(span < _SMALLEST, 1.0, span))
+    return low, high, np.clip(fraction, 0.0, 1.0)
 
 
-def _pack(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+def _pack(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Numbers in [0, 1] in so many bits each, the first highest, in one word [N]."""
-    word = np.zeros(len(shares), np.uint32)
-    for column, count in zip(shares.T, bits, strict=True):
+    word = np.zeros(len(fractions), np.uint32)
+    for column, count in zip(fractions.T, bits, strict=True):
         most = (1 << count) - 1
         word = (word << np.uint32(count)) | np.clip(np.floor(column * most + 0.5), 0, most).astype(np.uint32)
     return word
@@ -166,12 +166,12 @@ def _column(path: object, element: PlyElement, name: str) -> np.ndarray:
     return values
 
 
-def _between(path: object, chunk: PlyElement, what: str, shares: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _between(path: object, chunk: PlyElement, what: str, fractions: np.ndarray, at: np.ndarray) -> np.ndarray:
     low, high = (
         np.stack([_column(path, chunk, f"{end}_{x}").astype(np.float64) for x in _SPAN[what]], axis=1)
         for end in ("min", "max")
     )
-    return np.asarray(low[at] * (1.0 - shares) + high[at] * shares)
+    return np.asarray(low[at] * (1.0 - fractions) + high[at] * fractions)
 
 
 def _unpack(word: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
@@ -206,5 +206,5 @@ def _sh(path: object, element: PlyElement | None, n: int) -> np.ndarray:
             "export the file again"
         )
     rest = np.stack([_column(path, element, f"f_rest_{i}") for i in range(count)], axis=1).astype(np.float64)
-    share = np.where(rest == 0, 0.0, np.where(rest == 255, 1.0, (rest + 0.5) / 256.0))
-    return ((share - 0.5) * 8.0).astype(np.float32).reshape(n, 3, count // 3).transpose(0, 2, 1)
+    fraction = np.where(rest == 0, 0.0, np.where(rest == 255, 1.0, (rest + 0.5) / 256.0))
+    return ((fraction - 0.5) * 8.0).astype(np.float32).reshape(n, 3, count // 3).transpose(0, 2, 1)

@@ -45,7 +45,7 @@ class SplatFile:
 
     kind: str
     gaussians: Gaussians
-    disks: Splats | None
+    to_surfels: Splats | None
 
 
 def layout_of(path: Path) -> str | None:
@@ -100,7 +100,7 @@ def read_disks(path: str | os.PathLike[str]) -> Splats:
         Missing, broken, no splats, or 3D Gaussians.
     """
     file = read_splat_file(path)
-    return file.gaussians.disks(path) if file.disks is None else file.disks
+    return file.gaussians.to_surfels(path) if file.to_surfels is None else file.to_surfels
 
 
 def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> SplatFile:
@@ -108,4 +108,4 @@ def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> Spla
         values = getattr(gaussians, name)
         if not np.isfinite(values).all():
             raise DataError(f"{os.fspath(path)}: finite numbers were expected, got NaN or infinity in its {name}")
-    return SplatFile(kind, gaussians, gaussians.disks(path) if gaussians.is_flat else None)
+    return SplatFile(kind, gaussians, gaussians.to_surfels(path) if gaussians.is_flat else None)

@@ -41,7 +41,7 @@ ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120"
 OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v", "--device-as-default-execution-space")
 REMEDY = "pip install nvidia-cuda-nvrtc cuda-bindings (torch's CUDA wheels bring both), or use --backend cpu"
 DIGEST_BYTES = 32
-LEAST_CAPABILITY = (7, 5)
+MIN_CAPABILITY = (7, 5)
 # GPUs in one chip with a CPU (Xavier, Orin, Thor): their code runs on no other GPU of the same major version.
 INTEGRATED = frozenset({72, 87, 88, 101, 110})
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
@@ -157,7 +157,7 @@ def architecture_for(capability: tuple[int, int]) -> str:
     BackendError
         The device is too old, or between what NVRTC knows.
     """
-    if capability < LEAST_CAPABILITY:
+    if capability < MIN_CAPABILITY:
         raise BackendError(
             f"the GPU must have compute capability 7.5 or more (Turing, 2018), got {capability[0]}.{capability[1]}; "
             "use --backend cpu"

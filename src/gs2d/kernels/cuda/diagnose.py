@@ -15,7 +15,7 @@ from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda.driver import DRIVER_REMEDY, OLD_DRIVER, driver_version, load_driver
 
-__all__ = ["Facts", "Missing", "describe", "gather", "missing"]
+__all__ = ["Facts", "MissingFile", "describe", "gather", "missing"]
 
 ANYWAY = "or use --backend cpu"
 OLDEST_CUDA = (12, 0)  # the driver's functions that load kernels for every device at once are of that version
@@ -60,45 +60,45 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Missing:
+class MissingFile:
     """The first thing that is missing, and what to do about it."""
 
     reason: str
     remedy: str
 
 
-def missing(facts: Facts) -> Missing | None:
+def missing(facts: Facts) -> MissingFile | None:
     """What keeps the backend from running; None if nothing does."""
     if facts.torch_cuda is None:
-        return Missing(
+        return MissingFile(
             f"torch {facts.torch_version} is built without CUDA",
             f"install a CUDA build of torch (on Linux plain `pip install torch` brings one), {ANYWAY}",
         )
     if facts.torch_cuda < OLDEST_CUDA:
-        return Missing(
+        return MissingFile(
             f"torch is built for CUDA {_dotted(facts.torch_cuda)}, CUDA 12 or newer is needed",
             f"install a torch build for CUDA 12 or 13, {ANYWAY}",
         )
     if facts.bindings_error:
-        return Missing(
+        return MissingFile(
             f"the Python package cuda.bindings is not here ({facts.bindings_error})", _install(facts.torch_cuda[0])
         )
     if facts.nvrtc_error:
-        return Missing(f"the CUDA compiler NVRTC is not here ({facts.nvrtc_error})", _install(facts.torch_cuda[0]))
+        return MissingFile(f"the CUDA compiler NVRTC is not here ({facts.nvrtc_error})", _install(facts.torch_cuda[0]))
     if facts.driver_error or facts.driver is None:
-        return Missing(f"no NVIDIA driver is here ({facts.driver_error})", DRIVER_REMEDY)
+        return MissingFile(f"no NVIDIA driver is here ({facts.driver_error})", DRIVER_REMEDY)
     for name, needs in (("torch", facts.torch_cuda), ("NVRTC", facts.nvrtc)):
         if needs is not None and facts.driver[0] < needs[0]:  # within a major version newer code runs on older drivers
-            return Missing(
+            return MissingFile(
                 f"the driver supports CUDA {_dotted(facts.driver)}, but {name} is of CUDA {_dotted(needs)}",
                 f"{OLD_DRIVER}, {ANYWAY}",
             )
     if not facts.devices:
         said = f" ({facts.torch_error})" if facts.torch_error else ""
-        return Missing(f"torch sees no CUDA device{said}", f"check `nvidia-smi` and CUDA_VISIBLE_DEVICES, {ANYWAY}")
+        return MissingFile(f"torch sees no CUDA device{said}", f"check `nvidia-smi` and CUDA_VISIBLE_DEVICES, {ANYWAY}")
     if facts.architecture_error:
         reason, _, remedy = facts.architecture_error.partition("; ")
-        return Missing(f"{facts.devices[0][0]}: {reason}", remedy)
+        return MissingFile(f"{facts.devices[0][0]}: {reason}", remedy)
     return None
 
 

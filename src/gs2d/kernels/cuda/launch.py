@@ -23,7 +23,7 @@ from gs2d.kernels.cuda.driver import call, failure, load_driver
 __all__ = ["GpuLauncher", "Launcher", "launcher_for"]
 
 STATIC_SHARED_BYTES = 48 << 10  # what a block may have without asking
-MOST_BLOCKS = (1 << 31) - 1
+MAX_BLOCKS = (1 << 31) - 1
 
 
 class Launcher(Protocol):
@@ -101,7 +101,7 @@ class GpuLauncher:
         """
         if blocks == 0:
             return
-        if blocks > MOST_BLOCKS:
+        if blocks > MAX_BLOCKS:
             raise BackendError(f"{name} needs {blocks} blocks, expected at most 2^31 - 1; use fewer splats or pixels")
         driver = self._driver
         with self._in_context():

@@ -258,7 +258,7 @@ def normal_consistency(
     ----------
     normal : Tensor [H, W, 3] float32
         sum w n, world frame.
-    depth : Tensor [H, W] float32, wu
+    depth : Tensor [H, W] float32, world units
         0 where nothing was hit.
     alpha : Tensor [H, W] float32
     camera : Camera

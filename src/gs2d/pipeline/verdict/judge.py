@@ -131,10 +131,10 @@ def _overlap(measures: Measures) -> Finding | None:
             f"{len(thin)} of {total} views are thin: the next camera is more than {grades.WIDE_ANGLE:.0f} degrees "
             f"away, or fewer than {few:.0f} points are seen."
         )
-    return Finding("overlap", grade, ", ".join(parts), text, _photograph_between(far, bare, apart), thin)
+    return Finding("overlap", grade, ", ".join(parts), text, _image_between(far, bare, apart), thin)
 
 
-def _photograph_between(far: Sequence[str], bare: Sequence[str], apart: dict[str, Neighbour]) -> str:
+def _image_between(far: Sequence[str], bare: Sequence[str], apart: dict[str, Neighbour]) -> str:
     if far:
         widest = sorted(far, key=lambda name: -apart[name].degrees)
         pairs = {frozenset((name, apart[name].next)): apart[name] for name in reversed(widest)}  # each once

@@ -229,7 +229,7 @@ def neighbours_of(
     Parameters
     ----------
     train, test : sequence of View
-    subject : ndarray [3] wu, optional
+    subject : ndarray [3] world units, optional
         Its middle; None: where the axes meet.
 
     Returns
@@ -270,7 +270,7 @@ def _degrees_around(directions: np.ndarray, up: np.ndarray) -> float:
     return float(360.0 - gaps.max())
 
 
-def placed_photographs(capture: Path | None) -> tuple[int | None, int | None, tuple[str, ...]]:
+def placed_images(capture: Path | None) -> tuple[int | None, int | None, tuple[str, ...]]:
     """Return how many photographs have a place, of how many, and the names of the others; None where nobody knows."""
     path = None if capture is None else capture / POSES_JSON
     if path is None or not path.is_file():
@@ -288,5 +288,5 @@ def measure(
 ) -> Measures:
     """Return the measures of a run whose views were measured; ``subject`` [3] as in :func:`neighbours_of`."""
     neighbours, around = neighbours_of(scene.train, scene.test, subject)
-    placed, count, lost = placed_photographs(scene.root)
+    placed, count, lost = placed_images(scene.root)
     return Measures(views, neighbours, around, placed, count, lost, learns_exposure)

@@ -9,7 +9,7 @@ from typing import Any
 from gs2d.core.images import read_image
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.report.html import escape, missing, picture, table
+from gs2d.report.html import escape, image_tag, missing, table
 
 CAPTURE = "capture"  # in a run of `gs2d reconstruct`
 POSES_JSON, POSES_PNG = "poses.json", "poses.png"  # of a capture that `gs2d poses` made
@@ -57,13 +57,13 @@ def capture_section(run: Path, definition: Mapping[str, Any]) -> str:
         if lost
         else ""
     )
-    return "<h2>The cameras</h2>" + lead + cameras + lens + _picture(folder / POSES_PNG) + without
+    return "<h2>The cameras</h2>" + lead + cameras + lens + _image(folder / POSES_PNG) + without
 
 
-def _picture(path: Path) -> str:
+def _image(path: Path) -> str:
     try:
         image = read_image(path)[:, :, :3]
     except DataError as error:
         return missing(f"{POSES_PNG} does not show: {error}")
     text = "Cameras (red) and points, from above and from the side"
-    return picture(image, text, alt=text, width=WIDTH)
+    return image_tag(image, text, alt=text, width=WIDTH)

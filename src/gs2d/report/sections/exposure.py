@@ -11,7 +11,7 @@ import numpy as np
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.report.html import drawing, escape, missing
-from gs2d.report.plots import INK, plot_by_photograph, svg_text
+from gs2d.report.plots import INK, plot_by_image, svg_text
 
 GREY = 0.5  # the scene's colour whose picture is shown
 _CHANNELS = {"red": "#d0463b", "green": "#3f9a5f", "blue": "#3f86d6"}
@@ -56,9 +56,9 @@ def _matched(stage: Mapping[str, Any]) -> str:
 def _gains(path: Path) -> tuple[list[str], np.ndarray]:
     """Names, and what a middle grey becomes as a share of itself [V, 3]."""
     try:
-        photographs = read_json(path)["photographs"]
-        names = [str(entry["name"]) for entry in photographs]
-        gains = np.array([entry["grey"] for entry in photographs], dtype=np.float64).reshape(len(names), 3) / GREY
+        images = read_json(path)["photographs"]
+        names = [str(entry["name"]) for entry in images]
+        gains = np.array([entry["grey"] for entry in images], dtype=np.float64).reshape(len(names), 3) / GREY
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path} must hold name and grey of each photograph, got another entry ({error})") from error
     if not names or not np.isfinite(gains).all():
@@ -67,7 +67,7 @@ def _gains(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _plot(gains: np.ndarray) -> str:
-    figure, axes = plot_by_photograph(2.7)
+    figure, axes = plot_by_image(2.7)
     axes.axhline(1.0, color=INK, linewidth=0.8)
     for k, (name, color) in enumerate(_CHANNELS.items()):
         axes.plot(

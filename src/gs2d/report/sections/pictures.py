@@ -15,12 +15,12 @@ from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RENDERS
-from gs2d.report.html import color_bar, escape, missing, picture, wipe
+from gs2d.report.html import color_bar, escape, image_tag, missing, wipe
 from gs2d.report.images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
-from gs2d.report.mesh_images import mesh_pictures, orbit_cameras
+from gs2d.report.mesh_images import mesh_images, orbit_cameras
 
-MOST_VIEWS = 4
-MOST_FACES = 4_000_000  # a picture of more would take gigabytes
+MAX_VIEWS = 4
+MAX_FACES = 4_000_000  # a picture of more would take gigabytes
 PHOTOS = "photos"
 KINDS = {
     "color": "Colour",
@@ -33,7 +33,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class ShownView:
-    """A view of which there are pictures; ``file`` is the stem of their names, ``depth_limits`` are wu."""
+    """A view of which there are pictures; ``file`` is the stem of their names, ``depth_limits`` are world units."""
 
     name: str
     file: str
@@ -136,7 +136,7 @@ def hero(renders: Path) -> str:
         for kind in (("normal", "depth") if compared else ("color", "normal", "depth"))
     ]
     others = "".join(
-        picture(image, title, alt=f"{title} of {view.name}", width=520, full=full)
+        image_tag(image, title, alt=f"{title} of {view.name}", width=520, full=full)
         for title, image, full in figures
         if image is not None
     )
@@ -167,12 +167,12 @@ def view_sections(renders: Path, *, expected_stages: Sequence[str]) -> str:
         return missing("renders/ holds no pictures (gs2d render RUN makes them).")
     stages = list(dict.fromkeys([*gallery.stages, *expected_stages]))
     parts = []
-    for view in gallery.views[:MOST_VIEWS]:
+    for view in gallery.views[:MAX_VIEWS]:
         split = f" <small>{escape(view.split)} view</small>" if view.split else ""
         compared = comparison(gallery, view) if view is not gallery.views[0] and gallery.stages else ""  # that: on top
         grid = f'<div class="scroll">{_grid(gallery, view, stages)}</div>'
         parts.append(f"<h3>{escape(view.name)}{split}</h3>{compared}{grid}")
-    left = len(gallery.views) - MOST_VIEWS
+    left = len(gallery.views) - MAX_VIEWS
     if left > 0:
         parts.append(missing(f"{left} more views are in the folder renders/."))
     return "".join(parts)
@@ -187,7 +187,7 @@ def _grid(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> str:
         cells.append(f'<div class="row">{title}</div>')
         if kind == "color":
             missing_photo = missing("no photograph in renders/photos")
-            shown = "" if photo is None else picture(photo, alt=f"photograph {view.name}", full=gallery.beside(view))
+            shown = "" if photo is None else image_tag(photo, alt=f"photograph {view.name}", full=gallery.beside(view))
             cells.append(shown or missing_photo)
         else:
             cells.append(_key(kind, view))
@@ -197,7 +197,7 @@ def _grid(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> str:
                 continue
             caption = _psnr_caption(image, photo) if kind == "color" else ""
             alt, full = f"{title} of {view.name} after {stage}", gallery.beside(view, stage, kind)
-            cells.append(picture(image, caption, alt=alt, full=full))
+            cells.append(image_tag(image, caption, alt=alt, full=full))
     columns = f"5.2rem repeat({len(stages) + 1}, minmax(8rem, 1fr))"
     return f'<div class="views" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
 
@@ -248,15 +248,15 @@ def mesh_section(path: Path, cameras: Sequence[Camera]) -> str:
     if not len(mesh.faces):
         return missing("mesh.ply has no faces: no surface was covered well enough.")
     counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces"
-    if len(mesh.faces) > MOST_FACES:
-        return missing(f"mesh.ply has {counts}: too many for a picture here (at most {MOST_FACES:,} faces).")
+    if len(mesh.faces) > MAX_FACES:
+        return missing(f"mesh.ply has {counts}: too many for a picture here (at most {MAX_FACES:,} faces).")
     chosen = tuple(cameras)[:3] or orbit_cameras(mesh)
     where = "from cameras of the capture" if cameras else "from two sides, taking the third axis as up"
     figures = []
-    for shown in mesh_pictures(mesh, chosen):
-        pair = picture(shown.shape, alt="the mesh as clay", width=420)
+    for shown in mesh_images(mesh, chosen):
+        pair = image_tag(shown.shape, alt="the mesh as clay", width=420)
         if shown.color is not None:
-            pair += picture(shown.color, alt="the mesh in its vertex colours", width=420)
+            pair += image_tag(shown.color, alt="the mesh in its vertex colours", width=420)
         figures.append(f'<div class="pair">{pair}</div>')
     words = "as clay and in its vertex colours" if mesh.colors is not None else "as clay (it has no vertex colours)"
     return f'<div class="meshes">{"".join(figures)}</div><p class="soft">The mesh, {counts}, {words}, {where}.</p>'

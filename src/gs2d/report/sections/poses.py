@@ -11,7 +11,7 @@ import numpy as np
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.report.html import drawing, escape, missing
-from gs2d.report.plots import INK, plot_by_photograph, svg_text
+from gs2d.report.plots import INK, plot_by_image, svg_text
 
 MEASURES = ("pixels", "degrees", "shift")
 
@@ -68,7 +68,7 @@ def _moved(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _plot(pixels: np.ndarray) -> str:
-    figure, axes = plot_by_photograph(2.4)
+    figure, axes = plot_by_image(2.4)
     axes.bar(np.arange(1, len(pixels) + 1), pixels, color="#3f86d6")
     axes.set_ylabel("px", fontsize=8, color=INK)
     return svg_text(figure)

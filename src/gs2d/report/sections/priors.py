@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.images import read_image
-from gs2d.report.html import drawing, escape, missing, picture
-from gs2d.report.plots import INK, plot_by_photograph, svg_text
+from gs2d.report.html import drawing, escape, image_tag, missing
+from gs2d.report.plots import INK, plot_by_image, svg_text
 
 TITLES = {
     "known-depth": "known depth",
@@ -49,7 +49,7 @@ def priors_section(folder: Path, stages: Sequence[Mapping[str, Any]]) -> str:
         )
         parts.append(f"<p>{escape(words)} What is known may be wrong: its weight falls as training goes on.</p>")
         parts.append(f'<div class="curves">{drawing(_plot(figures), title)}</div>')
-    return "".join(parts) + _pictures(folder, last.get("priors_shown"))
+    return "".join(parts) + _images(folder, last.get("priors_shown"))
 
 
 def _figures(entry: Any) -> tuple[np.ndarray, float] | None:
@@ -61,7 +61,7 @@ def _figures(entry: Any) -> tuple[np.ndarray, float] | None:
     return (values, float(np.median(values))) if len(values) else None
 
 
-def _pictures(folder: Path, shown: Any) -> str:
+def _images(folder: Path, shown: Any) -> str:
     """What is known beside what is rendered."""
     parts = []
     for view in shown if isinstance(shown, list) else ():
@@ -69,14 +69,14 @@ def _pictures(folder: Path, shown: Any) -> str:
         for kind, title in TITLES.items():
             path = folder / f"{view.get('file')}.{kind}.png"
             if path.is_file():
-                figures.append(picture(read_image(path), title, alt=f"{title} of {view.get('name')}", width=420))
+                figures.append(image_tag(read_image(path), title, alt=f"{title} of {view.get('name')}", width=420))
         if figures:
             parts.append(f'<h3>{escape(str(view.get("name")))}</h3><div class="hero">{"".join(figures)}</div>')
     return "".join(parts)
 
 
 def _plot(values: np.ndarray) -> str:
-    figure, axes = plot_by_photograph(2.4)
+    figure, axes = plot_by_image(2.4)
     axes.bar(np.arange(1, len(values) + 1), values, color="#3f86d6")
     axes.set_ylim(bottom=0)
     axes.tick_params(colors=INK)

@@ -12,15 +12,15 @@ from gs2d.core.files import atomic_write
 from gs2d.core.images import read_image
 from gs2d.data.subject import OBJECT, Subject, read_subject
 from gs2d.io.run_dir import RENDERS
-from gs2d.report.html import escape, picture
+from gs2d.report.html import escape, image_tag
 
-PICTURE = "subject.png"
-MOST_POINTS = 8000
+IMAGE = "subject.png"
+MAX_POINTS = 8000
 SPAN = 1.3  # times the farthest camera's or corner's distance from the middle: what the picture shows
 _CAMERA, _BOX = "#d62728", "#111111"
 
 
-def write_subject_picture(path: Path, subject: Subject, cameras: Sequence[Camera], points: np.ndarray) -> None:
+def write_subject_image(path: Path, subject: Subject, cameras: Sequence[Camera], points: np.ndarray) -> None:
     """Draw a subject among the training cameras and sparse points [P, 3] of a capture, as PNG.
 
     Raises
@@ -38,7 +38,7 @@ def write_subject_picture(path: Path, subject: Subject, cameras: Sequence[Camera
     centers = np.array([camera.center for camera in cameras])
     reach = SPAN * max(float(np.linalg.norm(np.concatenate([centers, corners]) - middle, axis=1).max()), 1e-9)
     arrows = 0.08 * reach * np.array([camera.forward for camera in cameras])
-    shown = points[:: max(1, -(-len(points) // MOST_POINTS))]
+    shown = points[:: max(1, -(-len(points) // MAX_POINTS))]
     figure = Figure(figsize=(10, 5), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     for place, (name, upwards) in enumerate((("from above", 1), ("from the side", 2)), start=1):
@@ -77,10 +77,10 @@ def subject_section(run: Path) -> str:
     what = "The subject" if subject.kind == OBJECT else "No subject, the whole scene"
     numbers = " ".join(f"{value:.4g}" for value in subject.box.ravel())
     text = f"<p>{what}: {escape(subject.why)}. Box (<code>--subject-box</code>): <code>{numbers}</code></p>"
-    drawn = run / RENDERS / PICTURE
+    drawn = run / RENDERS / IMAGE
     if not drawn.is_file():
         return text
     caption = "Training cameras (red), sparse points, and the box of the subject."
-    return text + picture(
+    return text + image_tag(
         read_image(drawn) / np.float32(255), caption, alt="cameras, points and the subject", width=1000
     )

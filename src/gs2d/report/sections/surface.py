@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.core.images import read_image
-from gs2d.report.html import escape, missing, picture, table
+from gs2d.report.html import escape, image_tag, missing, table
 from gs2d.report.terms import titles_of
 
 SCORES = (
@@ -42,7 +42,7 @@ _MEANINGS = {  # of the entries of metrics.json, in the order of the report
     "culled": ("Mesh culled", "share of the mesh's corners outside some photograph's silhouette"),
     "reason": ("No score", "why there is none"),
 }
-_SHARES = ("mesh_hidden", "truth_hidden", "dropped_mesh", "dropped_truth", "culled")
+_FRACTIONS = ("mesh_hidden", "truth_hidden", "dropped_mesh", "dropped_truth", "culled")
 
 
 def surface_scores(surface: Mapping[str, Any] | None, reason: str | None, folder: Path | None = None) -> str:
@@ -76,7 +76,7 @@ def surface_scores(surface: Mapping[str, Any] | None, reason: str | None, folder
     figures = [_row(name, surface[name]) for name in names if _is_figure(surface[name])]
     if figures:
         parts.append(table(["Figure", "Value", "Meaning"], figures, texts=(2,)))
-    parts += _picture(surface.get("files"), folder)
+    parts += _image(surface.get("files"), folder)
     return "".join(parts) or missing("metrics.json has a surface entry without figures.")
 
 
@@ -90,13 +90,13 @@ def _doubts(check: Any) -> list[str]:
     return [missing(message) for message in messages]
 
 
-def _picture(files: Any, folder: Path | None) -> list[str]:
+def _image(files: Any, folder: Path | None) -> list[str]:
     """The scored points of both sides, coloured by distance."""
     name = files.get("picture") if isinstance(files, Mapping) else None
     if folder is None or name is None or not (folder / name).is_file():
         return []
     alt = "mesh and true surface, coloured by their distance"
-    return [picture(read_image(folder / name), CLOUDS, alt=alt, width=960)]
+    return [image_tag(read_image(folder / name), CLOUDS, alt=alt, width=960)]
 
 
 def _is_figure(value: Any) -> bool:
@@ -111,7 +111,7 @@ def _row(name: str, value: Any) -> list[str]:
     label, meaning = _MEANINGS.get(name, (name.replace("_", " ").capitalize(), ""))
     if name == "ground_truth":
         shown = Path(str(value)).name
-    elif name in _SHARES and isinstance(value, float):
+    elif name in _FRACTIONS and isinstance(value, float):
         shown = f"{100 * value:.1f} %"
     elif isinstance(value, float):
         shown = f"{value:.5g}"

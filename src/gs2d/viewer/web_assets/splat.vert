@@ -11,7 +11,7 @@ uniform vec3 shift, eye;           // x_cam = turn x + shift; the camera's centr
 uniform vec4 lens;                 // fx, fy, cx, cy, px
 uniform vec2 size;                 // of the picture, px
 uniform float near, alphaMin, lowpass, crossingCutoff;
-uniform int degree, stored, crossing, kind;  // crossing: 0 draw, 1 cull, 2 box; kind: 0 colour, 1 normals, 2 depth
+uniform int degree, stored, near_plane_policy, kind;  // near_plane_policy: 0 draw, 1 cull, 2 box; kind: 0 colour, 1 normals, 2 depth
 uniform vec3 boxLow, boxHigh;      // only splats whose means lie between are drawn
 uniform float scales[15];          // of the 8-bit coefficients, by place
 
@@ -84,9 +84,9 @@ void main() {
     float steep = dot(depths, depths);
     bool crosses = crossingCutoff * crossingCutoff * steep >= p.z * p.z;
     vec2 low = vec2(0.0), high = size;
-    if (crosses && crossing == 1) return;
-    if (crosses && crossing == 2) kk = crossingCutoff * crossingCutoff;
-    if (kk * steep < p.z * p.z || (crosses && crossing == 2)) {
+    if (crosses && near_plane_policy == 1) return;
+    if (crosses && near_plane_policy == 2) kk = crossingCutoff * crossingCutoff;
+    if (kk * steep < p.z * p.z || (crosses && near_plane_policy == 2)) {
         float ww = kk * steep - p.z * p.z;
         vec2 h = extent(lens.x, lens.z, center.x, vec2(a.x, b.x), depths, kk, ww);
         vec2 v = extent(lens.y, lens.w, center.y, vec2(a.y, b.y), depths, kk, ww);

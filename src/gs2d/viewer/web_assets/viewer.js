@@ -180,7 +180,7 @@ async function begin() {
   gl.uniform1i(at.splats, 0);
   gl.uniform1i(at.harmonics, 1);
   for (const name of ["near", "alphaMin", "alphaMax", "lowpass", "crossingCutoff"]) gl.uniform1f(at[name], facts[name]);
-  for (const name of ["degree", "stored", "crossing"]) gl.uniform1i(at[name], facts[name]);
+  for (const name of ["degree", "stored", "near_plane_policy"]) gl.uniform1i(at[name], facts[name]);
   gl.uniform1fv(at.scales, facts.scales);
   gl.useProgram(finalProgram.made);
   gl.uniform3f(finalProgram.at.background, ...facts.background);

@@ -7,7 +7,7 @@ from gs2d.training import events
 from gs2d.training.state import TrainState
 
 
-class Watch:
+class TrainingObserver:
     """Nobody watches a training; ``pipeline.live.Live`` has the same methods."""
 
     def __init__(self, on_event: OnEvent) -> None:

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from gs2d.core.files import atomic_write
-from gs2d.sfm.model import Piece, focal_length
+from gs2d.sfm.model import SfmModel, focal_length
 
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 _VIEWS = (("from above", 0, 1), ("from the side", 0, 2))
 _WEDGE = 0.06  # length of a camera's wedge, of the picture's width
 _CAMERA = "#d62728"
 
 
-def write_picture(path: Path, piece: Piece, title: str) -> None:
+def write_image_of(path: Path, piece: SfmModel, title: str) -> None:
     """Draw a model in the plane of its first two axes, and of the first and third.
 
     Raises
@@ -51,9 +51,9 @@ def write_picture(path: Path, piece: Piece, title: str) -> None:
         figure.savefig(file, format="png", metadata={"Software": None})
 
 
-def _thinned(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-    """At most ``MOST_POINTS`` points [P, 3] and their colours [P, 3] in [0, 1], evenly from the list."""
-    step = max(1, -(-len(piece.points.xyz) // MOST_POINTS))
+def _thinned(piece: SfmModel) -> tuple[np.ndarray, np.ndarray]:
+    """At most ``MAX_POINTS`` points [P, 3] and their colours [P, 3] in [0, 1], evenly from the list."""
+    step = max(1, -(-len(piece.points.xyz) // MAX_POINTS))
     return piece.points.xyz[::step], piece.points.rgb[::step] / 255
 
 
@@ -66,7 +66,7 @@ def _limits(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _wedge(
-    T_cam_world: np.ndarray, center: np.ndarray, piece: Piece, camera_id: int, box: np.ndarray, plane: list[int]
+    T_cam_world: np.ndarray, center: np.ndarray, piece: SfmModel, camera_id: int, box: np.ndarray, plane: list[int]
 ) -> np.ndarray:
     """What a camera sees, from its centre to the two ends of its picture's middle row: [4, 2], closed."""
     camera = piece.cameras[camera_id]

@@ -7,18 +7,18 @@ from collections.abc import Callable
 import numpy as np
 
 from gs2d.core.camera import look_at
-from gs2d.meshing.bounds import FusionLimits
-from gs2d.meshing.depth_maps import Frame
-from gs2d.meshing.unbounded_bounds import Nest
+from gs2d.meshing.bounds import FusionBounds
+from gs2d.meshing.depth_maps import RenderedView
+from gs2d.meshing.unbounded_bounds import TsdfCascade
 from gs2d.meshing.volume import BLOCK, VOXELS, Volume
 from surface_shapes import rays, sphere_depth
 
 GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it
 
 
-def nest_of(
+def cascade_of(
     count: int, *, voxels: int = 32, half: float = 1.0, truncation: float | None = None, depth_limit: float = 1e9
-) -> Nest:
+) -> TsdfCascade:
     """``count`` levels around the origin."""
     size = 2 * half / voxels
     levels = []
@@ -26,26 +26,26 @@ def nest_of(
         first, last = (-half + 0.5 * size) * 2**k, half * 2**k
         band = (truncation or 5 * size) * 2**k
         low, high = (first, first, first), (last, last, last)
-        levels.append(FusionLimits(low, high, 2 * last, size * 2**k, band, depth_limit, 1.0, 1.0, size, 0.0))
-    return Nest(tuple(levels), voxels, (0.0, 0.0, 0.0), half)
+        levels.append(FusionBounds(low, high, 2 * last, size * 2**k, band, depth_limit, 1.0, 1.0, size, 0.0))
+    return TsdfCascade(tuple(levels), voxels, (0.0, 0.0, 0.0), half)
 
 
-def volumes_of(nest: Nest, field: Callable[[np.ndarray], np.ndarray]) -> list[Volume]:
+def volumes_of(cascade: TsdfCascade, field: Callable[[np.ndarray], np.ndarray]) -> list[Volume]:
     """Every level full of a field of points [P, 3] -> signed distance [P], all known."""
     volumes = []
     local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1)
-    for k, limits in enumerate(nest.levels):
-        blocks = np.stack(np.unravel_index(np.arange(nest.dims[0] ** 3), nest.dims), axis=1)
-        first, last = nest.hole
+    for k, limits in enumerate(cascade.levels):
+        blocks = np.stack(np.unravel_index(np.arange(cascade.dims[0] ** 3), cascade.dims), axis=1)
+        first, last = cascade.hole
         blocks = blocks[~((blocks >= first) & (blocks < last)).all(axis=1)] if k else blocks
-        keys = (blocks[:, 0] * nest.dims[1] + blocks[:, 1]) * nest.dims[2] + blocks[:, 2]
+        keys = (blocks[:, 0] * cascade.dims[1] + blocks[:, 1]) * cascade.dims[2] + blocks[:, 2]
         at = np.asarray(limits.lower) + (blocks[:, None] * BLOCK + local) * limits.voxel
         tsdf = np.clip(field(at.reshape(-1, 3)).reshape(-1, VOXELS) / limits.truncation, -1, 1).astype(np.float32)
-        volumes.append(Volume(limits, nest.dims, keys, tsdf, np.ones_like(tsdf), None, None, 1))
+        volumes.append(Volume(limits, cascade.dims, keys, tsdf, np.ones_like(tsdf), None, None, 1))
     return volumes
 
 
-def outdoor_frames(sky: str, *, views: int = 24, size: int = 96, seed: int = 0) -> list[Frame]:
+def outdoor_frames(sky: str, *, views: int = 24, size: int = 96, seed: int = 0) -> list[RenderedView]:
     """A ball on a plane to the horizon, seen by a ring of cameras. What the sky's pixels say:
 
     "unseen": nothing; "thin": a depth of 30, but alpha 0.3; "scattered": a random depth from 15 to 80 at every pixel;
@@ -67,5 +67,5 @@ def outdoor_frames(sky: str, *, views: int = 24, size: int = 96, seed: int = 0) 
             depth = np.where(above, rng.uniform(15, 80), depth)
         elif sky == "thin":
             depth, alpha = np.where(above, 30.0, depth), np.where(above, 0.3, 1.0)
-        frames.append(Frame(camera, depth, np.full((*depth.shape, 3), 0.5), alpha >= 0.5))
+        frames.append(RenderedView(camera, depth, np.full((*depth.shape, 3), 0.5), alpha >= 0.5))
     return frames
