@@ -13,6 +13,7 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gs2d.config.recipe import CloneInPlace, RankByError, Recipe, validate
+from gs2d.config.renamed import current_names, current_path
 from gs2d.errors import RecipeError
 
 ACTIONS: Mapping[str, type] = {"rank_by_error": RankByError, "clone_in_place": CloneInPlace}
@@ -27,14 +28,14 @@ def to_json(recipe: Recipe) -> dict[str, Any]:
 
 
 def from_json(data: Mapping[str, Any]) -> Recipe:
-    """The recipe that :func:`to_json` wrote, validated.
+    """Return the recipe that :func:`to_json` wrote, validated; names of version 0.1 are read too.
 
     Raises
     ------
     RecipeError
         Where a key is unknown or missing, or a value has another type.
     """
-    recipe = _decode(data, Recipe, "recipe")
+    recipe = _decode(current_names(data), Recipe, "recipe")
     assert isinstance(recipe, Recipe)
     return validate(recipe)
 
@@ -65,7 +66,7 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     data = to_json(recipe)
     for override in overrides:
         path, equals, text = override.partition("=")
-        words = path.strip().split(".")
+        words = current_path(path.strip().split("."))
         if not equals or not all(words):
             raise RecipeError(f"an override is stage.field=value, got {override!r}")
         _set(data, words, _parse(text.strip()), override)

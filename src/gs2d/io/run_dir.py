@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gs2d.config.renamed import current_names
 from gs2d.core.files import atomic_write, disk_error
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
@@ -95,7 +96,7 @@ class RunFolder:
         RunError
             Written by a later gs2d, or damaged.
         """
-        data = _object(self.file(RUN_JSON))
+        data = current_names(_object(self.file(RUN_JSON)))
         if data.get("format") != FORMAT:
             raise RunError(
                 f"{self.file(RUN_JSON)} has format {data.get('format')!r}, expected {FORMAT}; use the gs2d that made it"
