@@ -60,6 +60,7 @@ INSIDE = {
         "cache undistort": 0,
     },
     "render": {
+        "tensor_api": 6,
         "api": 5,
         "backends cpu_cached pose_gradient exposure": 4,
         "cpu cuda reference_errors": 3,

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gs2d.errors import Gs2dError
     from gs2d.render.api import rasterize, splat_errors
     from gs2d.render.backends import backend_report, get_backend
+    from gs2d.render.tensor_api import rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
 
 __version__ = "0.1.0"
@@ -34,6 +35,7 @@ __all__ = [
     "get_backend",
     "look_at",
     "rasterize",
+    "rasterize_2dgs",
     "splat_errors",
 ]
 
@@ -50,6 +52,7 @@ _HOME = {
     "get_backend": "gs2d.render.backends",
     "look_at": "gs2d.core.camera",
     "rasterize": "gs2d.render.api",
+    "rasterize_2dgs": "gs2d.render.tensor_api",
     "splat_errors": "gs2d.render.api",
 }
 

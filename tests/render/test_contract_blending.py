@@ -13,12 +13,28 @@ from math import cos, radians, sin, sqrt
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings
-from render_scenes import BLUE, C0, GREEN, IMAGES, Y_AXIS, equal, front_camera, requiring_grad, splat, stack
+from gs2d.render.types import PLAIN_COLORS, RasterSettings
+from render_scenes import (
+    BLUE,
+    C0,
+    GREEN,
+    IMAGES,
+    Y_AXIS,
+    contraction,
+    equal,
+    front_camera,
+    random_camera,
+    random_cotangents,
+    random_splats,
+    requiring_grad,
+    splat,
+    stack,
+)
 
 
 # 7 ---------------------------------------------------------------------------------------------------------------
@@ -170,6 +186,49 @@ def test_11_clamped_channels_are_zero_with_zero_gradient_and_bright_ones_are_kep
     assert float(scene.sh0.grad[0, 0, 0]) == 0
     # d color / d sh0 = C0 sum of w over the image.
     equal(scene.sh0.grad[0, 0, 1:], (C0 * out.alpha.detach().sum()).expand(2))
+
+
+def test_11_plain_colours_are_drawn_as_they_are_whatever_their_sign(backend: Backend) -> None:
+    one = splat(scales=(50.0, 50.0), opacity=0.5)
+    one.sh0 = torch.tensor([[[-3.0, 0.0, 70.25]]])
+    settings = RasterSettings(sh_degree=PLAIN_COLORS, background=(-1.0, 2.0, 0.0))
+    out = rasterize(one, front_camera(), settings, backend=backend)
+    alpha = out.alpha[4, 4]
+    expected = alpha * torch.tensor([-3.0, 0.0, 70.25]) + (1 - alpha) * torch.tensor([-1.0, 2.0, 0.0])
+    equal(out.color[4, 4], expected)
+
+
+def test_11_plain_colours_get_the_gradient_of_their_weights_and_the_harmonics_none(backend: Backend) -> None:
+    rng = np.random.default_rng(5)
+    camera = random_camera(rng)
+    splats = random_splats(rng, camera, 12, ("plain", "huge"))
+    settings = RasterSettings(sh_degree=PLAIN_COLORS)
+    cotangents = random_cotangents(rng, camera)
+    judge, leaves = requiring_grad(splats), requiring_grad(splats.to(torch.float32))
+    contraction(rasterize(judge, camera, settings, backend="reference"), cotangents).backward()
+    contraction(rasterize(leaves, camera, settings, backend=backend), cotangents).backward()
+    for (name, tensor), (_, expected) in zip(leaves.items(), judge.items(), strict=True):
+        if name == "shN":
+            assert tensor.grad is None or not tensor.grad.any()
+            continue
+        assert tensor.grad is not None
+        assert expected.grad is not None
+        assert_close(tensor.grad.double(), expected.grad, rtol=2e-3, atol=2e-4 * float(expected.grad.abs().max()))
+
+
+def test_11_plain_colours_carry_gradients_where_nothing_else_learns(backend: Backend) -> None:
+    rng = np.random.default_rng(6)
+    camera = random_camera(rng)
+    splats = random_splats(rng, camera, 12, ("plain", "huge")).to(torch.float32)
+    settings, found = RasterSettings(sh_degree=PLAIN_COLORS), []
+    for all_learn in (False, True):
+        leaves = requiring_grad(splats) if all_learn else splats.clone()
+        leaves.sh0.requires_grad_()
+        rasterize(leaves, camera, settings, backend=backend).color.square().sum().backward()
+        found.append(leaves.sh0.grad)
+    assert found[0] is not None
+    assert found[0].any()
+    assert_close(*found, rtol=1e-5, atol=1e-6)
 
 
 # 12 --------------------------------------------------------------------------------------------------------------

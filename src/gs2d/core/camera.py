@@ -30,6 +30,8 @@ class Camera:
         x_cam = T_cam_world @ x_world (homogeneous). May be given as a torch tensor, which ``pose`` keeps if it learns.
     pose : Tensor [4, 4] or None
         The tensor that ``T_cam_world`` was given as, where it requires a gradient (``rasterize``, rule 20).
+    intrinsics : Tensor [4] or None
+        fx, fy, cx and cy as a tensor that requires a gradient, with the same numbers (``rasterize``, rule 21).
     """
 
     width: int
@@ -40,6 +42,7 @@ class Camera:
     cy: float
     T_cam_world: np.ndarray  # [4, 4]
     pose: Tensor | None = None  # [4, 4]
+    intrinsics: Tensor | None = None  # [4]
 
     def __post_init__(self) -> None:
         given: Any = self.T_cam_world
@@ -74,11 +77,21 @@ class Camera:
                 "pose must be the tensor that T_cam_world was made of, got another; give the new T_cam_world as a "
                 "tensor, or with pose=None"
             )
+        if not self.has_its_intrinsics:
+            raise ShapeError(
+                "intrinsics must be a tensor [4] of fx, fy, cx and cy, got other numbers; give the tensor of the new "
+                "ones, or intrinsics=None"
+            )
 
     @property
     def is_at_pose(self) -> bool:
         """Whether ``pose``, if there is one, still holds the numbers of ``T_cam_world``."""
         return self.pose is None or np.array_equal(self.T_cam_world, self.pose.detach().cpu().numpy())
+
+    @property
+    def has_its_intrinsics(self) -> bool:
+        """Whether ``intrinsics``, if there is one, still holds fx, fy, cx and cy."""
+        return self.intrinsics is None or self.intrinsics.tolist() == [self.fx, self.fy, self.cx, self.cy]
 
     @property
     def K(self) -> np.ndarray:
@@ -103,9 +116,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with another image size (intrinsics scale with each axis)."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
-        )
+        return self._with(width, height, (self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy), (sx, sy, sx, sy))
 
     def downscaled(self, factor: int) -> Camera:
         """The camera of an image area-filtered by an integer factor; leftover rows and columns are cut.
@@ -119,7 +130,16 @@ class Camera:
         if factor < 1 or width < 1 or height < 1:
             raise ShapeError(f"downscale must leave at least one pixel of {self.width}x{self.height}, got {factor}")
         f = float(factor)
-        return replace(self, width=width, height=height, fx=self.fx / f, fy=self.fy / f, cx=self.cx / f, cy=self.cy / f)
+        return self._with(width, height, (self.fx / f, self.fy / f, self.cx / f, self.cy / f), (1 / f,) * 4)
+
+    def _with(self, width: int, height: int, numbers: tuple[float, ...], factors: tuple[float, ...]) -> Camera:
+        """Another size, and these fx, fy, cx and cy; those that learn are a function of what they were."""
+        learning = None
+        if self.intrinsics is not None:
+            learning = self.intrinsics * self.intrinsics.new_tensor(factors)
+            numbers = tuple(learning.tolist())
+        fx, fy, cx, cy = numbers
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, intrinsics=learning)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points.

@@ -30,8 +30,9 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     to weights and depths.
 11. *Colour* c = SH of degree min(settings.sh_degree, splats.sh_degree) along the unit vector from the camera centre to
     the splat's centre, + 0.5, clamped at 0; clamped channels have zero gradient. The direction carries gradient.
-12. *Gradients* reach means, quats, log_scales, opacity_logits, sh0, shN, screen_probe and the camera's pose (20); not
-    its intrinsics, settings, radii, nor any threshold or order.
+    With settings.sh_degree = -1 c is sh0 itself, of any sign, neither shifted nor clamped, and so is its gradient.
+12. *Gradients* reach means, quats, log_scales, opacity_logits, sh0, shN, screen_probe and the camera's pose (20) and
+    intrinsics (21); not settings, radii, nor any threshold or order.
 13. *Screen probe.* screen_probe is zeros, [N, 2] or [N, 4]. Columns 0:2 of its gradient are
     z_c (W/2, H/2) * dL/d(Tu.z, Tv.z), where Tu, Tv are the first rows of the splat-to-pixel map
     (x z, y z, z) = (Tu, Tv, Tw) (u, v, 1): the densification signal of 2DGS. Only pairs with rho3d <= rho2d count.
@@ -59,6 +60,9 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     with a change of T_cam_world along a rigid motion is the derivative of the loss. Of other changes (of scale, of
     shear) it says nothing. Images and all other gradients are the same bit for bit. ``gradient_rows`` (18) would leave
     out the part of the other splats, and is refused.
+21. *Intrinsics.* Where the camera has a tensor ``intrinsics`` that requires a gradient it gets the derivative of the
+    loss by fx, fy, cx and cy, [4], the pixels' centres held. Images and all other gradients are the same bit for bit.
+    ``gradient_rows`` is refused as in 20.
 """
 
 from __future__ import annotations
@@ -76,7 +80,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import attach_pose_grad, with_world_normals
-from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings, RenderOutput
+from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "splat_errors"]
 
@@ -97,7 +101,7 @@ def rasterize(
     splats : Splats
         N splats, float32, or float64 for the reference backend.
     camera : Camera
-        With a ``pose`` that requires a gradient, that of the camera is worked out too (rule 20).
+        With a ``pose``, or ``intrinsics``, that requires a gradient, that of the camera is worked out too (20, 21).
     settings : RasterSettings
     backend : str or Backend
         "auto" (by the device of the splats), "cpu", "cuda" or "reference" (``gs2d.render.backends``).
@@ -135,12 +139,14 @@ def rasterize(
         # On a GPU the look would make the host wait in every iteration.
         if screen_probe.device.type == "cpu" and bool((screen_probe.detach() != 0).any()):
             raise ShapeError("screen_probe must be all zeros (its gradient is what matters), got other values")
-    if camera.pose is not None and torch.is_grad_enabled():
-        if gradient_rows is not None:
-            raise ShapeError(
-                "gradient_rows must be None for a camera that learns, whose gradient is a sum over all splats, got "
-                "rows; leave one of the two away"
-            )
+    if not torch.is_grad_enabled() and (camera.pose is not None or camera.intrinsics is not None):
+        camera = replace(camera, pose=None, intrinsics=None)
+    if gradient_rows is not None and (camera.pose is not None or camera.intrinsics is not None):
+        raise ShapeError(
+            "gradient_rows must be None for a camera that learns, whose gradient is a sum over all splats, got "
+            "rows; leave one of the two away"
+        )
+    if camera.pose is not None:
         splats = attach_pose_grad(splats, camera.pose, settings.sh_degree)
         output = chosen.rasterize(splats, camera, settings, screen_probe)
         return with_world_normals(output, camera.pose)
@@ -231,6 +237,11 @@ def _check_types(splats: object, camera: object, settings: object, **tensors: ob
             "the camera must stand where its pose is, got a pose that has changed since the camera was made (by an "
             "optimizer?); make a camera of the new one: replace(camera, T_cam_world=camera.pose)"
         )
+    if not camera.has_its_intrinsics:
+        raise ShapeError(
+            "the camera must have the fx, fy, cx and cy of its intrinsics, got a tensor that has changed since the "
+            "camera was made (by an optimizer?); make a camera of the new ones"
+        )
 
 
 def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> RasterSettings:
@@ -272,7 +283,10 @@ def _check_settings(s: RasterSettings) -> None:
     require(0 < s.transmittance_min < 0.5, "transmittance_min", "in (0, 0.5)")
     require(math.isfinite(s.error_cutoff) and s.error_cutoff > 0, "error_cutoff", "positive")
     require(math.isfinite(s.lowpass_px) and s.lowpass_px > 0, "lowpass_px", "positive")
-    require(len(s.background) == 3 and all(0 <= b <= 1 for b in s.background), "background", "3 numbers in [0, 1]")
-    require(0 <= s.sh_degree <= MAX_DEGREE, "sh_degree", f"0 to {MAX_DEGREE}")
+    if s.sh_degree == PLAIN_COLORS:
+        require(len(s.background) == 3 and all(map(math.isfinite, s.background)), "background", "3 finite numbers")
+    else:
+        require(len(s.background) == 3 and all(0 <= b <= 1 for b in s.background), "background", "3 numbers in [0, 1]")
+        require(0 <= s.sh_degree <= MAX_DEGREE, "sh_degree", f"0 to {MAX_DEGREE} (-1: plain colours)")
     require(s.lowpass_depth in ("center", "plane"), "lowpass_depth", "'center' or 'plane'")
     require(s.near_plane_policy in NEAR_PLANE_POLICIES, "near_plane_policy", "'draw', 'cull' or 'box'")

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from operator import attrgetter
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -18,8 +19,8 @@ from torch.autograd.function import once_differentiable
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels.library import Library, ready_library
-from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings, RenderOutput
+from gs2d.kernels.library import REMEDY, Library, ready_library
+from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
@@ -129,9 +130,9 @@ def _check_tensors(splats: Splats, settings: RasterSettings, dtype: torch.dtype)
                 f"{name} must be {dtype} on the CPU for the cpu backend, got {tensor.dtype} on {tensor.device}; "
                 "convert with splats.to(...) or use --backend reference"
             )
-    if not 0 <= settings.sh_degree <= 3 or (settings.sh_degree + 1) ** 2 > 1 + splats.shN.shape[1]:
+    if not PLAIN_COLORS <= settings.sh_degree <= 3 or (settings.sh_degree + 1) ** 2 > 1 + splats.shN.shape[1]:
         raise ShapeError(
-            f"sh_degree must be 0 to 3 and within the stored coefficients ({1 + splats.shN.shape[1]}), "
+            f"sh_degree must be -1 to 3 and within the stored coefficients ({1 + splats.shN.shape[1]}), "
             f"got {settings.sh_degree}"
         )
     if len(splats) >= 1 << 31:
@@ -157,13 +158,20 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, library: Library, view: _View, probe: Tensor | None, rows: Tensor | None, *parameters: Tensor
+        ctx: Any,
+        library: Library,
+        view: _View,
+        rows: Tensor | None,
+        probe: Tensor | None,
+        intrinsics: Tensor | None,
+        *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         images, radii, frame = _forward(library, view, tensors)
         if any(ctx.needs_input_grad):
             ctx.library, ctx.frame, ctx.rows = library, frame, rows
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
+            ctx.of_intrinsics = None if intrinsics is None else intrinsics.detach()  # for its dtype and device
             saved = [images[name] for name in ("color", "alpha", "normal", "depth_mean", "distortion")]
             ctx.save_for_backward(*saved, *tensors)
             ctx.set_materialize_grads(False)
@@ -177,17 +185,25 @@ class _Rasterize(torch.autograd.Function):
         color, alpha, normal, depth_mean, distortion, *tensors = ctx.saved_tensors
         images = _Images(*(_address(t) for t in (color, alpha, normal, depth_mean, None, distortion, None)))
         given = [_plain(g, library.dtype) for g in upstream[: len(IMAGES)]]
-        _, _, want_probe, _, *want = ctx.needs_input_grad
+        want_probe, want_intrinsics, *want = ctx.needs_input_grad[3:]
         empty, dtype = library.recycler.empty, library.dtype
         grads = [empty(t.shape, dtype) if wanted else None for t, wanted in zip(tensors, want, strict=True)]
         probe = empty(ctx.probe_shape, dtype) if want_probe else None
         columns = 0 if probe is None else int(probe.shape[1])
         out = _ParameterGradients(*(_address(g) for g in grads), _address(probe), columns, _address(ctx.rows))
-        backward = library.function("gs2d_raster_backward", ctypes.c_int, [ctypes.c_void_p] * 5)
+        to_intrinsics = empty((len(tensors[0]), 4), dtype) if want_intrinsics else None
         native_splats, native_given = _parameters(tensors), _ImageGradients(*(_address(g) for g in given))
         arguments = (native_splats, images, native_given, out)
-        _check(backward(ctx.frame.pointer, *(ctypes.byref(a) for a in arguments)))
-        return None, None, probe, None, *grads
+        pointers = (ctx.frame.pointer, *(ctypes.byref(a) for a in arguments))
+        if to_intrinsics is None:
+            backward = library.function("gs2d_raster_backward", ctypes.c_int, [ctypes.c_void_p] * 5)
+            _check(backward(*pointers))
+            return None, None, None, probe, None, *grads
+        backward = library.function("gs2d_raster_backward_intrinsics", ctypes.c_int, [ctypes.c_void_p] * 6)
+        _check(backward(*pointers, _address(to_intrinsics)))
+        # numpy adds one row after the other: the same bits for any number of threads
+        total = torch.from_numpy(to_intrinsics.numpy().sum(axis=0, dtype=np.float64))
+        return None, None, None, probe, total.to(ctx.of_intrinsics), *grads
 
 
 def rasterize_with(
@@ -209,8 +225,12 @@ def rasterize_with(
                 f"gradient_rows must be bool [{len(splats)}], got {gradient_rows.dtype} {list(gradient_rows.shape)}"
             )
         gradient_rows = gradient_rows.to("cpu", copy=True).contiguous()  # it may change before the backward pass
+    news = settings.sh_degree == PLAIN_COLORS or camera.intrinsics is not None
+    if news and not library.has("gs2d_raster_backward_intrinsics"):
+        raise BackendError(f"the CPU kernels are older than plain colours and gradients of intrinsics; {REMEDY}")
     view = _view(camera, settings, exact_masks)
-    *images, radii = _Rasterize.apply(library, view, screen_probe, gradient_rows, *(t for _, t in splats.items()))
+    given = (library, view, gradient_rows, screen_probe, camera.intrinsics)
+    *images, radii = _Rasterize.apply(*given, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
 
 

@@ -168,6 +168,8 @@ def cache_view(
     """
     library = library or ready_library()
     _check_tensors(splats, settings, library.dtype)
+    if settings.sh_degree < 0:
+        raise ShapeError("a cached view needs colours from harmonics, got plain colours (sh_degree -1)")
     height, width, count = camera.height, camera.width, len(rows)
     view = _view(camera, settings, True)
     tensors = [t.detach().contiguous() for _, t in splats.items()]

@@ -22,7 +22,7 @@ from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.cuda_passes import IMAGES, PARAMETERS, ForwardState, Wanted, backward, errors, forward
 from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.pair_budget import PairBudget
-from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
@@ -34,9 +34,9 @@ def _check_tensors(splats: Splats, settings: RasterSettings) -> None:
             raise ShapeError(
                 f"{name} must be float32 on {splats.device} for the cuda backend, got {tensor.dtype} on {tensor.device}"
             )
-    if not 0 <= settings.sh_degree <= 3 or (settings.sh_degree + 1) ** 2 > 1 + splats.shN.shape[1]:
+    if not PLAIN_COLORS <= settings.sh_degree <= 3 or (settings.sh_degree + 1) ** 2 > 1 + splats.shN.shape[1]:
         raise ShapeError(
-            f"sh_degree must be 0 to 3 and within the stored coefficients ({1 + splats.shN.shape[1]}), "
+            f"sh_degree must be -1 to 3 and within the stored coefficients ({1 + splats.shN.shape[1]}), "
             f"got {settings.sh_degree}"
         )
 
@@ -61,7 +61,9 @@ class _Rasterize(torch.autograd.Function):
     """Images and radii from the six parameter tensors."""
 
     @staticmethod
-    def forward(ctx: Any, options: _Options, probe: Tensor | None, *parameters: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, options: _Options, probe: Tensor | None, intrinsics: Tensor | None, *parameters: Tensor
+    ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         launcher, view = options.launcher, options.view
         choices = {"exact": options.exact_masks, "distortion": options.distortion}
@@ -71,6 +73,7 @@ class _Rasterize(torch.autograd.Function):
             # attribute would not. The rest is nobody else's.
             ctx.options = options
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
+            ctx.of_intrinsics = None if intrinsics is None else intrinsics.detach()  # for its dtype and device
             ctx.save_for_backward(*(getattr(frame, name) for name in SAVED), *frame.images.values(), *tensors)
             ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(frame.radii)
@@ -88,15 +91,17 @@ class _Rasterize(torch.autograd.Function):
         given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[: len(IMAGES)]]
         if not options.distortion:
             given[IMAGES.index("distortion")] = None  # a constant
-        want_probe, *want = ctx.needs_input_grad[1:]
+        want_probe, want_intrinsics, *want = ctx.needs_input_grad[1:]
         gradients = {
             name: torch.empty_like(t) if w else None for name, t, w in zip(PARAMETERS, tensors, want, strict=True)
         }
         device = tensors[0].device
         probe = torch.empty(ctx.probe_shape, dtype=torch.float32, device=device) if want_probe else None
-        wanted = Wanted({**gradients, "probe": probe}, options.learns, options.deterministic)
+        each = torch.zeros(len(tensors[0]), 4, dtype=torch.float32, device=device) if want_intrinsics else None
+        wanted = Wanted({**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic)
         backward(options.launcher, frame, tensors, dict(zip(IMAGES, given, strict=True)), wanted)
-        return None, probe, *gradients.values()
+        total = None if each is None else each.sum(dim=0, dtype=torch.float64).to(ctx.of_intrinsics)
+        return None, probe, total, *gradients.values()
 
 
 def rasterize_with(
@@ -155,7 +160,7 @@ def rasterize_with(
     if deterministic is None:
         deterministic = torch.are_deterministic_algorithms_enabled()
     options = _Options(launcher, _view(camera, settings), exact_masks, distortion, deterministic, gradient_rows, budget)
-    *images, radii = _Rasterize.apply(options, screen_probe, *(t for _, t in splats.items()))
+    *images, radii = _Rasterize.apply(options, screen_probe, camera.intrinsics, *(t for _, t in splats.items()))
     return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
 
 

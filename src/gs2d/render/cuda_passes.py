@@ -270,7 +270,7 @@ class Wanted:
     Attributes
     ----------
     parameters : dict of Tensor or None
-        To be filled, by name of the parameter and ``probe``; None is not computed.
+        To be filled, by name of the parameter, ``probe`` and ``intrinsics`` [N, 4]; None is not computed.
     learns : Tensor [N] bool, optional
         The splats that have gradients; all others get zeros.
     deterministic : bool

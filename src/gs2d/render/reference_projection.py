@@ -16,7 +16,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.sh import num_coefficients, sh_to_rgb
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.render.types import RasterSettings
+from gs2d.render.types import PLAIN_COLORS, RasterSettings
 
 TILE = 16  # px; side of the blocks of pixels that share a list of splats
 MAX_PAIRS = 1 << 21  # pairs of splat and pixel evaluated at once; bounds the memory
@@ -61,7 +61,7 @@ def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, fo
     """
     used = splats.detach()
     keep = used.quats.norm(dim=1) > 0
-    shN = used.shN[:, : num_coefficients(settings.sh_degree) - 1]
+    shN = used.shN[:, : num_coefficients(max(settings.sh_degree, 0)) - 1]
     for tensor in (used.means, used.quats, used.scales, used.log_scales, used.opacity_logits, used.sh0, shN):
         keep &= tensor.isfinite().flatten(1).all(dim=1) if tensor.dim() > 1 else tensor.isfinite()
     depth = _to_camera(used.means, camera)[:, 2]
@@ -101,15 +101,20 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
     Tw = H[:, 2]
     # c - (cx, cy) = f p.xy / p.z, hence Tu - c_x Tw = fx H_x - (c_x - cx) H_z
     offset = p[:, :2] / p[:, 2:]  # [M, 2]
-    Au = camera.fx * (H[:, 0] - offset[:, :1] * H[:, 2])
-    Av = camera.fy * (H[:, 1] - offset[:, 1:] * H[:, 2])
+    given = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    intrinsics = (given if camera.intrinsics is None else camera.intrinsics).to(means)  # [4]
+    focal, principal = intrinsics[:2], intrinsics[2:]
+    Au = focal[0] * (H[:, 0] - offset[:, :1] * H[:, 2])
+    Av = focal[1] * (H[:, 1] - offset[:, 1:] * H[:, 2])
     third = torch.tensor([1.0, 1.0, 0.0], dtype=means.dtype, device=means.device)  # 0 but for rounding: say so
-    focal = torch.tensor([camera.fx, camera.fy], dtype=means.dtype, device=means.device)
-    principal = torch.tensor([camera.cx, camera.cy], dtype=means.dtype, device=means.device)
 
     to_splat = means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
     directions = to_splat / to_splat.norm(dim=1, keepdim=True)
     degree = min(settings.sh_degree, splats.sh_degree)
+    if degree == PLAIN_COLORS:
+        color = splats.sh0[rows][:, 0]
+    else:
+        color = sh_to_rgb(splats.sh0[rows], splats.shN[rows], directions, degree)
     normal = frames[:, :, 2]
     away = (normal * to_splat).sum(dim=1).detach() > 0  # rule 8
     return ScreenSplats(
@@ -118,7 +123,7 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
         Av=Av * third,
         Tw=Tw,
         opacity=splats.opacity_logits[rows].sigmoid(),
-        color=sh_to_rgb(splats.sh0[rows], splats.shN[rows], directions, degree),
+        color=color,
         normal=torch.where(away[:, None], -normal, normal),
     )
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+PLAIN_COLORS = -1  # of RasterSettings.sh_degree
 NEAR_PLANE_POLICIES = (
     "draw",
     "cull",
@@ -33,9 +34,10 @@ class RasterSettings:
     lowpass_px : float
         px. Standard deviation of the screen-space low-pass filter.
     background : tuple of 3 floats
-        Colour behind everything, in [0, 1].
+        Colour behind everything, in [0, 1]; with ``PLAIN_COLORS`` any finite numbers.
     sh_degree : int
-        SH degree that is evaluated (coefficients above it are ignored and get zero gradient).
+        SH degree that is evaluated (coefficients above it are ignored and get zero gradient). ``PLAIN_COLORS`` (-1):
+        ``sh0`` holds the colours, or any three features, as they are (rule 11).
     lowpass_depth : str
         Depth of a pair where the low-pass filter wins: "center" (the splat centre's), or "plane" (the ray-plane depth
         of the current official code; reference backend only).

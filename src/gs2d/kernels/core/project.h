@@ -182,6 +182,18 @@ GS2D_HD ParameterGradient<V> project_vjp(const SplatParameters<V>& s, const Fram
     return out;
 }
 
+// What one splat says of the camera's intrinsics (docs/math.md, "Camera").
+template <class V> struct IntrinsicsGradient {
+    V fx, fy, cx, cy;
+};
+template <class V, class S>
+GS2D_HD IntrinsicsGradient<V> intrinsics_vjp(const Frame3<V>& f, const Record<V>& r, const RecordGradient<V>& g, const PinholeCamera<S>& cam) {
+    const V cx = g.cx + g.lowpass_cx, cy = g.cy + g.lowpass_cy;
+    const V kx = V(S(1) / cam.fx), ky = V(S(1) / cam.fy);
+    const V along_x = fma(g.au, r.au, fma(g.av, r.av, g.ai * r.ai)), along_y = fma(g.bu, r.bu, fma(g.bv, r.bv, g.bi * r.bi));
+    return {fnma(kx, along_x, cx * (f.p.x * r.iz)), fnma(ky, along_y, cy * (f.p.y * r.iz)), cx, cy};
+}
+
 // Where the disc rho3d <= k^2 and the low-pass disc can be seen.
 template <class V> struct Footprint {
     // |pixel - e| in the metric (a, b, c) is at most 1 inside the ellipse; slightly widened against rounding.

@@ -6,12 +6,13 @@
 namespace gs2d {
 
 constexpr int SH_MAX = 16;  // coefficients of degree 3
-GS2D_HD int sh_count(int degree) { return (degree + 1) * (degree + 1); }
+// Degree -1 is no harmonic but the first coefficient itself: the colour, neither shifted nor clamped (rule 11).
+GS2D_HD int sh_count(int degree) { return degree < 0 ? 1 : (degree + 1) * (degree + 1); }
 
 // The first sh_count(degree) basis functions at the unit vector d.
 template <class V> GS2D_HD void sh_basis(Vec3<V> d, int degree, V* basis) {
     const V x = d.x, y = d.y, z = d.z;
-    basis[0] = V(0.28209479177387814);
+    basis[0] = degree < 0 ? V(1.0) : V(0.28209479177387814);
     if (degree < 1) return;
     const V c1 = V(0.4886025119029199);
     basis[1] = -(c1 * y);
@@ -39,11 +40,16 @@ template <class V> GS2D_HD void sh_basis(Vec3<V> d, int degree, V* basis) {
 
 // Colour + 1/2, not clamped, from the coefficients sh[3 * k + channel].
 template <class V> GS2D_HD Vec3<V> sh_color(const V* sh, const V* basis, int degree) {
-    const V half = V(0.5f);
+    const V half = degree < 0 ? V(0.f) : V(0.5f);
     Vec3<V> c = {half, half, half};
     for (int k = 0; k < sh_count(degree); ++k) c = axpy(basis[k], Vec3<V>{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]}, c);
     return c;
 }
+
+// What is drawn of a channel of that colour.
+template <class V> GS2D_HD V clamped_color(V c, int degree) { return degree < 0 ? c : max(c, V(0.f)); }
+// What its gradient g is of the colour's.
+template <class V> GS2D_HD V clamped_color_vjp(V c, int degree, V g) { return degree < 0 ? g : keep(c > V(0.f), g); }
 
 // Gradient with respect to d of sum_k g[k] basis[k], d taken as a free vector (its length is dealt with by the caller).
 template <class V> GS2D_HD Vec3<V> sh_basis_vjp(Vec3<V> d, int degree, const V* g) {

@@ -90,14 +90,20 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
     return NO_MEMORY;
 }
 
-// Gradients of the parameters of the same call's splats; `images` are that call's outputs.
-GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, const Images* images,
-                                     const ImageGradients* upstream, const ParameterGradients* out) {
-    if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out)) return NO_MEMORY;
+// Gradients of the parameters of the same call's splats; `images` are that call's outputs. `intrinsics` [N, 4], or null: what each
+// splat says of fx, fy, cx and cy.
+GS2D_EXPORT int gs2d_raster_backward_intrinsics(Frame* frame, const Parameters* splats, const Images* images,
+                                                const ImageGradients* upstream, const ParameterGradients* out, real* intrinsics) {
+    if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out, intrinsics || wants_geometry(*out))) return NO_MEMORY;
     StageClock clock;
-    project_splats_vjp(*frame, *splats, *out);
+    project_splats_vjp(*frame, *splats, *out, intrinsics);
     clock.done(PROJECT_BACKWARD);
     return OK;
+}
+
+GS2D_EXPORT int gs2d_raster_backward(Frame* frame, const Parameters* splats, const Images* images,
+                                     const ImageGradients* upstream, const ParameterGradients* out) {
+    return gs2d_raster_backward_intrinsics(frame, splats, images, upstream, out, nullptr);
 }
 
 // The inner sum of E_i: `image` [H, W, 3], `mask` [H, W] bytes or null, `errors` [N].

@@ -347,14 +347,15 @@ TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
 
 }  // namespace
 
-bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t sh_rest, const ParameterGradients& out) {
+bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t sh_rest, const ParameterGradients& out,
+                     bool geometry) {
     StageClock clock;
     GradientSums sums(f, sh_rest, out);
     if (!sums.prepare()) return false;
     clock.done(INDEX_SLOTS);
     const bool dist = g.distortion != nullptr;
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
-    const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, !wants_geometry(out));
+    const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, !geometry);
     const BlendLimits<V> limits = limits_of(f.view);
     const RowLines read = images_read(f, images, g);
     sums.for_each_tile([&](int64_t tile, int64_t next, Slots to) {

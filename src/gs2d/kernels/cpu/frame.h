@@ -215,9 +215,9 @@ bool project_splats(Frame& frame, const Parameters& splats, Reach reach, real* r
 bool bin_splats(Frame& frame);
 bool blend_tiles(Frame& frame, const Images& images);
 bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, int64_t sh_rest,
-                     const ParameterGradients& out);
+                     const ParameterGradients& out, bool geometry);
 bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 bool occluded_splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
-void project_splats_vjp(Frame& frame, const Parameters& splats, const ParameterGradients& out);
+void project_splats_vjp(Frame& frame, const Parameters& splats, const ParameterGradients& out, real* intrinsics);
 
 }  // namespace gs2d

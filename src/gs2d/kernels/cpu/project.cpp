@@ -34,7 +34,7 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     for (int k = 0; k < 3 * sh_count(degree); ++k) size = size + abs(sh[k]);
     g.alive = g.alive & is_finite(size);
     const Vec3<V> c = sh_color(sh, basis, degree);
-    g.record.red = max(c.x, V(0)), g.record.green = max(c.y, V(0)), g.record.blue = max(c.z, V(0));
+    g.record.red = clamped_color(c.x, degree), g.record.green = clamped_color(c.y, degree), g.record.blue = clamped_color(c.z, degree);
 }
 
 // Rectangles and radii of the splats `boxed` (a bit each) of a group: rule 19, "box".
@@ -141,7 +141,7 @@ inline M not_all_zero(const V* fields, const V* extras) {
     return ~(size <= V(0));
 }
 
-void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradients& out, int64_t begin, int64_t end) {
+void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradients& out, real* intrinsics, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += LANES) {
         const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
         if (i + 2 * LANES <= s.count) {
@@ -154,7 +154,7 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
         if (!any(seen)) {
             zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes), zero_rows(out.log_scales, i, 2, lanes);
             zero_rows(out.opacity_logits, i, 1, lanes), zero_rows(out.sh0, i, 3, lanes);
-            zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes);
+            zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes), zero_rows(intrinsics, i, 4, lanes);
             continue;
         }
         const RecordGradient<V> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8],  g[9],
@@ -168,14 +168,14 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
         load_sh(s, i, lanes, degree, sh);
         sh_basis(frame.to_splat, degree, basis);
         const Vec3<V> c = sh_color(sh, basis, degree);
-        const Vec3<V> g_color = {keep((c.x > V(0)) & seen, gr.red), keep((c.y > V(0)) & seen, gr.green),
-                                 keep((c.z > V(0)) & seen, gr.blue)};
+        const Vec3<V> g_color = {keep(seen, clamped_color_vjp(c.x, degree, gr.red)), keep(seen, clamped_color_vjp(c.y, degree, gr.green)),
+                                 keep(seen, clamped_color_vjp(c.z, degree, gr.blue))};
         for (int k = 0; k < sh_count(degree); ++k) {
             basis[k] = keep(seen, basis[k]);
             along[k] = fma(g_color.x, sh[3 * k], fma(g_color.y, sh[3 * k + 1], g_color.z * sh[3 * k + 2]));
         }
         write_sh(degree, s.sh_rest, out, i, lanes, g_color, basis);
-        if (!wants_geometry(out)) continue;
+        if (!wants_geometry(out) && !intrinsics) continue;
 
         const ParameterGradient<V> d = project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
         const auto write = [&]<int K>(real* to, V (&values)[K]) {
@@ -193,6 +193,10 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
             write(out.probe, probe);
         else
             write(out.probe, probe2);
+        if (!intrinsics) continue;
+        const IntrinsicsGradient<V> of_intrinsics = intrinsics_vjp(frame, r, gr, f.camera);
+        V values_of_intrinsics[] = {of_intrinsics.fx, of_intrinsics.fy, of_intrinsics.cx, of_intrinsics.cy};
+        write(intrinsics, values_of_intrinsics);
     }
 }
 
@@ -201,7 +205,7 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
 // Where the sums are the beginning of shN's gradient, row i is written over the sums of splats behind i. So the last splats come
 // first, and as many at a time as write over nothing that is still to be read; of at most LANES splats everything is read
 // before anything is written.
-void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out) {
+void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients& out, real* intrinsics) {
     for (int64_t end = s.count, first = 0; end > 0; end = first) {
         first = 0;
         if (f.sums.coefficient_row) {
@@ -209,7 +213,7 @@ void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients&
             first = (free + LANES - 1) / LANES * LANES;
             if (first > last_group) first = last_group;
         }
-        parallel_ranges(end - first, 16 * LANES, [&](int64_t a, int64_t b) { project_range_vjp(f, s, out, first + a, first + b); });
+        parallel_ranges(end - first, 16 * LANES, [&](int64_t a, int64_t b) { project_range_vjp(f, s, out, intrinsics, first + a, first + b); });
     }
 }
 

@@ -156,6 +156,7 @@ class ProjectVjpArguments(ctypes.Structure):
         *_pointers(*PARAMETERS, "tile_counts", "learns", "gradients", "extras"),
         *_pointers(*(f"g_{name}" for name in PARAMETERS), "g_probe"),
         ("probe_columns", ctypes.c_int64),
+        *_pointers("g_intrinsics"),
     )
 
 

@@ -14,7 +14,7 @@ struct CoefficientGradients {  // null: not wanted
 };
 
 template <int DEGREE> struct Basis {
-    static constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1);
+    static constexpr int COUNT = DEGREE < 0 ? 1 : (DEGREE + 1) * (DEGREE + 1);
     float values[COUNT], sh[3 * COUNT];
     __device__ __forceinline__ Basis(const Coefficients& from, Vec3<float> direction) {
         sh_basis(direction, DEGREE, values);
@@ -30,6 +30,7 @@ template <int DEGREE> struct Degree {
 };
 template <class F> __device__ __forceinline__ Vec3<float> with_degree(int degree, F f) {
     switch (degree) {
+        case -1: return f(Degree<-1>());  // no harmonics: sh.h
         case 0: return f(Degree<0>());
         case 1: return f(Degree<1>());
         case 2: return f(Degree<2>());
@@ -55,7 +56,7 @@ __device__ __forceinline__ Vec3<float> color_vjp(int degree, const Coefficients&
         constexpr int DEGREE = decltype(d)::value;
         const Basis<DEGREE> b(from, direction);
         const Vec3<float> c = b.color();
-        g = {keep(c.x > 0.f, g.x), keep(c.y > 0.f, g.y), keep(c.z > 0.f, g.z)};  // clamped channels
+        g = {clamped_color_vjp(c.x, DEGREE, g.x), clamped_color_vjp(c.y, DEGREE, g.y), clamped_color_vjp(c.z, DEGREE, g.z)};
         float along[b.COUNT];
 #pragma unroll
         for (int k = 0; k < b.COUNT; ++k) {

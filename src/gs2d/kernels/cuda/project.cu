@@ -54,7 +54,7 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
     const Vec3<float> c = color_of(v.sh_degree, sh, frame.to_splat, sh_size);
     if (!is_finite(sh_size)) return;
-    r.red = max(c.x, 0.f), r.green = max(c.y, 0.f), r.blue = max(c.z, 0.f);
+    r.red = clamped_color(c.x, v.sh_degree), r.green = clamped_color(c.y, v.sh_degree), r.blue = clamped_color(c.z, v.sh_degree);
 
     const float k2 = a.errors ? v.error_k2 : max(float(2 * LN2) * (r.log2_opacity - v.log2_alpha_min), 0.f);
     const Footprint<float> o = footprint(frame, r, k2, v.lowpass_px, v.camera);

@@ -13,6 +13,7 @@ struct ProjectVjpArguments {
     const float* extras;     // [N, 4]
     float *g_means, *g_quats, *g_log_scales, *g_opacity_logits, *g_sh0, *g_shN, *g_probe;  // null where not wanted
     int64 probe_columns;     // 2 or 4
+    float* g_intrinsics;     // [N, 4]: what each splat says of fx, fy, cx, cy; or null
 };
 
 __device__ __forceinline__ void write_row(float* to, int64 i, int columns, float a, float b = 0.f, float c = 0.f, float d = 0.f) {
@@ -27,6 +28,7 @@ __device__ __forceinline__ void write_row(float* to, int64 i, int columns, float
 __device__ __forceinline__ void write_zeros(const ProjectVjpArguments& a, int64 i) {
     write_row(a.g_means, i, 3, 0.f), write_row(a.g_quats, i, 4, 0.f), write_row(a.g_log_scales, i, 2, 0.f);
     write_row(a.g_opacity_logits, i, 1, 0.f), write_row(a.g_sh0, i, 3, 0.f), write_row(a.g_probe, i, int(a.probe_columns), 0.f);
+    write_row(a.g_intrinsics, i, 4, 0.f);
     if (a.g_shN)
         for (int64 k = 0; k < 3 * a.sh_rest; ++k) a.g_shN[3 * a.sh_rest * i + k] = 0.f;
 }
@@ -56,6 +58,9 @@ extern "C" __global__ void __launch_bounds__(128, 5) project_splats_vjp(ProjectV
     write_row(a.g_opacity_logits, i, 1, d.logit);
     const float half_w = 0.5f * float(a.view.width), half_h = 0.5f * float(a.view.height);
     write_row(a.g_probe, i, int(a.probe_columns), d.probe_x * half_w, d.probe_y * half_h, gr.abs_x * half_w, gr.abs_y * half_h);
+    if (!a.g_intrinsics) return;
+    const IntrinsicsGradient<float> intrinsics = intrinsics_vjp(frame, r, gr, a.view.camera);
+    write_row(a.g_intrinsics, i, 4, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy);
 }
 
 }  // namespace gs2d

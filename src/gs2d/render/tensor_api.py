@@ -1,0 +1,502 @@
+"""The rasterizer on bare tensors and batches of cameras, also as the torch operator ``gs2d::rasterize_2dgs``.
+
+The operator is for what captures graphs (``torch.compile``, ``torch.export``): its autograd formula renders again in
+the backward pass, because a graph can hold tensors but not what the kernels keep. Otherwise :func:`rasterize_2dgs`
+calls :func:`gs2d.render.api.rasterize` as anybody may, a camera and three channels at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.core.splats import Splats
+from gs2d.errors import BackendError, ShapeError
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend, get_backend
+from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
+
+__all__ = ["Rasterization", "rasterize_2dgs"]
+
+GROUP = 3  # channels that a backend blends at a time
+MIN_SCALE = 1e-18  # world units; the kernels' own floor: a disc without extent is drawn by the low-pass filter alone
+MIN_OPACITY, MAX_OPACITY = (
+    1e-30,
+    1 - 2.0**-20,
+)  # so that the logit is finite; below alpha_min a splat is not drawn anyway
+CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
+
+
+class Rasterization(NamedTuple):
+    """Images of C cameras and facts of N splats; what each means is in the contract (``gs2d.render.api``).
+
+    Attributes
+    ----------
+    colors : Tensor [C, H, W, D]
+        Blended channels over the background.
+    alphas : Tensor [C, H, W, 1]
+    normals : Tensor [C, H, W, 3]
+        World frame, each splat's facing the camera, summed by weight and not normalised.
+    depth_mean, depth_median : Tensor [C, H, W, 1]
+        World units; 0 where nothing was hit. The mean is divided by alpha.
+    distortion : Tensor [C, H, W, 1]
+        Squared differences of mapped depth.
+    radii : Tensor [C, N]
+        px, half the longer side of each splat's box; 0 for splats that touch no pixel. Without gradient.
+    """
+
+    colors: Tensor
+    alphas: Tensor
+    normals: Tensor
+    depth_mean: Tensor
+    depth_median: Tensor
+    distortion: Tensor
+    radii: Tensor
+
+
+def rasterize_2dgs(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,
+    screen_probe: Tensor | None = None,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008 (frozen)
+    backend: str | Backend = "auto",
+) -> Rasterization:
+    """Render 2D Gaussians given as tensors into C cameras, differentiable in every tensor.
+
+    Names, shapes and units are those of gsplat's ``rasterization_2dgs``. What differs: images come as one named tuple,
+    with both depths always; ``near_plane`` and everything else that is constant are fields of ``settings``; splats are
+    low-pass filtered and cut off as in the 2DGS paper's code (``eps2d``, ``radius_clip`` and ``tile_size`` do not
+    exist); the distortion is the squared one; ``Ks`` has gradients; the densification signal is the gradient of
+    ``screen_probe`` instead of an entry of a dictionary. docs/migration.md has the whole table.
+
+    Each camera, and each further three channels, is one call of :func:`gs2d.rasterize`, with the same bits: 64 channels
+    cost what 22 renderings cost. Under ``torch.compile`` and ``torch.export`` it is the operator
+    ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
+
+    Parameters
+    ----------
+    means : Tensor [N, 3]
+        Centres, world units. float32, or float64 with the reference backend; what follows has the same dtype.
+    quats : Tensor [N, 4]
+        Rotations (w, x, y, z), of any length; the splat's normal is the third column of the matrix.
+    scales : Tensor [N, 2] or [N, 3]
+        Standard deviations along the first two columns, world units, not their logarithms. A third is not looked at.
+    opacities : Tensor [N]
+        In [0, 1], not logits.
+    colors : Tensor [N, D] or [C, N, D]; with ``sh_degree`` [N, K, 3] or [C, N, K, 3]
+        D features of any sign, blended as they are; or SH coefficients, as in rule 11 (0.5 is added, negative colours
+        are 0), in the order of the official code: degree by degree, red, green, blue.
+    viewmats : Tensor [C, 4, 4]
+        World to camera, OpenCV axes (x right, y down, z forward), of any dtype. The gradient is that of rigid motions
+        (rule 20): of changes of scale and shear it says nothing.
+    Ks : Tensor [C, 3, 3]
+        Intrinsics, px, without skew; pixel (0, 0) is centred at (0.5, 0.5). Gradients reach fx, fy, cx and cy.
+    width, height : int
+        px, of all C images.
+    sh_degree : int, optional
+        Degree that is evaluated, at most that of ``colors``; None: ``colors`` are colours.
+    backgrounds : Tensor [C, D] or [D], optional
+        Behind everything; default 0. With ``sh_degree`` in [0, 1].
+    screen_probe : Tensor [C, N, 2] or [C, N, 4], optional
+        Zeros that require a gradient, which is the densification signal of 2DGS, and AbsGS's (rule 13). With four
+        columns at most three channels: sums of absolute values cannot be taken three channels at a time.
+    settings : RasterSettings
+        The constants; its ``background`` and ``sh_degree`` are not looked at.
+    backend : str or Backend
+        As for :func:`gs2d.rasterize`; "auto" goes by the device of ``means``.
+
+    Returns
+    -------
+    Rasterization
+        Named tuple ``colors, alphas, normals, depth_mean, depth_median, distortion, radii``, each with a leading C.
+
+    Raises
+    ------
+    ShapeError
+        If a tensor has another shape, dtype or range than stated: the message says which.
+    BackendError
+        If the backend cannot run here.
+
+    Examples
+    --------
+    >>> import torch, gs2d
+    >>> means, quats = torch.rand(50, 3) - 0.5, torch.randn(50, 4)
+    >>> viewmat = torch.eye(4)
+    >>> viewmat[2, 3] = 3.0
+    >>> K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    >>> features = torch.randn(50, 8)
+    >>> out = gs2d.rasterize_2dgs(
+    ...     means, quats, torch.full((50, 2), 0.1), torch.full((50,), 0.7), features, viewmat[None], K[None], 64, 48
+    ... )
+    >>> out.colors.shape, out.alphas.shape, out.radii.shape
+    (torch.Size([1, 48, 64, 8]), torch.Size([1, 48, 64, 1]), torch.Size([1, 50]))
+    """
+    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
+    if torch.compiler.is_compiling() or not _is_plain(means):
+        if not isinstance(backend, str):
+            raise BackendError(f"a captured graph names its backend: give backend={backend.name!r}")
+        constants = [float(getattr(settings, name)) for name in CONSTANTS]
+        choices = (settings.lowpass_depth, settings.near_plane_policy, settings.with_distortion, backend)
+        degree = PLAIN_COLORS if sh_degree is None else sh_degree
+        return Rasterization(*_operator(*tensors, width, height, degree, constants, *choices))
+    return _render(*tensors, width, height, sh_degree, settings, backend)
+
+
+def _is_plain(tensor: object) -> bool:
+    """Whether it holds numbers: not one of the subclasses by which graphs are captured."""
+    return type(tensor) in (Tensor, torch.nn.Parameter)
+
+
+def _render(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    backgrounds: Tensor | None,
+    screen_probe: Tensor | None,
+    width: int,
+    height: int,
+    sh_degree: int | None,
+    settings: RasterSettings,
+    backend: str | Backend,
+) -> Rasterization:
+    """Render by :func:`gs2d.render.api.rasterize`, whose autograd functions are all there is."""
+    cameras = _cameras(viewmats, Ks, width, height)
+    count, channels = len(cameras), _check(means, quats, scales, opacities, colors, viewmats, sh_degree)
+    if screen_probe is not None and screen_probe.shape[-1] == 4 and channels > GROUP:
+        raise ShapeError(
+            f"screen_probe must be [C, N, 2] for more than {GROUP} channels, got [C, N, 4] and {channels}: absolute "
+            "values cannot be summed in parts; render the features in a call of their own"
+        )
+    if screen_probe is not None and screen_probe.shape[:-1] != (count, len(means)):
+        raise ShapeError(
+            f"screen_probe must be [{count}, {len(means)}, 2] or [{count}, {len(means)}, 4], "
+            f"got {list(screen_probe.shape)}"
+        )
+    behind = _backgrounds(backgrounds, count, channels, means)
+    backend = backend if isinstance(backend, Backend) else get_backend(backend, means.device.type)
+    shape = (_LogScales.apply(scales[:, :2]), _Logits.apply(opacities))
+    per_camera = colors.dim() == (3 if sh_degree is None else 4)
+    views = []
+    for index, camera in enumerate(cameras):
+        own = colors[index] if per_camera else colors
+        parts, values = _parts(own, sh_degree), behind[index].tolist()
+        probe = None if screen_probe is None else screen_probe[index]
+        outputs: list[RenderOutput] = []
+        for number, (sh0, shN) in enumerate(parts):
+            background = (*values[GROUP * number : GROUP * (number + 1)], 0.0, 0.0)[:GROUP]
+            constants = replace(
+                settings,
+                background=background,
+                sh_degree=PLAIN_COLORS if sh_degree is None else sh_degree,
+                with_distortion=settings.with_distortion and number == 0,
+            )
+            splats = Splats(means, quats, *shape, sh0, shN)
+            outputs.append(rasterize(splats, camera, constants, backend=backend, screen_probe=probe))
+        views.append(_joined(outputs, behind[index], channels))
+    return Rasterization(*(torch.stack(images) for images in zip(*views, strict=True)))
+
+
+def _joined(outputs: Sequence[RenderOutput], background: Tensor, channels: int) -> tuple[Tensor, ...]:
+    """The images of one camera, in the order of Rasterization: channels of all parts, the rest of the first."""
+    first = outputs[0]
+    color = first.color if channels == GROUP else torch.cat([o.color for o in outputs], dim=2)[..., :channels]
+    if background.requires_grad and torch.is_grad_enabled():
+        color = _OverBackground.apply(color, first.alpha.detach(), background)
+    single = (first.depth_mean, first.depth_median, first.distortion)
+    return (color, first.alpha[..., None], first.normal, *(image[..., None] for image in single), first.radii)
+
+
+def _parts(colors: Tensor, sh_degree: int | None) -> list[tuple[Tensor, Tensor]]:
+    """``sh0`` [N, 1, 3] and ``shN`` of each call: coefficients, or three features at a time, the last filled with 0."""
+    if sh_degree is not None:
+        return [(colors[:, :1], colors[:, 1:])]
+    padded = torch.nn.functional.pad(colors, (0, -colors.shape[1] % GROUP))
+    return [(part[:, None], part.new_zeros(len(part), 0, GROUP)) for part in padded.split(GROUP, dim=1)]
+
+
+def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Camera]:
+    """The cameras, with what of them learns."""
+    sizes = check_shapes({"viewmats": (viewmats, "C 4 4"), "Ks": (Ks, "C 3 3")})
+    if sizes["C"] < 1:
+        raise ShapeError("viewmats must hold at least one camera, got [0, 4, 4]")
+    poses, matrices = (tensor.detach().to("cpu", torch.float64).numpy() for tensor in (viewmats, Ks))  # one wait each
+    if matrices[:, [0, 1, 2, 2], [1, 0, 0, 1]].any() or (matrices[:, 2, 2] != 1).any():
+        raise ShapeError("Ks must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: pinhole cameras without skew, got others")
+    learn = [tensor.requires_grad and torch.is_grad_enabled() for tensor in (viewmats, Ks)]
+    rows, columns = (0, 1, 0, 1), (0, 1, 2, 2)
+    numbers = Ks[:, rows, columns] if learn[1] else None  # [C, 4]
+    cameras = []
+    for index in range(sizes["C"]):
+        fx, fy, cx, cy = matrices[index, rows, columns].tolist()
+        pose: Any = viewmats[index] if learn[0] else poses[index]
+        cameras.append(
+            Camera(width, height, fx, fy, cx, cy, pose, intrinsics=None if numbers is None else numbers[index])
+        )
+    return cameras
+
+
+def _check(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    sh_degree: int | None,
+) -> int:
+    """Check the splats and return the number of channels; what :func:`rasterize` checks is left to it."""
+    third = 3 if scales.dim() == 2 and scales.shape[1] == 3 else 2
+    layout = "N D" if sh_degree is None else "N K 3"
+    if colors.dim() == len(layout.split()) + 1:
+        layout = f"C {layout}"
+    sizes = check_shapes(
+        {
+            "means": (means, "N 3"),
+            "quats": (quats, "N 4"),
+            "scales": (scales, f"N {third}"),
+            "opacities": (opacities, "N"),
+            "viewmats": (viewmats, "C 4 4"),
+            "colors": (colors, layout),
+        }
+    )
+    if sh_degree is not None and not 0 <= (sh_degree + 1) ** 2 <= sizes["K"]:
+        raise ShapeError(f"sh_degree must be within the {sizes['K']} coefficients of colors, got {sh_degree}")
+    channels = GROUP if sh_degree is not None else sizes["D"]
+    if channels < 1:
+        raise ShapeError("colors must have at least one channel, got none")
+    if sizes["N"] > 0:  # NaN passes: such splats are not drawn (rule 16)
+        least = torch.stack([scales.detach()[:, :2].min(), opacities.detach().min(), -opacities.detach().max()])
+        smallest, lowest, highest = least.tolist()
+        if smallest < 0:
+            raise ShapeError(f"scales must not be negative, got {smallest:.4g}; give exp of logarithms")
+        if lowest < 0 or highest < -1:
+            got = lowest if lowest < 0 else -highest
+            raise ShapeError(f"opacities must be in [0, 1], got {got:.4g}; give the sigmoid of logits")
+    return channels
+
+
+def _backgrounds(backgrounds: Tensor | None, cameras: int, channels: int, like: Tensor) -> Tensor:
+    """What is behind each image [C, D]."""
+    if backgrounds is None:
+        return like.new_zeros(cameras, channels)
+    if backgrounds.dim() == 1:
+        backgrounds = backgrounds.expand(cameras, -1)
+    if tuple(backgrounds.shape) != (cameras, channels):
+        raise ShapeError(
+            f"backgrounds must be [C, D] = [{cameras}, {channels}] or [{channels}], got {list(backgrounds.shape)}"
+        )
+    return backgrounds
+
+
+class _LogScales(torch.autograd.Function):
+    """Logarithms; a splat that is not drawn has no gradient, whatever its scales are."""
+
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor) -> Tensor:
+        held = scales.clamp(min=MIN_SCALE)
+        ctx.save_for_backward(held)
+        return held.log()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (held,) = ctx.saved_tensors
+        return torch.where(gradients[0] == 0, 0.0, gradients[0] / held)
+
+
+class _Logits(torch.autograd.Function):
+    """Logits; what is beyond the limits has the gradient that it has at them, so that it finds its way back."""
+
+    @staticmethod
+    def forward(ctx: Any, opacities: Tensor) -> Tensor:
+        held = opacities.clamp(MIN_OPACITY, MAX_OPACITY)
+        ctx.save_for_backward(held)
+        return torch.logit(held)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (held,) = ctx.saved_tensors
+        return torch.where(gradients[0] == 0, 0.0, gradients[0] / (held * (1 - held)))
+
+
+class _OverBackground(torch.autograd.Function):
+    """The image, unchanged; its gradient also reaches the background that is in it, weighted by 1 - alpha."""
+
+    @staticmethod
+    def forward(ctx: Any, color: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
+        ctx.save_for_backward(alpha, background.detach())
+        return color.view_as(color)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        alpha, background = ctx.saved_tensors
+        return gradients[0], None, torch.einsum("ij,ijk->k", 1 - alpha, gradients[0]).to(background)
+
+
+# The operator -----------------------------------------------------------------------------------------------------
+
+_TENSORS = 9  # means to screen_probe
+
+
+@torch.library.custom_op("gs2d::rasterize_2dgs", mutates_args=())
+def _operator(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    backgrounds: Tensor | None,
+    screen_probe: Tensor | None,
+    width: int,
+    height: int,
+    sh_degree: int,
+    constants: Sequence[float],
+    lowpass_depth: str,
+    near_plane_policy: str,
+    with_distortion: bool,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Render without gradients; ``sh_degree`` -1 is None, ``constants`` are those of ``CONSTANTS``."""
+    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
+    numbers = (width, height, sh_degree, constants, lowpass_depth, near_plane_policy, with_distortion, backend)
+    with torch.no_grad():
+        return tuple(_render(*tensors, *_python_options(*numbers)))  # type: ignore[return-value]
+
+
+def _python_options(
+    width: int,
+    height: int,
+    sh_degree: int,
+    constants: Sequence[float],
+    lowpass_depth: str,
+    near_plane_policy: str,
+    with_distortion: bool,
+    backend: str,
+) -> tuple[int, int, int | None, RasterSettings, str]:
+    """The operator's numbers as :func:`_render` takes them."""
+    given: dict[str, Any] = dict(zip(CONSTANTS, constants, strict=True))
+    settings = RasterSettings(
+        **given,
+        lowpass_depth=lowpass_depth,
+        near_plane_policy=near_plane_policy,
+        with_distortion=with_distortion,
+    )
+    return width, height, None if sh_degree == PLAIN_COLORS else sh_degree, settings, backend
+
+
+@_operator.register_fake
+def _(*arguments: Any) -> tuple[Tensor, ...]:
+    means, colors, viewmats = arguments[0], arguments[4], arguments[5]
+    width, height, sh_degree = arguments[_TENSORS : _TENSORS + 3]
+    cameras, channels = viewmats.shape[0], GROUP if sh_degree != PLAIN_COLORS else colors.shape[-1]
+    shapes = [(cameras, height, width, depth) for depth in (channels, 1, 3, 1, 1, 1)]
+    return tuple(means.new_empty(shape) for shape in (*shapes, (cameras, means.shape[0])))
+
+
+@torch.library.custom_op("gs2d::rasterize_2dgs_backward", mutates_args=())
+def _backward_operator(
+    upstream: Sequence[Tensor | None],
+    wanted: Sequence[bool],
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    backgrounds: Tensor | None,
+    screen_probe: Tensor | None,
+    width: int,
+    height: int,
+    sh_degree: int,
+    constants: Sequence[float],
+    lowpass_depth: str,
+    near_plane_policy: str,
+    with_distortion: bool,
+    backend: str,
+) -> list[Tensor]:
+    """Render again and return the gradients of the tensors that are wanted."""
+    tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
+    numbers = (width, height, sh_degree, constants, lowpass_depth, near_plane_policy, with_distortion, backend)
+    stream = torch.cuda.current_stream(means.device) if means.is_cuda else None
+
+    def again() -> list[Tensor]:
+        with torch.cuda.stream(stream):  # of a GPU; None changes nothing
+            return _gradients(upstream, wanted, tensors, _python_options(*numbers))
+
+    # Within an operator the dispatcher records nothing, in this thread; another has a dispatcher as it always is.
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(again).result()
+
+
+def _gradients(
+    upstream: Sequence[Tensor | None],
+    wanted: Sequence[bool],
+    tensors: Sequence[Tensor | None],
+    options: tuple[Any, ...],
+) -> list[Tensor]:
+    """Gradients of the tensors that are wanted; those of the images are ``upstream``."""
+    leaves: list[Any] = [
+        None if tensor is None else tensor.detach().requires_grad_(want)
+        for tensor, want in zip(tensors, wanted, strict=True)
+    ]
+    learning = [leaf for leaf, want in zip(leaves, wanted, strict=True) if want]
+    images = _render(*leaves, *options)
+    pairs = [(image, g) for image, g in zip(images, upstream, strict=True) if g is not None and image.requires_grad]
+    if not pairs:
+        return [torch.zeros_like(leaf) for leaf in learning]
+    ends, cotangents = [image for image, _ in pairs], [g for _, g in pairs]
+    found = torch.autograd.grad(ends, learning, cotangents, allow_unused=True)
+    return [
+        torch.zeros_like(leaf) if gradient is None else gradient.clone()
+        for leaf, gradient in zip(learning, found, strict=True)
+    ]
+
+
+@_backward_operator.register_fake
+def _(upstream: Sequence[Tensor | None], wanted: Sequence[bool], *arguments: Any) -> list[Tensor]:
+    tensors = arguments[:_TENSORS]
+    return [torch.empty_like(tensor) for tensor, want in zip(tensors, wanted, strict=True) if want]
+
+
+def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    ctx.save_for_backward(*inputs[:_TENSORS])
+    ctx.options = inputs[_TENSORS:]
+    ctx.mark_non_differentiable(output[-1])
+    ctx.set_materialize_grads(False)
+
+
+def _backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+    wanted = list(ctx.needs_input_grad[:_TENSORS])
+    found = iter(_backward_operator(list(upstream), wanted, *ctx.saved_tensors, *ctx.options))
+    gradients = tuple(next(found) if want else None for want in wanted)
+    return (*gradients, *[None] * len(ctx.options))
+
+
+_operator.register_autograd(_backward, setup_context=_setup_context)
