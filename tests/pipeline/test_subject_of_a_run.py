@@ -6,13 +6,15 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from gs2d.config.protocols import PROTOCOLS
-from gs2d.data.subject import OBJECT, read_subject
+from gs2d.data import View
+from gs2d.data.subject import OBJECT, given_subject, read_subject
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
@@ -21,10 +23,11 @@ from gs2d.pipeline.events import Notice
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import protocol_from_json, reload_job
 from gs2d.pipeline.jobs import export_run
-from gs2d.pipeline.mesh import extract_mesh
+from gs2d.pipeline.mesh import bare_of, extract_mesh
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.subject import meshed_subject, subject_line, within
 from gs2d.report.sections.subject import subject_section
+from wall_scene import wall
 
 BOX = (-0.5, -0.6, -0.7, 0.5, 0.6, 0.7)
 
@@ -66,6 +69,46 @@ def test_a_box_of_the_user_becomes_the_subject_and_limits_the_mesh(undisturbed: 
         assert meshed_subject(run, generic, splats, options, said.append) is None
         with pytest.raises(ProtocolError, match="exclude each other"):
             meshed_subject(run, generic, splats, replace(options, subject_box=BOX), said.append)
+
+
+def test_what_shows_nothing_is_left_out_of_a_subject_and_kept_in_a_scene(
+    undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, splats = reload_job(undisturbed, lambda _: None), finished_splats(undisturbed)
+    generic = replace(job, protocol=replace(job.protocol, fusion=PROTOCOLS["generic"].fusion))
+    asked: list[bool] = []
+
+    def extract(frames: Any, *, with_bare: bool, **rest: Any) -> Any:
+        asked.append(with_bare)
+        raise ProtocolError("enough")
+
+    monkeypatch.setattr("gs2d.pipeline.mesh.extract", extract)
+    box = given_subject(BOX, [view.camera for view in job.scene.train])
+    for one, options, subject in (
+        (generic, MeshOptions(), box),
+        (generic, MeshOptions(bbox=BOX), None),
+        (generic, MeshOptions(), None),
+        (generic, MeshOptions(bbox=BOX, whole_scene=True), None),
+        (job, MeshOptions(), box),
+    ):
+        with pytest.raises(ProtocolError, match="enough"):
+            extract_mesh(one, splats, options, tmp_path / "mesh.ply", lambda _: None, subject=subject)
+    assert asked == [False, False, True, True, True]
+
+
+def test_bare_walls_are_found_in_photographs_that_say_where_their_points_are(undisturbed: RunFolder) -> None:
+    job = replace(reload_job(undisturbed, lambda _: None), scene=wall())
+    generic = replace(job, protocol=PROTOCOLS["generic"])
+    view = generic.scene.train[0]
+    found = bare_of(generic, view)
+    assert found is not None
+    gray = (np.abs(view.image().astype(int) - 128) <= 1).all(axis=2)  # the left third
+    assert found[gray].mean() > 0.8
+    assert found[~gray].mean() < 0.1
+    assert bare_of(job, view) is None  # official protocols are as they were
+    assert bare_of(replace(generic, scene=replace(wall(), observe=None)), view) is None
+    opaque = np.concatenate([view.image(), np.full((*view.image().shape[:2], 1), 255, np.uint8)], axis=2)
+    assert bare_of(generic, View.from_arrays(view.name, view.camera, opaque)) is None
 
 
 def test_runs_of_before_there_was_a_subject_still_open() -> None:

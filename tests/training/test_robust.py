@@ -12,21 +12,26 @@ import torch
 from gs2d.config.presets import refine, surface, two_dgs, with_exposure, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea
 from gs2d.config.schedule import scale_schedule
+from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
 from gs2d.errors import DataError, RecipeError
+from gs2d.render.backends import get_backend
+from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.backdrop import backdrop_color
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.plane_sweep import start_points, sweep_views
 from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import Robustness
+from gs2d.training.seen_area import inside_fraction, mostly_unseen, shown_weights, shrunk, whole_weights
 from gs2d.training.trainer import Trainer
 from train_toys import full_state, make_scene, random_splats
 from wall_scene import HEIGHT, WALL, WIDTH, wall
 
+RASTER, BACKEND = RasterSettings(), get_backend("reference")
 SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
 
 
@@ -189,16 +194,96 @@ def test_a_capture_without_observations_is_refused_in_one_line() -> None:
 
 
 def test_a_scene_of_fog_alone_is_left_as_it_is() -> None:
-    robust, state = Robustness(wall(), short()), full_state(4)
+    robust, state = Robustness(wall(), short(), RASTER, BACKEND), full_state(4)
     state.splats.means[:] = torch.tensor([0.5, 0.0, 1.8])
     assert robust.prune(state, short().stages[0], 10) == []
     assert len(state.splats) == 4
 
 
+# -- how much of a splat is photographed ------------------------------------------------------------------------------
+def walls_of(*rows: tuple[float, float, float, float, float]) -> Splats:
+    """Opaque splats that face the cameras: x, z, both scales, opacity."""
+    splats = splat_at(*((x, 0.0, z) for x, z, *_ in rows))
+    splats.log_scales[:] = torch.tensor([[u, v] for *_, u, v, _ in rows]).log()
+    splats.opacity_logits[:] = torch.logit(torch.tensor([row[4] for row in rows]))
+    return splats
+
+
+def cameras_of_the_wall() -> list[Camera]:
+    return [view.camera for view in wall().train]
+
+
+def aside() -> Camera:
+    """A camera that looks at the right of the wall, which no other shows."""
+    place, up = np.array([-0.8, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
+    return look_at(place, np.array([9.0, 0.0, WALL]), up, width=WIDTH, height=HEIGHT, fx=40.0)
+
+
+def test_a_splat_alone_in_the_picture_is_seen_whole() -> None:
+    splats = walls_of((0.1, WALL, 0.2, 0.1, 0.8))
+    for camera in cameras_of_the_wall():
+        shown, whole = shown_weights(splats, camera, RASTER, BACKEND), whole_weights(splats, camera)
+        assert shown.item() == pytest.approx(whole.item(), rel=0.06)  # the blending ends at three deviations
+
+
+def test_large_splats_of_which_only_a_border_is_photographed_are_found() -> None:
+    beside = (9.0, WALL, 3.0, 3.0, 0.99)  # pictures end at x = 3.2 at the most
+    behind = (0.2, 2 * WALL, 1.0, 1.0, 0.99)
+    before = (0.2, WALL, 4.0, 4.0, 0.99)
+    splats = walls_of(before, beside, behind)
+    found = mostly_unseen(splats, cameras_of_the_wall(), SeenArea(), RASTER, BACKEND)
+    assert found.tolist() == [False, True, False]  # what is behind another hides nothing
+    strict = mostly_unseen(splats, cameras_of_the_wall(), SeenArea(inside=1.1), RASTER, BACKEND)
+    assert strict.tolist() == [False, True, True]
+    lenient = mostly_unseen(splats, cameras_of_the_wall(), SeenArea(least=1e-6), RASTER, BACKEND)
+    assert not lenient.any()
+
+
+def test_one_photograph_that_shows_a_splat_is_enough_and_small_ones_stay() -> None:
+    cameras = cameras_of_the_wall()
+    beside = walls_of((9.0, WALL, 3.0, 3.0, 0.99))
+    assert mostly_unseen(beside, cameras, SeenArea(), RASTER, BACKEND).tolist() == [True]
+    assert mostly_unseen(beside, [*cameras, aside()], SeenArea(), RASTER, BACKEND).tolist() == [False]
+    small = SeenArea(size=20.0)
+    assert mostly_unseen(beside, cameras, small, RASTER, BACKEND).tolist() == [False]
+
+
+def test_what_lies_within_the_pictures_is_counted_over_all_of_them() -> None:
+    cameras = cameras_of_the_wall()
+    near, half = (0.0, WALL, 0.1, 0.1, 0.9), (cameras[0].center[0], 1.0, 1e-3, 1e-3, 0.9)
+    assert inside_fraction(walls_of(near, half), cameras).tolist() == [1.0, 1.0]
+    assert inside_fraction(walls_of((0.0, -2.0, 0.1, 0.1, 0.9)), cameras).tolist() == [0.0]
+    left, right = cameras[0], aside()
+    wide = walls_of((4.0, WALL, 4.0, 0.1, 0.9))
+    parts = [inside_fraction(wide, [camera]).item() for camera in (left, right)]
+    assert 0 < max(parts) < inside_fraction(wide, [left, right]).item() <= 1
+
+
+def test_small_pictures_are_looked_at() -> None:
+    camera = cameras_of_the_wall()[0]
+    assert (shrunk(camera, 24).width, shrunk(camera, 24).height) == (24, 18)
+    assert (shrunk(camera, 200).width, shrunk(camera, 200).fx) == (WIDTH, camera.fx)
+
+
+def test_what_is_hardly_photographed_is_pruned_so_many_times_a_stage_and_said() -> None:
+    recipe = short(dense_start=None, free_space=None, opacity_decay=None, seen_area=SeenArea(times=3))
+    robust, stage = Robustness(wall(), recipe, RASTER, BACKEND), recipe.stages[0]
+    due = [n for n in range(1, stage.iterations + 1) if robust.prunes(stage, n)]
+    assert due == [5, 10, 15]
+    state = full_state(2)
+    for (_, mine), (_, made) in zip(state.splats.items(), walls_of((0, WALL, 1, 1, 0.9), (9, WALL, 3, 3, 0.9)).items(),
+                                    strict=True):  # fmt: skip
+        mine.copy_(made[:, : mine.shape[1]] if mine.dim() > 1 else made)
+    assert robust.prune(state, stage, 4) == []
+    assert robust.prune(state, stage, 5) == [events.UnseenPruned(stage.name, 5, 1, 1)]
+    assert state.splats.means[0, 0] == 0
+    assert not any(robust.prunes(refine(), n) for n in range(1, 20))
+
+
 # -- opacity decay --------------------------------------------------------------------------------------------------
 def test_opacity_decays_by_its_rate_every_so_many_iterations_and_not_below_the_least() -> None:
     recipe = short(dense_start=None, free_space=None, opacity_decay=OpacityDecay(rate=0.1, every=5, least=0.02))
-    robust, state = Robustness(make_scene(), recipe), full_state(4)
+    robust, state = Robustness(make_scene(), recipe, RASTER, BACKEND), full_state(4)
     state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.9, 0.5, 0.021, 0.01]))
     robust.decay(state, recipe.stages[0], 4)
     assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.021, 0.01]), abs=1e-6)
@@ -210,7 +295,7 @@ def test_opacity_decays_by_its_rate_every_so_many_iterations_and_not_below_the_l
 
 def test_frozen_opacity_does_not_decay() -> None:
     recipe = short(dense_start=None, free_space=None)
-    robust, state = Robustness(make_scene(), recipe), full_state(4)
+    robust, state = Robustness(make_scene(), recipe, RASTER, BACKEND), full_state(4)
     before = state.splats.opacity_logits.clone()
     robust.decay(state, refine(), 10)
     assert torch.equal(state.splats.opacity_logits, before)

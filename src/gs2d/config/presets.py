@@ -28,7 +28,7 @@ from gs2d.config.recipe import (
     Recipe,
     Stage,
 )
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea
 from gs2d.errors import RecipeError
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
@@ -202,8 +202,9 @@ def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: st
 def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
     """Return the recipe with what photographs of the street need; what it has of that already stays.
 
-    Not in the paper: a dense start, free space that is kept free, opacity that decays (docs/decisions.md, "Fog"). The
-    capture must say which sparse points its photographs show.
+    Not in the paper: a dense start, free space that is kept free, opacity that decays, no large
+    splat that is hardly photographed (docs/decisions.md, "Fog"). The capture must say which sparse points its
+    photographs show.
     """
     return replace(
         recipe,
@@ -211,6 +212,7 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
         dense_start=recipe.dense_start or DenseStart(),
         free_space=recipe.free_space or FreeSpace(),
         opacity_decay=recipe.opacity_decay or OpacityDecay(),
+        seen_area=recipe.seen_area or SeenArea(),
     )
 
 

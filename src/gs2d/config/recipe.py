@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
 from gs2d.config.priors import PRIOR_KINDS, DepthPrior, NormalPrior, check_priors
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, check_robust
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
 from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
 from gs2d.config.views import PoseRefinement as PoseRefinement
@@ -244,7 +244,7 @@ class Recipe:
     ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
     photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says. ``multiview``,
     ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses that do.
-    ``dense_start``, ``free_space``, ``opacity_decay``: what keeps fog out where photographs are few.
+    ``dense_start``, ``free_space``, ``opacity_decay``, ``seen_area``: what keeps fog out where photographs are few.
     """
 
     name: str
@@ -260,6 +260,7 @@ class Recipe:
     dense_start: DenseStart | None = None
     free_space: FreeSpace | None = None
     opacity_decay: OpacityDecay | None = None
+    seen_area: SeenArea | None = None
 
     @property
     def iterations(self) -> int:
@@ -292,7 +293,7 @@ def validate(recipe: Recipe) -> Recipe:
     kinds = [term.kind for stage in recipe.stages for term in stage.losses]
     check_multiview(f"{where}: multiview", recipe.multiview, kinds)
     check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
-    check_robust(where, recipe.dense_start, recipe.free_space, recipe.opacity_decay)
+    check_robust(where, recipe.dense_start, recipe.free_space, recipe.opacity_decay, recipe.seen_area)
     names = [stage.name for stage in recipe.stages]
     for name in names:
         require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")

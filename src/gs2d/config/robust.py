@@ -103,7 +103,41 @@ class OpacityDecay:
     least: float = 0.005
 
 
-def check_robust(where: str, start: DenseStart | None, free: FreeSpace | None, decay: OpacityDecay | None) -> None:
+@dataclass(frozen=True)
+class SeenArea:
+    """Prune large splats of which photographs show next to nothing (``training/seen_area.py``).
+
+    What lies outside of all pictures answers to no loss, and hides what a new view between them should show. What lies
+    behind other things hides nothing, and stays.
+
+    Attributes
+    ----------
+    times : int
+        Looks per stage that moves all splats, evenly spaced; the last one after its last iteration.
+    least : float
+        A splat stays where some photograph shows this fraction of its weight.
+    inside : float
+        It stays as well where this fraction of it lies within the pictures, all together.
+    size : float
+        Large is a splat that would fill this fraction of some picture; smaller ones cannot hide much.
+    side : int, px
+        Longer side of the pictures that are looked at.
+    """
+
+    times: int = 5
+    least: float = 0.05
+    inside: float = 0.6
+    size: float = 0.001
+    side: int = 200
+
+
+def check_robust(
+    where: str,
+    start: DenseStart | None,
+    free: FreeSpace | None,
+    decay: OpacityDecay | None,
+    seen: SeenArea | None = None,
+) -> None:
     """Raise RecipeError for a value that cannot be trained with."""
     if start is not None:
         at = f"{where}: dense_start"
@@ -128,3 +162,10 @@ def check_robust(where: str, start: DenseStart | None, free: FreeSpace | None, d
         for name in ("rate", "least"):
             value = number(f"{at}.{name}", getattr(decay, name), low=0.0)
             require(value < 1, f"{at}.{name} must be below 1, got {value}")
+    if seen is not None:
+        at = f"{where}: seen_area"
+        integer(f"{at}.times", seen.times, low=1)
+        integer(f"{at}.side", seen.side, low=16)
+        for name in ("least", "inside", "size"):
+            number(f"{at}.{name}", getattr(seen, name), low=0.0)
+        require(seen.least < 1, f"{at}.least must be below 1, got {seen.least}: no splat is seen whole")

@@ -56,6 +56,7 @@ def extract(
     backend: str = "auto",
     folder: str | os.PathLike[str] | None = None,
     by_evidence: bool = False,
+    with_bare: bool = True,
 ) -> Extraction:
     """Fuse frames into a mesh.
 
@@ -81,6 +82,8 @@ def extract(
         Where the temporary file goes.
     by_evidence : bool
         Leave only what enough views saw, in no more faces than their pixels carry (``evidence.clean``).
+    with_bare : bool
+        Take the depth of pixels that show nothing which could be matched (``Frame.bare``).
 
     Raises
     ------
@@ -97,6 +100,8 @@ def extract(
         raise TypeError("give limits, or the numbers to derive them from, not both")
     backend = fusion_backend(backend)
     with Spool.of(frames, folder) as spool:
+        if not with_bare:
+            spool.leave_out_bare()
         if limits is None:
             samples = [sample_depths(item) for item in spool]
             limits = derive_limits(

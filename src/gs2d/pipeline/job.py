@@ -48,7 +48,7 @@ ROBUST = ("auto", "on", "off")
 DIFFERS = 0.03  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
 LATER_FIELDS = (  # of recipes, that run folders of before there were such lack
     *("exposure", "poses", "multiview", "depth_prior", "normal_prior"),
-    *("dense_start", "free_space", "opacity_decay"),
+    *("dense_start", "free_space", "opacity_decay", "seen_area"),
 )
 
 

@@ -21,6 +21,7 @@ from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError
 from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.meshes import write_mesh
+from gs2d.meshing.bare import bare_pixels
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.pipeline.evaluate import SeenView
@@ -33,6 +34,7 @@ from gs2d.render.types import RenderOutput
 
 OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
 ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
+MIN_POINTS = 20  # sparse points in a photograph, below which it is not known where it shows anything
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
 
@@ -186,7 +188,8 @@ def _extract(
     bbox = bbox if subject is None else subject.box
     own = bbox is not None or options.unbounded
     subject_only = fusion.subject and not options.unbounded
-    fuse_frames = extract_unbounded if options.unbounded else partial(extract, by_evidence=subject_only)
+    bare = not subject_only or options.whole_scene or bbox is None  # in a room bare walls are most of what there is
+    fuse_frames = extract_unbounded if options.unbounded else partial(extract, by_evidence=subject_only, with_bare=bare)
     if isinstance(frames, Spool):
         on_event(Phase("fusing", 0))
     result = fuse_frames(
@@ -224,7 +227,23 @@ def fusion_frame(job: Job, view: View, output: RenderOutput, depth: str) -> Rend
             valid = valid & pixels
     if job.protocol.fusion.subject:
         valid = valid & one_surface(output)
-    return RenderedView(view.camera, output.depth(depth).cpu().numpy(), surface_color(output, job).cpu().numpy(), valid)
+    color = surface_color(output, job).cpu().numpy()
+    return RenderedView(view.camera, output.depth(depth).cpu().numpy(), color, valid, bare_of(job, view))
+
+
+def bare_of(job: Job, view: View) -> np.ndarray | None:
+    """Return the pixels of a photograph that show nothing which could be matched, [H, W] bool.
+
+    None where that is not asked for (the protocols of data sets), where the photograph itself says what is empty, or
+    where the capture does not say enough of which points its photographs show.
+    """
+    scene = job.scene
+    if not job.protocol.fusion.subject or scene.observe is None or view.alpha() is not None:
+        return None
+    points = scene.observe().inside(view.camera, min_track=2).pixels
+    if len(points) < MIN_POINTS:
+        return None
+    return bare_pixels(view.target(job.settings.background), points, view.valid())
 
 
 def one_surface(output: RenderOutput) -> np.ndarray:

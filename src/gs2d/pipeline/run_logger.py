@@ -168,7 +168,7 @@ class RunLogger:
             self._log("stage_end", event)
             self._finish_stage(event.index)
         else:
-            if isinstance(event, train_events.Densified | train_events.OpacityLimited | train_events.FreeSpacePruned):
+            if isinstance(event, _ROWS_OR_JUMPS):
                 self._before = None  # other rows, or a jump that no gradient made
             if isinstance(event, train_events.Initialised):
                 self._on_event(Notice(start_text(event)))
@@ -382,7 +382,14 @@ _KINDS = {
     train_events.Densified: "densify",
     train_events.OpacityLimited: "opacity_limited",
     train_events.FreeSpacePruned: "free_space_pruned",
+    train_events.UnseenPruned: "unseen_pruned",
 }
+_ROWS_OR_JUMPS = (
+    train_events.Densified,
+    train_events.OpacityLimited,
+    train_events.FreeSpacePruned,
+    train_events.UnseenPruned,
+)
 
 
 def _due(iteration: int, iterations: int, count: int, step: int) -> bool:

@@ -118,6 +118,16 @@ class FreeSpacePruned:
 
 
 @dataclass(frozen=True)
+class UnseenPruned:
+    """Large splats of which the training photographs show next to nothing were pruned."""
+
+    stage: str
+    iteration: int
+    pruned: int
+    splats: int
+
+
+@dataclass(frozen=True)
 class StageFinished:
     """A stage is done; the state already points at the next one. ``unseen`` splats, in no training view, are gone."""
 
@@ -138,5 +148,6 @@ Event = (
     | Densified
     | OpacityLimited
     | FreeSpacePruned
+    | UnseenPruned
     | StageFinished
 )

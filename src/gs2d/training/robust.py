@@ -12,15 +12,26 @@ from gs2d.config.recipe import Recipe, Stage
 from gs2d.config.robust import DenseStart
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
-from gs2d.training import events
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.training import events, per_image
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.plane_sweep import start_points, sweep_views
 from gs2d.training.rows import keep_rows
+from gs2d.training.seen_area import mostly_unseen
 from gs2d.training.state import TrainState
 
 
 class Robustness:
-    """The dense start, free space and opacity decay of a recipe on a scene; nothing where it has none of them.
+    """The dense start, pruning and opacity decay of a recipe on a scene; nothing where it has none of them.
+
+    Parameters
+    ----------
+    scene : Scene
+    recipe : Recipe
+    raster : RasterSettings
+        Of training, and ``backend`` that renders: to see how much of a splat is photographed.
+    backend : Backend
 
     Attributes
     ----------
@@ -33,8 +44,9 @@ class Robustness:
         From the constructor: the capture does not say which sparse points its photographs show.
     """
 
-    def __init__(self, scene: Scene, recipe: Recipe) -> None:
-        self.scene, self._recipe = scene, recipe
+    def __init__(self, scene: Scene, recipe: Recipe, raster: RasterSettings, backend: Backend) -> None:
+        self.scene, self._given, self._recipe = scene, scene, recipe
+        self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
         if recipe.dense_start is None and recipe.free_space is None:
             return
@@ -55,20 +67,33 @@ class Robustness:
             self._free.move_to(device)
 
     def prunes(self, stage: Stage, iteration: int) -> bool:
-        """Whether splats in free space are pruned at the end of an iteration (1-based) of a stage."""
+        """Whether splats may be pruned at the end of an iteration (1-based) of a stage."""
+        return self._looks_at_free_space(stage, iteration) or self._looks_at_seen_area(stage, iteration)
+
+    def prune(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
+        """Prune the splats in free space, and those of which little is photographed, where that is due."""
+        happened: list[events.Event] = []
+        if self._free is not None and self._looks_at_free_space(stage, iteration):
+            pruned = _drop(state, self._free.inside(state.splats))
+            if pruned:
+                happened.append(events.FreeSpacePruned(stage.name, iteration, pruned, len(state.splats)))
+        settings = self._recipe.seen_area
+        if settings is not None and self._looks_at_seen_area(stage, iteration):
+            cameras = [view.camera for view in per_image.scene_now(state, self._given).train]
+            pruned = _drop(state, mostly_unseen(state.splats, cameras, settings, self._raster, self._backend))
+            if pruned:
+                happened.append(events.UnseenPruned(stage.name, iteration, pruned, len(state.splats)))
+        return happened
+
+    def _looks_at_free_space(self, stage: Stage, iteration: int) -> bool:
         settings = self._recipe.free_space
         return settings is not None and stage.moves_all and iteration % settings.every == 0
 
-    def prune(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
-        """Prune the splats in free space, where that is due."""
-        if self._free is None or not self.prunes(stage, iteration):
-            return []
-        keep = ~self._free.inside(state.splats)
-        pruned = int((~keep).sum())
-        if pruned == 0 or pruned == len(keep):  # nothing would be left: the photographs contradict each other
-            return []
-        keep_rows(state, keep)
-        return [events.FreeSpacePruned(stage.name, iteration, pruned, len(state.splats))]
+    def _looks_at_seen_area(self, stage: Stage, iteration: int) -> bool:
+        settings = self._recipe.seen_area
+        if settings is None or not stage.moves_all:
+            return False
+        return iteration * settings.times // stage.iterations > (iteration - 1) * settings.times // stage.iterations
 
     @torch.no_grad()
     def decay(self, state: TrainState, stage: Stage, iteration: int, cancel: Tensor | None = None) -> None:
@@ -81,3 +106,12 @@ class Robustness:
         faded = torch.logit(torch.sigmoid(logits) * (1 - settings.rate)).clamp_min(least)
         changed = logits > least
         logits.copy_(torch.where(changed if cancel is None else changed & (cancel == 0), faded, logits))
+
+
+def _drop(state: TrainState, mask: Tensor) -> int:
+    """Drop the splats of a mask [N] and return how many: none where nothing would be left."""
+    dropped = int(mask.sum())
+    if dropped == 0 or dropped == len(mask):  # all: the photographs contradict each other
+        return 0
+    keep_rows(state, ~mask)
+    return dropped

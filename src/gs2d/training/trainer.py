@@ -108,7 +108,7 @@ class Trainer:
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
         self._on_event, self._between, self._progress_every = on_event, between, progress_every
         self._pending: list[events.Event] = []
-        self._robust = Robustness(scene, self.recipe)
+        self._robust = Robustness(scene, self.recipe, self.settings, self.backend)
         self.state = self._new_state(dtype) if state is None else self._checked(state)
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)

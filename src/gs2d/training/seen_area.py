@@ -1,0 +1,107 @@
+"""How much of each splat the training photographs show, and the splats of which they show next to nothing.
+
+A splat whose corner explains a hundred pixels may be as large as a wall: no loss asks what the rest of it, outside of
+all pictures, looks like, and a new view between two photographs may show nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gs2d.config.robust import SeenArea
+from gs2d.core.camera import Camera
+from gs2d.core.sh import C0
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import quats_to_matrices
+from gs2d.render.api import rasterize
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+
+PLACES = 7
+
+
+def mostly_unseen(
+    splats: Splats, cameras: Sequence[Camera], settings: SeenArea, raster: RasterSettings, backend: Backend
+) -> Tensor:
+    """Find large splats of which no photograph shows more than a small fraction, and which lie outside of most.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        Of the training photographs. Small pictures of them are looked at: fractions do not need more.
+    raster : RasterSettings
+        Of training.
+
+    Returns
+    -------
+    Tensor [N] bool
+    """
+    most = torch.zeros(len(splats), dtype=splats.dtype, device=splats.device)
+    large = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
+    for camera in cameras:
+        small = shrunk(camera, settings.side)
+        whole = whole_weights(splats, small)
+        large |= whole > settings.size * small.width * small.height
+        most = torch.maximum(most, shown_weights(splats, small, raster, backend) / whole.clamp_min(1e-6))
+    found = large & (most < settings.least)
+    rows = found.nonzero().squeeze(1)
+    found[rows] = inside_fraction(splats.rows(rows), cameras) < settings.inside
+    return found
+
+
+@torch.no_grad()
+def inside_fraction(splats: Splats, cameras: Sequence[Camera]) -> Tensor:
+    """Return how much of each splat [N] lies within the pictures, all together, hidden there or not.
+
+    Looked at are ``PLACES`` x ``PLACES`` places that divide its Gaussian evenly.
+    """
+    normal = torch.distributions.Normal(splats.means.new_zeros(()), splats.means.new_ones(()))
+    steps = normal.icdf((torch.arange(PLACES, device=splats.device).to(splats.dtype) + 0.5) / PLACES)
+    axes = quats_to_matrices(splats.quats)[:, :, :2].transpose(1, 2) * splats.scales[:, :, None]  # [N, 2, 3]
+    places = splats.means[:, None] + torch.cartesian_prod(steps, steps) @ axes  # [N, P, 3]
+    inside = torch.zeros(places.shape[:2], dtype=torch.bool, device=splats.device)
+    for camera in cameras:
+        pose = torch.as_tensor(camera.T_cam_world, dtype=splats.dtype, device=splats.device)
+        x, y, z = (places @ pose[:3, :3].T + pose[:3, 3]).unbind(dim=-1)
+        column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside |= (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return inside.to(splats.dtype).mean(dim=1)
+
+
+def shrunk(camera: Camera, side: int) -> Camera:
+    """Return a camera whose picture has a longer side of at most so many pixels."""
+    factor = min(1.0, side / max(camera.width, camera.height))
+    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+
+
+def shown_weights(splats: Splats, camera: Camera, raster: RasterSettings, backend: Backend) -> Tensor:
+    """Return the blending weight [N] px of each splat, summed over a picture.
+
+    It is the derivative of the sum of all pixels with respect to the splat's colour.
+    """
+    parts = {name: tensor.detach() for name, tensor in splats.items()}
+    grey = torch.zeros_like(parts["sh0"]).requires_grad_()
+    bare = replace(raster, sh_degree=0, with_distortion=False)
+    with torch.enable_grad():
+        output = rasterize(Splats(**{**parts, "sh0": grey}), camera, bare, backend=backend)
+        (found,) = torch.autograd.grad(output.color[..., 0].sum(), grey)
+    return found[:, 0, 0] / C0
+
+
+@torch.no_grad()
+def whole_weights(splats: Splats, camera: Camera) -> Tensor:
+    """Return the weight [N] px that each splat would have in a picture without borders and without other splats.
+
+    The integral of its Gaussian over the image plane, to first order; 0 behind the camera.
+    """
+    pose = torch.as_tensor(camera.T_cam_world, dtype=splats.dtype, device=splats.device)
+    seen = splats.means @ pose[:3, :3].T + pose[:3, 3]
+    normals = quats_to_matrices(splats.quats)[:, :, 2] @ pose[:3, :3].T
+    z = seen[:, 2].clamp_min(1e-9)
+    area = 2 * torch.pi * splats.scales.prod(dim=1) * (seen * normals).sum(dim=1).abs() / z  # facing the image plane
+    weight = splats.opacities.reshape(-1) * area * (camera.fx * camera.fy) / z.square()
+    return torch.where(seen[:, 2] > 0, weight, torch.zeros_like(weight))
