@@ -38,7 +38,7 @@ from gs2d.pipeline.train import train
 PHASES = (
     *RUN_PHASES,
     Rule("photograph the demo scene", (("synthetic/capture.py", "write_demo_capture"),)),
-    Rule("evaluate", (("pipeline/jobs.py", "evaluate_run"),)),
+    Rule("evaluate", (("pipeline/evaluate.py", "evaluate_run"),)),
 )
 PARTS = (
     Rule("rasterizer", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),

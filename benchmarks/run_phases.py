@@ -15,7 +15,7 @@ RUN_PHASES = (  # names that a version of the code does not have are found nowhe
     Rule("rank by E_i", (("training/rank_clone.py", "rank_by_error"),)),
     Rule("fill the stage 2 cache", (("training/cached_objective.py", "choose_objective"),)),
     Rule("mesh", (("pipeline/mesh.py", "extract_mesh"),)),
-    Rule("report", (("pipeline/jobs.py", "report_run"),)),
+    Rule("report", (("pipeline/report.py", "report_run"),)),
     Rule("training iterations", ((LOOP, "step"),)),
     Rule("enter a stage", ((LOOP, "enter"),)),
 )

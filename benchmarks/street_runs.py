@@ -33,7 +33,6 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, METRICS, PAGE, REPORT, SPLATS
 from gs2d.meshing.depth_maps import depth_map
 from gs2d.meshing.evidence import gather, pixels
-from gs2d.pipeline.evaluate import score_views
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import open_job
@@ -42,6 +41,7 @@ from gs2d.pipeline.mesh import fusion_frame
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.pipeline.render import render_view
+from gs2d.pipeline.scoring import score_views
 from gs2d.pipeline.subject import sights
 from gs2d.render.api import rasterize
 from gs2d.sfm.images import find_photos

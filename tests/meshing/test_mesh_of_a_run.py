@@ -21,8 +21,7 @@ from gs2d.meshing.integrate import Add, integrator
 from gs2d.meshing.volume import Volume
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import check_same_run, reload_job
-from gs2d.pipeline.jobs import mesh_run
-from gs2d.pipeline.mesh import extract_mesh
+from gs2d.pipeline.mesh import extract_mesh, mesh_run
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.train import train
 from gs2d.render.backends import get_backend

@@ -20,10 +20,14 @@ from gs2d.errors import DataError, DiskError, ProtocolError, RecipeError, RunErr
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.run_dir import RunFolder, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
+from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, StageDone, Step
-from gs2d.pipeline.jobs import evaluate_run, export_run, mesh_run, orbit_cameras, render_run, report_run
+from gs2d.pipeline.export import export_run
+from gs2d.pipeline.mesh import mesh_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
-from gs2d.pipeline.render import file_name, file_names
+from gs2d.pipeline.paths import orbit_cameras
+from gs2d.pipeline.render import file_name, file_names, render_run
+from gs2d.pipeline.report import report_run
 from gs2d.pipeline.train import train
 from tiny import ball_cameras, write_ball_mesh
 
@@ -240,7 +244,7 @@ def test_a_rendering_is_not_written_over_a_photograph(
     def plain(views: Sequence[View]) -> list[str]:
         return [Path(view.name).stem for view in views]  # as in captures without sub-folders
 
-    monkeypatch.setattr("gs2d.pipeline.jobs.file_names", plain)
+    monkeypatch.setattr("gs2d.pipeline.render.file_names", plain)
     image = capture / "test" / "r_0.png"
     before = image.read_bytes()
     with pytest.raises(RunError, match=r"--out would write over the capture's photograph .*r_0\.png"):

@@ -17,8 +17,8 @@ from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline import mesh as surface
 from gs2d.pipeline import run_logger as recorder
-from gs2d.pipeline.evaluate import SeenView, score_views
-from gs2d.pipeline.jobs import mesh_run
+from gs2d.pipeline.mesh import mesh_run
+from gs2d.pipeline.scoring import SeenView, score_views
 from gs2d.pipeline.train import train
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings

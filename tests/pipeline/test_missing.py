@@ -16,7 +16,7 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline import train as train_module
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Event, MissingFile
-from gs2d.pipeline.jobs import report_run
+from gs2d.pipeline.report import report_run
 from gs2d.pipeline.train import train
 
 MADE = ("mesh.ply", "report.html", "scene.html")

@@ -20,14 +20,15 @@ from gs2d.errors import RecipeError, RunError
 from gs2d.evaluation.images import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
 from gs2d.pipeline.demo import DemoOptions, demo
-from gs2d.pipeline.evaluate import score_views
+from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import build_recipe, prepare_job, reload_job
-from gs2d.pipeline.jobs import evaluate_run, render_run, report_run
 from gs2d.pipeline.options import EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.refined_poses import aligned, how_far
-from gs2d.pipeline.render import render_view, shown_cameras
+from gs2d.pipeline.render import render_run, render_view, shown_cameras
+from gs2d.pipeline.report import report_run
+from gs2d.pipeline.scoring import score_views
 from gs2d.pipeline.texture import _views
 from gs2d.pipeline.train import train
 from gs2d.report.sections.poses import poses_section

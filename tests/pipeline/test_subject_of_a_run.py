@@ -20,9 +20,9 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import Notice
+from gs2d.pipeline.export import export_run
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import protocol_from_json, reload_job
-from gs2d.pipeline.jobs import export_run
 from gs2d.pipeline.mesh import bare_of, extract_mesh
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.subject import meshed_subject, subject_line, within

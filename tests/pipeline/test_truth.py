@@ -12,8 +12,9 @@ import pytest
 from gs2d.errors import DataError, RunError
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.io.run_dir import RunFolder, open_run
+from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.jobs import evaluate_run, mesh_run
+from gs2d.pipeline.mesh import mesh_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions
 from tiny import write_ball_mesh
 

@@ -68,7 +68,7 @@ def run(argv: Sequence[str]) -> int:
     try:
         actions = importlib.import_module("gs2d.cli.handlers")
         if isinstance(command, _HEAVY):
-            importlib.import_module("gs2d.pipeline.jobs")  # torch and all: see `interrupts`
+            importlib.import_module("gs2d.pipeline.train")  # torch and all: see `interrupts`
         with interruptible:
             actions.execute(command, console)
             console.flush()

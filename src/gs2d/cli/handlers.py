@@ -97,7 +97,7 @@ def demo(command: c.Demo, console: Console) -> None:
 
 def mesh(command: c.Mesh, console: Console) -> None:
     """``gs2d mesh``."""
-    from gs2d.pipeline.jobs import mesh_run
+    from gs2d.pipeline.mesh import mesh_run
     from gs2d.pipeline.options import MeshOptions
 
     options = MeshOptions(**values(MeshOptions, command))
@@ -140,7 +140,7 @@ def _refuse_texture_options(command: c.Mesh) -> None:
 
 def render(command: c.Render, console: Console) -> None:
     """``gs2d render``."""
-    from gs2d.pipeline.jobs import render_run
+    from gs2d.pipeline.render import render_run
 
     result = render_run(
         command.run,
@@ -189,7 +189,7 @@ def page(command: c.Page, console: Console) -> None:
 
 def evaluate(command: c.Evaluate, console: Console) -> None:
     """``gs2d evaluate``."""
-    from gs2d.pipeline.jobs import evaluate_run
+    from gs2d.pipeline.evaluate import evaluate_run
     from gs2d.pipeline.options import EvaluateOptions
 
     options = EvaluateOptions(**values(EvaluateOptions, command))
@@ -211,7 +211,7 @@ def evaluate(command: c.Evaluate, console: Console) -> None:
 
 def export(command: c.Export, console: Console) -> None:
     """``gs2d export``."""
-    from gs2d.pipeline.jobs import export_run
+    from gs2d.pipeline.export import export_run
 
     result = export_run(command.run, command.out, command.layout, bbox=command.bbox)
     console.say(
@@ -224,7 +224,7 @@ def export(command: c.Export, console: Console) -> None:
 
 def report(command: c.Report, console: Console) -> None:
     """``gs2d report``."""
-    from gs2d.pipeline.jobs import report_run
+    from gs2d.pipeline.report import report_run
 
     path = report_run(command.run, console.on_event)
     console.say(str(path))

@@ -268,7 +268,7 @@ def train_and_evaluate(job: Job, on_event: OnEvent) -> dict[str, str]:
     Gs2dError
         The run itself failed.
     """
-    from gs2d.pipeline.jobs import evaluate_run
+    from gs2d.pipeline.evaluate import evaluate_run
     from gs2d.pipeline.train import train
 
     missing: list[MissingFile] = []

@@ -1,180 +1,87 @@
-"""Image metrics of a scene of splats over many views, and how much memory it took."""
+"""Score a finished run: its splats on the views, its mesh against a ground truth."""
 
 from __future__ import annotations
 
-import contextlib
-import math
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from gs2d.core.splats import Splats
-from gs2d.data import View
-from gs2d.evaluation.images import ImageMetrics, image_metrics, mean_metrics, psnr_float
-from gs2d.evaluation.lpips import Lpips
-from gs2d.pipeline.events import OnEvent, Phase, Step
-from gs2d.pipeline.exposure import NONE, Transforms, matched_by_halves, photographed
-from gs2d.render.api import rasterize
-from gs2d.render.backends import Backend
-from gs2d.render.types import RasterSettings, RenderOutput
-
-
-@dataclass(frozen=True, eq=False)
-class SeenView:
-    """A view that was rendered, beside its photograph: what whoever looks at it needs, so that it is rendered once.
-
-    Attributes
-    ----------
-    view : View
-    split : str
-        "train", "test", or "" where nobody said.
-    output : RenderOutput
-        As the scene is, without its distortion.
-    image : Tensor [H, W, 3]
-        Its colour in the exposure of the photograph; may exceed 1.
-    target : Tensor [H, W, 3]
-        The photograph over the background, in [0, 1].
-    mask : Tensor [H, W] bool or None
-        False = ignore this pixel.
-    """
-
-    view: View
-    split: str
-    output: RenderOutput
-    image: torch.Tensor
-    target: torch.Tensor
-    mask: torch.Tensor | None
+from gs2d.errors import RunError
+from gs2d.evaluation.lpips import load_lpips
+from gs2d.io.meshes import read_mesh
+from gs2d.io.run_dir import (
+    MESH,
+    SURFACE,
+    VERDICT,
+)
+from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.events import Notice, OnEvent, ignore
+from gs2d.pipeline.exposure import read_exposures
+from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.options import EvaluateOptions
+from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.refined_poses import aligned
+from gs2d.pipeline.report import report_again
+from gs2d.pipeline.scoring import score_views, split_metrics
+from gs2d.pipeline.verdict.file import write_verdict
+from gs2d.pipeline.verdict.measures import Collector
 
 
-Visitor = Callable[[SeenView, ImageMetrics], None]
-"""Is shown each view with its scores while it is in memory, and keeps what it needs of it, not the view."""
-
-
-def score_views(
-    splats: Splats,
-    views: Sequence[View],
-    settings: RasterSettings,
-    backend: Backend,
+def evaluate_run(
+    path: Path,
+    options: EvaluateOptions = EvaluateOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
     *,
-    name: str,
-    on_event: OnEvent,
-    lpips: Lpips | None = None,
-    exposures: Transforms = NONE,
-    match: bool = False,
-    split: str = "",
-    visitors: Sequence[Visitor] = (),
-) -> dict[str, ImageMetrics]:
-    """Image metrics of each view by its name; pixels that the view's mask leaves out count nowhere.
-
-    A view with a transform in ``exposures`` is rendered in the exposure of its photograph, any other as the scene is;
-    with ``match`` by :func:`~gs2d.pipeline.exposure.matched_by_halves`. ``visitors`` see each view, named ``split``.
-    """
-    on_event(Phase(name, len(views)))
-    scores: dict[str, ImageMetrics] = {}
-    for done, seen in enumerate(_seen(splats, views, settings, backend, exposures, match, split), start=1):
-        metrics = image_metrics(seen.image, seen.target, seen.mask, backend_name=backend.name, lpips=lpips)
-        scores[seen.view.name] = metrics
-        for visit in visitors:
-            visit(seen, metrics)
-        on_event(Step(done))
-    return scores
-
-
-def mean_psnr(
-    splats: Splats,
-    views: Sequence[View],
-    settings: RasterSettings,
-    backend: Backend,
-    exposures: Transforms = NONE,
-) -> float | None:
-    """Mean ``psnr_float`` of the views that have one, as by :func:`score_views`, without the other metrics."""
-    values = [psnr_float(s.image, s.target, s.mask) for s in _seen(splats, views, settings, backend, exposures)]
-    finite = [value for value in values if math.isfinite(value)]
-    return sum(finite) / len(finite) if finite else None
-
-
-def _seen(
-    splats: Splats,
-    views: Sequence[View],
-    settings: RasterSettings,
-    backend: Backend,
-    exposures: Transforms,
-    match: bool = False,
-    split: str = "",
-) -> Iterator[SeenView]:
-    settings = replace(settings, sh_degree=splats.sh_degree, with_distortion=False)
-    for view in views:
-        with torch.no_grad():
-            output = rasterize(splats, view.camera, settings, backend=backend)
-        target = torch.from_numpy(view.target(settings.background)).to(output.color)
-        pixels = view.mask()
-        mask = None if pixels is None else torch.from_numpy(pixels).to(target.device)
-        if match:
-            image = matched_by_halves(view, output.color, target, mask, settings.background)
-        else:
-            image = photographed(view, output.color, exposures, settings.background)
-        yield SeenView(view, split, output, image, target, mask)
-
-
-def split_metrics(
-    scores: dict[str, ImageMetrics], name: str, split: str | None = None, *, of: int | None = None
+    threads: int | None = None,
 ) -> dict[str, Any]:
-    """``{name: means}``; null with the reason where the scene has no views of the split (by default ``name``).
+    """Score the final splats of a run, and its mesh against a ground truth; updates ``metrics.json`` and the report.
 
-    Where fewer views than the split has, ``of``, were scored, ``views`` says how many.
+    Raises
+    ------
+    RunError, DataError
     """
-    if not scores:
-        return {name: None, f"{name}_reason": f"the scene has no {split or name} views"}
-    some = {} if of is None or len(scores) == of else {"views": len(scores)}
-    return {name: {**mean_metrics(list(scores.values())).to_json(), **some}}
+    from gs2d.pipeline.truth import OfficialTruth, Truth, check_thresholds, choose_truth, read_truth, score_surface
 
-
-def is_partial(entry: Mapping[str, Any]) -> bool:
-    """Whether the scores of a stage in ``metrics.json`` are of some of the views only."""
-    return any("views" in (entry.get(split) or {}) for split in ("train", "test"))
-
-
-def evenly(views: Sequence[View], most: int) -> Sequence[View]:
-    """At most so many of the views, from all along their order."""
-    count = min(most, len(views))
-    return [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
-
-
-class PeakGpuMemory:
-    """Peak of torch's memory on the current GPU since :meth:`reset`; 0 where the backend uses none."""
-
-    def __init__(self, backend: Backend) -> None:
-        self._used = backend.device == "cuda"
-
-    def reset(self) -> None:
-        """Start again from what is allocated now."""
-        if self._used:
-            torch.cuda.reset_peak_memory_stats()
-
-    def read(self) -> int:
-        """Bytes."""
-        return int(torch.cuda.max_memory_allocated()) if self._used else 0
-
-
-class PeakMemory:
-    """Peak resident memory of this process since :meth:`reset` (Linux), or since it started (elsewhere)."""
-
-    def reset(self) -> None:
-        """Start again from what is resident now."""
-        with contextlib.suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")
-
-    def read(self) -> int:
-        """Bytes."""
-        with contextlib.suppress(OSError):
-            for line in Path("/proc/self/status").read_text().splitlines():
-                if line.startswith("VmHWM:"):
-                    return int(line.split()[1]) * 1024
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return int(peak if sys.platform == "darwin" else peak * 1024)
+    check_thresholds(options.thresholds)
+    path, given = Path(path), options.ground_truth
+    truth: Truth | OfficialTruth | None = None if given is None or given.is_dir() else read_truth(given)
+    lpips = None if options.lpips_weights is None else load_lpips(options.lpips_weights)
+    run, job, splats = open_job(path, threads, on_event)
+    lpips = None if lpips is None else lpips.to(job.backend.device)
+    result: dict[str, Any] = {"run": str(run.path), "surface": run.metrics().get("surface")}
+    if truth is None and job.scene.root is not None:
+        truth = choose_truth(given, job.scene.root, on_event)
+    has_mesh = run.file(MESH).exists()
+    if truth is not None and not has_mesh and given is not None:
+        raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
+    drawing = (job.settings, job.backend)
+    exposures = with_predicted(read_exposures(run, job.recipe), job.scene)
+    if options.match_exposure:
+        name = "scoring test views, colours matched"
+        scores = score_views(splats, job.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)
+        result |= split_metrics(scores, "test_matched", "test")
+    if options.match_poses:
+        name = "scoring test views, cameras aligned"
+        best = tuple(aligned(splats, job.scene.test, *drawing, job.scene.extent, on_event))
+        scores = score_views(splats, best, *drawing, name=name, on_event=on_event, lpips=lpips)
+        result |= split_metrics(scores, "test_aligned", "test")
+    collected = Collector(job.scene, job.settings.background)
+    for split, views in (("train", job.scene.train), ("test", job.scene.test)):
+        name = f"scoring {split} views"
+        more: dict[str, Any] = {"exposures": exposures, "split": split, "visitors": [collected.visit]}
+        scores = score_views(splats, views, *drawing, name=name, on_event=on_event, lpips=lpips, **more)
+        result |= split_metrics(scores, split)
+        result[f"{split}_views"] = {view: metrics.to_json() for view, metrics in scores.items()}
+    if truth is not None and has_mesh:
+        mesh = read_mesh(run.file(MESH))
+        result["surface"] = score_surface(mesh, truth, job, options, on_event, folder=run.file(SURFACE))
+    elif truth is not None:
+        on_event(Notice(f"the surface is not scored: no {MESH}; make it with `gs2d mesh {path}`"))
+    with run.locked():
+        metrics = run.metrics()
+        last = {k: v for k, v in result.items() if k.startswith(("train", "test")) and not k.endswith("_views")}
+        stages = [*metrics["stages"][:-1], {**metrics["stages"][-1], **last}] if metrics["stages"] else []
+        run.write_metrics({**metrics, "stages": stages, "surface": result["surface"]})
+        with attempted(VERDICT, again("evaluate", path), on_event):
+            result["verdict"] = write_verdict(run, job, collected)["verdict"]
+    report_again(run, on_event)
+    return result

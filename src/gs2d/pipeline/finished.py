@@ -8,7 +8,11 @@ import torch
 
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError
-from gs2d.io.run_dir import SPLATS, RunFolder, open_run
+from gs2d.io.run_dir import (
+    SPLATS,
+    RunFolder,
+    open_run,
+)
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import OnEvent
 from gs2d.pipeline.job import Job, reload_job
@@ -49,3 +53,25 @@ def open_job(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFol
     splats = finished_splats(run)
     job = reload_job(run, on_event)
     return run, job, splats.to(job.backend.device)
+
+
+def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") -> Path:
+    """``out``, if it may be written: a PLY by its name, and not the splats of the run, from which all else is made.
+
+    Parameters
+    ----------
+    ending : str
+        That of its name.
+    what : str
+        What needs that ending, for the error.
+
+    Raises
+    ------
+    RunError
+    """
+    path, out = Path(path), Path(out)
+    if out.suffix.lower() != ending:
+        raise RunError(f"--out must name a {ending} file, which is what {what or 'is written'}, got {out}")
+    if out.resolve() == (path / SPLATS).resolve():
+        raise RunError(f"--out {out} is the splats of the run, which stay as they are; choose another name")
+    return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from functools import partial
@@ -21,14 +22,22 @@ from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError
 from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.meshes import write_mesh
+from gs2d.io.run_dir import (
+    MESH,
+    SURFACE,
+    TEXTURED,
+)
 from gs2d.meshing.bare import bare_pixels
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
-from gs2d.pipeline.evaluate import SeenView
-from gs2d.pipeline.events import Notice, OnEvent, Phase, counted
+from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
+from gs2d.pipeline.finished import checked_output, open_job
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions
+from gs2d.pipeline.report import report_again
+from gs2d.pipeline.scoring import SeenView
+from gs2d.pipeline.subject import meshed_subject
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 
@@ -41,7 +50,7 @@ MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 class MeshFrames:
     """Depth maps of the training views, kept in a temporary file while others look at the same renderings.
 
-    Its :meth:`visit` is for :func:`~gs2d.pipeline.evaluate.score_views`.
+    Its :meth:`visit` is for :func:`~gs2d.pipeline.scoring.score_views`.
     """
 
     def __init__(self, job: Job) -> None:
@@ -257,3 +266,36 @@ def surface_color(output: RenderOutput, job: Job) -> torch.Tensor:
     alpha = output.alpha[..., None]
     background = output.color.new_tensor(job.settings.background)
     return ((output.color - (1 - alpha) * background) / alpha.clamp(min=1e-3)).clamp(0, 1)
+
+
+def mesh_run(
+    path: Path,
+    options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+    *,
+    out: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Extract the mesh of a finished run; returns its file, counts and limits.
+
+    Raises
+    ------
+    RunError, DataError, ProtocolError, DiskError
+    """
+    path, out = Path(path), None if out is None else checked_output(path, out)
+    run, job, splats = open_job(path, threads, on_event)
+    if out is not None and out.resolve() != run.file(MESH).resolve():
+        subject = meshed_subject(run, job, splats, options, on_event)
+        return extract_mesh(job, splats, options, out, on_event, subject=subject)
+    with run.locked():
+        subject = meshed_subject(run, job, splats, options, on_event)
+        result = extract_mesh(job, splats, options, run.file(MESH), on_event, subject=subject)
+        metrics = run.metrics()
+        if metrics.get("surface"):  # was of the mesh before
+            run.write_metrics({**metrics, "surface": None})
+            shutil.rmtree(run.file(SURFACE), ignore_errors=True)
+        if run.file(TEXTURED).exists():
+            run.file(TEXTURED).unlink()
+            on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
+    report_again(run, on_event)
+    return result

@@ -19,9 +19,9 @@ from gs2d.meshing.atlas import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Plan, ignore
 from gs2d.pipeline.job import check_train_options
-from gs2d.pipeline.jobs import report_again
 from gs2d.pipeline.options import TrainOptions, paths_of
 from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
+from gs2d.pipeline.report import report_again
 from gs2d.pipeline.sfm import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run

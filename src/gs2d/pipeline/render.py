@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -15,16 +16,29 @@ import torch
 from torch import Tensor
 
 from gs2d.core.camera import Camera
+from gs2d.core.extras import FFMPEG
+from gs2d.core.files import check_writable
 from gs2d.core.images import write_image
 from gs2d.core.json_files import write_json
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View
-from gs2d.errors import DataError
-from gs2d.io.run_dir import RENDERS, RunFolder, make_folder
-from gs2d.pipeline.evaluate import evenly
-from gs2d.pipeline.exposure import NONE, Transforms, photographed
+from gs2d.data.subject import OBJECT, read_subject
+from gs2d.errors import DataError, RunError
+from gs2d.io.run_dir import (
+    LOCK,
+    RENDERS,
+    RunFolder,
+    make_folder,
+    remove_made,
+)
+from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
+from gs2d.pipeline.exposure import NONE, Transforms, exposed, exposure_named, photographed, read_exposures
+from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job
+from gs2d.pipeline.paths import flight_cameras, orbit_cameras
+from gs2d.pipeline.scoring import evenly
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings, RenderOutput
@@ -176,3 +190,132 @@ def splatted(splats: Splats, values: Tensor, view: View, settings: RasterSetting
     marked = Splats(**{**dict(splats.items()), "sh0": rgb_to_sh0(grey), "shN": torch.zeros_like(splats.shN)})
     settings = replace(settings, background=(0.0, 0.0, 0.0))
     return np.asarray(render_view(marked, view, settings, backend).color[..., 0].cpu().numpy())
+
+
+MAX_FRAMES = 100_000  # of an orbit or a flight
+FPS = 30.0
+
+
+def render_run(
+    path: Path,
+    on_event: OnEvent = ignore,
+    *,
+    split: str = "test",
+    orbit: int = 0,
+    flight: int = 0,
+    out: Path | None = None,
+    video: Path | None = None,
+    fps: float = FPS,
+    exposure_of: str | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Render the views of a split, ``orbit`` frames of a circle or ``flight`` frames past the photographs, as PNGs.
+
+    Frames of a circle or a flight can be made a video too: ``video`` names it, ``fps`` frames a second. All are in the
+    mean exposure of the photographs, or in that of the training photograph ``exposure_of``.
+
+    Raises
+    ------
+    RunError, DataError, BackendError, DiskError
+    """
+    from gs2d.io.video import write_video
+
+    path, out, video = Path(path), None if out is None else Path(out), None if video is None else Path(video)
+    asked, (moving, video) = video, check_frames(orbit, flight, video, fps)
+    if video is not None and video != asked and video.suffix == ".webp":
+        on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
+    run, job, splats = open_job(path, threads, on_event)
+    transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, job.recipe))
+    views: list[tuple[str, View]]
+    if moving:
+        image = np.zeros((1, 1, 3), np.uint8)
+        seen = [view.camera for view in job.scene.train]
+        subject = read_subject(path)
+        focus = None if subject is None or subject.kind != OBJECT else subject.center
+        cameras = orbit_cameras(seen, orbit, focus) if orbit else flight_cameras(seen, flight)
+        views = [(f"{i:04d}", View.from_arrays(f"{i:04d}", camera, image)) for i, camera in enumerate(cameras)]
+    else:
+        chosen = job.scene.test if split == "test" else job.scene.train
+        views = list(zip(file_names(chosen), chosen, strict=True))
+    if not views:
+        raise DataError(f"the capture of {path} has no {split} views; use --split train or --orbit N")
+    if out is not None:
+        _spare_images([out / f"{name}.png" for name, _ in views], "--out", job)
+    if video is not None:
+        _spare_images([video], "--video", job)
+    folder = out or run.file(RENDERS) / (moving or split)
+    made = make_folder(folder)
+    with _alone_in(folder) if out is None else contextlib.nullcontext():
+        if moving and out is None:  # the run's own folder: no frame of a longer film stays among these
+            for old in folder.glob("[0-9]*.png"):
+                if old.stem.isdecimal():
+                    old.unlink()
+        written: list[Path] = []
+        try:
+            for name, view in counted(views, "rendering", len(views), on_event):
+                color = exposed(render_view(splats, view, job.settings, job.backend), transform, job).clamp(0, 1)
+                is_new = not (folder / f"{name}.png").exists()
+                write_image(folder / f"{name}.png", color.cpu().numpy())
+                written += [folder / f"{name}.png"] if is_new else []
+        except BaseException:  # a full disk, Ctrl-C: half of the pictures would look like all of them
+            for picture in written:
+                picture.unlink(missing_ok=True)
+            if made and out is None:
+                (folder / LOCK).unlink(missing_ok=True)
+            remove_made(made)
+            raise
+        result: dict[str, Any] = {"folder": str(folder), "images": len(views)}
+        if video is None:
+            return result
+        on_event(Phase("compressing the video", len(views)))
+        frames = [folder / f"{name}.png" for name, _ in views]
+        with attempted(str(video), again("render", path, f"--{moving}", len(views), "--video", video), on_event):
+            threads = torch.get_num_threads()
+            write_video(video, frames, fps=fps, threads=threads, on_frame=lambda done: on_event(Step(done)))
+            result |= {"video": str(video), "seconds": len(views) / fps, "video_bytes": video.stat().st_size}
+        return result
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold a folder of the run, whose older frames go, against another command that renders into it."""
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(RunFolder(folder).locked())
+        except RunError as error:
+            raise RunError(f"{folder} is written by another process; wait for it or choose another --out") from error
+        yield
+
+
+def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tuple[str, Path | None]:
+    """Return what moves ("orbit", "flight" or nothing) and the video's whole name.
+
+    Raises for what makes no video, before anything is loaded.
+
+    Raises
+    ------
+    RunError, DataError, BackendError
+    """
+    from gs2d.io.video import check_video
+
+    for name, frames in (("--orbit", orbit), ("--flight", flight)):
+        if not (isinstance(frames, int) and 0 <= frames <= MAX_FRAMES):
+            raise RunError(f"{name} must be a number of frames from 1 to {MAX_FRAMES}, got {frames}")
+    if orbit and flight:
+        raise RunError(f"--orbit {orbit} and --flight {flight} exclude each other; give one")
+    if video is None and fps != FPS:
+        raise RunError(f"--fps {fps:g} is of a video, and no --video was given; give both")
+    if video is not None:
+        if not (orbit or flight):
+            raise RunError("--video needs frames that move, got neither --orbit N nor --flight N; give one")
+        video = check_video(video, fps, orbit or flight)
+        check_writable(video)
+    return "orbit" if orbit else "flight" if flight else "", video
+
+
+def _spare_images(files: Sequence[Path], option: str, job: Job) -> None:
+    """Raise rather than write a rendering over a photograph of the capture."""
+    images = {view.path.resolve() for view in job.scene.views if view.path is not None}
+    for file in files:
+        if file.resolve() in images:
+            raise RunError(f"{option} would write over the capture's photograph {file}; choose another name")

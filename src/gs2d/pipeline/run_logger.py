@@ -20,7 +20,16 @@ from gs2d.io.run_dir import RunFolder, load_tensors
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.estimate import start_text
-from gs2d.pipeline.evaluate import (
+from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
+from gs2d.pipeline.exposure import Transforms, named
+from gs2d.pipeline.interruption import HeldSignals
+from gs2d.pipeline.job import Job
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.prior_scores import score_priors
+from gs2d.pipeline.render import choose_views, draw_stage
+from gs2d.pipeline.resume import ResumePoint, put_in_cache
+from gs2d.pipeline.scoring import (
     PeakGpuMemory,
     PeakMemory,
     SeenView,
@@ -31,15 +40,6 @@ from gs2d.pipeline.evaluate import (
     score_views,
     split_metrics,
 )
-from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
-from gs2d.pipeline.exposure import Transforms, named
-from gs2d.pipeline.interruption import HeldSignals
-from gs2d.pipeline.job import Job
-from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prior_scores import score_priors
-from gs2d.pipeline.render import choose_views, draw_stage
-from gs2d.pipeline.resume import ResumePoint, put_in_cache
 from gs2d.render.types import RenderOutput
 from gs2d.training import events as train_events
 from gs2d.training.per_image import scene_now

@@ -25,8 +25,7 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job, read_scene
-from gs2d.pipeline.jobs import mesh_run
-from gs2d.pipeline.mesh import OPAQUE, extract_mesh
+from gs2d.pipeline.mesh import OPAQUE, extract_mesh, mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import meshed_subject

@@ -27,11 +27,9 @@ from gs2d.io.run_dir import (
 )
 from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
-from gs2d.pipeline.evaluate import Visitor
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.job import Job, check_same_run, check_train_options, prepare_job
-from gs2d.pipeline.jobs import report_run
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.mesh import MeshFrames, extract_mesh
@@ -40,8 +38,10 @@ from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.refined_poses import FoundPoses, found_poses, write_poses
+from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.run_logger import RunLogger
+from gs2d.pipeline.scoring import Visitor
 from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.verdict.file import write_verdict

@@ -77,7 +77,9 @@ WHOLE_PATH = """
 from functools import partial
 from gs2d.evaluation.surface import evaluate_surface
 from gs2d.pipeline import truth
-from gs2d.pipeline.jobs import evaluate_run, mesh_run, render_run
+from gs2d.pipeline.evaluate import evaluate_run
+from gs2d.pipeline.mesh import mesh_run
+from gs2d.pipeline.render import render_run
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
 import tiny

@@ -20,8 +20,8 @@ from gs2d.data.priors import ObservedPoints
 from gs2d.errors import DataError, RunError
 from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.images import ImageMetrics, psnr_float
-from gs2d.pipeline.evaluate import SeenView
 from gs2d.pipeline.exposure import GREY, matched_by_halves, over
+from gs2d.pipeline.scoring import SeenView
 from gs2d.render.exposure import fit_exposure
 from gs2d.sfm.workspace import POSES_JSON
 
@@ -116,7 +116,7 @@ def measures_from_json(data: Mapping[str, Any]) -> Measures:
 
 
 class Collector:
-    """Measures each view while it is scored; its :meth:`visit` is for :func:`~gs2d.pipeline.evaluate.score_views`."""
+    """Measures each view while it is scored; its :meth:`visit` is for :func:`~gs2d.pipeline.scoring.score_views`."""
 
     def __init__(self, scene: Scene, background: tuple[float, float, float]) -> None:
         self._background = background

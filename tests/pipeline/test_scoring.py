@@ -9,7 +9,7 @@ import torch
 from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import View
-from gs2d.pipeline.evaluate import mean_psnr, score_views
+from gs2d.pipeline.scoring import mean_psnr, score_views
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 

@@ -1,0 +1,47 @@
+"""The splats of a run in another layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from gs2d.errors import RunError
+from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout
+from gs2d.io.run_dir import (
+    MESH,
+    open_run,
+)
+from gs2d.pipeline.finished import checked_output, finished_splats
+from gs2d.pipeline.options import Box
+from gs2d.pipeline.subject import within
+
+
+def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None) -> dict[str, Any]:
+    """Write the splats of a run, or of a file of flat splats, in another layout.
+
+    Parameters
+    ----------
+    layout : str or None
+        A name of ``io.formats.registry.LAYOUTS``; None: by the ending of ``out``.
+    bbox : six floats, optional
+        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units.
+
+    Raises
+    ------
+    RunError, DataError, DiskError
+    """
+    layout = layout or layout_of(Path(out))
+    if layout is None:
+        raise RunError(f"--out must end in {', '.join(ENDINGS)}, which say what is written, got {out}")
+    if layout not in LAYOUTS:
+        raise RunError(f"--layout must be one of {', '.join(LAYOUTS)}, got {layout}")
+    path, out = Path(path), checked_output(path, out, LAYOUTS[layout].ending, f"layout {layout} is")
+    if out.resolve() == (path / MESH).resolve():
+        raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
+    if path.is_file() and out.resolve() == path.resolve():
+        raise RunError(f"--out {out} is the file that is read; choose another name")
+    splats = read_disks(path) if path.is_file() else finished_splats(open_run(path))
+    splats = splats if bbox is None else within(splats, bbox)
+    notes = write_layout(out, splats, layout)
+    size = out.stat().st_size
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes)}
