@@ -1,12 +1,14 @@
-"""The guides keep their word: the program of docs/guides/python.md runs, and what the guides link to is there."""
+"""The guides keep their word: their Python runs, and what they link to is there."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from gs2d.config.presets import RECIPES
 from tiny import write_capture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -25,6 +27,16 @@ def test_the_program_of_the_python_guide_runs(tmp_path: Path, monkeypatch: pytes
         exec(compile("\n" * lines + block.group(1), str(page), "exec"), names)  # line numbers are those of the page
     assert (tmp_path / "runs/mine/mesh.ply").is_file()
     assert (tmp_path / "runs/mine/for_viewers.ply").is_file()
+
+
+def test_the_recipes_of_the_concepts_page_are_recipes() -> None:
+    text = (DOCS / "concepts.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
+    assert blocks
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(compile(block, "docs/concepts.md", "exec"), names)
+    assert names["two_dgs_r"].stages == RECIPES["2dgs-r"]().stages
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
