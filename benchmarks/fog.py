@@ -112,7 +112,7 @@ def _score(
     return {
         "psnr": psnr_float(color, target, mask),
         "fitted": psnr_float(fitted, target, mask),
-        "ssim": image_metrics(color, target, mask, backend_name="cpu").ssim.value,
+        "ssim": image_metrics(color, target, mask, backend="cpu").ssim.value,
         "points": points,
     }
 

@@ -29,7 +29,7 @@ from gs2d.meshing.bounds import derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.evidence import gather
-from gs2d.meshing.integrate import BACKENDS, fusion_backend
+from gs2d.meshing.integrate import fusion_backend
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
 from gs2d.meshing.tsdf import fuse
 from gs2d.meshing.unbounded import cascade_marching_cubes, fuse_cascade
@@ -119,7 +119,7 @@ def run(
         size=size,
         resolution=resolution,
         threads=threads,
-        backend=fusion_backend(backend),
+        backend=fusion_backend(backend).name,
         levels=len(volumes),
         seconds=wall,
         cpu_seconds=cpu,
@@ -139,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--resolution", type=int, default=512)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--unbounded", action="store_true")
-    parser.add_argument("--backend", default="auto", choices=("auto", *BACKENDS))
+    parser.add_argument("--backend", default="auto", choices=("auto", "cpu", "cuda", "reference"))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     result = run(

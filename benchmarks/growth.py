@@ -108,7 +108,7 @@ def evaluation(width: int, height: int) -> Step:
     """PSNR and SSIM of an image."""
     generator = torch.Generator().manual_seed(0)
     image, target = (torch.rand(height, width, 3, generator=generator) for _ in range(2))
-    return partial(image_metrics, image, target, backend_name="cpu")
+    return partial(image_metrics, image, target, backend="cpu")
 
 
 def rendering(width: int, height: int) -> Step:

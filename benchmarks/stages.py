@@ -20,12 +20,12 @@ from gs2d.config.recipe import GradDensify
 from gs2d.core.splats import Splats
 from gs2d.kernels import losses as ops
 from gs2d.kernels.library import Library
+from gs2d.render.backends import get_backend
 from gs2d.render.cpu import IMAGES, rasterize_with
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.training.adam import begin_stage
-from gs2d.training.adam_fused import native_adam_step
-from gs2d.training.densify import densify_and_prune
-from gs2d.training.state import Statistics, TrainState
+from gs2d.training.adam import adam_step, begin_stage
+from gs2d.training.densify.gradient import densify_and_prune
+from gs2d.training.state import TrainState
 
 NATIVE = ("project", "sort", "bin", "blend_forward", "index_slots", "blend_backward", "project_backward")
 FORWARD_STAGES = 4  # of NATIVE; the others belong to the backward pass
@@ -153,11 +153,11 @@ def optimizer_step(workload: Workload) -> Callable[[], float]:
     state = TrainState(workload.splats.clone(), torch.Generator().manual_seed(4))
     begin_stage(state, stage)
     gradients = {name: torch.randn(t.shape, generator=state.generator) for name, t in state.splats.items()}
-    lr = dict.fromkeys(gradients, 1e-4)
+    lr, backend = dict.fromkeys(gradients, 1e-4), get_backend("cpu")
 
     def step() -> float:
         start = time.perf_counter()
-        native_adam_step(state, stage, gradients, lr)
+        adam_step(state, stage, gradients, lr, backend=backend)
         return 1e3 * (time.perf_counter() - start)
 
     return step
@@ -174,7 +174,7 @@ def densification_case(splats: Splats) -> Callable[[], object]:
     signal = torch.where(passes, 2.0, 0.5) * densify.grad_threshold
     state = TrainState(splats.clone(), torch.Generator().manual_seed(6))
     begin_stage(state, stage)
-    state.statistics = Statistics(signal, signal.clone(), torch.ones(n))
+    state.statistics = {"signed": signal, "absolute": signal.clone(), "count": torch.ones(n)}
     return partial(densify_and_prune, state, densify, iteration=600, extent=1.0, white=False)
 
 

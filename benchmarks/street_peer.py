@@ -299,9 +299,9 @@ def score_images(job: Job, files: Sequence[Path]) -> dict[str, Any]:
         target = torch.from_numpy(np.asarray(view.target(background), dtype=np.float32))
         pixels = view.mask()
         mask = None if pixels is None else torch.from_numpy(pixels)
-        plain[view.name] = image_metrics(image, target, mask, backend_name=job.backend.name)
+        plain[view.name] = image_metrics(image, target, mask, backend=job.backend)
         image = matched_by_halves(view, image, target, mask, background)
-        matched[view.name] = image_metrics(image, target, mask, backend_name=job.backend.name)
+        matched[view.name] = image_metrics(image, target, mask, backend=job.backend)
     return {"test": summary_of(plain), "test_matched": summary_of(matched)}
 
 

@@ -60,9 +60,10 @@ INSIDE = {
         "cache undistort": 0,
     },
     "render": {
-        "tensor_api": 6,
-        "api": 5,
-        "backends cpu_cached pose_gradient exposure": 4,
+        "tensor_api": 7,
+        "api": 6,
+        "backends": 5,
+        "cpu_cached pose_gradient exposure": 4,
         "cpu cuda reference_errors": 3,
         "cuda_passes reference": 2,
         "pair_budget reference_projection pose_gradient_native exposure_native": 1,
@@ -162,6 +163,28 @@ def test_inside_a_room_imports_go_down_too(room: str) -> None:
             other = imported.split(".")[2] if unit(imported) == room else own
             if other in floors and other != own:
                 assert floors[other] < floors[own], f"{module} imports {imported}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_of)
+def test_outside_of_render_nothing_asks_which_backend_it_has(path: Path) -> None:
+    """What differs between processors is the matter of ``Backend``: no comparison with its name, no table by it."""
+    if unit(module_of(path)) == "render":
+        return
+
+    def is_name(node: ast.AST) -> bool:
+        return isinstance(node, ast.Attribute) and node.attr == "name" and "backend" in ast.unparse(node.value).lower()
+
+    where = module_of(path)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Compare):
+            compared = any(map(is_name, [node.left, *node.comparators]))
+            assert not compared, f"{where}: line {node.lineno} compares a backend's name"
+        if isinstance(node, ast.Subscript):
+            assert not is_name(node.slice), f"{where}: line {node.lineno} looks something up by a backend's name"
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "get":
+            assert not any(map(is_name, node.args)), f"{where}: line {node.lineno} looks up a backend's name"
+        if isinstance(node, ast.alias):
+            assert not node.name.startswith(("gs2d.render.cuda", "gs2d.render.pair_budget")), f"imports {node.name}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=module_of)

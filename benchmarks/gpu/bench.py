@@ -22,9 +22,7 @@ import torch
 from benchmarks.timing import machine
 from gs2d.kernels.cuda import diagnose, launch
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.meshing import integrate
-from gs2d.render import backends, cuda
-from gs2d.render.backends import Backend, get_backend
+from gs2d.render.backends import BACKENDS, Backend, CudaBackend, get_backend
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -187,15 +185,15 @@ def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
 
     with tempfile.TemporaryDirectory() as folder:
         emulator = Emulator(Path(folder))
-        backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize)
-        before = launch.launcher_for, backends._LOADERS["cuda"], integrate.gpu_device
+        backend = CudaBackend()
+        backend.device = "cpu"
+        before = launch.launcher_for, BACKENDS._things["cuda"]
         launch.launcher_for = lambda device: emulator
-        backends._LOADERS["cuda"] = lambda: backend
-        integrate.gpu_device = lambda: torch.device("cpu")
+        BACKENDS._things["cuda"] = lambda: backend
         try:
             yield Bench(backend, emulator, True, end)
         finally:
-            launch.launcher_for, backends._LOADERS["cuda"], integrate.gpu_device = before
+            launch.launcher_for, BACKENDS._things["cuda"] = before
 
 
 def facts(bench: Bench) -> dict[str, Any]:

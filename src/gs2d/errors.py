@@ -56,3 +56,7 @@ class DiskError(Gs2dError):
 
 class DivergedError(Gs2dError):
     """Training produced NaN or infinity."""
+
+
+class PluginWarning(UserWarning):
+    """A package offers something that gs2d cannot take; it is left out, and the message says why."""

@@ -31,7 +31,7 @@ from gs2d.cli.usage import NAMES
         ("train here --out there --recip 2dgs", "gs2d train has no option --recip; did you mean --recipe?"),
         ("train here --out there --zzz", "gs2d train has no option --zzz; see `gs2d train --help`"),
         ("train here --out there --ground-truth a", "gs2d evaluate has one"),
-        ("train here --out there --backend gpu", "--backend must be auto, cpu, cuda or reference, got 'gpu'; did you"),
+        ("train here --out there --backend gpu", "backend must be one of auto, cpu, cuda, reference, got 'gpu"),
         ("train here --out there --format=colmp", "got 'colmp'; did you mean colmap?"),
         ("paper modlues --data here --out there", "got 'modlues'; did you mean modules?"),
         ("recipes shwo 2dgs", "ACTION must be list or show, got 'shwo'; did you mean show?"),

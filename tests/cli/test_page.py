@@ -35,7 +35,7 @@ def test_a_file_of_splats_becomes_a_page_beside_it(tmp_path: Path, capsys: pytes
 def test_a_file_of_another_format_becomes_a_page_too(
     tmp_path: Path, layout: str, degree: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / f"cloud{LAYOUTS[layout].ending}"
+    path = tmp_path / f"cloud{LAYOUTS.get(layout).ending}"
     write_layout(path, some_splats(50), layout)
     assert run(["page", str(path), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)

@@ -23,6 +23,7 @@ from gs2d.config.recipe import (
     Stage,
     validate,
 )
+from gs2d.config.serialize import to_json
 from gs2d.errors import RecipeError
 
 L1 = (LossTerm("l1", 1.0),)
@@ -257,8 +258,19 @@ def test_densification_without_resets_may_freeze_opacity() -> None:
     validate(one(densify=GradDensify(reset_every=0), train={"means": "all"}))
 
 
-def test_loss_kinds_are_those_of_the_losses_module() -> None:
-    from gs2d.config.recipe import LOSS_KINDS
-    from gs2d.losses.api import LOSSES
+def test_every_loss_that_a_recipe_may_name_is_there() -> None:
+    from gs2d.config.losses import LOSSES
 
-    assert set(LOSS_KINDS) == set(LOSSES)
+    assert all(callable(LOSSES.get(kind)) for kind in LOSSES.builtin)
+
+
+def test_an_unknown_loss_is_refused_with_what_was_meant() -> None:
+    with pytest.raises(RecipeError, match=r"loss must be one of l1, .*, got 'distorsion'; did you mean distortion\?"):
+        validate(one(losses=(*L1, LossTerm("distorsion", 1.0))))
+    with pytest.raises(RecipeError, match="loss 'l1' takes no options, got {'power': 2}"):
+        validate(one(losses=(LossTerm("l1", 1.0, options={"power": 2}),)))
+
+
+def test_a_term_without_options_is_written_as_it_was_before_there_were_any() -> None:
+    written = to_json(one(losses=L1))["stages"][0]["losses"][0]
+    assert list(written) == ["kind", "weight", "start", "depth"]

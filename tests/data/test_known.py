@@ -112,7 +112,7 @@ def test_unknown_pixels_are_no_target_of_any_protocol(use_masks: bool) -> None:
     view = images(0)
     black = (0.0, 0.0, 0.0)
     made: list[Any] = [
-        Targets([view], black, use_masks=use_masks, with_maps=False)[0],
+        Targets([view], black, use_masks=use_masks)[0],
         DeviceTargets([view], black, use_masks=use_masks, device=torch.device("cpu"))[0],
     ]
     for target in made:

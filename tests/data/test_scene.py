@@ -47,7 +47,7 @@ def test_formats_are_looked_for_in_the_documented_order_and_can_be_named(tmp_pat
         WRITERS[format](tmp_path)
         assert detect_format(tmp_path) == format
     assert load_scene(tmp_path, format="colmap").format == "colmap"
-    with pytest.raises(DataError, match="format must be auto or one of blender, nerfstudio, .*, got nerf"):
+    with pytest.raises(DataError, match="format must be one of auto, blender, nerfstudio, .*, got 'nerf"):
         load_scene(tmp_path, format="nerf")
 
 

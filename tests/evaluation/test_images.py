@@ -74,15 +74,15 @@ def test_masked_pixels_count_neither_in_psnr_nor_in_ssim() -> None:
     mask[5:9, 3:20] = False
     junk = torch.where(mask[..., None], image, torch.zeros(()))
     assert psnr_float(junk, target, mask) == psnr_float(image, target, mask)
-    a, b = (ssim_8bit(x, target, mask, backend_name="reference") for x in (junk, image))
+    a, b = (ssim_8bit(x, target, mask, backend="reference") for x in (junk, image))
     assert a == b
-    assert ssim_8bit(junk, target, backend_name="reference") < a - 0.05
+    assert ssim_8bit(junk, target, backend="reference") < a - 0.05
 
 
 def test_ssim_of_equal_images_is_one_and_of_inverted_ones_negative() -> None:
     image = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(1))
-    assert ssim_float(image, image, backend_name="reference") == pytest.approx(1, abs=1e-6)
-    assert ssim_float(1 - image, image, backend_name="reference") < 0
+    assert ssim_float(image, image, backend="reference") == pytest.approx(1, abs=1e-6)
+    assert ssim_float(1 - image, image, backend="reference") < 0
 
 
 def test_native_and_reference_ssim_agree(native: None) -> None:
@@ -90,24 +90,24 @@ def test_native_and_reference_ssim_agree(native: None) -> None:
     image, target = torch.rand(30, 41, 3, generator=g), torch.rand(30, 41, 3, generator=g)
     mask = torch.rand(30, 41, generator=g) < 0.7
     for function in (ssim_8bit, ssim_float):
-        expected = function(image, target, mask, backend_name="reference")
-        assert function(image, target, mask, backend_name="cpu") == pytest.approx(expected, abs=2e-6)
+        expected = function(image, target, mask, backend="reference")
+        assert function(image, target, mask, backend="cpu") == pytest.approx(expected, abs=2e-6)
 
 
 def test_a_metric_that_cannot_be_computed_is_null_with_its_reason() -> None:
     image = torch.rand(8, 9, 3)
-    same = image_metrics(image, quantise(image).float() / 255, backend_name="reference").to_json()
+    same = image_metrics(image, quantise(image).float() / 255, backend="reference").to_json()
     assert same["psnr"] is None
     assert "equal" in str(same["psnr_reason"])
     assert same["lpips"] is None
     assert "--lpips-weights" in str(same["lpips_reason"])
-    empty = image_metrics(image, image, torch.zeros(8, 9, dtype=torch.bool), backend_name="reference")
+    empty = image_metrics(image, image, torch.zeros(8, 9, dtype=torch.bool), backend="reference")
     assert empty.psnr == empty.ssim == Metric(None, "no valid pixel")
 
 
 def test_the_mean_over_views_says_how_many_were_left_out() -> None:
     target = torch.full((8, 8, 3), 0.5)
-    views = [image_metrics(target + error, target, backend_name="reference") for error in (0.1, 0.0, 0.01)]
+    views = [image_metrics(target + error, target, backend="reference") for error in (0.1, 0.0, 0.01)]
     mean = mean_metrics(views)
     assert mean.psnr_float.value == pytest.approx((20 + 40) / 2, abs=1e-3)
     assert mean.psnr_float.reason is not None
@@ -159,15 +159,15 @@ def test_lpips_is_zero_for_equal_images_and_ignores_masked_pixels(network: Lpips
     mask = torch.ones(16, 16, dtype=torch.bool)
     mask[:4] = False
     junk = torch.where(mask[..., None], target, 1 - target)
-    metrics = image_metrics(junk, target, mask, backend_name="reference", lpips=network)
+    metrics = image_metrics(junk, target, mask, backend="reference", lpips=network)
     assert metrics.lpips == metrics.lpips_signed == Metric(0.0)
-    unmasked = image_metrics(junk, target, backend_name="reference", lpips=network)
+    unmasked = image_metrics(junk, target, backend="reference", lpips=network)
     assert unmasked.lpips.value is not None
     assert unmasked.lpips.value > 0
 
 
 def test_lpips_of_a_tiny_image_is_null_with_its_reason(network: Lpips) -> None:
-    metrics = image_metrics(torch.zeros(8, 30, 3), torch.ones(8, 30, 3), backend_name="reference", lpips=network)
+    metrics = image_metrics(torch.zeros(8, 30, 3), torch.ones(8, 30, 3), backend="reference", lpips=network)
     assert metrics.lpips.value is None
     assert "16 px" in str(metrics.lpips.reason)
     with pytest.raises(ShapeError, match="at least 16 px"):

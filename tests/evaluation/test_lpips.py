@@ -117,7 +117,7 @@ def test_both_lpips_figures_are_of_the_8_bit_image_and_named(vgg_file: Path) -> 
     """A change below half a level of 255 vanishes in the 8-bit image, so that LPIPS does not see it."""
     network = load_lpips([vgg_file, HEADS / "vgg.pth"])
     target = torch.full((24, 24, 3), 100 / 255)
-    row = image_metrics(target + 0.4 / 255, target, backend_name="reference", lpips=network).to_json()
+    row = image_metrics(target + 0.4 / 255, target, backend="reference", lpips=network).to_json()
     assert row["lpips"] == row["lpips_signed"] == 0.0
     assert row["psnr"] is None  # equal after quantisation
     assert row["psnr_float"] is not None

@@ -161,8 +161,7 @@ class _Event:
 def install(guard: str, emulator: Emulator) -> Counter[str]:
     """From here on this process has a GPU; returns the launches by kernel, as they happen."""
     from gs2d.kernels.cuda import launch
-    from gs2d.render import backends, cuda
-    from gs2d.render.backends import Backend
+    from gs2d.render.backends import BACKENDS, CudaBackend
 
     launched: Counter[str] = Counter()
 
@@ -185,8 +184,7 @@ def install(guard: str, emulator: Emulator) -> Counter[str]:
     Tensor.pin_memory = lambda self: self.clone()  # type: ignore[assignment, method-assign]
     torch.autograd.Function.apply = _noting_tensors(vars(torch.autograd.Function)["apply"])
     launch.launcher_for = launcher_for
-    backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, device="cuda", rasterize_rows=cuda.rasterize)
-    backends._LOADERS["cuda"] = lambda: backend
+    BACKENDS._things["cuda"] = CudaBackend
     torch._C._set_only_lift_cpu_tensors(True)  # torch.tensor(..., device="cuda") asks the mode below, too
     _Everywhere().__enter__()
     return launched

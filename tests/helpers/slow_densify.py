@@ -11,8 +11,8 @@ from gs2d.config.recipe import GradDensify
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
-from gs2d.training.densify import DensifyCounts
-from gs2d.training.state import Statistics, TrainState
+from gs2d.training.densify.gradient import DensifyCounts, no_statistics
+from gs2d.training.state import TrainState
 
 
 def keep_rows(state: TrainState, mask: Tensor) -> None:
@@ -53,7 +53,7 @@ def densify_step_by_step(
             f"{densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or opacity_cull"
         )
     keep_rows(state, keep)
-    state.statistics = Statistics.zeros(state.splats)
+    state.statistics = no_statistics(state.splats)
     return DensifyCounts(int(to_clone.sum()), int(to_split.sum()), int(faint.sum()), int(large.sum()))
 
 
@@ -61,8 +61,8 @@ def _select(state: TrainState, densify: GradDensify, extent: float) -> tuple[Ten
     """Rows to clone and rows to split, bool [N] each."""
     statistics = state.statistics
     assert statistics is not None
-    count = statistics.count.clamp(min=1.0)  # never seen: sum 0, mean 0
-    signed, absolute = statistics.signed / count, statistics.absolute / count
+    count = statistics["count"].clamp(min=1.0)  # never seen: sum 0, mean 0
+    signed, absolute = statistics["signed"] / count, statistics["absolute"] / count
     small = state.splats.scales.amax(dim=1) <= densify.percent_dense * extent
     for_split, split_threshold = (
         (absolute, densify.abs_threshold) if densify.absolute else (signed, densify.grad_threshold)

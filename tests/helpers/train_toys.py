@@ -20,7 +20,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
-from gs2d.training.state import Moments, Statistics, TrainState
+from gs2d.training.state import Moments, TrainState
 from gs2d.training.trainer import Trainer
 
 VIEWS, SIZE, POINTS = 6, 24, 60
@@ -51,7 +51,8 @@ def full_state(count: int = 10, seed: int = 0) -> TrainState:
         name: Moments(torch.randn_like(tensor), torch.rand_like(tensor), 7) for name, tensor in splats.items()
     }
     state.groups = {"high_error": torch.arange(count) % 3 == 0}
-    state.statistics = Statistics(torch.rand(count), torch.rand(count), torch.arange(count).float())
+    tensors = (torch.rand(count), torch.rand(count), torch.arange(count).float())
+    state.statistics = dict(zip(("signed", "absolute", "count"), tensors, strict=True))
     return state
 
 

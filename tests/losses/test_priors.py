@@ -196,6 +196,6 @@ def test_a_loss_without_what_it_compares_with_is_refused(kind: str) -> None:
                 [LossTerm(kind, 0.1)],
                 iteration=1,
                 depth_kind="mean",
-                backend_name="reference",
+                backend="reference",
                 prior=prior,
             )

@@ -7,12 +7,13 @@ import torch
 from torch import Tensor
 
 import emulate
+from fake_backends import altered
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render import cuda
-from gs2d.render.backends import Backend, get_backend
+from gs2d.render.backends import Backend, CudaBackend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
 
 
@@ -66,7 +67,7 @@ def _emulated(launcher: Launcher) -> Backend:
     ) -> Tensor:
         return cuda.splat_errors_with(launcher, s, c, image, r, mask, occlusion)
 
-    return Backend("cuda", rasterize, splat_errors, rasterize_rows=rasterize)
+    return altered(CudaBackend(), device="cpu", rasterize=rasterize, splat_errors=splat_errors)
 
 
 def _from_host(backend: Backend) -> Backend:
@@ -80,10 +81,7 @@ def _from_host(backend: Backend) -> Backend:
         s: Splats, c: Camera, r: RasterSettings, p: Tensor | None = None, rows: Tensor | None = None
     ) -> RenderOutput:
         moved = Splats(**{k: t.to(device) for k, t in s.items()})
-        if rows is None or backend.rasterize_rows is None:
-            output = backend.rasterize(moved, c, r, there(p))
-        else:
-            output = backend.rasterize_rows(moved, c, r, there(p), there(rows))
+        output = backend.rasterize(moved, c, r, there(p), there(rows))
         return RenderOutput(**{k: t.cpu() for k, t in vars(output).items() if t is not None})
 
     def splat_errors(
@@ -91,4 +89,4 @@ def _from_host(backend: Backend) -> Backend:
     ) -> Tensor:
         return backend.splat_errors(s.to(device), c, image.to(device), r, there(mask), occlusion).cpu()
 
-    return Backend(backend.name, rasterize, splat_errors, rasterize_rows=backend.rasterize_rows and rasterize)
+    return altered(backend, device="cpu", rasterize=rasterize, splat_errors=splat_errors)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from fake_backends import altered
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels import library
-from gs2d.render import backends as backend
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.backends import Backend, backend_report, get_backend
+from gs2d.render.backends import BACKENDS, Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from render_scenes import front_camera, splat
 
@@ -104,9 +104,9 @@ def test_auto_takes_the_first_that_the_report_calls_available() -> None:
 
 def test_for_tensors_auto_follows_their_device(monkeypatch: pytest.MonkeyPatch) -> None:
     def gpu() -> Backend:
-        return replace(get_backend("reference"), name="cuda")
+        return altered(get_backend("reference"), name="cuda")
 
-    monkeypatch.setattr(backend, "_cuda", gpu)
+    monkeypatch.setitem(BACKENDS._things, "cuda", gpu)
     assert get_backend("auto").name == "cuda"
     assert get_backend("auto", "cuda").name == "cuda"
     assert get_backend("auto", "cpu").name in ("cpu", "reference")
@@ -117,7 +117,7 @@ def test_tensors_on_a_gpu_never_fall_back_to_a_slower_backend(monkeypatch: pytes
     def broken() -> Backend:
         raise BackendError("no compiler; install it")
 
-    monkeypatch.setattr(backend, "_cuda", broken)
+    monkeypatch.setitem(BACKENDS._things, "cuda", broken)
     with pytest.raises(BackendError, match="no compiler"):
         get_backend("auto", "cuda")
     assert get_backend("auto").name in ("cpu", "reference")

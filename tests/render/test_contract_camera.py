@@ -229,7 +229,7 @@ def test_20_normal_consistency_knows_that_both_normals_turn_with_the_camera(kind
         lens, pose = learning(camera)
         output = change(rasterize(splats, lens, backend="reference"))
         target = torch.zeros_like(output.color)
-        options: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend_name": "reference"}
+        options: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": "reference"}
         compute_losses(output, target, mask, lens, (LossTerm(kind, 1.0),), **options)[kind].backward()
         return along_motions(pose.grad, camera)
 

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from fake_backends import altered
 from gs2d.config.presets import appearance, refine
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.data.scene import Scene, View
+from gs2d.render.backends import PLAIN, Backend
 from gs2d.training import events
 from gs2d.training.cached_objective import CachedViews, choose_objective, is_cacheable
 from gs2d.training.objective import FullRender
@@ -188,14 +190,14 @@ def test_the_cache_is_freed_at_the_end_of_its_stage(masked: Scene) -> None:
 
 
 def test_only_stages_that_train_colours_of_a_group_by_colour_losses_on_the_native_backend_are_cached() -> None:
-    plain = replace(appearance(), iterations=100)
+    plain, caching = replace(appearance(), iterations=100), altered(PLAIN, caches_views=True)
 
-    def cacheable(stage: Stage, backend_name: str = "cpu", views: int = 50) -> bool:
-        return is_cacheable(Recipe("x", (stage,)), stage, backend_name=backend_name, views=views)
+    def cacheable(stage: Stage, backend: Backend = caching, views: int = 50) -> bool:
+        return is_cacheable(Recipe("x", (stage,)), stage, backend=backend, views=views)
 
     assert cacheable(plain)
     assert cacheable(replace(plain, train={"sh0": "high_error"}))
-    assert not cacheable(plain, backend_name="reference")
+    assert not cacheable(plain, PLAIN)
     assert not cacheable(plain, views=51)  # two visits of each view pay for filling
     assert not cacheable(replace(plain, train=dict.fromkeys(("sh0", "shN"), "all")))
     assert not cacheable(replace(plain, train={"sh0": "high_error", "shN": "clones"}))

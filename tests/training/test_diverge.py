@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fake_backends import altered
 from gs2d.config.presets import surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import ALL, LearningRates, Recipe
@@ -15,8 +16,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, DivergedError, RecipeError
-from gs2d.render import reference, reference_errors
-from gs2d.render.backends import Backend
+from gs2d.render import reference
+from gs2d.render.backends import PLAIN, Backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
@@ -41,7 +42,7 @@ def spoiled(spoil: Callable[[Splats, RenderOutput], RenderOutput], calls: int) -
         output = reference.rasterize(splats, camera, settings, probe)
         return spoil(splats, output) if count[0] == calls else output
 
-    return Backend("reference", rasterize, reference_errors.splat_errors)
+    return altered(PLAIN, rasterize=rasterize)
 
 
 def test_nan_in_the_loss_stops_with_stage_and_iteration(scene: Scene) -> None:

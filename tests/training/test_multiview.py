@@ -100,7 +100,7 @@ def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> Non
     mask = np.ones((20, 20), bool)
     mask[15, 12] = False
     view = View.from_arrays("0", camera, image, mask)
-    target = Targets((view,), (1.0, 1.0, 1.0), use_masks=True, with_maps=False)[0]
+    target = Targets((view,), (1.0, 1.0, 1.0), use_masks=True)[0]
     settings = MultiView(radius=2)
     clear = ImageFiles((view,), settings).of(0, target).clear.numpy()
     expected = np.zeros((20, 20), bool)
@@ -111,7 +111,7 @@ def test_patches_that_touch_what_is_masked_or_transparent_are_not_asked() -> Non
 
 
 def test_photographs_beyond_the_room_are_made_anew(scene: Scene) -> None:
-    targets = Targets(scene.train, (0.0, 0.0, 0.0), use_masks=False, with_maps=False)
+    targets = Targets(scene.train, (0.0, 0.0, 0.0), use_masks=False)
     kept, none = ImageFiles(scene.train, WIDE), ImageFiles(scene.train, WIDE, limit_bytes=0)
     for index in (0, 1, 0):
         a, b = (images.of(index, targets[index]) for images in (kept, none))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from fake_backends import lacking
 from gs2d.config.presets import appearance, surface
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import LearningRates, PoseRefinement, Recipe
@@ -248,9 +249,9 @@ def test_an_update_that_was_cancelled_on_the_device_changes_nothing(scene: Scene
     state = TrainState(random_splats(5), torch.Generator())
     state.poses = poses(scene)
     gradients = {"pose": torch.ones(6, dtype=torch.float64)}
-    per_image.update(state, quick(), 5, 1, gradients, torch.tensor(1, dtype=torch.int32))
+    per_image.update(state, quick(), 5, 1, gradients, lacking(1))
     assert state.poses.steps == [0] * VIEWS
-    per_image.update(state, quick(), 5, 1, gradients, torch.tensor(0, dtype=torch.int32))
+    per_image.update(state, quick(), 5, 1, gradients, lacking(0))
     assert state.poses.steps == [0, 1, 0, 0, 0, 0]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from fake_backends import lacking
 from gs2d.config.presets import refine, surface, two_dgs, with_exposure, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
@@ -18,7 +19,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
 from gs2d.errors import DataError, RecipeError
-from gs2d.render.backends import get_backend
+from gs2d.render.backends import PLAIN, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.backdrop import backdrop_color
@@ -285,11 +286,11 @@ def test_opacity_decays_by_its_rate_every_so_many_iterations_and_not_below_the_l
     recipe = short(dense_start=None, free_space=None, opacity_decay=OpacityDecay(rate=0.1, every=5, least=0.02))
     robust, state = Robustness(make_scene(), recipe, RASTER, BACKEND), full_state(4)
     state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.9, 0.5, 0.021, 0.01]))
-    robust.decay(state, recipe.stages[0], 4)
+    robust.decay(state, recipe.stages[0], 4, PLAIN)
     assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.021, 0.01]), abs=1e-6)
-    robust.decay(state, recipe.stages[0], 5, cancel=torch.tensor(1))
+    robust.decay(state, recipe.stages[0], 5, lacking(1))
     assert state.splats.opacities == pytest.approx(torch.tensor([0.9, 0.5, 0.021, 0.01]), abs=1e-6)
-    robust.decay(state, recipe.stages[0], 5)
+    robust.decay(state, recipe.stages[0], 5, lacking(0))
     assert state.splats.opacities == pytest.approx(torch.tensor([0.81, 0.45, 0.02, 0.01]), abs=1e-6)
 
 
@@ -297,9 +298,9 @@ def test_frozen_opacity_does_not_decay() -> None:
     recipe = short(dense_start=None, free_space=None)
     robust, state = Robustness(make_scene(), recipe, RASTER, BACKEND), full_state(4)
     before = state.splats.opacity_logits.clone()
-    robust.decay(state, refine(), 10)
+    robust.decay(state, refine(), 10, PLAIN)
     assert torch.equal(state.splats.opacity_logits, before)
-    robust.decay(state, surface(), 10)
+    robust.decay(state, surface(), 10, PLAIN)
     assert not torch.equal(state.splats.opacity_logits, before)
 
 

@@ -20,7 +20,7 @@ def row_tensors(state: TrainState) -> dict[str, torch.Tensor]:
         tensors |= {f"mean of {name}": moments.mean, f"square of {name}": moments.square}
     tensors |= {f"group {name}": mask for name, mask in state.groups.items()}
     assert state.statistics is not None
-    return tensors | vars(state.statistics)
+    return tensors | state.statistics
 
 
 def test_keep_rows_keeps_the_same_rows_of_everything_in_order() -> None:

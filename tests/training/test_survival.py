@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fake_backends import altered
 from gs2d.config.presets import get_recipe, surface
 from gs2d.config.protocols import GENERIC, NERF_SYNTHETIC, Protocol
 from gs2d.config.recipe import GradDensify, LearningRates, LossTerm, Recipe
@@ -15,7 +16,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import BackendError, DivergedError
-from gs2d.render.backends import Backend, get_backend
+from gs2d.render.backends import PLAIN, Backend, get_backend
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training import events
 from gs2d.training.trainer import Trainer
@@ -48,7 +49,7 @@ def opacity_model() -> Backend:
     def no_errors(*args: object) -> torch.Tensor:
         raise AssertionError("not ranked here")
 
-    return Backend("reference", rasterize, no_errors)
+    return altered(PLAIN, rasterize=rasterize, splat_errors=no_errors)
 
 
 def first_stage(factor: float, **changes: object) -> Recipe:

@@ -261,7 +261,7 @@ def test_a_missing_package_is_one_line_with_the_remedy(monkeypatch: pytest.Monke
 @pytest.mark.parametrize("layout", ["2dgs", "spz"])
 def test_a_file_of_splats_is_served_on_this_machine_until_the_viewer_is_closed(tmp_path: Path, layout: str) -> None:
     pytest.importorskip("viser", reason="viser is not installed (extra `view`)")
-    path = tmp_path / f"a{LAYOUTS[layout].ending}"
+    path = tmp_path / f"a{LAYOUTS.get(layout).ending}"
     write_layout(path, splats_at([[0.0, 0, 0], [1, 0, 0]], [[0.1, 0.2], [0.3, 0.1]]), layout)
     threads = set(threading.enumerate())
     viewer = open_viewer(path, ViewOptions(threads=1))

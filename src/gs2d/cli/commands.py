@@ -85,8 +85,8 @@ class Train(Training, TrainingCommon):
     Metashape, Meshroom."""
     out: Annotated[Path, arg(metavar="RUN")]
     """Run folder to make."""
-    format: Literal["auto", "blender", "nerfstudio", "dtu", "colmap", "opensfm", "metashape", "alicevision"] = "auto"
-    """Format of the capture."""
+    format: str = "auto"
+    """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
     downscale: int = 1
     """Shrink the photographs by this integer, area-filtered."""
     schedule_scale: float = 1.0
@@ -215,7 +215,7 @@ class Export(Common):
     """Run folder, or a file of flat splats: PLY (compressed too), .spz or .splat."""
     out: Annotated[Path, arg(metavar="FILE")]
     """File to write; by its ending .ply is 3dgs, .compressed.ply compressed, .spz spz, .splat splat."""
-    layout: Literal["2dgs", "3dgs", "compressed", "spz", "splat"] | None = None
+    layout: str | None = None
     """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open; compressed:
     PlayCanvas's and SuperSplat's PLY; spz: Niantic's, the smallest; splat: antimatter15's, one colour a splat."""
     bbox: Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")] = None

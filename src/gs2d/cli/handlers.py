@@ -234,14 +234,14 @@ def report(command: c.Report, console: Console) -> None:
 def recipes(command: c.Recipes, console: Console) -> None:
     """``gs2d recipes``."""
     from gs2d.config.describe import describe_recipe
-    from gs2d.config.presets import RECIPES, get_recipe
+    from gs2d.config.presets import RECIPES, about_recipe, get_recipe
     from gs2d.config.schedule import scale_schedule
     from gs2d.config.serialize import apply_overrides, to_json
 
     if command.action == "list":
         if command.name:
             raise RecipeError(f"`gs2d recipes list` takes no name, got {command.name!r}; use `gs2d recipes show NAME`")
-        names = {name: RECIPES[name].about for name in RECIPES}
+        names = {name: about_recipe(name) for name, _ in RECIPES.working()}
         width = max(map(len, names))
         for name, about in names.items():
             console.say(f"{name:<{width}}  {about}")

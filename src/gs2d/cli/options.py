@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from gs2d.errors import RecipeError
 
-Backend = Literal["auto", "cpu", "cuda", "reference"]
+Backend = str  # a package may add one
 LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Box = tuple[float, float, float, float, float, float]
 Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), tyro.conf.UseAppendAction]
@@ -34,7 +34,7 @@ class TrainingCommon(Common):
     """Options of the commands that train."""
 
     backend: Backend = "auto"
-    """Rasterizer: auto takes the fastest that this machine has; `gs2d doctor` lists them."""
+    """Rasterizer: auto (the fastest that this machine has), cpu, cuda, reference; `gs2d doctor` lists them."""
     seed: int = 0
     """Seed of every random choice; the same seed gives the same bytes."""
     threads: int | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from gs2d.config.densify import Densify
 from gs2d.config.recipe import ALL, CloneInPlace, RankByError, Recipe, Stage
 
 
@@ -67,7 +68,10 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
         weight = "the protocol's weight" if term.weight is None else f"{term.weight:g}"
         since = f" after iteration {term.start:,}" if term.start else ""
         yield f"loss {term.kind}: {weight}{since}"
-    if stage.densify is not None:
+    if isinstance(stage.densify, Densify):
+        given = ", ".join(f"{name}={value}" for name, value in stage.densify.options.items())
+        yield f"densifies by {stage.densify.name}{f' ({given})' if given else ''}"
+    elif stage.densify is not None:
         d = stage.densify
         signal = "absolute" if d.absolute else "signed"
         yield (

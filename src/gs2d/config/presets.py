@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 from gs2d.config.multiview import MultiView
 from gs2d.config.priors import DepthPrior, NormalPrior
@@ -28,6 +29,8 @@ from gs2d.config.recipe import (
     Recipe,
     Stage,
 )
+from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
+from gs2d.config.registry import Registry
 from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea
 from gs2d.errors import RecipeError
 
@@ -330,7 +333,23 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
         add(f"{base}-depth", about, partial(with_depth_prior, build()))
 
 
-RECIPES: Mapping[str, NamedRecipe] = MappingProxyType(_registry())
+_OWN = _registry()
+RECIPES: Registry[Any] = Registry("recipe", "gs2d.recipes", builtin=dict.fromkeys(_OWN, __name__), error=RecipeError)
+"""Names of recipes -> NamedRecipe; of guests a Recipe, or a function without arguments that makes one."""
+for _name, _named in _OWN.items():
+    RECIPES.register(_name)(_named)
+register_recipe = RECIPES.register
+
+
+def about_recipe(name: str) -> str:
+    """Return a line about a recipe: of guests the first line of the docstring, or its stages."""
+    found = get_recipe(name) if is_recipe_file(name) else RECIPES.get(name)
+    if isinstance(found, NamedRecipe):
+        return found.about
+    if isinstance(found, Recipe):
+        return ", ".join(f"{stage.name} ({stage.iterations:,})" for stage in found.stages)
+    return (getattr(found, "__doc__", None) or "").strip().partition("\n")[0] or f"a recipe of {RECIPES.source(name)}"
+
 
 # The paper's tables: row label -> recipe. "tab:..." are its LaTeX labels.
 TABLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
@@ -369,14 +388,23 @@ TABLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
 
 
 def get_recipe(name: str) -> Recipe:
-    """The recipe of a name.
+    """Return the recipe of a name, or of a file.
+
+    Parameters
+    ----------
+    name : str
+        One that is registered, ``file.json`` (what ``gs2d recipes show NAME --json`` prints) or ``file.py:name`` (a
+        Recipe, or a function without arguments that makes one).
 
     Raises
     ------
     RecipeError
-        Unknown name; says what is close or what exists.
+        Unknown name; says what is close or what exists. Of a file: that it cannot be read, or holds no recipe.
     """
+    if is_recipe_file(name):
+        return read_recipe_file(name)
     if name not in RECIPES:
-        near = get_close_matches(name, RECIPES, n=3) or list(RECIPES)
+        near = get_close_matches(name, list(RECIPES), n=3) or list(RECIPES)
         raise RecipeError(f"no recipe {name!r}; there is {', '.join(near)} (`gs2d recipes` lists all)")
-    return RECIPES[name]()
+    found = RECIPES.get(name)
+    return found() if isinstance(found, NamedRecipe) else made_recipe(found, f"recipe {name!r}")

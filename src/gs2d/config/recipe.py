@@ -12,9 +12,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
+from typing import Any
 
-from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
-from gs2d.config.priors import PRIOR_KINDS, DepthPrior, NormalPrior, check_priors
+from gs2d.config.densify import DENSIFIERS, Densify
+from gs2d.config.losses import LOSSES
+from gs2d.config.multiview import MultiView, check_multiview
+from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
 from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
 from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
@@ -23,11 +26,6 @@ from gs2d.config.views import check_exposure, check_poses
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
-LOSS_KINDS = (
-    *("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
-    *MULTIVIEW_KINDS,
-    *PRIOR_KINDS,
-)
 LARGEST_SEED = 2**63 - 1  # torch takes no larger one
 DEPTH_KINDS = ("mean", "median")
 
@@ -42,19 +40,23 @@ class LossTerm:
         "l1", "ssim" (1 - SSIM), "normal_consistency", "normal_consistency_per_splat" (the paper's Eq. 7 form),
         "distortion", "silhouette" (alpha against that of the photographs, which must have one), or, in a recipe with
         ``multiview``, "multiview_photometric" (1 - NCC of warped patches), "multiview_geometric" (round trip, px); with
-        ``depth_prior`` "depth_prior" (relative error of depth), with ``normal_prior`` "normal_prior" (1 - cosine).
+        ``depth_prior`` "depth_prior" (relative error of depth), with ``normal_prior`` "normal_prior" (1 - cosine); or
+        one that a package or a program has registered (docs/extending.md).
     weight : float or None
         None, for "distortion" only: the protocol's weight (Table 1 of the paper writes it 100/10).
     start : int
         Iterations of the stage without this term.
     depth : "mean", "median" or None
         Depth that surface normals come from; None takes the protocol's.
+    options : mapping of str to values of JSON
+        Of a registered loss: the keyword arguments that its function, or the constructor of its class, takes.
     """
 
     kind: str
     weight: float | None
     start: int = 0
     depth: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict, metadata={"omit_empty": True}, hash=False)
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ class Stage:
         Attributes that are absent are frozen: bit-identical through the stage.
     losses : tuple of LossTerm
     lr : LearningRates
-    densify : GradDensify or None
+    densify : GradDensify, Densify or None
     on_enter : tuple of actions
         Run once, in order, before the first iteration.
     sh_interval : int
@@ -219,7 +221,7 @@ class Stage:
     train: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({name: "all" for name in ALL}))
     losses: tuple[LossTerm, ...] = ()
     lr: LearningRates = LearningRates()
-    densify: GradDensify | None = None
+    densify: GradDensify | Densify | None = None
     on_enter: tuple[Action, ...] = ()
     sh_interval: int = 0
     moments: str = "fresh"
@@ -268,8 +270,8 @@ class Recipe:
         return sum(stage.iterations for stage in self.stages)
 
 
-def validate(recipe: Recipe) -> Recipe:
-    """Check that a recipe can be trained as written; returns it.
+def validate(recipe: Recipe, *, to_train: bool = True) -> Recipe:
+    """Check that a recipe can be trained as written; returns it. Not ``to_train``: names may be those of absent guests.
 
     Raises
     ------
@@ -302,11 +304,11 @@ def validate(recipe: Recipe) -> Recipe:
         )
     groups: list[str] = []
     for stage in recipe.stages:
-        _check_stage(f"stage {stage.name!r}", stage, groups)
+        _check_stage(f"stage {stage.name!r}", stage, groups, to_train)
     return recipe
 
 
-def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
+def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) -> None:
     """Check one stage; ``groups`` are the row groups written so far, and is extended."""
     integer(f"{where}: iterations", stage.iterations, low=0)
     integer(f"{where}: sh_interval", stage.sh_interval, low=0)
@@ -324,7 +326,7 @@ def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
         one_of(f"{where}: train", attribute, ALL)
         if rows != "all":
             group(f"{where}: train[{attribute!r}]", rows, groups)
-    _check_losses(where, stage)
+    _check_losses(where, stage, to_train)
     for entry in fields(LearningRates):
         number(f"{where}: lr.{entry.name}", getattr(stage.lr, entry.name), low=0.0)
     require(
@@ -333,14 +335,19 @@ def _check_stage(where: str, stage: Stage, groups: list[str]) -> None:
     )
     integer(f"{where}: rates.means_horizon", stage.lr.means_decay_steps, low=1)
     require(max(stage.lr.beta1, stage.lr.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
-    if stage.densify is not None:
+    if isinstance(stage.densify, Densify):
+        name = stage.densify.name
+        require(not to_train or name in DENSIFIERS, f"{where}: {DENSIFIERS.unknown(name)}")
+    elif stage.densify is not None:
         _check_densify(f"{where}: densify", stage.densify, stage)
 
 
-def _check_losses(where: str, stage: Stage) -> None:
+def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
     kinds = [term.kind for term in stage.losses]
     for term in stage.losses:
-        one_of(f"{where}: loss", term.kind, LOSS_KINDS)
+        require(not to_train or term.kind in LOSSES, f"{where}: {LOSSES.unknown(term.kind)}")
+        guest = term.kind not in LOSSES.builtin
+        require(guest or not term.options, f"{where}: loss {term.kind!r} takes no options, got {dict(term.options)}")
         require(kinds.count(term.kind) == 1, f"{where}: loss {term.kind!r} is there twice; add up the weights")
         if term.weight is None:
             require(

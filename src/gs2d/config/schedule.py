@@ -14,6 +14,7 @@ import math
 from dataclasses import fields, replace
 from typing import TypeVar
 
+from gs2d.config.densify import Densify
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import Exposure, GradDensify, LearningRates, PoseRefinement, Recipe, Stage
 from gs2d.errors import RecipeError
@@ -108,7 +109,9 @@ def _scale_stage(stage: Stage, factor: float) -> Stage:
     )
 
 
-def _scale_densify(densify: GradDensify, factor: float) -> GradDensify:
+def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify | Densify:
+    if isinstance(densify, Densify):
+        return densify.scaled(factor)
     start, stop = round(densify.start * factor), round(densify.stop * factor)
     wanted = min(MIN_DENSIFICATIONS, count_densifications(densify))
     every = densify.every

@@ -12,7 +12,8 @@ from dataclasses import MISSING, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from gs2d.config.recipe import CloneInPlace, RankByError, Recipe, validate
+from gs2d.config.densify import Densify
+from gs2d.config.recipe import CloneInPlace, GradDensify, RankByError, Recipe, validate
 from gs2d.config.renamed import current_names, current_path
 from gs2d.errors import RecipeError
 
@@ -27,8 +28,11 @@ def to_json(recipe: Recipe) -> dict[str, Any]:
     return encoded
 
 
-def from_json(data: Mapping[str, Any]) -> Recipe:
+def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
     """Return the recipe that :func:`to_json` wrote, validated; names of version 0.1 are read too.
+
+    Of a run that is there, and is not trained on (``to_train`` False), losses and densifiers may be gone that a file
+    or a package had registered.
 
     Raises
     ------
@@ -37,7 +41,7 @@ def from_json(data: Mapping[str, Any]) -> Recipe:
     """
     recipe = _decode(current_names(data), Recipe, "recipe")
     assert isinstance(recipe, Recipe)
-    return validate(recipe)
+    return validate(recipe, to_train=to_train)
 
 
 def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
@@ -128,7 +132,8 @@ def _entry(entries: list[Any], word: str, override: str) -> Any:
 
 def _encode(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
-        encoded = {entry.name: _encode(getattr(value, entry.name)) for entry in fields(value)}
+        kept = [entry for entry in fields(value) if getattr(value, entry.name) or not entry.metadata.get("omit_empty")]
+        encoded = {entry.name: _encode(getattr(value, entry.name)) for entry in kept}
         tags = [name for name, kind in ACTIONS.items() if type(value) is kind]
         return {ACTION_KEY: tags[0], **encoded} if tags else encoded
     if isinstance(value, Mapping):
@@ -161,6 +166,9 @@ def _decode_union(value: Any, kinds: tuple[Any, ...], where: str) -> Any:
     if value is None and NoneType in kinds:
         return None
     kinds = tuple(kind for kind in kinds if kind is not NoneType)
+    if Densify in kinds:  # by its name, or by the fields of 2DGS's own
+        named = isinstance(value, Mapping) and "name" in value
+        kinds = (Densify if named else GradDensify,)
     if len(kinds) == 1:
         return _decode(value, kinds[0], where)
     tag = value.get(ACTION_KEY) if isinstance(value, Mapping) else None
@@ -187,6 +195,8 @@ def _decode_dataclass(value: Any, kind: type, where: str) -> Any:
 
 
 def _decode_plain(value: Any, kind: Any, where: str) -> Any:
+    if kind is Any:
+        return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
     if kind is int and isinstance(value, float) and value.is_integer():

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from gs2d.data.benchmarks import missing_lines
@@ -15,19 +17,52 @@ from gs2d.data.readers.meshroom import read_alicevision, scene_file
 from gs2d.data.readers.metashape import camera_file, read_metashape
 from gs2d.data.readers.opensfm import read_opensfm, reconstruction_file
 from gs2d.data.readers.photographs import SUFFIXES
+from gs2d.data.readers.registry import READERS, Reader, register_reader
 from gs2d.data.readers.transforms import read_blender, read_nerfstudio
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 
-FORMATS = ("blender", "nerfstudio", "dtu", "colmap", "opensfm", "metashape", "alicevision")
-_READERS: Mapping[str, Callable[[Path], Capture]] = {
-    "blender": read_blender,
-    "nerfstudio": read_nerfstudio,
-    "dtu": read_dtu,
-    "opensfm": read_opensfm,
-    "metashape": read_metashape,
-    "alicevision": read_alicevision,
-}
+FORMATS = READERS.builtin
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """One of gs2d's own."""
+
+    holds: Callable[[Path], object]
+    make: Callable[[Path], Capture]
+
+    def detect(self, path: Path) -> bool:
+        return bool(self.holds(path))
+
+    def read(self, path: Path, *, downscale: int) -> Capture:
+        return self.make(path)
+
+
+class _Colmap:
+    """COLMAP keeps smaller photographs beside the large ones."""
+
+    def detect(self, path: Path) -> bool:
+        return model_folder(path) is not None
+
+    def read(self, path: Path, *, downscale: int) -> Capture:
+        return read_colmap(path, downscale)
+
+
+def _register(name: str, holds: Callable[[Path], object], make: Callable[[Path], Capture]) -> None:
+    made: Callable[[], _Reader] = partial(_Reader, holds, make)
+    made.__module__ = __name__
+    register_reader(name)(made)
+
+
+_register("blender", lambda root: (root / "transforms_train.json").is_file(), read_blender)
+_register("nerfstudio", lambda root: (root / "transforms.json").is_file(), read_nerfstudio)
+_register("dtu", lambda root: any((root / name).is_file() for name in CAMERA_FILES), read_dtu)
+register_reader("colmap")(_Colmap)
+_register("opensfm", reconstruction_file, read_opensfm)
+_register("metashape", camera_file, read_metashape)
+_register("alicevision", scene_file, read_alicevision)
+
 _PROJECTS = {  # files of other tools that do not hold cameras in the open
     ".psx": "in Metashape, File > Export > Export Cameras as Agisoft XML (cameras.xml)",
     ".mg": "take cameras.sfm of Meshroom's node StructureFromMotion, in its MeshroomCache",
@@ -39,7 +74,7 @@ DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures
 
 
 def detect_format(path: str | os.PathLike[str]) -> str:
-    """Which of FORMATS a folder holds.
+    """Return the format of a folder: one of FORMATS, or of a reader from elsewhere.
 
     Raises
     ------
@@ -47,20 +82,9 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         Missing or empty folder, or no known layout; lists what was looked for.
     """
     root = _folder(path)
-    if (root / "transforms_train.json").is_file():
-        return "blender"
-    if (root / "transforms.json").is_file():
-        return "nerfstudio"
-    if any((root / name).is_file() for name in CAMERA_FILES):
-        return "dtu"
-    if model_folder(root) is not None:
-        return "colmap"
-    if reconstruction_file(root) is not None:
-        return "opensfm"
-    if camera_file(root) is not None:
-        return "metashape"
-    if scene_file(root) is not None:
-        return "alicevision"
+    for name, make in READERS.working():
+        if make().detect(root):
+            return name
     held = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in root.iterdir())
     if not held:
         raise DataError(f"{root} must hold a capture, got an empty folder")
@@ -101,6 +125,19 @@ def _folder(path: str | os.PathLike[str]) -> Path:
     return root
 
 
+def reader_of(format: str) -> Reader:
+    """Return the reader of a format.
+
+    Raises
+    ------
+    DataError
+        There is none of this name, or its package cannot be imported.
+    """
+    if format not in READERS:
+        raise DataError(READERS.unknown(format, also=("auto",)))
+    return READERS.get(format)()
+
+
 def load_scene(
     path: str | os.PathLike[str],
     *,
@@ -116,7 +153,7 @@ def load_scene(
     path : path
         The capture's folder.
     format : str
-        One of FORMATS, or "auto": by the files that are there.
+        One of FORMATS, that of a reader from elsewhere, or "auto": by the files that are there.
     downscale : int
         Area-filter the photographs by this whole factor (COLMAP: ``images_N`` is used where it exists).
     test_every : int or None
@@ -133,9 +170,12 @@ def load_scene(
     root = _folder(path)
     if format == "auto":
         format = detect_format(root)
-    if format not in FORMATS:
-        raise DataError(f"format must be auto or one of {', '.join(FORMATS)}, got {format}")
+    reader = reader_of(format)
     if downscale < 1:
         raise DataError(f"downscale must be a whole number >= 1, got {downscale}")
-    capture = read_colmap(root, downscale) if format == "colmap" else _READERS[format](root)
+    capture = reader.read(root, downscale=downscale)
+    if isinstance(capture, Scene):
+        if downscale > 1:
+            raise DataError(f"format {format} cannot be shrunk when it is read, got downscale {downscale}; use 1")
+        return capture
     return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes)

@@ -17,6 +17,7 @@ from torch import Tensor
 from gs2d.core.checks import check_shapes
 from gs2d.evaluation.lpips import MIN_SIZE, REMEDY, Lpips
 from gs2d.losses import api as losses
+from gs2d.render.backends import Backend
 
 
 @dataclass(frozen=True)
@@ -102,21 +103,21 @@ def psnr_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None) -> floa
     return psnr_float(_as_8bit(image), _as_8bit(target), mask)
 
 
-def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend_name: str) -> float:
+def ssim_float(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend: str | Backend) -> float:
     """Mean SSIM over valid pixels (11x11 Gaussian window, zero padding: the SSIM of the loss); image clamped to [0, 1].
 
-    ``nan`` when no pixel is valid. ``backend_name`` is "cpu" or "cuda" (fused) or "reference" (torch).
+    ``nan`` when no pixel is valid. ``backend`` has fused operations, or torch does it.
     """
     check_shapes({"target": (target, "H W 3"), "image": (image, "H W 3")})
     if target.numel() == 0 or (mask is not None and not bool(mask.any())):
         return math.nan
     with torch.no_grad():
-        return float(losses.ssim(image.clamp(0, 1), target, mask, backend_name=backend_name))
+        return float(losses.ssim(image.clamp(0, 1), target, mask, backend=backend))
 
 
-def ssim_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend_name: str) -> float:
+def ssim_8bit(image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend: str | Backend) -> float:
     """``ssim_float`` after quantising both images to 8 bit."""
-    return ssim_float(_as_8bit(image), _as_8bit(target), mask, backend_name=backend_name)
+    return ssim_float(_as_8bit(image), _as_8bit(target), mask, backend=backend)
 
 
 def _metric(value: float) -> Metric:
@@ -144,7 +145,7 @@ def image_metrics(
     target: Tensor,
     mask: Tensor | None = None,
     *,
-    backend_name: str,
+    backend: str | Backend,
     lpips: Lpips | None = None,
 ) -> ImageMetrics:
     """Every image metric of one view.
@@ -155,15 +156,15 @@ def image_metrics(
         In [0, 1]; the image is clamped to it.
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel. LPIPS sees the target there and still averages over the whole image.
-    backend_name : "cpu", "cuda" or "reference"
+    backend : str or Backend
     lpips : Lpips, optional
         From ``evaluation.lpips.load_lpips``; without it LPIPS is null with the remedy as reason.
     """
     return ImageMetrics(
         psnr=_metric(psnr_8bit(image, target, mask)),
-        ssim=_metric(ssim_8bit(image, target, mask, backend_name=backend_name)),
+        ssim=_metric(ssim_8bit(image, target, mask, backend=backend)),
         psnr_float=_metric(psnr_float(image, target, mask)),
-        ssim_float=_metric(ssim_float(image, target, mask, backend_name=backend_name)),
+        ssim_float=_metric(ssim_float(image, target, mask, backend=backend)),
         lpips=_lpips(lpips, image, target, mask, "0..1"),
         lpips_signed=_lpips(lpips, image, target, mask, "-1..1"),
     )

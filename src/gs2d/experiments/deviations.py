@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from gs2d.config.presets import get_recipe
+from gs2d.config.recipe import GradDensify
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.images import image_size
 from gs2d.errors import Gs2dError
@@ -63,7 +64,7 @@ def deviations_of(
 def opacity_resets(scale: float) -> int:
     """How often stage 1 resets opacity at this part of the schedule, over a black background."""
     stage = scale_schedule(get_recipe("2dgs"), scale).stages[0]
-    assert stage.densify is not None
+    assert isinstance(stage.densify, GradDensify)
     return sum(stage.densify.resets(i, white=False) for i in range(1, stage.iterations + 1))
 
 

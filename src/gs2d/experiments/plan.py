@@ -138,7 +138,8 @@ def _table(options: PaperOptions) -> PaperTable:
 def canonical_recipe(name: str) -> str:
     """Return the first named recipe that trains the same: "2dgs-r" for "2dgs-r-k1"."""
     recipe = replace(get_recipe(name), name="")
-    return next(other for other in RECIPES if replace(get_recipe(other), name="") == recipe)
+    same = (other for other in RECIPES.builtin if replace(get_recipe(other), name="") == recipe)
+    return next(same, name)
 
 
 def trained_recipe(name: str, options: PaperOptions) -> Recipe:

@@ -17,7 +17,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from gs2d.config.presets import RECIPES, get_recipe
+from gs2d.config.presets import about_recipe, get_recipe
 from gs2d.core.files import atomic_write
 from gs2d.core.images import read_image
 from gs2d.core.json_files import read_json
@@ -163,7 +163,7 @@ def about_row(row: Row) -> str:
     """Return what is trained for a row: the name of one of the paper's says what the table is about."""
     if row.recipe is None:
         return ""
-    about = RECIPES[row.recipe].about
+    about = about_recipe(row.recipe)
     return about if row.name == row.recipe else about.partition(": ")[2] or about
 
 

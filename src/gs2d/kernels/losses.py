@@ -8,6 +8,8 @@ second pass. The formulas are in ``kernels/core/losses.h``; ``losses.reference``
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,6 +28,23 @@ SIGNATURES: dict[str, list[Any]] = {
     "gs2d_masked_mean": [POINTER] * 2 + [INT64] * 2 + [POINTER],
     "gs2d_normal_consistency": [POINTER] * 6 + [INT64] * 2 + [INT, DOUBLE] + [POINTER] * 4,
 }
+
+
+@dataclass(frozen=True)
+class LossOperations:
+    """The fused operations of a backend, with the signatures of this module's.
+
+    Attributes
+    ----------
+    photometric, normal_consistency, masked_mean : callable
+    blur : callable or None
+        Where ``photometric`` takes the local mean of the target, which is then worth keeping.
+    """
+
+    photometric: Callable[..., tuple[Tensor, Tensor]]
+    normal_consistency: Callable[..., Tensor]
+    masked_mean: Callable[..., Tensor]
+    blur: Callable[[Tensor], Tensor] | None = None
 
 
 def _call(library: Library, name: str, *arguments: Any) -> None:

@@ -6,6 +6,7 @@ Shapes and types are those of ``meshing/volume.py``; ``meshing/integrate.py``, t
 from __future__ import annotations
 
 import ctypes
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,15 +14,39 @@ import numpy as np
 from gs2d.errors import BackendError, ShapeError
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
     from gs2d.kernels.cuda.launch import Launcher
     from gs2d.kernels.library import Library
 
-__all__ = ["FuseArguments", "arguments_of", "fuse_on_cpu", "fuse_on_gpu", "mark_on_cpu"]
+__all__ = [
+    "FuseArguments",
+    "FusionOnDevice",
+    "FusionOnHost",
+    "arguments_of",
+    "fuse_on_cpu",
+    "fuse_on_gpu",
+    "mark_on_cpu",
+]
 
 VOXELS = 512  # of a block
 THREADS = 128  # of a CUDA block, fuse.cu
+
+
+@dataclass(frozen=True)
+class FusionOnHost:
+    """Volumes lie in the host's memory, and a native library adds to them."""
+
+    library: Library
+
+
+@dataclass(frozen=True)
+class FusionOnDevice:
+    """Volumes lie on a device while views are added to them."""
+
+    launcher: Launcher
+    device: torch.device
 
 
 class FuseArguments(ctypes.Structure):

@@ -1,40 +1,54 @@
-"""The terms of the training loss: kind -> function, and the weighted values of the terms of a stage.
+"""The terms of the training loss: what a loss is, gs2d's own, and the weighted values of the terms of a stage.
 
 The total of official 2DGS is 0.8 L1 + 0.2 (1 - SSIM) + lambda_n mean(1 - alpha <n, N>) + lambda_d mean(distortion): the
 weights are the :class:`~gs2d.config.recipe.LossTerm` of a recipe. Definitions, masks and gradients: ``docs/math.md``.
 
-There are two implementations of each kind: plain torch (``losses.reference``), used by the reference backend, and
-fused operations, native (``kernels.losses``) for the cpu backend and on the GPU (``kernels.cuda.ops``) for the cuda
-backend. The backend's name chooses; nothing falls back.
+A loss is a function of what was rendered and of the :class:`LossView`, registered by name: gs2d's own in plain torch
+here, by the formulas of ``losses.reference``. For some a backend has fused operations (``Backend.loss_operations``);
+nothing falls back.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from types import MappingProxyType
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from gs2d.config.multiview import MULTIVIEW_KINDS
-from gs2d.config.priors import PRIOR_KINDS
-from gs2d.config.recipe import LossTerm
+from gs2d.config.losses import LOSSES, register_loss
+from gs2d.config.recipe import LossTerm, Recipe
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
-from gs2d.errors import BackendError, RecipeError, ShapeError
-from gs2d.kernels import losses as ops
-from gs2d.kernels.cuda import launch
-from gs2d.kernels.cuda import losses as cuda_ops
+from gs2d.data.scene import Scene
+from gs2d.errors import RecipeError, ShapeError
+from gs2d.kernels.losses import LossOperations
 from gs2d.losses import multiview, priors, reference
 from gs2d.losses.multiview import Neighbour, ViewPair
 from gs2d.losses.priors import Prior
 from gs2d.losses.reference import normals_from_depth
+from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import normals_without_pose_grad
 from gs2d.render.types import RenderOutput
 
-__all__ = ["LOSSES", "LossInputs", "TargetMaps", "compute_losses", "normals_from_depth", "target_maps"]
+__all__ = [
+    "LOSSES",
+    "Loss",
+    "LossFunction",
+    "LossView",
+    "TargetMaps",
+    "compute_losses",
+    "loss_of",
+    "normals_from_depth",
+    "prepared",
+    "register_loss",
+    "ssim",
+    "target_maps",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,167 +81,210 @@ class TargetMaps:
             )
 
 
-def target_maps(target: Tensor) -> TargetMaps:
-    """The maps of a target [H, W, 3] for ``compute_losses(..., target_cache=...)`` on the cpu backend."""
+def target_maps(target: Tensor, backend: str | Backend = "cpu") -> TargetMaps | None:
+    """The maps of a target [H, W, 3] for ``compute_losses(..., target_cache=...)``; None: the backend takes none."""
     check_shapes({"target": (target, "H W 3")})
-    return TargetMaps(target, ops.blur(target), target._version)
+    operations = _operations(backend, target.device)
+    if operations is None or operations.blur is None:
+        return None
+    return TargetMaps(target, operations.blur(target), target._version)
 
 
-@dataclass(frozen=True)
-class FusedOperations:
-    """The fused operations of a backend, with the signatures of ``kernels.losses``."""
-
-    photometric: Callable[..., tuple[Tensor, Tensor]]
-    normal_consistency: Callable[..., Tensor]
-    masked_mean: Callable[..., Tensor]
+def _operations(backend: str | Backend, device: torch.device) -> LossOperations | None:
+    """The fused operations of a backend on a device, where it has any."""
+    chosen = get_backend(backend, device.type) if isinstance(backend, str) else backend
+    return chosen.loss_operations(device)
 
 
-def _fused_operations(backend_name: str, device: torch.device) -> FusedOperations | None:
-    """Those of a backend on a device; None for the reference."""
-    if backend_name == "cpu":
-        return FusedOperations(ops.photometric, ops.normal_consistency, ops.masked_mean)
-    if backend_name == "cuda":
-        launcher = launch.launcher_for(device)
-        return FusedOperations(
-            partial(cuda_ops.photometric, launcher=launcher),
-            partial(cuda_ops.normal_consistency, launcher=launcher),
-            partial(cuda_ops.masked_mean, launcher=launcher),
-        )
-    return None
-
-
-@dataclass(frozen=True, eq=False)
-class LossInputs:
-    """One rendered view and what it should look like.
+@dataclass(eq=False)
+class LossView:
+    """What a rendered view should look like, and all else that a loss may want to know of it.
 
     Attributes
     ----------
-    output : RenderOutput
     target : Tensor [H, W, 3]
-        In [0, 1].
+        The photograph, in [0, 1].
     mask : Tensor [H, W] bool or None
         False = ignore this pixel.
     camera : Camera
-    target_mean : Tensor [H, W, 3] or None
-        Local mean of the target when known (fused SSIM only).
-    weights : mapping of kind to float
-        Of the active terms. Not applied here: the native operations prepare their gradients for them.
-    fused : FusedOperations or None
-        What FUSED_LOSSES are made of; None for the reference.
+    iteration : int
+        Counted from 1 within the stage.
+    depth_kind : "mean" or "median"
+        The depth that the term asks for: ``output.depth(view.depth_kind)``.
+    index : int or None
+        Of the training view, in the order of ``scene.train``.
     silhouette : Tensor [H, W] or None
         Alpha of the photograph, in [0, 1], if it has one.
     neighbour : Neighbour or None
         The second view of the losses that compare two.
     prior : Prior or None
         What is known of the view beforehand.
+    target_mean : Tensor [H, W, 3] or None
+        Local mean of the target when known (fused SSIM only).
+    weights : mapping of kind to float
+        Of the active terms. Not applied here: the native operations prepare their gradients for them.
+    fused : LossOperations or None
+        The fused operations of the backend, where it has any.
     """
 
-    output: RenderOutput
     target: Tensor
     mask: Tensor | None
     camera: Camera
-    target_mean: Tensor | None = None
-    weights: Mapping[str, float] = field(default_factory=dict)
-    fused: FusedOperations | None = None
+    iteration: int = 1
+    depth_kind: str = "mean"
+    index: int | None = None
     silhouette: Tensor | None = None
     neighbour: Neighbour | None = None
     prior: Prior | None = None
+    target_mean: Tensor | None = None
+    weights: Mapping[str, float] = field(default_factory=dict)
+    fused: LossOperations | None = None
     _compared: dict[str, ViewPair] = field(default_factory=dict)
+    _photometric: tuple[Tensor, Tensor] | None = None
 
-    def two_views(self, depth_kind: str) -> ViewPair:
-        """The view beside its neighbour, by mean or median depth; shared by the losses that ask."""
+    def two_views(self, output: RenderOutput) -> ViewPair:
+        """Return the view beside its neighbour, by mean or median depth; shared by the losses that ask."""
         if self.neighbour is None:
             raise RecipeError("losses of two views need a neighbour, got none; pass one or take a recipe without them")
-        if depth_kind not in self._compared:
-            depth, output, reference = self.output.depth(depth_kind), self.output, self.neighbour.reference
+        kind = self.depth_kind
+        if kind not in self._compared:
+            depth, reference = output.depth(kind), self.neighbour.reference
             hit = (output.alpha.detach() > self.neighbour.settings.opacity) & (depth.detach() > 0)
-            self._compared[depth_kind] = ViewPair(
+            self._compared[kind] = ViewPair(
                 depth, output.normal, hit & reference.textured, self.camera, self.neighbour, self.mask
             )
-        return self._compared[depth_kind]
+        return self._compared[kind]
 
-    @cached_property
-    def fused_photometric(self) -> tuple[Tensor, Tensor]:
-        """(L1, SSIM) by one fused pass, shared by both terms."""
-        expected = (self.weights.get("l1", 0.0), -self.weights.get("ssim", 0.0))
-        return _fused(self).photometric(self.output.color, self.target, self.mask, self.target_mean, expected=expected)
-
-
-LossFunction = Callable[[LossInputs, str], Tensor]
-"""(inputs, "mean" or "median" depth) -> unweighted scalar."""
+    def photometric(self, output: RenderOutput, operations: LossOperations) -> tuple[Tensor, Tensor]:
+        """Return (L1, SSIM) by one fused pass, shared by both terms."""
+        if self._photometric is None:
+            expected = (self.weights.get("l1", 0.0), -self.weights.get("ssim", 0.0))
+            given = (output.color, self.target, self.mask, self.target_mean)
+            self._photometric = operations.photometric(*given, expected=expected)
+        return self._photometric
 
 
-def _normals(inputs: LossInputs, depth_kind: str) -> tuple[Tensor, Tensor, Tensor, Camera, Tensor | None]:
-    output, pose, normal = inputs.output, inputs.camera.pose, inputs.output.normal
+LossFunction = Callable[[RenderOutput, LossView], Tensor | None]
+"""(rendered view, what it should look like) -> unweighted scalar; None where it has nothing to say of this view."""
+
+
+class Loss(Protocol):
+    """A loss with data of its own: a class is registered, and made once for each stage and term that names it.
+
+    Its constructor takes the term's options as keyword arguments.
+    """
+
+    def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
+        """Get ready for a scene before training begins; raise a Gs2dError where it lacks what is needed."""
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
+        """Return the unweighted loss [] of a rendered view; None where there is nothing to say of it."""
+
+
+def prepared(term: LossTerm, scene: Scene, recipe: Recipe, device: torch.device) -> LossFunction:
+    """Return the function of a term, made with its options and, if it is a class, prepared for a scene.
+
+    Raises
+    ------
+    RecipeError
+        Options that it does not take.
+    """
+    made = LOSSES.get(term.kind)
+    try:
+        if not isinstance(made, type):
+            return partial(made, **term.options) if term.options else made
+        loss = made(**term.options)
+    except TypeError as error:
+        raise RecipeError(f"loss {term.kind!r} does not take the options {dict(term.options)}: {error}") from error
+    loss.prepare(scene, recipe, device)
+    return loss
+
+
+def loss_of(term: LossTerm) -> tuple[str, str]:
+    """Return what a term's function is known by: its kind and its options."""
+    return term.kind, json.dumps(dict(term.options), sort_keys=True, default=str)
+
+
+def _normals(output: RenderOutput, view: LossView) -> tuple[Tensor, Tensor, Tensor, Camera, Tensor | None]:
+    pose, normal = view.camera.pose, output.normal
     if pose is not None and normal.requires_grad:
         normal = normals_without_pose_grad(output, pose)  # both normals turn with the camera, which changes nothing
-    return normal, output.depth(depth_kind), output.alpha, inputs.camera, inputs.mask
+    return normal, output.depth(view.depth_kind), output.alpha, view.camera, view.mask
 
 
-def _silhouette(inputs: LossInputs, _: str) -> Tensor:
-    if inputs.silhouette is None:
+@register_loss("l1")
+def _l1(output: RenderOutput, view: LossView) -> Tensor:
+    return reference.l1(output.color, view.target, view.mask)
+
+
+@register_loss("ssim")
+def _ssim(output: RenderOutput, view: LossView) -> Tensor:
+    return 1 - reference.ssim(output.color, view.target, view.mask)
+
+
+@register_loss("normal_consistency")
+def _normal_consistency(output: RenderOutput, view: LossView) -> Tensor:
+    return reference.normal_consistency(*_normals(output, view))
+
+
+@register_loss("normal_consistency_per_splat")
+def _normal_consistency_per_splat(output: RenderOutput, view: LossView) -> Tensor:
+    return reference.normal_consistency_per_splat(*_normals(output, view))
+
+
+@register_loss("distortion")
+def _distortion(output: RenderOutput, view: LossView) -> Tensor:
+    return reference.distortion(output.distortion, view.mask)
+
+
+@register_loss("silhouette")
+def _silhouette(output: RenderOutput, view: LossView) -> Tensor:
+    if view.silhouette is None:
         raise RecipeError(
             "loss 'silhouette' needs photographs with an alpha channel, got one without; take a recipe without it"
         )
-    return reference.silhouette(inputs.output.alpha, inputs.silhouette, inputs.mask)
+    return reference.silhouette(output.alpha, view.silhouette, view.mask)
 
 
-def _depth_prior(inputs: LossInputs, depth_kind: str) -> Tensor:
-    if inputs.prior is None or inputs.prior.depth is None:
+@register_loss("multiview_photometric")
+def _multiview_photometric(output: RenderOutput, view: LossView) -> Tensor:
+    return multiview.photometric(view.two_views(output))
+
+
+@register_loss("multiview_geometric")
+def _multiview_geometric(output: RenderOutput, view: LossView) -> Tensor:
+    return multiview.geometric(view.two_views(output))
+
+
+@register_loss("depth_prior")
+def _depth_prior(output: RenderOutput, view: LossView) -> Tensor:
+    if view.prior is None or view.prior.depth is None:
         raise RecipeError("loss 'depth_prior' needs known depths, got none; pass them or take a recipe without it")
-    return priors.depth_prior(inputs.prior, inputs.output.depth(depth_kind), inputs.output.alpha, inputs.mask)
+    return priors.depth_prior(view.prior, output.depth(view.depth_kind), output.alpha, view.mask)
 
 
-def _normal_prior(inputs: LossInputs, _: str) -> Tensor:
-    if inputs.prior is None or inputs.prior.normal is None:
+@register_loss("normal_prior")
+def _normal_prior(output: RenderOutput, view: LossView) -> Tensor:
+    if view.prior is None or view.prior.normal is None:
         raise RecipeError("loss 'normal_prior' needs known normals, got none; pass them or take a recipe without it")
-    return priors.normal_prior(inputs.prior, inputs.output.normal, inputs.output.alpha, inputs.mask)
+    return priors.normal_prior(view.prior, output.normal, output.alpha, view.mask)
 
 
-def _fused(inputs: LossInputs) -> FusedOperations:
-    assert inputs.fused is not None
-    return inputs.fused
+def _fused_normals(output: RenderOutput, view: LossView, operations: LossOperations, kind: str) -> Tensor:
+    per_splat, weight = kind == "normal_consistency_per_splat", view.weights.get(kind, 1.0)
+    return operations.normal_consistency(*_normals(output, view), per_splat=per_splat, expected=weight)
 
 
-def _fused_normals(inputs: LossInputs, depth_kind: str, kind: str) -> Tensor:
-    per_splat = kind == "normal_consistency_per_splat"
-    weight = inputs.weights.get(kind, 1.0)
-    return _fused(inputs).normal_consistency(*_normals(inputs, depth_kind), per_splat=per_splat, expected=weight)
-
-
-LOSSES: Mapping[str, LossFunction] = MappingProxyType(
+FUSED: Mapping[str, Callable[[RenderOutput, LossView, LossOperations], Tensor]] = MappingProxyType(
     {
-        "l1": lambda x, _: reference.l1(x.output.color, x.target, x.mask),
-        "ssim": lambda x, _: 1 - reference.ssim(x.output.color, x.target, x.mask),
-        "normal_consistency": lambda x, depth: reference.normal_consistency(*_normals(x, depth)),
-        "normal_consistency_per_splat": lambda x, depth: reference.normal_consistency_per_splat(*_normals(x, depth)),
-        "distortion": lambda x, _: reference.distortion(x.output.distortion, x.mask),
-        "silhouette": _silhouette,
-        "multiview_photometric": lambda x, depth: multiview.photometric(x.two_views(depth)),
-        "multiview_geometric": lambda x, depth: multiview.geometric(x.two_views(depth)),
-        "depth_prior": _depth_prior,
-        "normal_prior": _normal_prior,
+        "l1": lambda output, view, fused: view.photometric(output, fused)[0],
+        "ssim": lambda output, view, fused: 1 - view.photometric(output, fused)[1],
+        "normal_consistency": partial(_fused_normals, kind="normal_consistency"),
+        "normal_consistency_per_splat": partial(_fused_normals, kind="normal_consistency_per_splat"),
+        "distortion": lambda output, view, fused: fused.masked_mean(output.distortion, view.mask),
     }
 )
-"""Every kind of loss in plain torch, unweighted."""
-
-FUSED_LOSSES: Mapping[str, LossFunction] = MappingProxyType(
-    {
-        "l1": lambda x, _: x.fused_photometric[0],
-        "ssim": lambda x, _: 1 - x.fused_photometric[1],
-        "normal_consistency": lambda x, depth: _fused_normals(x, depth, "normal_consistency"),
-        "normal_consistency_per_splat": lambda x, depth: _fused_normals(x, depth, "normal_consistency_per_splat"),
-        "distortion": lambda x, _: _fused(x).masked_mean(x.output.distortion, x.mask),
-        "silhouette": _silhouette,  # one subtraction and a mean: not worth an operation of its own
-        **{kind: LOSSES[kind] for kind in MULTIVIEW_KINDS},  # a few thousand patches
-        **{kind: LOSSES[kind] for kind in PRIOR_KINDS},  # a few thousand points, or five passes over a picture
-    }
-)
-"""The same kinds as fused operations."""
-
-_BY_BACKEND: Mapping[str, Mapping[str, LossFunction]] = MappingProxyType(
-    {"reference": LOSSES, "cpu": FUSED_LOSSES, "cuda": FUSED_LOSSES}
-)
+"""The losses for which a backend may have fused operations; the others are not worth any (docs/performance.md)."""
 
 
 def compute_losses(
@@ -239,11 +296,13 @@ def compute_losses(
     *,
     iteration: int,
     depth_kind: str,
-    backend_name: str,
+    backend: str | Backend,
     target_cache: TargetMaps | None = None,
     silhouette: Tensor | None = None,
     neighbour: Neighbour | None = None,
     prior: Prior | None = None,
+    index: int | None = None,
+    functions: Mapping[tuple[str, str], LossFunction] | None = None,
 ) -> dict[str, Tensor]:
     """Weighted values of the active terms; their sum is the loss.
 
@@ -262,8 +321,8 @@ def compute_losses(
         Counted from 1 within the stage.
     depth_kind : "mean" or "median"
         The protocol's depth, for terms that name none.
-    backend_name : "cpu", "cuda" or "reference"
-        Resolved name of the backend that rendered ``output`` (not "auto").
+    backend : str or Backend
+        That rendered ``output``: its fused operations are taken, where it has any.
     target_cache : TargetMaps, optional
         Of this target: spares the native SSIM one blur of four. It never changes the value.
     silhouette : Tensor [H, W], optional
@@ -272,20 +331,24 @@ def compute_losses(
         A second view, for the losses that compare two.
     prior : Prior, optional
         What is known of the view, for the losses on known depths and normals.
+    index : int, optional
+        Of the training view.
+    functions : mapping, optional
+        By :func:`loss_of` the functions of terms with data of their own, which :func:`prepared` makes.
 
     Returns
     -------
     dict of kind to Tensor []
-        weight * LOSSES[kind], in the order of ``terms``.
+        weight * loss, in the order of ``terms``; without those that have nothing to say of this view.
 
     Raises
     ------
     ShapeError
         Target, mask or camera of another size than the image, or a cache of another target.
     RecipeError
-        A kind that is not in LOSSES, a term without a weight, or a silhouette term without a silhouette.
+        A kind that nobody has registered, a term without a weight, or a silhouette term without a silhouette.
     BackendError
-        A backend without losses.
+        The backend cannot run here.
     """
     sizes = check_shapes({"color": (output.color, "H W 3"), "target": (target, "H W 3")})
     if mask is not None:
@@ -294,53 +357,81 @@ def compute_losses(
         check_shapes({"target": (target, "H W 3"), "silhouette": (silhouette, "H W")})
     if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
         raise ShapeError(f"camera is {camera.width}x{camera.height}, but the image is {sizes['W']}x{sizes['H']}")
-    if backend_name not in _BY_BACKEND:
-        raise BackendError(f"losses run on backend {' or '.join(map(repr, _BY_BACKEND))}, got {backend_name!r}")
-    functions = _BY_BACKEND[backend_name]
     if target_cache is not None:
         target_cache.check(target)
     weights: dict[str, float] = {}
     active: list[tuple[LossTerm, float]] = []
     for term in terms:
-        if term.kind not in functions:
-            raise RecipeError(f"loss kind must be one of {', '.join(LOSSES)}, got {term.kind!r}")
         if term.weight is None:
             raise RecipeError(f"loss {term.kind!r} has no weight; resolve the recipe's losses with a protocol first")
         if iteration > term.start:
             active.append((term, term.weight))
             weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
-    mean = target_cache.mean if target_cache is not None else None
-    fused = _fused_operations(backend_name, output.color.device)
-    inputs = LossInputs(output, target, mask, camera, mean, weights, fused, silhouette, neighbour, prior)
+    view = LossView(
+        target,
+        mask,
+        camera,
+        iteration,
+        depth_kind,
+        index,
+        silhouette,
+        neighbour,
+        prior,
+        None if target_cache is None else target_cache.mean,
+        weights,
+        _operations(backend, output.color.device),
+    )
     values: dict[str, Tensor] = {}
     for term, weight in active:
-        value = weight * functions[term.kind](inputs, term.depth or depth_kind)
-        values[term.kind] = values[term.kind] + value if term.kind in values else value
+        view.depth_kind = term.depth or depth_kind
+        found = _value(term, output, view, functions or {})
+        if found is not None:
+            value = weight * found
+            values[term.kind] = values[term.kind] + value if term.kind in values else value
     return values
 
 
+def _value(
+    term: LossTerm, output: RenderOutput, view: LossView, functions: Mapping[tuple[str, str], LossFunction]
+) -> Tensor | None:
+    """The unweighted value of a term."""
+    if view.fused is not None and term.kind in FUSED:
+        return FUSED[term.kind](output, view, view.fused)
+    function = functions.get(loss_of(term)) if functions else None
+    if function is None:
+        function = LOSSES.get(term.kind)
+        if isinstance(function, type):
+            raise RecipeError(f"loss {term.kind!r} has data of its own; pass what prepared() makes as `functions`")
+        function = partial(function, **term.options) if term.options else function
+    value: Tensor | None = function(output, view)
+    return value
+
+
 def ssim(
-    image: Tensor, target: Tensor, mask: Tensor | None = None, *, backend_name: str, target_mean: Tensor | None = None
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    *,
+    backend: str | Backend,
+    target_mean: Tensor | None = None,
 ) -> Tensor:
-    """Mean SSIM [] over valid pixels, for evaluation (``LOSSES["ssim"]`` is 1 minus this).
+    """Mean SSIM [] over valid pixels, for evaluation (the loss "ssim" is 1 minus this).
 
     Parameters
     ----------
     image, target : Tensor [H, W, 3]
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
-    backend_name : "cpu", "cuda" or "reference"
+    backend : str or Backend
     target_mean : Tensor [H, W, 3], optional
         ``target_maps(target).mean``.
 
     Raises
     ------
     BackendError
-        A backend without losses.
+        The backend cannot run here.
     """
-    if backend_name not in _BY_BACKEND:
-        raise BackendError(f"losses run on backend {' or '.join(map(repr, _BY_BACKEND))}, got {backend_name!r}")
-    fused = _fused_operations(backend_name, image.device)
+    fused = _operations(backend, image.device)
     if fused is not None:
         return fused.photometric(image, target, mask, target_mean)[1]
     return reference.ssim(image, target, mask)

@@ -20,6 +20,7 @@ from gs2d.meshing.tsdf import find_blocks
 from gs2d.meshing.unbounded import FAR_VIEWS, cascade_marching_cubes, fuse_cascade
 from gs2d.meshing.unbounded_bounds import derive_cascade
 from gs2d.meshing.volume import Volume
+from gs2d.render.backends import Backend
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def extract(
     keep: int | None = None,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
     folder: str | os.PathLike[str] | None = None,
     by_evidence: bool = False,
     with_bare: bool = True,
@@ -76,7 +77,7 @@ def extract(
     max_bytes : int
         Bound on the volume.
     threads : int, optional
-    backend : str
+    backend : str or Backend
         What fuses, see ``fuse``.
     folder : path, optional
         Where the temporary file goes.
@@ -142,7 +143,7 @@ def extract_unbounded(
     keep: int | None = None,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
     folder: str | os.PathLike[str] | None = None,
 ) -> Extraction:
     """Fuse frames of a scene without bounds into a mesh, in voxels that grow with the distance from its centre.
@@ -213,7 +214,7 @@ class _Fused:
 
 
 def _extraction(
-    whole: Mesh, limits: FusionBounds, fused: _Fused, *, min_faces: int, keep: int | None, backend: str
+    whole: Mesh, limits: FusionBounds, fused: _Fused, *, min_faces: int, keep: int | None, backend: Backend
 ) -> Extraction:
     """Without small pieces, with the figures."""
     mesh = keep_components(whole, min_faces=min_faces, keep=keep)
@@ -226,5 +227,5 @@ def _extraction(
         components=int(components(whole).max(initial=-1)) + 1,
         faces_removed=len(whole.faces) - len(mesh.faces),
         levels=fused.levels,
-        backend=backend,
+        backend=backend.name,
     )

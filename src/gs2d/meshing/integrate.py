@@ -1,6 +1,6 @@
 """Adding depth maps to volumes: in numpy, in native code, or on a GPU, with the same bits in single precision.
 
-numpy is the reference, and runs everywhere. Which of the three adds a view is asked for by the name of a backend.
+numpy is the reference, and runs everywhere. Which of the three adds a view is the matter of a backend.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gs2d.errors import BackendError
+from gs2d.kernels.tsdf import FusionOnHost
 from gs2d.meshing.sampling import DepthSampler, block_visibility
 from gs2d.meshing.volume import BLOCK, VOXELS, Volume
+from gs2d.render.backends import Backend, get_backend
 
 if TYPE_CHECKING:
     import torch
@@ -25,37 +26,32 @@ if TYPE_CHECKING:
     from gs2d.kernels.library import Library
 
 FULL_WEIGHT_BEHIND = 0.75  # of the truncation: the weight falls from 1 here to 0 at the truncation
-BACKENDS = ("cpu", "cuda", "reference")
 _CHUNK = 48  # blocks at a time in numpy: the temporaries of a chunk fit the second-level cache
 
 Add = Callable[[DepthSampler], None]
 
 
-def fusion_backend(name: str) -> str:
-    """The name of what will add views: "auto" is "cpu" where the native library was built, else "reference" (numpy).
+def fusion_backend(backend: str | Backend) -> Backend:
+    """Return what will add views: "auto" is the processor's, the native library where it was built, else numpy.
 
     Raises
     ------
     BackendError
-        If the name is unknown.
+        If the name is unknown, or that backend cannot run here.
     """
-    if name == "auto":
-        from gs2d.kernels.library import available_variants
-
-        return "cpu" if available_variants() else "reference"
-    if name not in BACKENDS:
-        raise BackendError(f"backend must be one of auto, {', '.join(BACKENDS)}, got {name!r}")
-    return name
+    return get_backend(backend, "cpu") if isinstance(backend, str) else backend
 
 
-def integrator(volumes: Sequence[Volume], backend: str, threads: int | None = None) -> AbstractContextManager[Add]:
-    """A context in which views can be added to all volumes; their arrays hold the result after it.
+def integrator(
+    volumes: Sequence[Volume], backend: str | Backend, threads: int | None = None
+) -> AbstractContextManager[Add]:
+    """Return a context in which views can be added to all volumes; their arrays hold the result after it.
 
     Parameters
     ----------
     volumes : sequence of Volume
-    backend : str
-        "auto", "cpu", "cuda" or "reference".
+    backend : str or Backend
+        "auto", "cpu", "cuda", "reference", or another's name.
     threads : int, optional
         Default: as many as the machine has. The result does not depend on it.
 
@@ -65,24 +61,12 @@ def integrator(volumes: Sequence[Volume], backend: str, threads: int | None = No
         If the backend is unknown or cannot run here.
     """
     threads = threads or os.cpu_count() or 1
-    name = fusion_backend(backend)
-    if name == "reference":
+    fusion = fusion_backend(backend).fusion()
+    if fusion is None:
         return add_in_numpy(volumes, threads)
-    if name == "cpu":
-        from gs2d.kernels.library import load
-
-        return add_natively(volumes, load(), threads)
-    from gs2d.kernels.cuda.launch import launcher_for
-
-    device = gpu_device()
-    return add_on_gpu(volumes, launcher_for(device), device)
-
-
-def gpu_device() -> torch.device:
-    """The GPU that fuses: torch's current one."""
-    import torch
-
-    return torch.device("cuda")
+    if isinstance(fusion, FusionOnHost):
+        return add_natively(volumes, fusion.library, threads)
+    return add_on_gpu(volumes, fusion.launcher, fusion.device)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import EDGES_OF_BLOCK, cell_surface, edge_vertices
 from gs2d.meshing.tsdf import Blocks, fuse_blocks
 from gs2d.meshing.volume import block_bytes
+from gs2d.render.backends import Backend
 
 SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared too often, much more and it is the peak
 
@@ -29,7 +30,7 @@ def fused_surface(
     min_weight: float = 1.0,
     slab_bytes: int = SLAB_BYTES,
     threads: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> Mesh:
     """Return what ``marching_cubes(fuse(...))`` returns, without all of the volume in memory.
 

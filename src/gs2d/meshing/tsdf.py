@@ -22,6 +22,7 @@ from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.integrate import fusion_backend, integrator
 from gs2d.meshing.sampling import make_sampler
 from gs2d.meshing.volume import BLOCK, Budget, Volume, block_bytes, block_grid, check_truncation, invalid_volume
+from gs2d.render.backends import Backend
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
@@ -36,7 +37,7 @@ def fuse(
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> Volume:
     """Fuse depth maps.
 
@@ -49,7 +50,7 @@ def fuse(
         The volume will not grow beyond this.
     threads : int, optional
         Default: as many as the machine has. The result does not depend on it.
-    backend : str
+    backend : str or Backend
         What adds the views: "reference" (numpy), "cpu" (native, the same bits), "cuda", or "auto" (see
         ``integrate.fusion_backend``).
 
@@ -100,7 +101,7 @@ def find_blocks(
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> Blocks:
     """Find the blocks that are fused; parameters and errors as of ``fuse``."""
     if iter(frames) is frames:
@@ -127,7 +128,7 @@ def fuse_blocks(
     blocks: Blocks,
     *,
     threads: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> Volume:
     """Fuse depth maps into these blocks; parameters as of ``fuse``."""
     volume = invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
@@ -222,9 +223,9 @@ def _lowest_blocks(
         yield flat[np.flatnonzero(np.diff(flat, prepend=-1))]  # neighbours mostly share a block
 
 
-def block_finder(backend: str, threads: int | None) -> Library | None:
+def block_finder(backend: str | Backend, threads: int | None) -> Library | None:
     """The native library for ``touched_blocks``, on so many threads; None: numpy, for the reference and without it."""
-    if fusion_backend(backend) == "reference":
+    if fusion_backend(backend).fusion() is None:
         return None
     from gs2d.kernels.library import available_variants, load
 

@@ -26,6 +26,7 @@ from gs2d.meshing.sampling import make_sampler
 from gs2d.meshing.tsdf import block_finder, merged, min_blocks, touched_blocks
 from gs2d.meshing.unbounded_bounds import STEP, TsdfCascade
 from gs2d.meshing.volume import BLOCK, VOXELS, Budget, Volume, check_truncation, invalid_volume
+from gs2d.render.backends import Backend
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
@@ -39,7 +40,7 @@ def fuse_cascade(
     *,
     max_bytes: int = 4 << 30,
     threads: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> tuple[Volume, ...]:
     """Fuse depth maps into every level of a nest.
 
@@ -52,7 +53,7 @@ def fuse_cascade(
         The volumes together will not grow beyond this.
     threads : int, optional
         Default: as many as the machine has. The result does not depend on it.
-    backend : str
+    backend : str or Backend
         As for ``fuse``.
 
     Returns

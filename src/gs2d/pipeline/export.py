@@ -34,8 +34,8 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
     if layout is None:
         raise RunError(f"--out must end in {', '.join(ENDINGS)}, which say what is written, got {out}")
     if layout not in LAYOUTS:
-        raise RunError(f"--layout must be one of {', '.join(LAYOUTS)}, got {layout}")
-    path, out = Path(path), checked_output(path, out, LAYOUTS[layout].ending, f"layout {layout} is")
+        raise RunError(LAYOUTS.unknown(layout))
+    path, out = Path(path), checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout} is")
     if out.resolve() == (path / MESH).resolve():
         raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
     if path.is_file() and out.resolve() == path.resolve():

@@ -26,10 +26,10 @@ from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.data.benchmarks import missing_lines, protocol_of
+from gs2d.data.load import reader_of
 from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
-from gs2d.kernels import library as native
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.priors import with_priors
@@ -94,7 +94,7 @@ class Job:
             },
             "raster": asdict(self.settings),
             "seed": self.recipe.seed,
-            "backend": backend_facts(self.backend.name),
+            "backend": self.backend.facts(),
             "stage2_cache_bytes": self.stage2_cache_bytes,
         }
 
@@ -106,7 +106,7 @@ class Job:
             "protocol": _training_facts(asdict(self.protocol)),
             "raster": asdict(self.settings),
             "seed": self.recipe.seed,
-            "backend": backend_facts(self.backend.name),
+            "backend": self.backend.facts(),
             "versions": {name: versions()[name] for name in ("2dgs-r", "torch")},
             "start": [recipe["init_points"], recipe["sh_degree"]],
             "stages": recipe["stages"][: index + 1],
@@ -119,8 +119,8 @@ class Job:
 
     def _uses_cached_views(self, index: int) -> bool:
         """Whether stage ``index`` or one before it can train from cached views."""
-        name, views, stages = self.backend.name, len(self.scene.train), self.recipe.stages[: index + 1]
-        return any(is_cacheable(self.recipe, stage, backend_name=name, views=views) for stage in stages)
+        views, stages = len(self.scene.train), self.recipe.stages[: index + 1]
+        return any(is_cacheable(self.recipe, stage, backend=self.backend, views=views) for stage in stages)
 
 
 def build_recipe(
@@ -267,6 +267,7 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     check_train_options(options)
     backend = choose_backend(options.backend, on_event)
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
+    reader_of(scene_format)  # a wrong name is told before anything is read
     protocol = choose_protocol(options, scene_format, on_event)
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
@@ -309,23 +310,16 @@ def choose_backend(name: str, on_event: OnEvent) -> Backend:
     backend = get_backend(name)
     if name != "auto":
         return backend
-    statuses = {status.name: status for status in backend_report()}
-    cuda, cpu = statuses["cuda"], statuses["cpu"]
-    if backend.name == "cuda":
-        on_event(Notice(f"training on {cuda.details} (--backend cpu for the processor)"))
+    report = backend_report()  # best first: all before the one that was taken cannot run
+    taken = [status.name for status in report].index(backend.name)
+    if backend.device != "cpu":
+        on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)"))
     elif torch.version.cuda is not None and torch.cuda.device_count() > 0:
-        on_event(Notice(f"training without the GPU: {cuda.reason}; {cuda.remedy}"))
-    if backend.name == "reference":
-        on_event(Notice(f"training with the reference backend, which is slow: {cpu.reason}; {cpu.remedy}"))
+        on_event(Notice(f"training without the GPU: {report[0].reason}; {report[0].remedy}"))
+    if backend.slow:
+        better = report[taken - 1]
+        on_event(Notice(f"training with a slow backend, {backend.name}: {better.reason}; {better.remedy}"))
     return backend
-
-
-def backend_facts(name: str) -> dict[str, Any]:
-    """What decides the bytes that a backend computes: its name, and of the native one instruction set and version."""
-    if name != "cpu":
-        return {"name": name}
-    library = native.load()
-    return {"name": name, "instruction_set": library.instruction_set, "kernels": native.ABI_VERSION}
 
 
 def read_scene(path: Path, scene_format: str, downscale: int, protocol: Protocol, on_event: OnEvent) -> Scene:
@@ -401,7 +395,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
     if not where.exists():
         raise RunError(f"the capture of {run.path} was at {where}, which is not there; put it back or link it there")
     try:
-        recipe, protocol = from_json(data["recipe"]), protocol_from_json(data["protocol"])
+        recipe, protocol = from_json(data["recipe"], to_train=False), protocol_from_json(data["protocol"])
         settings = RasterSettings(**{**data["raster"], "background": tuple(data["raster"]["background"])})
         named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
         cache_bytes = int(data.get("stage2_cache_bytes", 0))  # runs of before there were cached views had none

@@ -210,7 +210,7 @@ def _extract(
         keep=keep or None,
         max_bytes=int(options.max_gib * 2**30),
         threads=torch.get_num_threads(),
-        backend=job.backend.name,
+        backend=job.backend,
     )
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface was covered well enough"))

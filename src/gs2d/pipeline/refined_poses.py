@@ -176,7 +176,7 @@ def aligned(
         for step in range(1, STEPS + 1):
             camera = perturb_pose(view.camera, motion * unit)
             output = rasterize(splats, camera, settings, backend=backend)
-            options: dict[str, Any] = {"iteration": step, "depth_kind": "mean", "backend_name": backend.name}
+            options: dict[str, Any] = {"iteration": step, "depth_kind": "mean", "backend": backend}
             loss = sum(compute_losses(output, target, mask, camera, PHOTOMETRIC, **options).values())
             optimizer.zero_grad()
             if isinstance(loss, torch.Tensor) and loss.requires_grad:

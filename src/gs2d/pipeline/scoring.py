@@ -76,7 +76,7 @@ def score_views(
     on_event(Phase(name, len(views)))
     scores: dict[str, ImageMetrics] = {}
     for done, seen in enumerate(_seen(splats, views, settings, backend, exposures, match, split), start=1):
-        metrics = image_metrics(seen.image, seen.target, seen.mask, backend_name=backend.name, lpips=lpips)
+        metrics = image_metrics(seen.image, seen.target, seen.mask, backend=backend, lpips=lpips)
         scores[seen.view.name] = metrics
         for visit in visitors:
             visit(seen, metrics)

@@ -158,17 +158,7 @@ def rasterize(
             f"gradient_rows must be bool on {splats.device} (True = has gradients), got {gradient_rows.dtype} "
             f"on {gradient_rows.device}"
         )
-    if chosen.rasterize_rows is not None:
-        return chosen.rasterize_rows(splats, camera, settings, screen_probe, gradient_rows)
-    learning = Splats(**{name: _only_rows(tensor, gradient_rows) for name, tensor in splats.items()})
-    probe = None if screen_probe is None else _only_rows(screen_probe, gradient_rows)
-    return chosen.rasterize(learning, camera, settings, probe)
-
-
-def _only_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """The same values; gradients reach only these rows."""
-    shape = (-1, *[1] * (tensor.dim() - 1))
-    return torch.where(rows.reshape(shape), tensor, tensor.detach()) if tensor.requires_grad else tensor
+    return chosen.rasterize(splats, camera, settings, screen_probe, gradient_rows)
 
 
 def splat_errors(
@@ -263,7 +253,7 @@ def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> Rast
         if tensor.device != splats.device:
             raise ShapeError(f"{name} must be on {splats.device} like means, got {tensor.device}")
     _check_settings(settings)
-    if settings.lowpass_depth != "center" and backend.name != "reference":
+    if settings.lowpass_depth not in backend.lowpass_depths:
         raise BackendError(
             f"lowpass_depth={settings.lowpass_depth!r} is a setting of the reference backend, got backend "
             f"{backend.name!r}: use backend='reference' or lowpass_depth='center'"

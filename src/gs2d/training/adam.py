@@ -1,18 +1,18 @@
 """Adam over the six attributes, for all rows or for a row group; rows that are not trained are never written.
 
-The arithmetic is torch's fused Adam; moments live in the TrainState, so that rows can come and go.
+The arithmetic is torch's fused Adam; moments live in the TrainState, so that rows can come and go. A backend does it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-import torch
 from torch import Tensor
-from torch.optim.adam import adam
 
 from gs2d.config.recipe import LearningRates, Stage
 from gs2d.core.splats import ATTRIBUTES
+from gs2d.kernels.adam import AdamUpdate
+from gs2d.render.backends import PLAIN, Backend
 from gs2d.training.state import Moments, TrainState
 
 
@@ -32,13 +32,13 @@ def lr_at(lr: LearningRates, iteration: int, extent: float) -> dict[str, float]:
     return fixed | {"means": lr.means_at(iteration) * extent}
 
 
-@torch.no_grad()
 def adam_step(
     state: TrainState,
     stage: Stage,
     gradients: Mapping[str, Tensor],
     lr: Mapping[str, float],
     *,
+    backend: Backend = PLAIN,
     skip: Collection[str] = (),
     rows: Tensor | None = None,
 ) -> None:
@@ -51,47 +51,29 @@ def adam_step(
     gradients : mapping of attribute to Tensor
         Like the attributes; rows outside a row group are not read. With ``rows``, only of those, in their order.
     rates : mapping of attribute to float
+    backend : Backend
+        Does it; by default plain torch.
     skip : attributes that are left alone this time
     rows : Tensor [M] int64, optional
         The rows of the group that the stage trains, where the gradients are of those alone.
     """
+    updates = []
     for name, parameter in state.splats.items():
         if name not in stage.train or name in skip or parameter.numel() == 0:
             continue
         moments, group = state.moments[name], stage.train[name]
         moments.steps += 1
-        if group == "all":
-            _update(parameter, gradients[name], moments.mean, moments.square, moments.steps, lr[name], stage.lr)
-            continue
-        trained = state.groups[group].nonzero().squeeze(1) if rows is None else rows  # [M]
-        if len(trained) == 0:
-            continue
-        gradient = gradients[name][trained] if rows is None else gradients[name]
-        whole = (parameter, moments.mean, moments.square)
-        parts = [tensor[trained] for tensor in whole]
-        _update(parts[0], gradient, parts[1], parts[2], moments.steps, lr[name], stage.lr)
-        for tensor, part in zip(whole, parts, strict=True):
-            tensor[trained] = part
-
-
-def _update(
-    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, steps: int, rate: float, settings: LearningRates
-) -> None:
-    """Adam with bias correction, in place (``steps`` counts this update)."""
-    step = torch.tensor(float(steps - 1), device=parameter.device)  # adam() adds one
-    adam(
-        [parameter],
-        [gradient.contiguous()],
-        [mean],
-        [square],
-        [],
-        [step],
-        fused=True,
-        amsgrad=False,
-        beta1=settings.beta1,
-        beta2=settings.beta2,
-        lr=rate,
-        weight_decay=0.0,
-        eps=settings.eps,
-        maximize=False,
-    )
+        updates.append(
+            AdamUpdate(
+                parameter,
+                moments.mean,
+                moments.square,
+                gradients[name],
+                lr[name],
+                moments.steps,
+                trained=None if group == "all" or rows is not None else state.groups[group],
+                rows=None if group == "all" else rows,
+                compact=rows is not None and group != "all",
+            )
+        )
+    backend.adam_step(updates, beta1=stage.lr.beta1, beta2=stage.lr.beta2, eps=stage.lr.eps)

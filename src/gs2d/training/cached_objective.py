@@ -10,7 +10,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
-from gs2d.render.cpu_cached import CachedView, cache_view
+from gs2d.render.backends import Backend
+from gs2d.render.cpu_cached import CachedView
 from gs2d.render.types import RenderOutput
 from gs2d.training.objective import FullRender, Objective, StepResult
 from gs2d.training.state import TrainState
@@ -21,14 +22,14 @@ MIN_FRACTION = 0.5  # of the views: a cache for fewer saves little of a stage, a
 WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
 
 
-def is_cacheable(recipe: Recipe, stage: Stage, *, backend_name: str, views: int) -> bool:
+def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int) -> bool:
     """Whether a stage can train from cached views, and is long enough to gain by it.
 
     It trains the colours of one row group and nothing else, at one SH degree, by losses of the colour image.
     """
     groups = set(stage.train.values())
     return (
-        backend_name == "cpu"
+        backend.caches_views
         and COLORS.issuperset(stage.train)
         and len(groups) == 1
         and "all" not in groups
@@ -41,8 +42,8 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend_name: str, views: int)
 
 def choose_objective(whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int) -> Objective:
     """Cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
-    name, views = whole.backend.name, len(whole.scene.train)
-    if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend_name=name, views=views):
+    backend, views = whole.backend, len(whole.scene.train)
+    if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend=backend, views=views):
         cached = CachedViews(whole, state, stage, limit_bytes, least=MIN_FRACTION * views)
         return cached if cached.views else whole
     return whole
@@ -80,16 +81,19 @@ class CachedViews:
         self.views: list[CachedView] = []
         settings, room = whole.settings(stage, 1), limit_bytes
         for index in range(len(whole.scene.train)):
-            cached = cache_view(state.splats, whole.camera(state, index), settings, self.rows, limit_bytes=room)
+            camera = whole.camera(state, index)
+            cached = whole.backend.cache_view(state.splats, camera, settings, self.rows, limit_bytes=room)
             if cached is None or (index == 0 and cached.nbytes * least > limit_bytes):
                 break
             room -= cached.nbytes
             self.views.append(cached)
 
-    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> StepResult:
+    def evaluate(
+        self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
+    ) -> StepResult:
         """Loss and gradients of training view ``index``, checked to be finite (DivergedError)."""
         if index >= len(self.views):
-            return self._whole.evaluate(state, stage, iteration, index)
+            return self._whole.evaluate(state, stage, iteration, index, probe)
         parameters = dict(state.splats.items())
         leaves = {name: parameters[name][self.rows].requires_grad_(name in stage.train) for name in sorted(COLORS)}
         color = self.views[index].render(leaves["sh0"], leaves["shN"])

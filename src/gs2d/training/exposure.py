@@ -21,6 +21,7 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.sh import rgb_to_sh0, sh_to_rgb
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError
+from gs2d.render.backends import PLAIN, Backend
 from gs2d.render.exposure import expose, identity
 from gs2d.render.types import RasterSettings
 
@@ -114,7 +115,7 @@ def exposure_step(
     recipe: Recipe,
     stage: int,
     iteration: int,
-    cancel: Tensor | None = None,
+    backend: Backend = PLAIN,
 ) -> None:
     """One Adam update of the transform of a view, in place.
 
@@ -128,9 +129,8 @@ def exposure_step(
     recipe : Recipe
     stage, iteration : int
         Rates decay over the whole run; before ``recipe.exposure.start`` nothing happens.
-    cancel : Tensor [] int32, optional
-        On the device: where it is not 0 nothing is changed but the count, which is the host's
-        (:func:`uncount`).
+    backend : Backend
+        Writes the new values. Where it does not, the count has gone on all the same (:func:`uncount`).
     """
     settings, rate = recipe.exposure, _rate(recipe, stage, iteration)
     if settings is None or rate == 0:
@@ -143,7 +143,7 @@ def exposure_step(
     scale = (square / (1 - beta2**count)).sqrt() + settings.eps
     offset = rows[0] - rate / (1 - beta1**count) * mean / scale
     for row, new in zip(rows, (offset, mean, square), strict=True):
-        row.copy_(new if cancel is None else torch.where(cancel != 0, row, new))
+        backend.assign(row, new)
 
 
 def uncount(exposures: Exposures, index: int, recipe: Recipe, stage: int, iteration: int) -> None:

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol as Interface
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.config.losses import LOSSES
 from gs2d.config.multiview import MULTIVIEW_KINDS
 from gs2d.config.priors import PRIOR_KINDS
 from gs2d.config.protocols import Protocol
@@ -19,8 +19,8 @@ from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DivergedError
-from gs2d.kernels import adam
-from gs2d.losses.api import compute_losses
+from gs2d.kernels.reference import finite
+from gs2d.losses.api import compute_losses, loss_of, prepared
 from gs2d.losses.multiview import Neighbour
 from gs2d.losses.priors import Prior
 from gs2d.render.api import rasterize
@@ -85,8 +85,10 @@ class StepResult:
 class Objective(Interface):
     """How a stage gets the loss and the gradients of a view."""
 
-    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> StepResult:
-        """Loss and gradients of training view ``index``, checked to be finite (DivergedError)."""
+    def evaluate(
+        self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
+    ) -> StepResult:
+        """Loss and gradients of a training view, and of a screen probe; checked to be finite (DivergedError)."""
 
 
 class FullRender:
@@ -101,6 +103,9 @@ class FullRender:
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
             self._images = ImageFiles(scene.train, recipe.multiview)
+        guests = [term for stage in recipe.stages for term in stage.losses if term.kind not in LOSSES.builtin]
+        device = torch.device(backend.device)
+        self._functions = {loss_of(term): prepared(term, scene, recipe, device) for term in guests}
         self._priors = Priors(scene, recipe, device=backend.device) if has_priors(recipe) else None
 
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
@@ -114,18 +119,15 @@ class FullRender:
         given = self.scene.train[index].camera
         return given if state.poses is None else state.poses.camera(index, given, learns=learns)
 
-    def evaluate(self, state: TrainState, stage: Stage, iteration: int, index: int) -> StepResult:
+    def evaluate(
+        self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
+    ) -> StepResult:
         """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
-        splats, densify = state.splats, stage.densify
+        splats = state.splats
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
-        gather = densify is not None and iteration < densify.stop
-        probe = None
-        if gather:
-            columns = 4 if densify is not None and densify.absolute else 2
-            probe = splats.means.new_zeros(len(splats), columns, requires_grad=True)
         camera = self.camera(state, index, learns=pose_rate(self.recipe, state.stage, iteration) > 0)
         settings = self.settings(stage, iteration)
-        rows = None if gather else _learning_rows(state, stage)  # the signal is of every splat
+        rows = _learning_rows(state, stage) if probe is None else None  # the signal is of every splat
         output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
         neighbour = self._neighbour_of(state, stage, iteration, index)
         given = (index, camera, output, dict(leaves.items()), neighbour)
@@ -184,11 +186,13 @@ class FullRender:
             [t for t in self.protocol.resolve(stage.losses) if _can_be_asked(t.kind, neighbour, prior)],
             iteration=iteration,
             depth_kind=self.protocol.depth,
-            backend_name=self.backend.name,
+            backend=self.backend,
             target_cache=target.maps,
             silhouette=target.silhouette,
             neighbour=neighbour,
             prior=prior,
+            index=index,
+            functions=self._functions,
         )
         if transform is not None:
             assert self.recipe.exposure is not None
@@ -205,7 +209,7 @@ class FullRender:
         gradients = {name: _gradient(tensor) for name, tensor in leaves.items() if name in stage.train}
         if transform is not None:
             gradients["exposure"] = _gradient(transform)
-        broken = first_not_finite(gradients, self.backend.name) if watched else None
+        broken = first_not_finite(gradients, self.backend) if watched else None
         if state.poses is not None and camera.pose is not None:
             gradients["pose"] = state.poses.gradient(camera)  # in the host's memory, on a GPU too
             broken = broken if finite(gradients["pose"]) else "pose"
@@ -267,22 +271,7 @@ def _gradient(leaf: Tensor) -> Tensor:
     return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
 
 
-def first_not_finite(tensors: Mapping[str, Tensor], backend_name: str) -> str | None:
+def first_not_finite(tensors: Mapping[str, Tensor], backend: Backend) -> str | None:
     """The name of the first tensor that holds a NaN or an infinity; None if all are finite."""
-    if backend_name == "cpu":  # one native call: a tenth of the time of six sums
-        names = list(tensors)
-        found = adam.first_not_finite(list(tensors.values()))
-        return None if found is None else names[found]
-    return next((name for name, tensor in tensors.items() if not finite(tensor)), None)
-
-
-def finite(tensor: Tensor) -> bool:
-    """Whether all of a tensor is finite: a sum costs one pass, and cannot be finite if a term is not.
-
-    On the CPU numpy sums: it wakes no threads, which costs more than the sum where cores are busy.
-    """
-    detached = tensor.detach()
-    if detached.device.type != "cpu":
-        return bool(torch.isfinite(detached.sum()))
-    with np.errstate(all="ignore"):
-        return bool(np.isfinite(detached.numpy().sum()))
+    number = backend.first_not_finite(list(tensors.values()))
+    return None if number is None else list(tensors)[number]

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene
+from gs2d.kernels.reference import finite
+from gs2d.render.backends import Backend
 from gs2d.training.exposure import Exposures, check_views, exposure_step, uncount
-from gs2d.training.objective import finite
 from gs2d.training.point_gains import point_gains
 from gs2d.training.poses import Poses, check_poses, pose_rate, pose_step
 from gs2d.training.state import TrainState
@@ -39,13 +40,13 @@ def update(
     iteration: int,
     index: int,
     gradients: Mapping[str, Tensor],
-    cancel: Tensor | None = None,
+    backend: Backend,
 ) -> None:
-    """Update what is learned of a view; ``cancel`` on a device: where it is not 0 nothing changes."""
+    """Update what is learned of a view."""
     if state.exposures is not None:
-        exposure_step(state.exposures, index, gradients["exposure"], recipe, state.stage, iteration, cancel)
-    if state.poses is not None and "pose" in gradients and (cancel is None or int(cancel) == 0):
-        # The host has waited for the gradient, so it may look at ``cancel`` too.
+        exposure_step(state.exposures, index, gradients["exposure"], recipe, state.stage, iteration, backend)
+    if state.poses is not None and "pose" in gradients and backend.is_whole():
+        # The host has waited for the gradient, so it may ask.
         pose_step(state.poses, index, gradients["pose"], recipe, pose_rate(recipe, state.stage, iteration))
 
 

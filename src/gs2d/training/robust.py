@@ -96,16 +96,15 @@ class Robustness:
         return iteration * settings.times // stage.iterations > (iteration - 1) * settings.times // stage.iterations
 
     @torch.no_grad()
-    def decay(self, state: TrainState, stage: Stage, iteration: int, cancel: Tensor | None = None) -> None:
-        """Let opacity decay, where that is due; ``cancel`` on a device: where it is not 0 nothing changes."""
+    def decay(self, state: TrainState, stage: Stage, iteration: int, backend: Backend) -> None:
+        """Let opacity decay, where that is due."""
         settings = self._recipe.opacity_decay
         if settings is None or stage.train.get("opacity_logits") != "all" or iteration % settings.every:
             return
         logits = state.splats.opacity_logits
         least = math.log(settings.least / (1 - settings.least))
         faded = torch.logit(torch.sigmoid(logits) * (1 - settings.rate)).clamp_min(least)
-        changed = logits > least
-        logits.copy_(torch.where(changed if cancel is None else changed & (cancel == 0), faded, logits))
+        backend.assign(logits, torch.where(logits > least, faded, logits))
 
 
 def _drop(state: TrainState, mask: Tensor) -> int:

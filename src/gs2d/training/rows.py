@@ -47,8 +47,7 @@ def append_rows(
         moments.mean = rows.of(moments.mean)
         moments.square = rows.of(moments.square)
     if state.statistics is not None:
-        for name, tensor in vars(state.statistics).items():
-            setattr(state.statistics, name, rows.of(tensor))
+        state.statistics = {name: rows.of(tensor) for name, tensor in state.statistics.items()}
     new_names = [name for name in groups if name not in state.groups]
     nowhere = torch.zeros(rows.before if new_names else 0, dtype=torch.bool, device=state.splats.device)
     old_groups = state.groups | dict.fromkeys(new_names, nowhere)

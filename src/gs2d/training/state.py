@@ -41,28 +41,6 @@ class Moments:
 
 
 @dataclass(eq=False)
-class Statistics:
-    """Screen gradients gathered since the last densification.
-
-    Attributes
-    ----------
-    signed, absolute : Tensor [N]
-        Sums over views of the norm of the signed and of the absolute screen gradient.
-    count : Tensor [N]
-        Views in which the splat had a radius.
-    """
-
-    signed: Tensor
-    absolute: Tensor
-    count: Tensor
-
-    @classmethod
-    def zeros(cls, splats: Splats) -> Statistics:
-        """Nothing gathered yet, for N splats."""
-        return cls(*(torch.zeros_like(splats.opacity_logits, requires_grad=False) for _ in range(3)))
-
-
-@dataclass(eq=False)
 class TrainState:
     """Mutable state of a training run. Only ``rows.keep_rows`` and ``rows.append_rows`` change N.
 
@@ -76,8 +54,8 @@ class TrainState:
         Of the attributes that the stage trains.
     groups : dict of name to bool Tensor [N]
         Row groups that entry actions wrote.
-    statistics : Statistics or None
-        None in stages without densification.
+    statistics : dict of name to Tensor [N, ...], or None
+        What the densifier of the stage gathers; None in stages without one.
     stage, step : int
         Index of the stage, and its iterations that are done.
     entered : bool
@@ -94,7 +72,7 @@ class TrainState:
     generator: torch.Generator
     moments: dict[str, Moments] = field(default_factory=dict)
     groups: dict[str, Tensor] = field(default_factory=dict)
-    statistics: Statistics | None = None
+    statistics: dict[str, Tensor] | None = None
     stage: int = 0
     step: int = 0
     entered: bool = False
@@ -120,7 +98,7 @@ class TrainState:
             "groups": {name: _copy(mask) for name, mask in self.groups.items()},
             "statistics": None
             if self.statistics is None
-            else {name: _copy(tensor) for name, tensor in vars(self.statistics).items()},
+            else {name: _copy(tensor) for name, tensor in self.statistics.items()},
             "stage": self.stage,
             "step": self.step,
             "entered": self.entered,
@@ -154,7 +132,7 @@ class TrainState:
                     for k, m in data["moments"].items()
                 },
                 {name: mask.clone() for name, mask in data["groups"].items()},
-                None if statistics is None else Statistics(**{k: v.clone() for k, v in statistics.items()}),
+                None if statistics is None else {k: v.clone() for k, v in statistics.items()},
                 int(data["stage"]),
                 int(data["step"]),
                 bool(data["entered"]),
@@ -174,7 +152,7 @@ class TrainState:
             moments.mean, moments.square = moments.mean.to(device), moments.square.to(device)
         self.groups = {name: mask.to(device) for name, mask in self.groups.items()}
         if self.statistics is not None:
-            self.statistics = Statistics(**{k: v.to(device) for k, v in vars(self.statistics).items()})
+            self.statistics = {k: v.to(device) for k, v in self.statistics.items()}
         if self.exposures is not None:
             self.exposures.move_to(device)
 
@@ -188,7 +166,8 @@ class TrainState:
             arrays[f"squared moments of {name}"] = (moments.square, f"N {tail}")
         arrays |= {f"group {name}": (mask, "N") for name, mask in self.groups.items()}
         if self.statistics is not None:
-            arrays |= {f"statistics {name}": (tensor, "N") for name, tensor in vars(self.statistics).items()}
+            for name, tensor in self.statistics.items():
+                arrays[f"statistics {name}"] = (tensor, " ".join(["N", *["_"] * (tensor.dim() - 1)]))
         check_shapes(arrays)
         if self.exposures is not None:
             self.exposures.check()

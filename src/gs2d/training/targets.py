@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gs2d.data.scene import View
-from gs2d.losses.api import TargetMaps, target_maps
+from gs2d.losses.api import TargetMaps
 
 # Of 292 photographs of 780x520 a fifth would stay in twice as much, for less than 1 % of an iteration's time: to make a
 # target anew from its bytes takes a few ms. Small captures stay whole.
@@ -54,6 +54,8 @@ class TargetSource(Protocol):
 class Targets:
     """Targets of the training views. The first ones that fit in ``limit_bytes`` stay; the others are made anew.
 
+    ``maps`` makes what the losses need of an image alone, which stays with it.
+
     Nothing is evicted: views come in shuffled epochs, where the least recently used is the next to be wanted.
     """
 
@@ -63,7 +65,7 @@ class Targets:
         background: tuple[float, float, float],
         *,
         use_masks: bool,
-        with_maps: bool,
+        maps: Callable[[Tensor], TargetMaps | None] | None = None,
         with_silhouettes: bool = False,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
@@ -72,7 +74,7 @@ class Targets:
         self._views = views
         self._background = background
         self._use_masks = use_masks
-        self._with_maps, self._with_silhouettes = with_maps, with_silhouettes
+        self._maps, self._with_silhouettes = maps, with_silhouettes
         self._dtype, self._device = dtype, device
         self._room = limit_bytes
         self._kept: dict[int, Target] = {}
@@ -91,10 +93,10 @@ class Targets:
             None,
             None if alpha is None else torch.as_tensor(alpha).to(self._device, self._dtype),
         )
-        if target.nbytes + (image.nbytes if self._with_maps else 0) > self._room:
+        if target.nbytes + (0 if self._maps is None else image.nbytes) > self._room:
             return target
-        if self._with_maps:
-            target = replace(target, maps=target_maps(image))
+        if self._maps is not None:
+            target = replace(target, maps=self._maps(image))
         self._room -= target.nbytes
         self._kept[index] = target
         return target

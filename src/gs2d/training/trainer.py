@@ -7,7 +7,6 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -18,17 +17,15 @@ from gs2d.config.recipe import CloneInPlace, RankByError, Recipe, Stage, validat
 from gs2d.core.memory import trim
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
-from gs2d.errors import DataError, DivergedError, RunError
-from gs2d.render import cuda
+from gs2d.errors import DataError, RunError
+from gs2d.losses.api import target_maps
 from gs2d.render.api import splat_errors
 from gs2d.render.backends import Backend, get_backend
-from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
 from gs2d.training.adam import adam_step, begin_stage, lr_at
-from gs2d.training.adam_fused import fused_adam_step, native_adam_step
 from gs2d.training.cached_objective import choose_objective
-from gs2d.training.densify import accumulate, densify_and_prune, limit_opacity
+from gs2d.training.densify.densifier import Surroundings, densifier_of
 from gs2d.training.exposure import apply_exposure
 from gs2d.training.initialize import initial_splats
 from gs2d.training.objective import (
@@ -46,7 +43,7 @@ from gs2d.training.priors import with_known_points
 from gs2d.training.rank_clone import clone_in_place, rank_by_error
 from gs2d.training.robust import Robustness
 from gs2d.training.rows import keep_rows
-from gs2d.training.state import Statistics, TrainState
+from gs2d.training.state import TrainState
 from gs2d.training.targets import TARGET_BYTES, DeviceTargets, Targets, TargetSource
 
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
@@ -113,10 +110,9 @@ class Trainer:
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._targets = self._make_targets(target_bytes)
-        self._adam_step = {"cpu": native_adam_step, "cuda": fused_adam_step}.get(self.backend.name, adam_step)
-        self._budget = PairBudget()  # used by the cuda backend alone
-        self._last: tuple[int, int] | None = None  # iteration and view that settle() may have to do again
-        self._whole = FullRender(scene, self.recipe, protocol, self._with_budget(self.backend), self._targets)
+        self._learner = self.backend.for_training()
+        self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
+        self._whole = FullRender(scene, self.recipe, protocol, self._learner, self._targets)
         self._stage2_cache_bytes = stage2_cache_bytes
         self._objective: Objective | None = None  # of the stage under way, from its first iteration here
 
@@ -152,13 +148,15 @@ class Trainer:
         """Run the entry actions of a stage and prepare its first iteration."""
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
-        self._objective = self._last = None
+        self._objective = None
         while self._pending:
             self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
         happened = [self._act(stage, action) for action in stage.on_enter]
         begin_stage(state, stage)
-        state.statistics = None if stage.densify is None else Statistics.zeros(state.splats)
+        state.statistics, densifier = None, self._densifiers[index]
+        if densifier is not None:
+            densifier.begin(state)
         self._check_parameters(stage, tuple(name for name, _ in state.splats.items()))
         trim()  # what finding the first splats, ranking and cloning left
         state.entered = True
@@ -169,8 +167,8 @@ class Trainer:
     def step(self) -> None:
         """One iteration of the stage that was entered.
 
-        On a GPU it may be one that changes nothing, because there was no room for all pairs of splat and tile: it is
-        then done again at the start of the next one. After a Progress event everything is settled.
+        A backend that does not wait for its device may find that it changed nothing, and do it again at the start of
+        the next one (:meth:`gs2d.render.backends.Backend.iterate`). After a Progress event everything is settled.
 
         Raises
         ------
@@ -178,18 +176,21 @@ class Trainer:
             NaN or infinity in the loss, a gradient or a parameter; names the iteration, the stage and the attribute. On
             a GPU, whose host does not wait for it, at the next Progress event, before anything could be saved.
         """
-        self._replay_on_overflow()
         state = self.state
         stage, iteration = self.recipe.stages[state.stage], state.step + 1
         index = state.next_view(len(self.scene.train))
         if self._objective is None:
             self._objective = choose_objective(self._whole, state, stage, self._stage2_cache_bytes)
         reports = iteration % self._progress_every == 0 or iteration == stage.iterations
-        changes_rows = self._densifies_or_limits(stage, iteration) or self._robust.prunes(stage, iteration)
-        self._budget.exact = reports or changes_rows  # those wait for the device anyway
-        result, happened = self._learn(stage, iteration, index)
+        densifier = self._densifiers[state.stage]
+        densifies = densifier is not None and densifier.changes(iteration)
+        changes_rows = densifies or self._robust.prunes(stage, iteration)
+        result, happened = self._learner.iterate(
+            partial(self._learn, stage, iteration, index),
+            rollback=partial(self._rollback, stage, iteration, index),
+            exact=reports or changes_rows,  # those wait for the device anyway
+        )
         happened += self._robust.prune(self.state, stage, iteration)
-        self._last = (iteration, index)
         state.step = iteration
         for event in happened:
             self._on_event(event)
@@ -200,48 +201,31 @@ class Trainer:
             self._on_event(self._progress(stage, iteration, losses, lr))
 
     def _learn(self, stage: Stage, iteration: int, index: int) -> tuple[StepResult, list[events.Event]]:
-        """Gradients of a view, statistics and densification, Adam; on the device nothing if the image was cut short."""
+        """Gradients of a view, statistics and densification, Adam."""
         assert self._objective is not None
-        result = self._objective.evaluate(self.state, stage, iteration, index)
-        cancel = self._budget.overflow
-        happened = self._densify(stage, iteration, result, cancel)
+        densifier = self._densifiers[self.state.stage]
+        probe = None if densifier is None else densifier.before_backward(self.state, iteration)
+        result = self._objective.evaluate(self.state, stage, iteration, index, probe)
+        happened = [] if densifier is None else list(densifier.after_backward(self.state, result, iteration))
         if not any(isinstance(event, events.Densified) for event in happened):
             limited = any(isinstance(event, events.OpacityLimited) for event in happened)
-            options = {"skip": ("opacity_logits",) if limited else (), "rows": result.rows}
-            if cancel is not None:
-                options["cancel"] = cancel
-            lr = lr_at(stage.lr, iteration, self.scene.extent)
-            self._adam_step(self.state, stage, result.gradients, lr, **options)  # type: ignore[arg-type]
-        self._robust.decay(self.state, stage, iteration, cancel)
-        per_image.update(self.state, self.recipe, iteration, index, result.gradients, cancel)
+            skip, lr = ("opacity_logits",) if limited else (), lr_at(stage.lr, iteration, self.scene.extent)
+            options = {"backend": self._learner, "skip": skip, "rows": result.rows}
+            adam_step(self.state, stage, result.gradients, lr, **options)  # type: ignore[arg-type]
+        self._robust.decay(self.state, stage, iteration, self._learner)
+        per_image.update(self.state, self.recipe, iteration, index, result.gradients, self._learner)
         return result, happened
 
-    def _replay_on_overflow(self) -> None:
-        """Do the last iteration again if there was no room for its pairs."""
-        if self._last is None or not self._budget.overflowed():
-            return
-        stage = self.recipe.stages[self.state.stage]
+    def _rollback(self, stage: Stage, iteration: int, index: int) -> None:
+        """Take back what the host has counted of an iteration that changed nothing."""
         for name, parameter in self.state.splats.items():
             if name in stage.train and parameter.numel() > 0:
-                self.state.moments[name].steps -= 1  # counted on the host
-        per_image.rollback(self.state, self.recipe, *self._last)
-        self._budget.exact = True
-        self._learn(stage, *self._last)
+                self.state.moments[name].steps -= 1
+        per_image.rollback(self.state, self.recipe, iteration, index)
 
-    def _densifies_or_limits(self, stage: Stage, iteration: int) -> bool:
-        """Whether splats come and go, or opacities are limited, at the end of an iteration."""
-        densify = stage.densify
-        if densify is None or iteration >= densify.stop:
-            return False
-        capped = densify.cap_every > 0 and iteration % densify.cap_every == 0
-        return densify.densifies(iteration) or densify.resets(iteration, white=self.protocol.white) or capped
-
-    def _with_budget(self, backend: Backend) -> Backend:
-        """The backend for training iterations, which need not wait for the number of pairs."""
-        if backend.rasterize is not cuda.rasterize:
-            return backend
-        budgeted = partial(cuda.rasterize, budget=self._budget)
-        return replace(backend, rasterize=budgeted, rasterize_rows=budgeted)
+    def _surroundings(self, stage: Stage) -> Surroundings:
+        """Where the densifier of a stage works."""
+        return Surroundings(stage.name, self.scene, self.settings, self.protocol.white, self._learner)
 
     def _make_targets(self, limit_bytes: int | None) -> TargetSource:
         """The photographs, where the splats are."""
@@ -250,11 +234,13 @@ class Trainer:
         if is_async(device):
             limit = 1 << 31 if limit_bytes is None else limit_bytes
             return DeviceTargets(views, background, use_masks=use_masks, device=device, dtype=dtype, limit_bytes=limit)
+        operations = self.backend.loss_operations(device)
+        keeps = operations is not None and operations.blur is not None
         return Targets(
             views,
             background,
             use_masks=use_masks,
-            with_maps=self.backend.name == "cpu",
+            maps=partial(target_maps, backend=self.backend) if keeps else None,
             with_silhouettes=self.recipe.exposure is not None
             or any(t.kind == "silhouette" for stage in self.recipe.stages for t in stage.losses),
             dtype=dtype,
@@ -301,30 +287,6 @@ class Trainer:
             )
         per_image.check(state, self.recipe, len(self.scene.train))
         return state
-
-    def _densify(self, stage: Stage, iteration: int, result: StepResult, cancel: Tensor | None) -> list[events.Event]:
-        """Statistics, densification and opacity resets of one iteration."""
-        state, densify, white = self.state, stage.densify, self.protocol.white
-        happened: list[events.Event] = []
-        if densify is None or iteration >= densify.stop:
-            return happened
-        assert state.statistics is not None
-        assert result.signal is not None
-        assert result.radii is not None
-        seen = result.radii if cancel is None else result.radii * (1 - cancel)
-        accumulate(state.statistics, result.signal, seen, native=self.backend.name == "cpu")
-        if densify.densifies(iteration):
-            try:
-                counts = densify_and_prune(state, densify, iteration=iteration, extent=self.scene.extent, white=white)
-            except DivergedError as error:
-                raise DivergedError(f"stage {stage.name!r}: {error}") from error
-            happened.append(events.Densified(stage.name, iteration, **vars(counts), splats=len(state.splats)))
-        reset = densify.resets(iteration, white=white)
-        if reset or (densify.cap_every > 0 and iteration % densify.cap_every == 0):
-            ceiling = densify.reset_opacity if reset else densify.opacity_cap
-            limit_opacity(state, ceiling)
-            happened.append(events.OpacityLimited(stage.name, iteration, ceiling, reset))
-        return happened
 
     def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
         """Run an entry action."""
@@ -401,7 +363,7 @@ class Trainer:
     def _check_parameters(self, stage: Stage, names: tuple[str, ...]) -> None:
         """Raise DivergedError if a parameter is not finite: the rasterizer would quietly leave such a splat out."""
         parameters = {name: tensor for name, tensor in self.state.splats.items() if name in names}
-        broken = first_not_finite(parameters, self.backend.name)
+        broken = first_not_finite(parameters, self.backend)
         if broken is not None:
             raise diverged(stage, self.state.step, broken)
         if what := per_image.find_nonfinite(self.state):

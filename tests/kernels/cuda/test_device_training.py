@@ -20,12 +20,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import train_toys
 from emulate import Emulator
+from fake_backends import altered, cuda_on_host
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
-from gs2d.render import cuda, cuda_passes
+from gs2d.render import cuda_passes
 from gs2d.render import pair_budget as cuda_budget
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
@@ -43,7 +44,7 @@ pytestmark = pytest.mark.timeout(170)
 def emulated(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> Backend:
     """The cuda backend with the emulator in the place of the GPU."""
     monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
-    return Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize)
+    return cuda_on_host()
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +206,7 @@ def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
 ) -> None:
     """With room for half of the pairs every iteration that may be cut short is, changes nothing, and is done again."""
     recipe = VARIANTS[variant]
-    kept = train_toys.train(scene, recipe, backend=replace(emulated, rasterize=lambda *a: cuda.rasterize(*a)))[0]
+    kept = train_toys.train(scene, recipe, backend=altered(emulated, for_training=lambda: emulated))[0]
     monkeypatch.setattr(cuda_budget, "SLACK", slack)
     monkeypatch.setattr(cuda_budget, "STEP", 1)
     outcomes = []
@@ -292,7 +293,7 @@ def test_photographs_wait_as_bytes_and_become_the_targets_of_the_cpu() -> None:
     background = (0.25, 0.5, 1.0)
     options: dict[str, Any] = {"use_masks": True, "device": torch.device("cpu")}
     targets = DeviceTargets(scene_views, background, **options, limit_bytes=170, pinned_bytes=160, pin=pin)
-    plain = Targets(scene_views, background, use_masks=True, with_maps=False)
+    plain = Targets(scene_views, background, use_masks=True)
     for _ in range(2):
         for index in range(4):
             target, expected = targets[index], plain[index]
@@ -322,6 +323,6 @@ def test_a_state_on_a_device_is_saved_in_host_memory_and_moves_whole() -> None:
     state = train_toys.full_state()
     state.move_to("meta")
     tensors = [t for _, t in state.splats.items()] + [m.mean for m in state.moments.values()]
-    tensors += [m.square for m in state.moments.values()] + [*state.groups.values(), *vars(state.statistics).values()]
+    tensors += [m.square for m in state.moments.values()] + [*state.groups.values(), *state.statistics.values()]
     assert {tensor.device.type for tensor in tensors} == {"meta"}
     assert state.generator.device.type == "cpu"

@@ -29,7 +29,8 @@ sys.path.insert(0, sys.argv[2])
 
 from gs2d.kernels.cuda import adam, arguments, launch, losses as ops
 from gs2d.render import cuda, pair_budget as cuda_budget, cuda_passes
-from gs2d.render.backends import Backend
+from fake_backends import altered
+from gs2d.render.backends import CudaBackend
 
 launched, pointers = set(), [0]
 
@@ -61,7 +62,9 @@ from gs2d.training import trainer as loop
 from gs2d.training.initialize import initial_splats
 from gs2d.training.state import TrainState
 
-backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize, device="cuda:0")
+backend = CudaBackend()
+backend.device = "cuda:0"
+CudaBackend.for_training = lambda self: altered(self, _budget=cuda_budget.PairBudget())
 recipe, scene, generator = train_toys.compared(), train_toys.make_scene(), torch.Generator()
 start = initial_splats(scene, sh_degree=recipe.sh_degree, random_points=50, near=0.2, generator=generator)
 loop.validate = lambda recipe: recipe  # entry actions look at values: the groups that they write are made below
@@ -77,7 +80,7 @@ recipe = replace(recipe, stages=tuple(quiet(stage) for stage in recipe.stages))
 with FakeTensorMode(allow_non_fake_inputs=True):
     state = TrainState(start.splats, generator, queue=[0, 1] * 10)
     trainer = loop.Trainer(scene, recipe, GENERIC, backend=backend, state=state, progress_every=10**9)
-    trainer._budget.room = lambda tiles: 1000
+    trainer._learner._budget.room = lambda tiles: 1000
     ones = torch.ones(len(start.splats), dtype=torch.bool, device="cuda:0")
     trainer.state.groups = {g: ones for stage in recipe.stages for g in stage.train.values() if g != "all"}
     for index, _ in enumerate(recipe.stages):

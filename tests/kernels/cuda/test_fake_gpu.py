@@ -53,15 +53,15 @@ print(leaf.grad.tolist())
 
 TRAINING = """
 import train_toys
-from gs2d.render import cuda
-from gs2d.render.backends import Backend, get_backend
+from fake_backends import cuda_on_host
+from gs2d.render.backends import get_backend
 from gs2d.kernels.cuda import launch
 
 def trained(backend):
     return train_toys.train(train_toys.make_scene(), train_toys.short(), backend=backend)[0]
 
 before, launch.launcher_for = launch.launcher_for, lambda device: emulator
-plain = trained(Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize))  # on the host
+plain = trained(cuda_on_host())  # on the host
 launch.launcher_for = before
 launched = fake_gpu.install(guard, emulator)
 trainer = trained(get_backend("cuda"))

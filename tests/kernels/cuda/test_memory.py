@@ -12,9 +12,9 @@ from torch import Tensor
 
 import train_toys
 from emulate import Emulator
+from fake_backends import cuda_on_host
 from gs2d.kernels.cuda import launch
 from gs2d.render import cuda
-from gs2d.render.backends import Backend
 from kernel_cases import SETTINGS, many_tiles
 from render_scenes import IMAGES, contraction, random_cotangents, requiring_grad
 
@@ -69,7 +69,7 @@ def test_no_pass_of_the_rasterizer_reads_what_is_not_written(emulator: Emulator,
 def test_nothing_in_training_reads_what_is_not_written(emulator: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Losses, Adam, densification, ranking, clones and frozen rows of three short stages."""
     monkeypatch.setattr(launch, "launcher_for", lambda device: emulator)
-    backend = Backend("cuda", cuda.rasterize, cuda.splat_errors, rasterize_rows=cuda.rasterize)
+    backend = cuda_on_host()
     scene, recipe = train_toys.make_scene(), train_toys.short()
 
     def work() -> list[Tensor]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from gs2d.config.registry import Registry
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
@@ -28,13 +29,53 @@ class Layout:
     write: Writer
 
 
-LAYOUTS: Mapping[str, Layout] = {
-    "2dgs": Layout(".ply", lambda path, splats: write_splats(path, splats, layout="2dgs")),
-    "3dgs": Layout(".ply", lambda path, splats: write_splats(path, splats, layout="3dgs")),
-    "compressed": Layout(".ply", lambda path, splats: write_compressed_ply(path, Gaussians.of(splats))),
-    "spz": Layout(".spz", lambda path, splats: write_spz(path, Gaussians.of(splats))),
-    "splat": Layout(".splat", lambda path, splats: write_splat(path, Gaussians.of(splats))),
-}
+LAYOUTS: Registry[Layout] = Registry(
+    "layout",
+    "gs2d.formats",
+    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat"), __name__),
+    error=DataError,
+)
+"""Names of formats that splats are written in."""
+
+
+def register_format(name: str, *, ending: str) -> Callable[[Writer], Writer]:
+    """Return a decorator that registers a function ``(path, splats)`` as a format of files with this ending.
+
+    The function writes the file, and returns what the format could not hold, one sentence each, or None.
+    """
+
+    def registered(write: Writer) -> Writer:
+        LAYOUTS.register(name)(Layout(ending, write))
+        return write
+
+    return registered
+
+
+@register_format("2dgs", ending=".ply")
+def _write_2dgs(path: Path, splats: Splats) -> None:
+    write_splats(path, splats, layout="2dgs")
+
+
+@register_format("3dgs", ending=".ply")
+def _write_3dgs(path: Path, splats: Splats) -> None:
+    write_splats(path, splats, layout="3dgs")
+
+
+@register_format("compressed", ending=".ply")
+def _write_compressed(path: Path, splats: Splats) -> tuple[str, ...]:
+    return write_compressed_ply(path, Gaussians.of(splats))
+
+
+@register_format("spz", ending=".spz")
+def _write_spz(path: Path, splats: Splats) -> tuple[str, ...]:
+    return write_spz(path, Gaussians.of(splats))
+
+
+@register_format("splat", ending=".splat")
+def _write_splat(path: Path, splats: Splats) -> None:
+    write_splat(path, Gaussians.of(splats))
+
+
 _BY_ENDING = ((".compressed.ply", "compressed"), (".ply", "3dgs"), (".spz", "spz"), (".splat", "splat"))
 ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
@@ -49,9 +90,12 @@ class SplatFile:
 
 
 def layout_of(path: Path) -> str | None:
-    """The layout that a file is written in by its name, or None."""
+    """Return the layout that a file is written in by its name, gs2d's own first, or None."""
     name = path.name.lower()
-    return next((layout for ending, layout in _BY_ENDING if name.endswith(ending)), None)
+    for ending, layout in _BY_ENDING:
+        if name.endswith(ending):
+            return layout
+    return next((layout for layout, guest in LAYOUTS.working() if name.endswith(guest.ending)), None)
 
 
 def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
@@ -61,7 +105,7 @@ def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
     ------
     DataError, DiskError
     """
-    return LAYOUTS[layout].write(path, splats) or ()
+    return LAYOUTS.get(layout).write(path, splats) or ()
 
 
 def is_splat_file(path: str | os.PathLike[str]) -> bool:

@@ -6,17 +6,99 @@ The official screen-size prune is dead code there (its statistic is zeroed just 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from gs2d.config.densify import register_densifier
 from gs2d.config.recipe import GradDensify
+from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.errors import DivergedError
-from gs2d.kernels import densify_stats as screen_signal
+from gs2d.render.backends import PLAIN, Backend
+from gs2d.training import events
+from gs2d.training.densify.densifier import Densifier, Surroundings
 from gs2d.training.rows import append_rows
-from gs2d.training.state import Moments, Statistics, TrainState
+from gs2d.training.state import Moments, TrainState
+
+if TYPE_CHECKING:
+    from gs2d.training.objective import StepResult
+
+
+@register_densifier("gradient")
+class GradientDensifier(Densifier):
+    """Splats with a large mean screen gradient are cloned or split, faint and large ones pruned, opacities reset.
+
+    Parameters
+    ----------
+    surroundings : Surroundings
+    densify : GradDensify, optional
+    **options
+        Fields of GradDensify, instead.
+    """
+
+    columns = 2  # of the screen probe
+    absolute = False
+
+    def __init__(self, surroundings: Surroundings, densify: GradDensify | None = None, **options: Any) -> None:
+        super().__init__(surroundings)
+        given = GradDensify() if densify is None else densify
+        self._options = replace(given, **{"absolute": self.absolute, **options})
+
+    def begin(self, state: TrainState) -> None:
+        """Nothing is gathered yet."""
+        state.statistics = no_statistics(state.splats)
+
+    def changes(self, iteration: int) -> bool:
+        """Whether splats come and go, or opacities are limited, at the end of an iteration."""
+        options = self._options
+        if iteration >= options.stop:
+            return False
+        resets = options.resets(iteration, white=self.surroundings.white)
+        return options.densifies(iteration) or resets or self._caps(iteration)
+
+    def _caps(self, iteration: int) -> bool:
+        return self._options.cap_every > 0 and iteration % self._options.cap_every == 0
+
+    def before_backward(self, state: TrainState, iteration: int) -> Tensor | None:
+        """The screen probe, until densification stops."""
+        if iteration >= self._options.stop:
+            return None
+        return state.splats.means.new_zeros(len(state.splats), self.columns, requires_grad=True)
+
+    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
+        """Statistics, densification and opacity resets of one iteration."""
+        options, around = self._options, self.surroundings
+        happened: list[events.Event] = []
+        if iteration >= options.stop:
+            return happened
+        assert state.statistics is not None
+        assert output.signal is not None
+        assert output.radii is not None
+        accumulate(state.statistics, output.signal, output.radii, around.backend)
+        white = around.white
+        if options.densifies(iteration):
+            extent = around.scene.extent
+            try:
+                counts = densify_and_prune(state, options, iteration=iteration, extent=extent, white=white)
+            except DivergedError as error:
+                raise DivergedError(f"stage {around.stage!r}: {error}") from error
+            happened.append(events.Densified(around.stage, iteration, **vars(counts), splats=len(state.splats)))
+        reset = options.resets(iteration, white=white)
+        if reset or self._caps(iteration):
+            ceiling = options.reset_opacity if reset else options.opacity_cap
+            limit_opacity(state, ceiling)
+            happened.append(events.OpacityLimited(around.stage, iteration, ceiling, reset))
+        return happened
+
+
+def no_statistics(splats: Splats) -> dict[str, Tensor]:
+    """Nothing gathered yet: over views the sums of the norms of signed and absolute screen gradients, and the views."""
+    zeros = torch.zeros_like(splats.opacity_logits, requires_grad=False)
+    return {"signed": zeros, "absolute": zeros.clone(), "count": zeros.clone()}
 
 
 @dataclass(frozen=True)
@@ -30,28 +112,21 @@ class DensifyCounts:
 
 
 @torch.no_grad()
-def accumulate(statistics: Statistics, signal: Tensor, radii: Tensor, *, native: bool = False) -> None:
+def accumulate(statistics: Mapping[str, Tensor], signal: Tensor, radii: Tensor, backend: Backend = PLAIN) -> None:
     """Add one view.
 
     Parameters
     ----------
-    statistics : Statistics
-        Of N splats; changed in place.
+    statistics : mapping of "signed", "absolute" and "count" to Tensor [N]
+        Changed in place.
     signal : Tensor [N, 2] or [N, 4]
         Gradient of the screen probe: signed in columns 0:2, absolute in 2:4.
     radii : Tensor [N] px
         Splats with radius 0 are not counted.
-    native : bool
-        By the CPU library: one pass, the same to rounding.
+    backend : Backend
+        Does it; by default plain torch.
     """
-    if native:
-        return screen_signal.accumulate(statistics.signed, statistics.absolute, statistics.count, signal, radii)
-    seen = radii > 0
-    zero = torch.zeros_like(statistics.signed)
-    statistics.signed += torch.where(seen, torch.linalg.vector_norm(signal[:, :2], dim=1), zero)
-    if signal.shape[1] == 4:
-        statistics.absolute += torch.where(seen, torch.linalg.vector_norm(signal[:, 2:], dim=1), zero)
-    statistics.count += seen
+    backend.accumulate(statistics["signed"], statistics["absolute"], statistics["count"], signal, radii)
 
 
 @torch.no_grad()
@@ -92,9 +167,8 @@ def densify_and_prune(
     counts = _counts(clone, split, (faint, large), ends)
     if not bool(keep.any()) and not len(cloned) and not bool(living.any()):
         raise DivergedError(
-            f"all {counts.pruned_by_opacity + counts.pruned_large} splats were pruned at iteration {iteration}: "
-            "none has "
-            f"opacity >= {densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or "
+            f"all {counts.pruned_by_opacity + counts.pruned_large} splats were pruned at iteration {iteration}: none "
+            f"has opacity >= {densify.opacity_cull} and size <= {densify.scale_cull * extent:g}; check the cameras, or "
             "opacity_cull"
         )
     rows = torch.cat([cloned, children[living]])
@@ -103,7 +177,7 @@ def densify_and_prune(
     new.log_scales[len(cloned) :] = shrunk[living]
     state.statistics = None  # of rows that are no more
     append_rows(state, new, {name: group[rows] for name, group in state.groups.items()}, keep=keep)
-    state.statistics = Statistics.zeros(state.splats)
+    state.statistics = no_statistics(state.splats)
     return counts
 
 
@@ -122,8 +196,8 @@ def _select(state: TrainState, densify: GradDensify, sizes: Tensor, extent: floa
     """Rows to clone and rows to split, bool [N] each."""
     statistics = state.statistics
     assert statistics is not None
-    count = statistics.count.clamp(min=1.0)  # never seen: sum 0, mean 0
-    signed, absolute = statistics.signed / count, statistics.absolute / count
+    count = statistics["count"].clamp(min=1.0)  # never seen: sum 0, mean 0
+    signed, absolute = statistics["signed"] / count, statistics["absolute"] / count
     small = sizes <= densify.percent_dense * extent
     for_split, split_threshold = (
         (absolute, densify.abs_threshold) if densify.absolute else (signed, densify.grad_threshold)

@@ -1,0 +1,48 @@
+"""The densifiers that there are, by name, and one that a recipe names. Pure Python: checked without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from gs2d.config.registry import Registry
+from gs2d.errors import RecipeError
+
+DENSIFIERS: Registry[Any] = Registry(
+    "densifier",
+    "gs2d.densifiers",
+    builtin={
+        "gradient": "gs2d.training.densify.gradient",
+        "absolute-gradient": "gs2d.training.densify.absolute",
+    },
+    error=RecipeError,
+)
+"""Names of densifiers -> classes of ``gs2d.training.densify.densifier.Densifier``."""
+register_densifier = DENSIFIERS.register
+
+
+@dataclass(frozen=True)
+class Densify:
+    """A densifier by its name. (``GradDensify`` is that of 2DGS and of AbsGS, with their numbers as fields.)
+
+    Attributes
+    ----------
+    name : str
+    options : mapping of str to values of JSON
+        The keyword arguments of its constructor. ``start`` and ``stop``, where it has them, are iterations of the
+        stage, and scale with the schedule.
+    """
+
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    @property
+    def stop(self) -> int:
+        """The iteration from which splats come and go no more, where the options say it; else 0."""
+        return int(self.options.get("stop", 0))
+
+    def scaled(self, factor: float) -> Densify:
+        """Return it for a schedule ``factor`` times as long."""
+        scaled = {name: round(self.options[name] * factor) for name in ("start", "stop") if name in self.options}
+        return Densify(self.name, {**self.options, **scaled})

@@ -1,0 +1,21 @@
+"""The losses that there are, by name. Pure Python: a name can be checked without torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gs2d.config.multiview import MULTIVIEW_KINDS
+from gs2d.config.priors import PRIOR_KINDS
+from gs2d.config.registry import Registry
+from gs2d.errors import RecipeError
+
+LOSS_KINDS = (
+    *("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
+    *MULTIVIEW_KINDS,
+    *PRIOR_KINDS,
+)
+LOSSES: Registry[Any] = Registry(
+    "loss", "gs2d.losses", builtin=dict.fromkeys(LOSS_KINDS, "gs2d.losses.api"), error=RecipeError
+)
+"""Kinds of loss -> a function of images, or a class with data of its own (``gs2d.losses.api``)."""
+register_loss = LOSSES.register

@@ -1,0 +1,109 @@
+"""Recipes in files: ``file.json`` and ``file.py:name``. Pure Python; never imports torch by itself."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.registry import did_you_mean
+from gs2d.config.serialize import from_json
+from gs2d.errors import Gs2dError, RecipeError
+
+__all__ = ["is_recipe_file", "made_recipe", "read_recipe_file"]
+
+
+def is_recipe_file(name: str) -> bool:
+    """Whether a recipe is named by a file that holds it."""
+    return name.endswith((".json", ".py")) or ".py:" in name
+
+
+def read_recipe_file(name: str) -> Recipe:
+    """Read ``file.json``, or run ``file.py`` once and take what it calls ``name``.
+
+    Raises
+    ------
+    RecipeError
+        No such file, a file that cannot be read or run, or no recipe of this name in it.
+    """
+    if name.endswith(".json"):
+        return _from_json_file(Path(name))
+    file, colon, wanted = name.rpartition(":")
+    path = Path(file if colon else name)
+    if not path.is_file():
+        raise RecipeError(f"{path} must be a Python file with a recipe, got no such file; --recipe FILE.py:NAME")
+    module = _run(path.resolve())
+    if not colon:
+        raise RecipeError(f"{path} needs the name of a recipe: --recipe {path}:NAME, one of {_recipes_in(module)}")
+    if not hasattr(module, wanted):
+        names = [key for key in vars(module) if not key.startswith("_")]
+        raise RecipeError(f"{path} has no recipe {wanted!r}{did_you_mean(wanted, names)}; it has {_recipes_in(module)}")
+    return made_recipe(getattr(module, wanted), name)
+
+
+def made_recipe(found: Any, where: str) -> Recipe:
+    """Return a recipe, or what a function without arguments makes, validated.
+
+    Raises
+    ------
+    RecipeError
+        It is something else.
+    """
+    try:
+        value = found() if callable(found) else found
+    except Gs2dError:
+        raise
+    except Exception as error:  # a guest may raise anything
+        raise RecipeError(f"{where} cannot be made: {_line(error)}") from error
+    if not isinstance(value, Recipe):
+        raise RecipeError(f"{where} must be a gs2d.Recipe, or a function that returns one, got {type(value).__name__}")
+    return validate(value)
+
+
+def _from_json_file(path: Path) -> Recipe:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecipeError(f"cannot read the recipe {path}: {error.strerror or error}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise RecipeError(
+            f"{path} must hold a recipe in JSON, as `gs2d recipes show NAME --json` prints it, got: {error}"
+        ) from error
+    if not isinstance(data, dict):
+        raise RecipeError(f"{path} must hold a recipe, an object of JSON, got {type(data).__name__}")
+    return from_json(data)
+
+
+@cache  # what a file registers is registered once
+def _run(path: Path) -> ModuleType:
+    name = f"gs2d_recipe_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look for their module there
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # it may raise anything
+        del sys.modules[name]
+        raise RecipeError(f"{path} cannot be run: {_line(error)}") from error
+    return module
+
+
+def _recipes_in(module: ModuleType) -> str:
+    """The names of a file's recipes, and of the functions that are its own."""
+    own = [
+        name
+        for name, value in vars(module).items()
+        if isinstance(value, Recipe) or (callable(value) and getattr(value, "__module__", "") == module.__name__)
+    ]
+    return ", ".join(own) or "none"
+
+
+def _line(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"

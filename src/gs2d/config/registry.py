@@ -1,0 +1,176 @@
+"""Names that stand for things, and the packages that add to them: the doors of gs2d. Pure Python; never imports torch.
+
+Losses, readers, densifiers, recipes, backends and export formats are each one :class:`Registry`. Whoever adds one
+decorates it, or names it as an entry point of an installed package; the built-in ones are registered in the same way.
+"""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, TypeVar
+
+from gs2d.errors import Gs2dError, PluginWarning
+
+__all__ = ["Registry", "did_you_mean"]
+
+T = TypeVar("T")
+U = TypeVar("U")
+
+
+class Registry(Generic[T]):
+    """What can be asked for by name: what gs2d has, what programs register, and what installed packages offer.
+
+    Nothing is imported before it is asked for; a package that cannot be imported is told in one line, and stops only
+    those who ask for what it offers.
+
+    Parameters
+    ----------
+    what : str
+        One of the things, in words: "loss".
+    group : str
+        Entry points of packages that offer them: "gs2d.losses".
+    builtin : mapping of name to module
+        What gs2d itself has; the module registers it when it is imported.
+    error : type of Gs2dError
+        What a wrong name raises.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        group: str,
+        *,
+        builtin: Mapping[str, str] | None = None,
+        error: type[Gs2dError] = Gs2dError,
+    ) -> None:
+        self.what, self.group, self._error = what, group, error
+        self._homes = {} if builtin is None else dict(builtin)
+        self._things: dict[str, T] = {}
+
+    def register(self, name: str) -> Callable[[U], U]:
+        """Return a decorator that registers what it decorates under a name.
+
+        Raises
+        ------
+        Gs2dError
+            From the decorator: the name is taken.
+        """
+
+        def registered(thing: U) -> U:
+            module = getattr(thing, "__module__", "")
+            if self._homes.get(name, module) != module:
+                raise self._error(f"{self.what} {name!r} is one of gs2d's own; give yours another name")
+            holder = self._things.get(name)
+            if holder is not None and holder is not thing:
+                raise self._error(
+                    f"{self.what} {name!r} is registered already, by {getattr(holder, '__module__', 'another')}; give "
+                    "yours another name"
+                )
+            self._things[name] = thing  # type: ignore[assignment]
+            return thing
+
+        return registered
+
+    def get(self, name: str) -> T:
+        """Return the thing of this name, imported now if it was not before.
+
+        Raises
+        ------
+        Gs2dError
+            There is none of this name, or its package cannot be imported.
+        """
+        if name in self._homes and name not in self._things:
+            import_module(self._homes[name])
+        if name in self._things:
+            return self._things[name]
+        if name in self._offered:
+            return self._load(name)
+        raise self._error(self.unknown(name))
+
+    def __getitem__(self, name: str) -> T:
+        return self.get(name)
+
+    def unknown(self, name: str, *, also: Sequence[str] = ()) -> str:
+        """Return the line about a name that stands for nothing; ``also``: what can be said beside the names."""
+        names = (*also, *self.names())
+        return f"{self.what} must be one of {', '.join(names)}, got {name!r}{did_you_mean(name, names)}"
+
+    @property
+    def builtin(self) -> tuple[str, ...]:
+        """The names of what gs2d itself has."""
+        return tuple(self._homes)
+
+    def names(self) -> tuple[str, ...]:
+        """All names: gs2d's own, those of this program, those of packages."""
+        return tuple(dict.fromkeys((*self._homes, *self._things, *self._offered)))
+
+    def guests(self) -> tuple[str, ...]:
+        """The names that are not gs2d's own."""
+        return tuple(name for name in self.names() if name not in self._homes)
+
+    def working(self) -> Iterator[tuple[str, T]]:
+        """Names and things; of a package that cannot be imported a PluginWarning says so, and it is left out."""
+        for name in self.names():
+            try:
+                yield name, self.get(name)
+            except Gs2dError as error:
+                if name in self._homes:
+                    raise
+                warnings.warn(str(error), PluginWarning, stacklevel=2)
+
+    def source(self, name: str) -> str:
+        """Where a thing is from, in words: "gs2d", a package with its version, or a module of this program."""
+        if name in self._homes:
+            return "gs2d"
+        if name in self._offered:
+            return _package(self._offered[name])
+        return str(getattr(self._things.get(name), "__module__", "this program"))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._homes or name in self._things or name in self._offered
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names())
+
+    @cached_property
+    def _offered(self) -> dict[str, EntryPoint]:
+        """Entry points of installed packages by name; of a name that is taken the first package keeps it."""
+        offered: dict[str, EntryPoint] = {}
+        for entry in sorted(entry_points(group=self.group), key=_package):
+            taken = "gs2d" if entry.name in self._homes else None
+            if entry.name in offered and offered[entry.name].value != entry.value:
+                taken = _package(offered[entry.name])
+            if taken is None:
+                offered[entry.name] = entry
+            else:
+                text = f"{_package(entry)} offers the {self.what} {entry.name!r}, which {taken} has; it is left out"
+                warnings.warn(text, PluginWarning, stacklevel=3)
+        return offered
+
+    def _load(self, name: str) -> T:
+        entry = self._offered[name]
+        try:
+            thing: Any = entry.load()
+        except Exception as error:  # a guest may raise anything while it is imported
+            reason = str(error).partition("\n")[0]
+            raise self._error(
+                f"{self.what} {name!r} of {_package(entry)} cannot be imported from {entry.value}: "
+                f"{type(error).__name__}: {reason}; mend or uninstall that package"
+            ) from error
+        return self._things.setdefault(name, thing)
+
+
+def did_you_mean(name: str, names: Sequence[str]) -> str:
+    """Return "; did you mean ...?" where a name is nearly one of these, else ""."""
+    near = difflib.get_close_matches(name, names, n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _package(entry: EntryPoint) -> str:
+    """The package of an entry point, with its version."""
+    return "a package without a name" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"

@@ -1,0 +1,115 @@
+"""What a densifier is: the object that a stage asks, in every iteration, which splats come and go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from gs2d.config.densify import DENSIFIERS, Densify
+from gs2d.config.recipe import GradDensify
+from gs2d.data.scene import Scene
+from gs2d.errors import RecipeError
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.training import events
+from gs2d.training.state import TrainState
+
+if TYPE_CHECKING:
+    from gs2d.training.objective import StepResult
+
+__all__ = ["Densifier", "Surroundings", "densifier_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Where a densifier works.
+
+    Attributes
+    ----------
+    stage : str
+        Its name, for events.
+    scene : Scene
+        Its ``extent`` (world units) is what sizes are compared with.
+    settings : RasterSettings
+        To render with.
+    white : bool
+        Whether the background is white.
+    backend : Backend
+        That of the training: see ``assign`` and ``accumulate`` there.
+    """
+
+    stage: str
+    scene: Scene
+    settings: RasterSettings
+    white: bool
+    backend: Backend
+
+
+class Densifier:
+    """How splats come and go in a stage; this one lets them be.
+
+    N changes by ``training.rows.append_rows`` and ``keep_rows`` alone, which take all that belongs to a splat along:
+    what a densifier gathers of each splat is in ``state.statistics``, tensors [N, ...] by name, and is saved with the
+    run. All else that it needs follows from its options and the iteration, so that a run that is resumed does the same.
+
+    Parameters
+    ----------
+    surroundings : Surroundings
+    **options
+        Of the recipe (``Densify.options``); a wrong one is a TypeError.
+    """
+
+    def __init__(self, surroundings: Surroundings) -> None:
+        self.surroundings = surroundings
+
+    def begin(self, state: TrainState) -> None:
+        """Make the statistics, when the stage begins."""
+        state.statistics = {}
+
+    def changes(self, iteration: int) -> bool:
+        """Whether :meth:`after_backward` may change splats in this iteration, or look at a device."""
+        return True
+
+    def before_backward(self, state: TrainState, iteration: int) -> Tensor | None:
+        """Return the screen probe (rule 13 of ``render/api.py``) whose gradient is wanted, zeros [N, 2 or 4], or None.
+
+        Called before the view of an iteration (from 1) is rendered.
+        """
+        return None
+
+    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
+        """Gather, and change splats where that is due; return what happened.
+
+        Adam follows, but for an iteration with an event ``Densified`` (its rows are new), and but for opacity in one
+        with ``OpacityLimited``. In an iteration that does not change anything (:meth:`changes`) statistics are written
+        by ``backend.assign`` or ``backend.accumulate`` alone: on a GPU it may be done again.
+        """
+        return ()
+
+
+def densifier_of(densify: GradDensify | Densify | None, surroundings: Surroundings) -> Densifier | None:
+    """Return the densifier that a stage names.
+
+    Raises
+    ------
+    RecipeError
+        Unknown, of a package that cannot be imported, or with options that it does not take.
+    """
+    if densify is None:
+        return None
+    if isinstance(densify, GradDensify):
+        found: Densifier = DENSIFIERS.get("absolute-gradient" if densify.absolute else "gradient")(
+            surroundings, densify
+        )
+        return found
+    try:
+        found = DENSIFIERS.get(densify.name)(surroundings, **densify.options)
+    except TypeError as error:
+        raise RecipeError(
+            f"stage {surroundings.stage!r}: densifier {densify.name!r} does not take the options "
+            f"{dict(densify.options)}: {error}"
+        ) from error
+    return found

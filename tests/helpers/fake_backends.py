@@ -1,0 +1,36 @@
+"""Backends for tests: one with other functions in the place of its own, one whose images are not whole."""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import Any
+
+import torch
+
+from gs2d.render.backends import Backend, CudaBackend
+from gs2d.render.pair_budget import PairBudget
+
+
+def altered(backend: Backend, **changes: Any) -> Backend:
+    """A copy in which these functions and values stand instead; functions get no ``self``."""
+    changed = copy(backend)
+    for name, value in changes.items():
+        assert hasattr(backend, name), name
+        setattr(changed, name, value)
+    return changed
+
+
+def cuda_on_host() -> Backend:
+    """The cuda backend for tensors in host memory, where an emulator is the launcher."""
+
+    def for_training() -> Backend:
+        return altered(CudaBackend(PairBudget()), device="cpu")
+
+    return altered(CudaBackend(), device="cpu", for_training=for_training)
+
+
+def lacking(pairs: int) -> Backend:
+    """The cuda backend in an iteration that lacks so many pairs."""
+    budget = PairBudget()
+    budget.overflow = torch.tensor(min(pairs, 1), dtype=torch.int32)
+    return altered(CudaBackend(budget), device="cpu")

@@ -1,0 +1,87 @@
+"""Losses from elsewhere: a function with options, a class with data of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+import train_toys
+from gs2d.config.losses import LOSSES, register_loss
+from gs2d.config.recipe import LossTerm, Recipe, validate
+from gs2d.config.serialize import from_json, to_json
+from gs2d.data.scene import Scene
+from gs2d.errors import RecipeError
+from gs2d.losses.api import LossView, compute_losses
+from gs2d.render.types import RenderOutput
+from gs2d.training import events
+from loss_images import make_camera, make_output
+
+
+@pytest.fixture(autouse=True)
+def guests() -> Iterator[None]:
+    before = dict(LOSSES._things)
+    yield
+    LOSSES._things.clear()
+    LOSSES._things.update(before)
+
+
+def blackness(output: RenderOutput, view: LossView, power: float = 1.0) -> Tensor:
+    """How bright a picture is."""
+    return output.color.clamp_min(1e-6).pow(power).mean()
+
+
+class Mean:
+    """The mean colour of each photograph, found once."""
+
+    def __init__(self, only: int) -> None:
+        self._only = only
+
+    def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
+        self._means = [torch.tensor(view.image().mean() / 255, device=device) for view in scene.train]
+
+    def __call__(self, output: RenderOutput, view: LossView) -> Tensor | None:
+        assert view.index is not None
+        return (output.color.mean() - self._means[view.index]).square() if view.index == self._only else None
+
+
+def losses_of(terms: list[LossTerm]) -> dict[str, Tensor]:
+    output, camera, target = make_output(5, 6), make_camera(6, 5), torch.rand(5, 6, 3, dtype=torch.float64)
+    return compute_losses(output, target, None, camera, terms, iteration=1, depth_kind="mean", backend="reference")
+
+
+def test_a_function_is_a_loss_with_its_options_and_weight() -> None:
+    register_loss("blackness")(blackness)
+    color = make_output(5, 6).color
+    found = losses_of([LossTerm("blackness", 3.0, options={"power": 2.0}), LossTerm("blackness", 1.0)])
+    assert found["blackness"].item() == pytest.approx((3 * color.pow(2).mean() + color.mean()).item())
+
+
+def test_a_recipe_with_a_guest_is_written_and_read_with_its_options() -> None:
+    register_loss("blackness")(blackness)
+    recipe = train_toys.short()
+    first = replace(recipe.stages[0], losses=(LossTerm("blackness", 3.0, options={"power": 2.0}),))
+    made = validate(replace(recipe, stages=(first, *recipe.stages[1:])))
+    assert from_json(to_json(made)) == made
+
+
+def test_a_class_is_prepared_for_the_scene_and_may_leave_a_view_out() -> None:
+    register_loss("mean")(Mean)
+    recipe, scene = train_toys.short(), train_toys.make_scene()
+    stage = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("mean", 1.0, options={"only": 1})))
+    _, recorder = train_toys.train(scene, replace(recipe, stages=(stage,)))
+    told = [event.losses for event in recorder.events if isinstance(event, events.Progress)]
+    assert sum("mean" in losses for losses in told) == pytest.approx(len(told) / len(scene.train), abs=1)
+
+
+def test_options_that_a_loss_does_not_take_stop_before_training() -> None:
+    register_loss("mean")(Mean)
+    recipe = train_toys.short()
+    stage = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("mean", 1.0)))
+    with pytest.raises(RecipeError, match="loss 'mean' does not take the options {}: .*only"):
+        train_toys.train(train_toys.make_scene(), replace(recipe, stages=(stage,)))
+    with pytest.raises(RecipeError, match="loss 'mean' has data of its own"):
+        losses_of([LossTerm("mean", 1.0, options={"only": 1})])

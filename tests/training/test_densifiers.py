@@ -1,0 +1,108 @@
+"""Densifiers as objects: one from elsewhere, what a recipe says of it, and that the loop asks nobody else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+import train_toys
+from gs2d.config.densify import DENSIFIERS, Densify, register_densifier
+from gs2d.config.recipe import GradDensify, Recipe, validate
+from gs2d.config.schedule import scale_schedule
+from gs2d.config.serialize import apply_overrides, from_json, to_json
+from gs2d.errors import RecipeError
+from gs2d.training import events
+from gs2d.training.densify.densifier import Densifier, Surroundings
+from gs2d.training.objective import StepResult
+from gs2d.training.rows import append_rows
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+
+
+class Twins(Densifier):
+    """At one iteration the splats that were seen most often get a twin each."""
+
+    def __init__(self, surroundings: Surroundings, at: int, count: int = 2) -> None:
+        super().__init__(surroundings)
+        self.at, self.count = at, count
+
+    def begin(self, state: TrainState) -> None:
+        state.statistics = {"seen": torch.zeros(len(state.splats))}
+
+    def changes(self, iteration: int) -> bool:
+        return iteration == self.at
+
+    def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
+        assert state.statistics is not None
+        assert output.radii is not None
+        seen = state.statistics["seen"]
+        self.surroundings.backend.assign(seen, seen + (output.radii > 0))
+        if iteration != self.at:
+            return ()
+        rows = seen.argsort(descending=True, stable=True)[: self.count]
+        append_rows(state, state.splats.rows(rows))
+        return (events.Densified(self.surroundings.stage, iteration, self.count, 0, 0, 0, len(state.splats)),)
+
+
+@pytest.fixture(autouse=True)
+def twins() -> Iterator[None]:
+    register_densifier("twins")(Twins)
+    yield
+    del DENSIFIERS._things["twins"]
+
+
+def with_twins(**options: object) -> Recipe:
+    recipe = train_toys.short()
+    return replace(recipe, stages=(replace(recipe.stages[0], densify=Densify("twins", options)),))
+
+
+def test_a_densifier_from_elsewhere_makes_splats_and_its_statistics_go_along() -> None:
+    trainer = Trainer(train_toys.make_scene(), with_twins(at=4, count=3), train_toys.GENERIC, backend="reference")
+    trainer.enter(0)
+    before = len(trainer.splats)
+    for _ in range(5):
+        trainer.step()
+    assert len(trainer.splats) == before + 3
+    statistics = trainer.state.statistics
+    assert statistics is not None
+    assert statistics["seen"][-3:].tolist() == [1.0, 1.0, 1.0]  # of the fifth iteration alone
+    again = TrainState.from_state_dict(trainer.state.state_dict())
+    assert again.statistics is not None
+    assert torch.equal(again.statistics["seen"], statistics["seen"])
+
+
+def test_a_recipe_says_which_densifier_and_with_what() -> None:
+    recipe = validate(with_twins(at=4, start=100, stop=3000))
+    assert from_json(to_json(recipe)) == recipe
+    scaled = scale_schedule(recipe, 0.1).stages[0].densify
+    assert scaled == Densify("twins", {"at": 4, "start": 10, "stop": 300})
+    changed = apply_overrides(recipe, [f"{recipe.stages[0].name}.densify.options.at=9"]).stages[0].densify
+    assert isinstance(changed, Densify)
+    assert changed.options["at"] == 9
+
+
+def test_wrong_names_and_options_stop_before_training() -> None:
+    wrong = with_twins(at=4)
+    with pytest.raises(RecipeError, match="densifier must be one of gradient, absolute-gradient, .*did you mean twins"):
+        validate(replace(wrong, stages=(replace(wrong.stages[0], densify=Densify("twinz")),)))
+    with pytest.raises(RecipeError, match="'twins' does not take the options {'when': 4}"):
+        Trainer(train_toys.make_scene(), with_twins(when=4), train_toys.GENERIC, backend="reference")
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_gs2ds_own_by_name_train_the_same_bytes_as_by_their_fields(absolute: bool) -> None:
+    recipe = train_toys.short()
+    given = recipe.stages[0].densify
+    assert isinstance(given, GradDensify)
+    fields = to_json(recipe)["stages"][0]["densify"] | {"absolute": absolute, "reset_at": tuple(given.reset_at)}
+    name = "absolute-gradient" if absolute else "gradient"
+    by_name = Densify(name, {key: value for key, value in fields.items() if key != "absolute"})
+    splats: list[dict[str, Tensor]] = []
+    for densify in (replace(given, absolute=absolute), by_name):
+        made = replace(recipe, stages=(replace(recipe.stages[0], densify=densify),))
+        splats.append(dict(train_toys.train(train_toys.make_scene(), made)[0].splats.items()))
+    assert all(torch.equal(splats[0][name], splats[1][name]) for name in splats[0])
