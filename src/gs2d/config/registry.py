@@ -137,6 +137,9 @@ class Registry(Generic[T]):
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())
 
+    def __len__(self) -> int:
+        return len(self.names())
+
     @cached_property
     def _offered(self) -> dict[str, EntryPoint]:
         """Entry points of installed packages by name; of a name that is taken the first package keeps it."""
