@@ -94,8 +94,10 @@ def test_auto_follows_the_format(scene_format: str, name: str) -> None:
 def test_unknown_names_say_what_exists() -> None:
     with pytest.raises(ProtocolError, match="nerf-synthetic"):
         get_protocol("nerf")
-    with pytest.raises(ProtocolError, match="colmap"):
-        protocol_for("ply")
+
+
+def test_a_format_of_a_reader_from_elsewhere_has_the_generic_protocol() -> None:
+    assert protocol_for("of-a-guest") is GENERIC
 
 
 def test_nerf_synthetic_masks_are_in_its_alpha_not_in_the_loss() -> None:
