@@ -67,7 +67,7 @@ def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
     drawn = sorted(path.name for path in (run.path / "renders" / "priors").iterdir())
     kinds = ("depth", "known-depth", "known-normal", "normal")
     assert drawn == [f"train__r_{k}.{kind}.png" for k in (1, 3, 5) for kind in kinds]
-    report = run.file(REPORT).read_text()
+    report = " ".join(run.file(REPORT).read_text().split())
     assert "What was known of the photographs" in report
     assert "rendered and known depth differ by" in report
     assert "rendered normals" in report

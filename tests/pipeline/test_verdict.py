@@ -26,7 +26,7 @@ from gs2d.pipeline.verdict.measures import (
     neighbours_of,
     placed_images,
 )
-from gs2d.report.sections.verdict import graded, verdict_section
+from gs2d.report.sections.verdict import grade_of, verdict_section
 
 
 def views(train: float = 29.0, test: float = 27.0, **changes: float) -> tuple[ViewMeasures, ...]:
@@ -56,7 +56,7 @@ def test_a_good_run_is_good_and_asks_for_nothing() -> None:
 def test_new_views_are_graded_by_their_psnr(psnr: float, grade: str) -> None:
     measures = Measures(views(train=psnr + 1, test=psnr))
     assert found(measures, "new views").grade == grade
-    assert f'class="{grade}"' in graded(psnr, "test")
+    assert grade_of(psnr, "test") == grade
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ OnFailure = Callable[[str, Exception], None]
 
 
 class Guard:
-    """Builds parts (HTML) of a page.
+    """Make the parts of a page.
 
     Parameters
     ----------

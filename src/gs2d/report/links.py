@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from markupsafe import Markup
+
 from gs2d.io.run_dir import EVENTS, EXPOSURE, MESH, METRICS, PAGE, POSES, RUN_JSON, SPLATS, TEXTURED
-from gs2d.report.html import escape, missing
+from gs2d.report.html import macro, missing
 
 FILES = {  # in the order in which people want them
     PAGE: "the scene to turn, in any browser",
@@ -20,17 +22,13 @@ FILES = {  # in the order in which people want them
 }
 
 
-def links(folder: Path) -> str:
+def links(folder: Path) -> Markup:
     """Return links (HTML) to those of a run's files that exist."""
     found = [(name, words) for name, words in FILES.items() if (folder / name).is_file()]
     if not found:
         return missing("There are no files beside this report.")
-    entries = "".join(
-        f'<li><a href="{escape(name)}"><b>{escape(name)}</b> <span class="soft">{escape(words)}, '
-        f"{size_text((folder / name).stat().st_size)}</span></a></li>"
-        for name, words in found
-    )
-    return f'<ul class="files">{entries}</ul>'
+    sized = [(name, words, size_text((folder / name).stat().st_size)) for name, words in found]
+    return macro("lists.html", "files", sized)
 
 
 def size_text(count: int) -> str:

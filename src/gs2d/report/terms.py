@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gs2d.report.html import escape
+from markupsafe import Markup
+
+from gs2d.report.html import macro
 
 TERMS = {
     "PSNR": "Peak signal-to-noise ratio, in decibels: how near a rendering is to its photograph, pixel by pixel. "
@@ -48,8 +50,6 @@ def titles_of(columns: Sequence[str]) -> dict[str, str]:
     return {column: TERMS[term] for column, term in terms.items() if term in TERMS}
 
 
-def glossary() -> str:
+def glossary() -> Markup:
     """Return the terms as HTML that opens on demand."""
-    entries = "".join(f"<dt>{escape(term)}</dt><dd>{escape(meaning)}</dd>" for term, meaning in TERMS.items())
-    title = "What these figures and words mean"
-    return f'<details id="terms"><summary>{title}</summary><dl class="terms">{entries}</dl></details>'
+    return macro("lists.html", "glossary", TERMS)

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
 from gs2d.io.run_dir import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, VERDICT, open_run
 from gs2d.report.guard import Guard, OnFailure
-from gs2d.report.html import drawing, escape, facts, missing, page, table
+from gs2d.report.html import macro, missing, page, render
 from gs2d.report.links import links
 from gs2d.report.plots import curves, read_history
 from gs2d.report.sections.capture import capture_section
@@ -29,7 +30,7 @@ from gs2d.report.sections.poses import poses_section
 from gs2d.report.sections.priors import priors_section
 from gs2d.report.sections.subject import subject_section
 from gs2d.report.sections.surface import surface_scores
-from gs2d.report.sections.verdict import graded, scaled, verdict_section
+from gs2d.report.sections.verdict import grade_of, scaled, verdict_section
 from gs2d.report.terms import glossary, titles_of
 
 _IMAGE_METRICS = (("psnr", "PSNR, dB", 2, 1), ("ssim", "SSIM", 4, 1), ("lpips", "LPIPS", 4, -1))
@@ -114,55 +115,62 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
         The report could not be written.
     """
     record = read_record(run)
-    renders, part = record.path / RENDERS, Guard(on_failure)
-    title, stages = _title(record), [stage["name"] for stage in record.stages]
-    body = [
-        f'<div class="eyebrow">gs2d report</div><h1>{escape(title)}</h1>',
-        part("summary", lambda: f'<p class="lead">{verdict(record)}</p>'),
-        part("verdict", lambda: verdict_section(record.path / VERDICT)),
-        part("pictures at the top", lambda: hero(renders)),
-        "<h2>Files</h2>",
-        part("list of files", lambda: links(record.path)),
-        "<h2>Results</h2>",
-        part("table of stages", lambda: stage_table(record)),
-        glossary(),
-        "<h2>Surface</h2>",
-        part("scores of the surface", lambda: surface_scores(record.surface, record.surface_reason, record.path)),
-        part("picture of the subject", lambda: subject_section(record.path)),
-        part("pictures of the mesh", lambda: mesh_section(record.path / MESH, cameras)),
-        "<h2>Every stage beside the photographs</h2>",
-        part("pictures of the stages", lambda: view_sections(renders, expected_stages=stages)),
-        "<h2>Training</h2>",
-        part("curves", lambda: curve_section(record)),
-        part("story of the training", lambda: story(record.events)),
-        *_of_views(record, part),
-        "<h2>What was run</h2>",
-        part("facts of the run", lambda: facts(definition_facts(record.definition))),
-        _raw("The whole definition (run.json)", record.definition),
-        _raw("All figures (metrics.json)", {"stages": record.stages, "surface": record.surface}),
-    ]
+    title, guard, parts = _title(record), Guard(on_failure), _parts(record, cameras)
+    body = render(
+        "report.html",
+        title=title,
+        part=lambda name: guard(name, parts[name]),
+        of_views=_of_views(record),
+        raw=[
+            ("The whole definition (run.json)", _indented(record.definition)),
+            ("All figures (metrics.json)", _indented({"stages": record.stages, "surface": record.surface})),
+        ],
+    )
     target = record.path / REPORT
     with atomic_write(target, "w") as file:
-        file.write(page(f"{title}: gs2d report", [part for part in body if part]))
+        file.write(page(f"{title}: gs2d report", [body]))
     return target
 
 
-def _of_views(record: RunRecord, part: Guard) -> list[str]:
-    """The sections about cameras, exposures, poses and priors, where the capture or the recipe has them."""
-    recipe, last = record.definition.get("recipe"), record.stages[-1] if record.stages else {}
+def _parts(record: RunRecord, cameras: Sequence[Camera]) -> dict[str, Callable[[], Markup]]:
+    """Return the parts by their names, which failures are told with; ``templates/report.html`` has their order."""
+    path, renders, last = record.path, record.path / RENDERS, record.stages[-1] if record.stages else {}
+    stages = [stage["name"] for stage in record.stages]
+    return {
+        "summary": lambda: verdict(record),
+        "verdict": lambda: verdict_section(path / VERDICT),
+        "pictures at the top": lambda: hero(renders),
+        "list of files": lambda: links(path),
+        "table of stages": lambda: stage_table(record),
+        "glossary": glossary,
+        "scores of the surface": lambda: surface_scores(record.surface, record.surface_reason, path),
+        "picture of the subject": lambda: subject_section(path),
+        "pictures of the mesh": lambda: mesh_section(path / MESH, cameras),
+        "pictures of the stages": lambda: view_sections(renders, expected_stages=stages),
+        "curves": lambda: curve_section(record),
+        "story of the training": lambda: story(record.events),
+        "photographs": lambda: capture_section(path, record.definition),
+        "exposures": lambda: exposure_section(path / EXPOSURE, last),
+        "cameras": lambda: poses_section(path / POSES, last),
+        "known depths": lambda: priors_section(renders / PRIORS, record.stages),
+        "facts of the run": lambda: macro("macros.html", "facts", definition_facts(record.definition)),
+    }
+
+
+def _of_views(record: RunRecord) -> list[tuple[str, str]]:
+    """Titles and parts about exposures, poses and priors, where the recipe has them."""
+    recipe = record.definition.get("recipe")
     learned: Mapping[str, Any] = recipe if isinstance(recipe, Mapping) else {}
-    parts = [part("photographs", lambda: capture_section(record.path, record.definition))]
-    if learned.get("exposure"):
-        section = part("exposures", lambda: exposure_section(record.path / EXPOSURE, last))
-        parts += ["<h2>Exposure of the photographs</h2>", section]
-    if learned.get("poses"):
-        section = part("cameras", lambda: poses_section(record.path / POSES, last))
-        parts += ["<h2>Where the photographs were taken</h2>", section]
-    if learned.get("depth_prior") or learned.get("normal_prior"):
-        folder = record.path / RENDERS / PRIORS
-        section = part("known depths", lambda: priors_section(folder, record.stages))
-        parts += ["<h2>What was known of the photographs</h2>", section]
-    return parts
+    wanted = (
+        ("Exposure of the photographs", "exposures", learned.get("exposure")),
+        ("Where the photographs were taken", "cameras", learned.get("poses")),
+        (
+            "What was known of the photographs",
+            "known depths",
+            learned.get("depth_prior") or learned.get("normal_prior"),
+        ),
+    )
+    return [(title, part) for title, part, is_learned in wanted if is_learned]
 
 
 def _title(record: RunRecord) -> str:
@@ -184,25 +192,26 @@ def figure(value: Any, digits: int) -> str:
     return f"{value:,.{digits}f}"
 
 
-def verdict(record: RunRecord) -> str:
-    """One sentence (HTML) on what the run shows: quality at its end, and what the later stages changed and cost."""
-    recipe = escape(_name_of(record.definition.get("recipe", "an unnamed recipe")))
+def verdict(record: RunRecord) -> Markup:
+    """Return one sentence on what the run shows: quality at its end, what the later stages changed and cost."""
     split, scored = record.split, [s for s in record.stages if (s.get(record.split) or {}).get("psnr") is not None]
-    if not scored:
-        return f"No stage of {recipe} is finished and scored yet."
-    first, last = scored[0], scored[-1]
-    text = f"{recipe} reaches {graded(last[split]['psnr'], split)} PSNR on the {split} views"
-    if isinstance(last[split].get("ssim"), int | float):
-        text += f" (SSIM {last[split]['ssim']:.4f})"
-    if first is not last:
-        gain = last[split]["psnr"] - first[split]["psnr"]
-        words = "more than" if gain >= 0 else "less than"
-        text += f", {abs(gain):.2f} dB {words} after its first stage ({escape(first['name'])})"
-        text += _price(first, last, record.stages)
-    return text + "." + _surface_sentence(record.surface) + _unfinished(record)
+    values: dict[str, Any] = {"recipe": _name_of(record.definition.get("recipe", "an unnamed recipe")), "last": None}
+    if scored:
+        first, last = scored[0], scored[-1]
+        values |= {
+            "last": {"psnr": last[split]["psnr"], "ssim": last[split].get("ssim")},
+            "grade": grade_of(last[split]["psnr"], split),
+            "split": split,
+            "first": first["name"],
+            "gain": None if first is last else last[split]["psnr"] - first[split]["psnr"],
+            "price": _price(first, last, record.stages),
+            "surface": _middle_score(record.surface),
+            "unfinished": _unfinished(record),
+        }
+    return render("summary.html", **values)
 
 
-def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[Mapping[str, Any]]) -> str:
+def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[Mapping[str, Any]]) -> list[str]:
     """What the stages after the first cost in storage and time."""
     parts = []
     if first.get("bytes") and last.get("bytes"):
@@ -210,27 +219,25 @@ def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[M
     later = [s.get("seconds") for s in stages[list(stages).index(first) + 1 :]]
     if first.get("seconds") and later and all(isinstance(s, int | float) for s in later):
         parts.append(f"{100 * sum(s for s in later if s is not None) / first['seconds']:+.0f} % training time")
-    return f", for {' and '.join(parts)}" if parts else ""
+    return parts
 
 
-def _surface_sentence(surface: Mapping[str, Any] | None) -> str:
+def _middle_score(surface: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The row of scores at the threshold that is neither the strictest nor the kindest."""
     rows = [row for row in (surface or {}).get("thresholds") or [] if isinstance(row.get("f_score"), int | float)]
-    if not rows:
-        return ""
-    middle = rows[len(rows) // 2]  # neither the strictest nor the kindest
-    return f" The mesh has an F-score of {middle['f_score']:.3f} within {middle['threshold']:.3g} (units of the truth)."
+    return rows[len(rows) // 2] if rows else None
 
 
-def _unfinished(record: RunRecord) -> str:
+def _unfinished(record: RunRecord) -> list[str]:
+    """Names of the stages that are planned and not done."""
     recipe = record.definition.get("recipe")
     planned = [_name_of(s) for s in recipe.get("stages", ())] if isinstance(recipe, Mapping) else []
     done = [stage["name"] for stage in record.stages]
-    left = [name for name in planned if name not in done]
-    return f" Not finished: {escape(', '.join(left))}." if left else ""
+    return [name for name in planned if name not in done]
 
 
-def stage_table(record: RunRecord) -> str:
-    """One row a stage: quality, size, time."""
+def stage_table(record: RunRecord) -> Markup:
+    """Return a table with one row a stage: quality, size, time."""
     if not record.stages:
         return missing("metrics.json has no finished stage yet.")
     splits = [name for name in ("test", "train") if any(stage.get(name) for stage in record.stages)]
@@ -243,26 +250,45 @@ def stage_table(record: RunRecord) -> str:
     ]
     columns += [f"{label} ({split})" for split, _, label, _, _ in shown]
     columns += ["Splats", "MB", "Seconds", "Peak memory, MB"]
-    rows = []
+    rows: list[list[str]] = []
+    marked: list[tuple[int, int]] = []
     for stage in record.stages:
-        rows.append([_stage_name(stage), figure(stage.get("iterations"), 0)])
-        rows[-1] += [_metric_cell(stage.get(split) or {}, key, digits, best) for split, key, _, digits, best in shown]
-        rows[-1] += [
-            figure(stage.get("splats"), 0),
-            figure(scaled(stage.get("bytes"), 1e-6), 2),
-            figure(stage.get("seconds"), 1),
-            figure(scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
+        values = [(stage.get(split) or {}).get(key) for split, key, *_ in shown]
+        marked += [
+            (len(rows), 2 + k)
+            for k, (value, (*_, best)) in enumerate(zip(values, shown, strict=True))
+            if value is not None and value == best
         ]
-    words = "PSNR and SSIM: means over the views, of pictures rounded to 8 bits. Higher is better, the best is bold."
-    legend = f'<p class="soft">{words}{_other_conventions(record)}</p>' if shown else ""
-    notes = [legend, _reasons(record.stages, splits), _clone_note(record)]
-    return table(columns, rows, titles=titles_of(columns)) + "".join(notes)
+        rows.append(
+            [
+                _stage_name(stage),
+                figure(stage.get("iterations"), 0),
+                *(figure(value, digits) for value, (*_, digits, _) in zip(values, shown, strict=True)),
+                figure(stage.get("splats"), 0),
+                figure(scaled(stage.get("bytes"), 1e-6), 2),
+                figure(stage.get("seconds"), 1),
+                figure(scaled(stage.get("peak_memory_bytes"), 1e-6), 0),
+            ]
+        )
+    return render(
+        "stages.html",
+        columns=columns,
+        rows=rows,
+        titles=titles_of(columns),
+        best=marked,
+        is_scored=bool(shown),
+        split=record.split,
+        other=_other_conventions(record),
+        reasons=_reasons(record.stages, splits),
+        clones=_clones(record),
+    )
 
 
-def _stage_name(stage: Mapping[str, Any]) -> str:
+def _stage_name(stage: Mapping[str, Any]) -> str | Markup:
     source = stage.get("reused_from")  # a file of the stage cache, or a run; metrics.json has the whole path
-    reused = f'<span class="why">trained before ({escape(Path(source).name[:12])})</span>' if source else ""
-    return f"<td>{escape(stage['name'])}{reused}</td>"
+    if not source:
+        return str(stage["name"])
+    return Markup('{}<span class="why">trained before ({})</span>').format(stage["name"], Path(source).name[:12])
 
 
 def _best(stages: Sequence[Mapping[str, Any]], split: str, key: str, sign: int) -> float | None:
@@ -271,13 +297,7 @@ def _best(stages: Sequence[Mapping[str, Any]], split: str, key: str, sign: int) 
     return sign * max(numbers) if len(numbers) > 1 else None
 
 
-def _metric_cell(scores: Mapping[str, Any], key: str, digits: int, best: float | None) -> str:
-    value = scores.get(key)
-    style = ' class="best"' if value is not None and value == best else ""
-    return f"<td{style}>{figure(value, digits)}</td>"
-
-
-def _reasons(stages: Sequence[Mapping[str, Any]], splits: Sequence[str]) -> str:
+def _reasons(stages: Sequence[Mapping[str, Any]], splits: Sequence[str]) -> list[str]:
     """Why figures are missing, once each."""
     said: dict[str, None] = {}
     for stage in stages:
@@ -289,38 +309,33 @@ def _reasons(stages: Sequence[Mapping[str, Any]], splits: Sequence[str]) -> str:
                 scores = stage.get(split) or {}
                 if scores.get(f"{key}_reason"):
                     said[f"{label.partition(',')[0]}: {scores[f'{key}_reason']}"] = None
-    return "".join(missing(text) for text in said)
+    return list(said)
 
 
-def _clone_note(record: RunRecord) -> str:
+def _clones(record: RunRecord) -> list[dict[str, Any]]:
     """PSNR just before and just after splats were cloned in place."""
-    split, lines = record.split, []
+    split, found = record.split, []
     for before, stage in zip(record.stages, record.stages[1:], strict=False):
         after = ((stage.get("after_clone") or {}).get(split) or {}).get("psnr")
         earlier = (before.get(split) or {}).get("psnr")
         if isinstance(after, int | float) and isinstance(earlier, int | float):
-            lines.append(
-                f"Cloning in place at the start of {stage['name']} changed PSNR on the {split} views "
-                f"from {earlier:.2f} to {after:.2f} dB."
-            )
-    return "".join(f'<p class="soft">{escape(line)}</p>' for line in lines)
+            found.append({"stage": stage["name"], "before": earlier, "after": after})
+    return found
 
 
-def _other_conventions(record: RunRecord) -> str:
-    """The last stage's figures by the other conventions: from floats, and LPIPS fed with [-1, 1]."""
+def _other_conventions(record: RunRecord) -> dict[str, float | None]:
+    """The last stage's figures by the other conventions: from floats, and LPIPS fed with [-1, 1]; None: not known."""
     scores = record.stages[-1].get(record.split) or {}
-    psnr, ssim, signed = (scores.get(name) for name in ("psnr_float", "ssim_float", "lpips_signed"))
-    text = ""
-    if isinstance(psnr, int | float) and isinstance(ssim, int | float):
-        text += f" From floats, unrounded, the last stage has {psnr:.2f} dB and {ssim:.4f} ({record.split} views)."
-    if isinstance(signed, int | float):
-        text += f" LPIPS is fed with pictures in [0, 1]; fed with [-1, 1], as its authors do, it is {signed:.4f}."
-    return text
+    psnr, ssim, signed = (
+        value if isinstance(value, int | float) else None
+        for value in (scores.get(name) for name in ("psnr_float", "ssim_float", "lpips_signed"))
+    )
+    return {"psnr": None if ssim is None else psnr, "ssim": ssim, "signed": signed}
 
 
 # -- training ----------------------------------------------------------------------------------------------------------
-def curve_section(record: RunRecord) -> str:
-    """Curves from the log."""
+def curve_section(record: RunRecord) -> Markup:
+    """Return curves from the log."""
     if not record.events:
         return missing("events.jsonl is missing or empty: there are no curves.")
     split = record.split
@@ -332,11 +347,11 @@ def curve_section(record: RunRecord) -> str:
     drawn = curves(read_history(record.events), ends, split)
     if not drawn:
         return missing("events.jsonl holds no figures of training steps: there are no curves.")
-    return '<div class="curves">' + "".join(drawing(svg, title) for title, svg in drawn.items()) + "</div>"
+    return macro("lists.html", "curves", drawn)
 
 
-def story(events: Sequence[Mapping[str, Any]]) -> str:
-    """The log's turning points as a list."""
+def story(events: Sequence[Mapping[str, Any]]) -> Markup:
+    """Return the log's turning points as a list."""
     lines: list[str] = []
     densified: dict[str, list[int]] = {}
     resets: dict[str, int] = {}
@@ -370,7 +385,7 @@ def story(events: Sequence[Mapping[str, Any]]) -> str:
         for stage, (clone, split, prune) in densified.items()
     ]
     lines = [*lines[:1], *grown, *lines[1:]]
-    return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
+    return macro("lists.html", "story", lines)
 
 
 # -- the definition ----------------------------------------------------------------------------------------------------
@@ -397,6 +412,5 @@ def definition_facts(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
     return pairs
 
 
-def _raw(title: str, value: Any) -> str:
-    text = json.dumps(value, indent=2, ensure_ascii=False)
-    return f"<details><summary>{escape(title)}</summary><pre>{escape(text)}</pre></details>"
+def _indented(value: Any) -> str:
+    return json.dumps(value, indent=2, ensure_ascii=False)

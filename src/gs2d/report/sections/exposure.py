@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.report.html import drawing, escape, missing
+from gs2d.report.html import missing, render
 from gs2d.report.plots import INK, plot_by_image, svg_text
 
 GREY = 0.5  # the scene's colour whose picture is shown
 _CHANNELS = {"red": "#d0463b", "green": "#3f9a5f", "blue": "#3f86d6"}
 
 
-def exposure_section(path: Path, last_stage: Mapping[str, Any]) -> str:
+def exposure_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
     """Plot and sentences (HTML) about ``exposure.json``.
 
     Parameters
@@ -31,26 +32,16 @@ def exposure_section(path: Path, last_stage: Mapping[str, Any]) -> str:
         return missing(f"{path.name} is missing: it is written when training is finished.")
     names, gains = _gains(path)
     low, high = int(gains.mean(axis=1).argmin()), int(gains.mean(axis=1).argmax())
-    words = (
-        f"Each training photograph has a colour transform of its own, learned with the scene; their mean is the "
-        f"identity. A middle grey of the scene is {gains[low].mean():.2f} times as bright in {escape(names[low])} (the "
-        f"darkest) and {gains[high].mean():.2f} times in {escape(names[high])} (the brightest). Training views are "
-        "scored and drawn in the exposures of their photographs; test views, the mesh and new views in the mean "
-        "exposure, and nothing is fitted to test photographs."
-    )
-    title = "How bright a middle grey comes out, by photograph and channel (1 = the mean)"
-    return f'<p>{words}</p>{_matched(last_stage)}<div class="curves">{drawing(_plot(gains), title)}</div>'
+    dark, bright = ({"name": names[row], "gain": gains[row].mean()} for row in (low, high))
+    return render("exposure.html", dark=dark, bright=bright, matched=_matched(last_stage), plot=_plot(gains))
 
 
-def _matched(stage: Mapping[str, Any]) -> str:
+def _matched(stage: Mapping[str, Any]) -> dict[str, float] | None:
     """The second score of the test views, where there is one."""
     plain, matched = (stage.get(name) or {} for name in ("test", "test_matched"))
     if not isinstance(matched.get("psnr"), int | float) or not isinstance(plain.get("psnr"), int | float):
-        return ""
-    return (
-        f"<p>Test views have {plain['psnr']:.2f} dB as they are, and {matched['psnr']:.2f} dB where each half of a "
-        "rendering is matched in colour to the other half of its photograph, which also forgives errors of colour.</p>"
-    )
+        return None
+    return {"plain": plain["psnr"], "matched": matched["psnr"]}
 
 
 def _gains(path: Path) -> tuple[list[str], np.ndarray]:

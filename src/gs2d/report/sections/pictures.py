@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from gs2d.core.camera import Camera
 from gs2d.core.images import composite, read_image
@@ -15,7 +16,7 @@ from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RENDERS
-from gs2d.report.html import color_bar, escape, image_tag, missing, wipe
+from gs2d.report.html import Pair, missing, render
 from gs2d.report.images import ERROR_TOP, HIGHLIGHT, depth_scale, error_scale
 from gs2d.report.mesh_images import mesh_images, orbit_cameras
 
@@ -123,105 +124,85 @@ def _is_view(entry: Any) -> bool:
     return known and isinstance(entry.get("file", ""), str) and isinstance(entry.get("camera", {}), dict)
 
 
-def hero(renders: Path) -> str:
-    """The first view large: the photograph wiped over the last stage's colour; its normal and its depth."""
+def hero(renders: Path) -> Markup:
+    """Return the first view large: the photograph wiped over the last stage's colour; its normal and its depth."""
     gallery = read_gallery(renders)
     if gallery is None or not gallery.views or not gallery.stages:
-        return ""
+        return Markup()
     view, stage = gallery.views[0], gallery.stages[-1]
-    compared = comparison(gallery, view, width=1000)
-    figures = [] if compared else [("Photograph", gallery.photo(view), gallery.beside(view))]
+    pair = compared(gallery, view, width=1000)
+    figures = [] if pair else [("Photograph", gallery.photo(view), gallery.beside(view))]
     figures += [
         (f"{KINDS[kind]}, {stage}", gallery.rendering(stage, view, kind), gallery.beside(view, stage, kind))
-        for kind in (("normal", "depth") if compared else ("color", "normal", "depth"))
+        for kind in (("normal", "depth") if pair else ("color", "normal", "depth"))
     ]
-    others = "".join(
-        image_tag(image, title, alt=f"{title} of {view.name}", width=520, full=full)
-        for title, image, full in figures
-        if image is not None
-    )
-    beside = f'<div class="hero">{others}</div>' if others else ""
-    return f'<div class="hero first">{compared}{beside}</div>' if compared else beside
+    there = [{"title": t, "pixels": pixels, "full": full} for t, pixels, full in figures if pixels is not None]
+    return render("hero.html", pair=pair, images=there, name=view.name)
 
 
-def comparison(gallery: Gallery, view: ShownView, *, width: int = 800) -> str:
-    """Return the photograph of a view wiped over the last stage's rendering; "" where there are not both."""
+def compared(gallery: Gallery, view: ShownView, *, width: int = 800) -> Pair | None:
+    """Return the photograph of a view and the last stage's rendering of it; None where there are not both."""
     stage = gallery.stages[-1]
     photo, color = gallery.photo(view), gallery.rendering(stage, view, "color")
     if photo is None or color is None or photo.shape[:2] != color.shape[:2]:
-        return ""
+        return None
     split = f" ({view.split} view)" if view.split else ""
-    return wipe(
+    return Pair(
         (photo, color),
         ("photograph", "rendering"),
         title=f"{view.name}{split}, {_psnr_caption(color, photo)}",
-        width=width,
         full=(gallery.beside(view), gallery.beside(view, stage, "color")),
+        width=width,
     )
 
 
-def view_sections(renders: Path, *, expected_stages: Sequence[str]) -> str:
-    """For every shown view a grid: kinds of picture down, photograph and stages across."""
+def view_sections(renders: Path, *, expected_stages: Sequence[str]) -> Markup:
+    """Return a grid for every shown view: kinds of picture down, photograph and stages across."""
     gallery = read_gallery(renders)
     if gallery is None or not gallery.views:
         return missing("renders/ holds no pictures (gs2d render RUN makes them).")
     stages = list(dict.fromkeys([*gallery.stages, *expected_stages]))
-    parts = []
-    for view in gallery.views[:MAX_VIEWS]:
-        split = f" <small>{escape(view.split)} view</small>" if view.split else ""
-        compared = comparison(gallery, view) if view is not gallery.views[0] and gallery.stages else ""  # that: on top
-        grid = f'<div class="scroll">{_grid(gallery, view, stages)}</div>'
-        parts.append(f"<h3>{escape(view.name)}{split}</h3>{compared}{grid}")
-    left = len(gallery.views) - MAX_VIEWS
-    if left > 0:
-        parts.append(missing(f"{left} more views are in the folder renders/."))
-    return "".join(parts)
+    solid = np.tile(np.array(HIGHLIGHT, dtype=np.float32), (2, 1))
+    fade = np.stack([np.full(3, 0.8, dtype=np.float32), solid[0]])
+    return render(
+        "views.html",
+        views=[_shown(gallery, view, stages) for view in gallery.views[:MAX_VIEWS]],
+        stages=stages,
+        left=max(len(gallery.views) - MAX_VIEWS, 0),
+        scales={"error": error_scale(9), "depth": depth_scale(9), "high_error": fade},
+        top=f"{ERROR_TOP:g}",
+    )
 
 
-def _grid(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> str:
+def _shown(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> dict[str, Any]:
+    """What the grid of a view shows: a row for each kind of picture, a cell for each stage."""
     photo = gallery.photo(view)
-    cells = ['<div class="head"></div><div class="head">photograph</div>']
-    cells += [f'<div class="head">{escape(stage)}</div>' for stage in stages]
+    limits = ("near", "far") if view.depth_limits is None else tuple(f"{limit:.3g}" for limit in view.depth_limits)
+    rows = []
     for kind, title in KINDS.items():
-        images = [gallery.rendering(stage, view, kind) for stage in stages]
-        cells.append(f'<div class="row">{title}</div>')
-        if kind == "color":
-            missing_photo = missing("no photograph in renders/photos")
-            shown = "" if photo is None else image_tag(photo, alt=f"photograph {view.name}", full=gallery.beside(view))
-            cells.append(shown or missing_photo)
-        else:
-            cells.append(_key(kind, view))
-        for stage, image in zip(stages, images, strict=True):
-            if image is None:
-                cells.append(missing(_why_missing(kind, stage)))
-                continue
-            caption = _psnr_caption(image, photo) if kind == "color" else ""
-            alt, full = f"{title} of {view.name} after {stage}", gallery.beside(view, stage, kind)
-            cells.append(image_tag(image, caption, alt=alt, full=full))
-    columns = f"5.2rem repeat({len(stages) + 1}, minmax(8rem, 1fr))"
-    return f'<div class="views" style="grid-template-columns: {columns}">{"".join(cells)}</div>'
+        cells = []
+        for stage in stages:
+            pixels = gallery.rendering(stage, view, kind)
+            caption = _psnr_caption(pixels, photo) if kind == "color" and pixels is not None else ""
+            why, full = _why_missing(kind, stage), gallery.beside(view, stage, kind)
+            cells.append({"stage": stage, "pixels": pixels, "caption": caption, "full": full, "why": why})
+        rows.append({"kind": kind, "title": title, "cells": cells})
+    on_top = view is gallery.views[0] or not gallery.stages
+    return {
+        "name": view.name,
+        "split": view.split,
+        "pair": None if on_top else compared(gallery, view),
+        "photo": photo,
+        "photo_file": gallery.beside(view),
+        "limits": limits,
+        "rows": rows,
+    }
 
 
 def _why_missing(kind: str, stage: str) -> str:
     if kind == "high_error":
         return "no splats were ranked by error up to this stage"
     return f"not rendered for {stage}"
-
-
-def _key(kind: str, view: ShownView) -> str:
-    """What the colours of a row mean."""
-    if kind == "error":
-        return color_bar(
-            error_scale(9), "0", f"{ERROR_TOP:g} and more", "mean absolute error over channels, colours in [0, 1]"
-        )
-    if kind == "depth":
-        near, far = ("near", "far") if view.depth_limits is None else (f"{limit:.3g}" for limit in view.depth_limits)
-        return color_bar(depth_scale(9), near, far, "depth along the optical axis, world units")
-    if kind == "normal":
-        return '<div class="key">world normals facing the camera: red, green, blue for x, y, z</div>'
-    solid = np.tile(np.array(HIGHLIGHT, dtype=np.float32), (2, 1))
-    fade = np.stack([np.full(3, 0.8, dtype=np.float32), solid[0]])
-    return color_bar(fade, "0", "1", "share of the splats with the highest colour error in a pixel")
 
 
 def _psnr_caption(image: np.ndarray, photo: np.ndarray | None) -> str:
@@ -234,8 +215,8 @@ def _psnr_caption(image: np.ndarray, photo: np.ndarray | None) -> str:
     return "equal" if squared == 0 else f"{-10 * np.log10(squared):.2f} dB"
 
 
-def mesh_section(path: Path, cameras: Sequence[Camera]) -> str:
-    """Pictures of the mesh as clay and in its colours.
+def mesh_section(path: Path, cameras: Sequence[Camera]) -> Markup:
+    """Return pictures of the mesh as clay and in its colours.
 
     Raises
     ------
@@ -252,11 +233,10 @@ def mesh_section(path: Path, cameras: Sequence[Camera]) -> str:
         return missing(f"mesh.ply has {counts}: too many for a picture here (at most {MAX_FACES:,} faces).")
     chosen = tuple(cameras)[:3] or orbit_cameras(mesh)
     where = "from cameras of the capture" if cameras else "from two sides, taking the third axis as up"
-    figures = []
-    for shown in mesh_images(mesh, chosen):
-        pair = image_tag(shown.shape, alt="the mesh as clay", width=420)
-        if shown.color is not None:
-            pair += image_tag(shown.color, alt="the mesh in its vertex colours", width=420)
-        figures.append(f'<div class="pair">{pair}</div>')
-    words = "as clay and in its vertex colours" if mesh.colors is not None else "as clay (it has no vertex colours)"
-    return f'<div class="meshes">{"".join(figures)}</div><p class="soft">The mesh, {counts}, {words}, {where}.</p>'
+    return render(
+        "mesh.html",
+        images=mesh_images(mesh, chosen),
+        counts=counts,
+        has_colors=mesh.colors is not None,
+        where=where,
+    )

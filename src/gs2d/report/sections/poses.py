@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
-from gs2d.report.html import drawing, escape, missing
+from gs2d.report.html import missing, render
 from gs2d.report.plots import INK, plot_by_image, svg_text
 
 MEASURES = ("pixels", "degrees", "shift")
 
 
-def poses_section(path: Path, last_stage: Mapping[str, Any]) -> str:
+def poses_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
     """Plot and sentences (HTML) about ``poses.json``.
 
     Parameters
@@ -30,28 +31,24 @@ def poses_section(path: Path, last_stage: Mapping[str, Any]) -> str:
         return missing(f"{path.name} is missing: it is written when training is finished.")
     names, far = _moved(path)
     most, mean = int(far[:, 0].argmax()), far.mean(axis=0)
-    words = (
-        f"Each training camera was moved to where the scene looks like its photograph: by {mean[0]:.2f} pixels in the "
-        f"mean, most in {escape(names[most])} ({far[most, 0]:.2f} pixels). That is {mean[1]:.3f} degrees and "
-        f"{100 * mean[2]:.3f} % of the scene's extent; a turn and a shift may cancel in the picture. Training views "
-        "are scored and drawn, and the surface is fused, from there."
+    return render(
+        "poses.html",
+        pixels=mean[0],
+        degrees=mean[1],
+        percent=100 * mean[2],
+        most={"name": names[most], "pixels": far[most, 0]},
+        has_test=bool(last_stage.get("test")),
+        aligned=_aligned(last_stage),
+        plot=_plot(far[:, 0]),
     )
-    if last_stage.get("test"):
-        words += " Test views keep the cameras of the capture, and nothing is fitted to test photographs."
-    title = "How far each camera was moved, pixels at the distance of the scene's middle"
-    plot = drawing(_plot(far[:, 0]), title)
-    return f'<p>{words}</p>{_aligned(last_stage)}<div class="curves">{plot}</div>'
 
 
-def _aligned(stage: Mapping[str, Any]) -> str:
+def _aligned(stage: Mapping[str, Any]) -> dict[str, float] | None:
     """The second score of the test views, where there is one."""
     plain, aligned = (stage.get(name) or {} for name in ("test", "test_aligned"))
     if not isinstance(aligned.get("psnr"), int | float) or not isinstance(plain.get("psnr"), int | float):
-        return ""
-    return (
-        f"<p>Test views have {plain['psnr']:.2f} dB from where the capture says, and {aligned['psnr']:.2f} dB where "
-        "each camera is moved to fit its photograph, which also forgives a scene that is not where it should be.</p>"
-    )
+        return None
+    return {"plain": plain["psnr"], "aligned": aligned["psnr"]}
 
 
 def _moved(path: Path) -> tuple[list[str], np.ndarray]:

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from gs2d.core.images import read_image
-from gs2d.report.html import drawing, escape, image_tag, missing
+from gs2d.report.html import missing, render
 from gs2d.report.plots import INK, plot_by_image, svg_text
 
 TITLES = {
@@ -20,7 +21,7 @@ TITLES = {
 }
 
 
-def priors_section(folder: Path, stages: Sequence[Mapping[str, Any]]) -> str:
+def priors_section(folder: Path, stages: Sequence[Mapping[str, Any]]) -> Markup:
     """Sentences, plots and pictures (HTML).
 
     Parameters
@@ -34,22 +35,16 @@ def priors_section(folder: Path, stages: Sequence[Mapping[str, Any]]) -> str:
     depth, normal = _figures(last.get("depth_prior")), _figures(last.get("normal_prior"))
     if depth is None and normal is None:
         return missing("no stage is finished and measured yet.")
-    parts = []
-    for found, name, text, title in (
-        (depth, "depth_prior", "rendered and known depth differ by {} of the depth", "Error of depth by photograph, %"),
-        (normal, "normal_prior", "rendered and known normals differ by {}", "Error of normals by photograph, degrees"),
-    ):
-        if found is None:
-            continue
-        by_view, median = found
-        figures = 100 * by_view if name == "depth_prior" else by_view
-        value = f"{100 * median:.2f} %" if name == "depth_prior" else f"{median:.1f} degrees"
-        words = (
-            f"In the middle pixel of the middle photograph {text.format(value)}, after {last.get('name', 'training')}."
-        )
-        parts.append(f"<p>{escape(words)} What is known may be wrong: its weight falls as training goes on.</p>")
-        parts.append(f'<div class="curves">{drawing(_plot(figures), title)}</div>')
-    return "".join(parts) + _images(folder, last.get("priors_shown"))
+    figures = []
+    if depth is not None:
+        text = f"rendered and known depth differ by {100 * depth[1]:.2f} % of the depth"
+        figures.append({"text": text, "title": "Error of depth by photograph, %", "plot": _plot(100 * depth[0])})
+    if normal is not None:
+        text = f"rendered and known normals differ by {normal[1]:.1f} degrees"
+        title = "Error of normals by photograph, degrees"
+        figures.append({"text": text, "title": title, "plot": _plot(normal[0])})
+    views = _views(folder, last.get("priors_shown"))
+    return render("priors.html", figures=figures, stage=last.get("name", "training"), views=views)
 
 
 def _figures(entry: Any) -> tuple[np.ndarray, float] | None:
@@ -61,18 +56,15 @@ def _figures(entry: Any) -> tuple[np.ndarray, float] | None:
     return (values, float(np.median(values))) if len(values) else None
 
 
-def _images(folder: Path, shown: Any) -> str:
-    """What is known beside what is rendered."""
-    parts = []
+def _views(folder: Path, shown: Any) -> list[dict[str, Any]]:
+    """What is known beside what is rendered: names of views, and titles and pictures of each."""
+    views = []
     for view in shown if isinstance(shown, list) else ():
-        figures = []
-        for kind, title in TITLES.items():
-            path = folder / f"{view.get('file')}.{kind}.png"
-            if path.is_file():
-                figures.append(image_tag(read_image(path), title, alt=f"{title} of {view.get('name')}", width=420))
-        if figures:
-            parts.append(f'<h3>{escape(str(view.get("name")))}</h3><div class="hero">{"".join(figures)}</div>')
-    return "".join(parts)
+        paths = [(title, folder / f"{view.get('file')}.{kind}.png") for kind, title in TITLES.items()]
+        images = [(title, read_image(path)) for title, path in paths if path.is_file()]
+        if images:
+            views.append({"name": str(view.get("name")), "pictures": images})
+    return views
 
 
 def _plot(values: np.ndarray) -> str:

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
 from gs2d.core.images import read_image
 from gs2d.data.subject import OBJECT, Subject, read_subject
 from gs2d.io.run_dir import RENDERS
-from gs2d.report.html import escape, image_tag
+from gs2d.report.html import render
 
 IMAGE = "subject.png"
 MAX_POINTS = 8000
@@ -63,7 +64,7 @@ def plane_axes(up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(up, right), up])
 
 
-def subject_section(run: Path) -> str:
+def subject_section(run: Path) -> Markup:
     """Return what the cameras look at, in words and as a picture; nothing for runs of before it was found.
 
     Raises
@@ -73,14 +74,12 @@ def subject_section(run: Path) -> str:
     """
     subject = read_subject(run)
     if subject is None:
-        return ""
-    what = "The subject" if subject.kind == OBJECT else "No subject, the whole scene"
-    numbers = " ".join(f"{value:.4g}" for value in subject.box.ravel())
-    text = f"<p>{what}: {escape(subject.why)}. Box (<code>--subject-box</code>): <code>{numbers}</code></p>"
+        return Markup()
     drawn = run / RENDERS / IMAGE
-    if not drawn.is_file():
-        return text
-    caption = "Training cameras (red), sparse points, and the box of the subject."
-    return text + image_tag(
-        read_image(drawn) / np.float32(255), caption, alt="cameras, points and the subject", width=1000
+    return render(
+        "subject.html",
+        is_object=subject.kind == OBJECT,
+        why=subject.why,
+        box=" ".join(f"{value:.4g}" for value in subject.box.ravel()),
+        pixels=read_image(drawn) / np.float32(255) if drawn.is_file() else None,
     )

@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from markupsafe import Markup
+
 from gs2d.core.images import read_image
-from gs2d.report.html import escape, image_tag, missing, table
+from gs2d.report.html import missing, render
 from gs2d.report.terms import titles_of
 
 SCORES = (
@@ -45,7 +48,7 @@ _MEANINGS = {  # of the entries of metrics.json, in the order of the report
 _FRACTIONS = ("mesh_hidden", "truth_hidden", "dropped_mesh", "dropped_truth", "culled")
 
 
-def surface_scores(surface: Mapping[str, Any] | None, reason: str | None, folder: Path | None = None) -> str:
+def surface_scores(surface: Mapping[str, Any] | None, reason: str | None, folder: Path | None = None) -> Markup:
     """Distances and scores against the true surface as HTML, or why there are none.
 
     Parameters
@@ -60,24 +63,24 @@ def surface_scores(surface: Mapping[str, Any] | None, reason: str | None, folder
     if not surface:
         why = reason or "no true surface was given (gs2d evaluate RUN --ground-truth FILE)"
         return missing(f"The surface was not scored: {why}.")
-    parts = []
-    rows = [
+    scores = [
         [f"{row['threshold']:.4g}", *(_score(row.get(name)) for name in ("precision", "recall", "f_score"))]
         for row in surface.get("thresholds") or []
     ]
-    if rows:
-        columns = ["Nearer than", "Precision", "Recall", "F-score"]
-        parts.append(table(columns, rows, titles=titles_of(columns)))
-        counts = _COUNTS.get(str(surface.get("evaluator", "visible-surface")), "")
-        parts.append(f'<p class="soft">{escape(SCORES + counts)}</p>')
-    parts += _doubts(surface.get("self_check"))
     rest = (name for name in surface if name not in _MEANINGS and name not in _IN_TABLE)
     names = [*(name for name in _MEANINGS if name in surface), *rest]
-    figures = [_row(name, surface[name]) for name in names if _is_figure(surface[name])]
-    if figures:
-        parts.append(table(["Figure", "Value", "Meaning"], figures, texts=(2,)))
-    parts += _image(surface.get("files"), folder)
-    return "".join(parts) or missing("metrics.json has a surface entry without figures.")
+    values: dict[str, Any] = {
+        "scores": scores,
+        "doubts": _doubts(surface.get("self_check")),
+        "figures": [_row(name, surface[name]) for name in names if _is_figure(surface[name])],
+        "pixels": _image(surface.get("files"), folder),
+    }
+    if not any(value is not None and len(value) for value in values.values()):
+        return missing("metrics.json has a surface entry without figures.")
+    columns = ["Nearer than", "Precision", "Recall", "F-score"]
+    meaning = SCORES + _COUNTS.get(str(surface.get("evaluator", "visible-surface")), "")
+    about = {"columns": columns, "titles": titles_of(columns), "meaning": meaning, "clouds": CLOUDS}
+    return render("surface.html", **values, **about)
 
 
 def _doubts(check: Any) -> list[str]:
@@ -87,16 +90,15 @@ def _doubts(check: Any) -> list[str]:
     messages = [str(message) for message in check.get("messages") or ()]
     if not check.get("ok", True):
         messages = ["Do not believe these figures, their own check failed: " + ("; ".join(messages) or "no score")]
-    return [missing(message) for message in messages]
+    return messages
 
 
-def _image(files: Any, folder: Path | None) -> list[str]:
+def _image(files: Any, folder: Path | None) -> np.ndarray | None:
     """The scored points of both sides, coloured by distance."""
     name = files.get("picture") if isinstance(files, Mapping) else None
     if folder is None or name is None or not (folder / name).is_file():
-        return []
-    alt = "mesh and true surface, coloured by their distance"
-    return [image_tag(read_image(folder / name), CLOUDS, alt=alt, width=960)]
+        return None
+    return read_image(folder / name)
 
 
 def _is_figure(value: Any) -> bool:
@@ -117,4 +119,4 @@ def _row(name: str, value: Any) -> list[str]:
         shown = f"{value:.5g}"
     else:
         shown = f"{value:,}" if isinstance(value, int) else str(value)
-    return [escape(label), escape(shown), escape(meaning)]
+    return [label, shown, meaning]
