@@ -26,7 +26,7 @@ from gs2d.errors import DataError
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
 from gs2d.report.images import depth_image, normal_image
-from gs2d.viewer.web import MAX_SPLATS, Seen, pack, texels_of, write_page
+from gs2d.viewer.web import MAX_SPLATS, Packed, Seen, pack, texels_of, write_page
 
 ORIGIN = np.array([1000.0, -2000.0, 500.0])  # far away: float32 keeps a tenth of a millimetre there
 CAMERA = look_at(ORIGIN + np.array([0.3, -4.0, 0.8]), ORIGIN, np.array([0.0, 0.0, 1.0]), width=120, height=80, fx=100.0)
@@ -75,6 +75,11 @@ def unpacked(data: bytes, count: int, degree: int, scales: list[float]) -> Splat
     )
 
 
+def data_of(packed: Packed) -> bytes:
+    """What the page is given, in one piece."""
+    return packed.words.tobytes() + packed.harmonics.tobytes()
+
+
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(((a - b) ** 2).mean()))
 
@@ -90,12 +95,25 @@ def test_what_is_stored_renders_as_the_splats_do(degree: int, least: float) -> N
     splats, settings = some_splats(), replace(SETTINGS, sh_degree=degree)
     packed = pack(splats, ORIGIN, degree, settings.alpha_min)
     assert (packed.degree, packed.stored) == (degree, texels_of(degree))
-    stored = unpacked(packed.data, packed.count, degree, packed.scales)
+    stored = unpacked(data_of(packed), packed.count, degree, packed.scales)
     with torch.no_grad():
         before = rasterize(splats, CAMERA, settings, backend="reference")
         after = rasterize(stored, at_origin(CAMERA), settings, backend="reference")
     assert psnr(before.color.numpy(), after.color.numpy()) > least
     assert float((before.normal - after.normal).abs().mean()) < 1e-3
+
+
+def test_splats_are_stored_some_at_a_time_with_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    splats = some_splats(50)
+    splats.opacity_logits[11] = -20
+    whole = pack(splats, ORIGIN, 3, 1 / 255)
+    zipped = b"".join(whole.zipped())
+    monkeypatch.setattr("gs2d.viewer.web.SPLATS_AT_ONCE", 7)
+    monkeypatch.setattr("gs2d.viewer.web.PIECE", 100)
+    parts = pack(splats, ORIGIN, 3, 1 / 255)
+    assert data_of(parts) == data_of(whole)
+    assert parts.scales == whole.scales
+    assert gzip.decompress(b"".join(parts.zipped())) == gzip.decompress(zipped) == data_of(whole)
 
 
 def test_what_nobody_can_see_is_left_out() -> None:
@@ -189,7 +207,7 @@ def test_the_page_is_one_file_that_loads_nothing_and_holds_what_it_is_told(tmp_p
     assert [camera["name"] for camera in facts["cameras"]] == ["</script>.png", "2.png"]
     assert np.allclose(facts["cameras"][0]["t"], at_origin(CAMERA).T_cam_world[:3, 3])
     packed = pack(some_splats(), ORIGIN, 3, SETTINGS.alpha_min)
-    assert gzip.decompress(base64.b64decode(page.texts["splats"])) == packed.data
+    assert gzip.decompress(base64.b64decode(page.texts["splats"])) == data_of(packed)
     assert (facts["splats"], facts["stored"], facts["background"]) == (packed.count, 3, [0.2, 0.5, 0.9])
     names = set(re.findall(r"uniform \w+ ([\w, ]+);", page.texts["splat-vert"].replace("[15]", "")))
     told = {name.strip() for line in names for name in line.split(",")}

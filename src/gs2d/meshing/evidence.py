@@ -23,6 +23,7 @@ FEW_VIEWS = 12  # in a capture, of which two are enough
 SMALL = 0.01  # of the largest component's area: smaller ones go
 FACES_A_PIXEL = 2.0  # a depth map has as many
 VERTICES_AT_ONCE = 1 << 15  # by all views in turn: what is made of so many stays in a core's cache
+FACES_AT_ONCE = 1 << 16  # corners of all faces, nine numbers each, were most of what cleaning a mesh took
 GRAZING = 0.1  # cosine between a view's ray and a face, below which the view does not see it
 
 
@@ -111,26 +112,41 @@ def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 def _normals(mesh: Mesh) -> np.ndarray:
     """Unit normals [P, 3] of the vertices, by the areas of their faces."""
-    corners = mesh.vertices.astype(np.float32)[mesh.faces]
-    of_face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat = mesh.faces.ravel()
-    total = np.stack(
-        [np.bincount(flat, np.repeat(of_face[:, axis], 3), len(mesh.vertices)) for axis in range(3)], axis=1
-    )
+    vertices, flat = mesh.vertices.astype(np.float32), mesh.faces.ravel()
+    of_face = np.empty((len(mesh.faces), 3), np.float32)
+    for part in _parts(len(mesh.faces)):
+        of_face[part] = _crosses(vertices[mesh.faces[part]])
+    total = np.empty((len(vertices), 3))
+    for axis in range(3):
+        total[:, axis] = np.bincount(flat, np.repeat(of_face[:, axis], 3), len(vertices))
+    del of_face
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30), np.float32)
 
 
 def areas(mesh: Mesh) -> np.ndarray:
     """Return the areas [F] of the faces, world units^2."""
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    return np.asarray(
-        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    )
+    vertices, found = mesh.vertices.astype(np.float64), np.empty(len(mesh.faces))
+    for part in _parts(len(mesh.faces)):
+        found[part] = 0.5 * np.linalg.norm(_crosses(vertices[mesh.faces[part]]), axis=1)
+    return found
+
+
+def _crosses(corners: np.ndarray) -> np.ndarray:
+    """Normals [F, 3] of triangles [F, 3, 3], twice as long as their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _parts(count: int) -> list[slice]:
+    """Rows, some at a time."""
+    return [slice(start, min(start + FACES_AT_ONCE, count)) for start in range(0, count, FACES_AT_ONCE)]
 
 
 def pixels(mesh: Mesh, evidence: Evidence) -> float:
     """Return how many pixels the surface has, each part of it in the view that saw it best."""
-    return float((areas(mesh) * evidence.density[mesh.faces].mean(axis=1)).sum()) if len(mesh.faces) else 0.0
+    found = areas(mesh)
+    for part in _parts(len(found)):
+        found[part] *= evidence.density[mesh.faces[part]].mean(axis=1)
+    return float(found.sum())
 
 
 @dataclass(frozen=True)
@@ -163,13 +179,15 @@ def clean(mesh: Mesh, maps: Iterable[DepthMap], count: int, tolerance: float) ->
         As for ``gather``.
     """
     evidence = gather(mesh, maps, tolerance)
-    seen, of_seen = supported(mesh, evidence, min_views(count))
-    whole, of_whole = large_components(seen, of_seen)
-    found = pixels(whole, of_whole)
-    total = max(float(areas(mesh).sum()), 1e-300)
-    parts = [float(areas(part).sum()) / total for part in (seen, whole)]
-    small = simplified_to(whole, int(FACES_A_PIXEL * found))
-    return Cleaned(small, found, 1 - parts[0], parts[0] - parts[1])
+    left = [float(areas(mesh).sum())]
+    mesh, evidence = supported(mesh, evidence, min_views(count))  # what is left takes the name: one is held, not three
+    left.append(float(areas(mesh).sum()))
+    mesh, evidence = large_components(mesh, evidence)
+    left.append(float(areas(mesh).sum()))
+    found = pixels(mesh, evidence)
+    del evidence
+    parts = [area / max(left[0], 1e-300) for area in left[1:]]
+    return Cleaned(simplified_to(mesh, int(FACES_A_PIXEL * found)), found, 1 - parts[0], parts[0] - parts[1])
 
 
 def supported(mesh: Mesh, evidence: Evidence, views: int) -> tuple[Mesh, Evidence]:
@@ -204,9 +222,11 @@ def simplified_to(mesh: Mesh, faces: int) -> Mesh:
     vertices = mesh.vertices.astype(np.float64)
     middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0
     scaled = np.ascontiguousarray((vertices - middle) / size, np.float32)
+    del vertices
     triangles = np.ascontiguousarray(mesh.faces, np.int32)
     points, left = fast_simplification.simplify(scaled, triangles, target_count=max(faces, 4))
+    del scaled, triangles
     points = points * size + middle
-    colors = None if mesh.colors is None else mesh.colors[cKDTree(vertices).query(points)[1]]
+    colors = None if mesh.colors is None else mesh.colors[cKDTree(mesh.vertices.astype(np.float64)).query(points)[1]]
     small = Mesh(points.astype(mesh.vertices.dtype), np.asarray(left, np.int32), colors)
     return select_faces(small, np.ones(len(small.faces), bool))

@@ -206,19 +206,21 @@ def components(mesh: Mesh) -> np.ndarray:
 
     Ties go to the component with the lowest face number.
     """
-    n = len(mesh.vertices)
-    if not len(mesh.faces):
+    n, faces = len(mesh.vertices), mesh.faces
+    if not len(faces):
         return np.zeros(0, dtype=np.int64)
-    faces = mesh.faces.astype(np.int64)
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
-    names, first, of_face, sizes = np.unique(
-        label[faces[:, 0]], return_index=True, return_inverse=True, return_counts=True
-    )
-    order = np.lexsort((first, -sizes))
-    rank = np.empty(len(names), dtype=np.int64)
-    rank[order] = np.arange(len(names))
+    ends = (np.concatenate([faces[:, 0], faces[:, 1]]), np.concatenate([faces[:, 1], faces[:, 2]]))
+    graph = coo_array((np.ones(len(ends[0]), bool), ends), shape=(n, n)).tocsr()
+    del ends
+    count, label = connected_components(graph, directed=False)
+    del graph
+    of_face = label[faces[:, 0]]
+    sizes = np.bincount(of_face, minlength=count)
+    first = np.full(count, len(faces))
+    first[of_face[::-1]] = np.arange(len(faces))[::-1]  # of several the last one stays
+    order = np.lexsort((first, -sizes))  # of vertices without faces last
+    rank = np.empty(count, dtype=np.int64)
+    rank[order] = np.arange(count)
     return rank[of_face]
 
 

@@ -8,13 +8,13 @@ with attributes that are stored as below.
 from __future__ import annotations
 
 import base64
-import gzip
 import html
 import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -45,6 +45,9 @@ HINT = (
 )
 MAX_SPLATS = 5_000_000  # rows of 2048 texels, 3 a splat: what a texture of 8192 rows, which any GPU has, can hold
 CLIPPED = 1e-4  # of the SH coefficients of one place may be cut off: the steps of the others are smaller then
+SPLATS_AT_ONCE = 1 << 14  # in 64 bits
+PIECE = 1 << 20  # bytes that are zipped and written at once
+ZIP_LEVEL = 6
 WORD_BYTES = 32  # of a splat, without its SH coefficients above degree 0
 
 
@@ -68,17 +71,28 @@ class Packed:
     degree : int
     scales : list of 15 floats
         What the value 127 of an 8-bit SH coefficient means, by its place (degree 1 to 3, in order).
-    data : bytes
-        Per splat 8 words: mean (3 x float32), log scales (2 x float16), unit quaternion w x y z (4 x 16-bit signed,
-        32767 = 1), SH of degree 0 (3 x float16), opacity (float16). Then per splat its other SH coefficients, 8-bit
-        signed, coefficient by coefficient in red, green, blue, filled up to 16 bytes.
+    words : ndarray [N, 8] uint32
+        Per splat: mean (3 x float32), log scales (2 x float16), unit quaternion w x y z (4 x 16-bit signed,
+        32767 = 1), SH of degree 0 (3 x float16), opacity (float16).
+    harmonics : ndarray [N, 16 * stored] int8
+        Per splat its other SH coefficients, coefficient by coefficient in red, green, blue, filled up to 16 bytes.
     """
 
     count: int
     origin: np.ndarray
     degree: int
     scales: list[float]
-    data: bytes
+    words: np.ndarray
+    harmonics: np.ndarray
+
+    def zipped(self) -> Iterator[bytes]:
+        """Words, then harmonics, as a gzip file, piece by piece."""
+        zipper = zlib.compressobj(ZIP_LEVEL, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
+        for array in (self.words, self.harmonics):
+            flat = array.reshape(-1).view(np.uint8)
+            for start in range(0, len(flat), PIECE):
+                yield zipper.compress(flat[start : start + PIECE].data)
+        yield zipper.flush()
 
     @property
     def stored(self) -> int:
@@ -95,30 +109,45 @@ def texels_of(degree: int) -> int:
 def pack(splats: Splats, origin: np.ndarray, degree: int, alpha_min: float) -> Packed:
     """Splats as the page stores them; those that nobody can see (not finite, fainter than ``alpha_min``) are left out.
 
+    What is computed in 64 bits is computed of some splats at a time, or a run's memory would peak here.
+
     Raises
     ------
     DataError
         Too many.
     """
-    splats = splats.to("cpu", torch.float64)
-    rows = [tensor.reshape(len(tensor), -1) for _, tensor in splats.items() if tensor.numel()]
-    seen = splats.opacities >= alpha_min
-    for tensor in rows:
-        seen &= tensor.isfinite().all(dim=1)
-    seen &= splats.quats.norm(dim=1) > 0
-    splats = splats.rows(seen)
-    count, degree = len(splats), min(degree, splats.sh_degree)
+    splats = splats.to("cpu")
+    rows = _seen_rows(splats, alpha_min)
+    count, degree = len(rows), min(degree, splats.sh_degree)
     if count > MAX_SPLATS:
         raise DataError(f"a page holds at most {MAX_SPLATS:,} splats, got {count:,}; train with a smaller max_splats")
+    scales = _harmonic_scales(splats, rows, degree)
     words = np.zeros((count, WORD_BYTES // 4), np.uint32)
+    harmonics = np.zeros((count, 16 * texels_of(degree)), np.int8)
+    for start in range(0, count, SPLATS_AT_ONCE):
+        part, to = splats.rows(rows[start : start + SPLATS_AT_ONCE]).to("cpu", torch.float64), slice(start, None)
+        _fill_words(words[to][: len(part)], part, origin)
+        _fill_harmonics(harmonics[to][: len(part)], part.shN.numpy(), scales, degree)
+    return Packed(count, origin, degree, [float(scale) for scale in scales], words, harmonics)
+
+
+def _seen_rows(splats: Splats, alpha_min: float) -> torch.Tensor:
+    """Indices of the splats that can be seen."""
+    seen = splats.opacity_logits.double().sigmoid() >= alpha_min
+    seen &= splats.quats.double().norm(dim=1) > 0
+    for _, tensor in splats.items():
+        if tensor.numel():
+            seen &= tensor.reshape(len(tensor), -1).isfinite().all(dim=1)
+    return seen.nonzero().squeeze(1)
+
+
+def _fill_words(words: np.ndarray, splats: Splats, origin: np.ndarray) -> None:
     words[:, :3] = (splats.means.numpy() - origin).astype(np.float32).view(np.uint32)
     words[:, 3] = _halves(splats.log_scales)
     quats = torch.nn.functional.normalize(splats.quats, dim=1).numpy()
     words[:, 4:6] = np.round(quats * 32767).astype(np.int16).view(np.uint32)
-    light = torch.cat([splats.sh0.reshape(count, 3), splats.opacities[:, None]], dim=1)
+    light = torch.cat([splats.sh0.reshape(len(splats), 3), splats.opacities[:, None]], dim=1)
     words[:, 6], words[:, 7] = _halves(light[:, :2]), _halves(light[:, 2:])
-    scales, harmonics = _harmonics(splats.shN.numpy(), degree)
-    return Packed(count, origin, degree, scales, words.tobytes() + harmonics.tobytes())
 
 
 def _halves(pairs: torch.Tensor) -> np.ndarray:
@@ -127,17 +156,19 @@ def _halves(pairs: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(limited).view(np.uint32)[:, 0]
 
 
-def _harmonics(shN: np.ndarray, degree: int) -> tuple[list[float], np.ndarray]:
-    """Scales by place, and the coefficients [N, 16 * texels] int8."""
-    count, places = len(shN), (degree + 1) ** 2 - 1
-    used = shN[:, :places]  # [N, K, 3]
+def _harmonic_scales(splats: Splats, rows: torch.Tensor, degree: int) -> np.ndarray:
+    """Scales [15] by place."""
     scales = np.zeros(15)
-    if used.size:
-        scales[:places] = np.quantile(np.abs(used), 1 - CLIPPED, axis=(0, 2))
+    for place in range((degree + 1) ** 2 - 1 if len(rows) else 0):
+        used = splats.shN[:, place].index_select(0, rows).double().numpy()
+        scales[place] = np.quantile(np.abs(used), 1 - CLIPPED)
+    return scales
+
+
+def _fill_harmonics(stored: np.ndarray, shN: np.ndarray, scales: np.ndarray, degree: int) -> None:
+    places = (degree + 1) ** 2 - 1
     steps = np.where(scales > 0, scales, 1.0)[:places, None]
-    stored = np.zeros((count, 16 * texels_of(degree)), np.int8)
-    stored[:, : 3 * places] = np.clip(np.round(used / steps * 127), -127, 127).reshape(count, -1)
-    return [float(scale) for scale in scales], stored
+    stored[:, : 3 * places] = np.clip(np.round(shN[:, :places] / steps * 127), -127, 127).reshape(len(shN), -1)
 
 
 def write_page(
@@ -190,7 +221,6 @@ def write_page(
     shade = "#" + "".join(f"{round(255 * part):02x}" for part in settings.background)
     is_dark = sum(settings.background) < 1.5
     told = json.dumps(_facts(packed, views, settings, unit, up, subject), allow_nan=False)
-    zipped = base64.b64encode(gzip.compress(packed.data, 6, mtime=0)).decode()
     values = {
         "title": html.escape(title),
         "count": f"{packed.count:,}",
@@ -205,13 +235,30 @@ def write_page(
         "aboutwhat": "the subject" if subject.kind == OBJECT else "what is in the middle of the picture",
         "facts": told.replace("<", "\\u003c"),
         "parts": "\n".join(_part(name, *part) for name, part in PARTS.items()),
-        "splats": zipped,
         "viewer": "\n\n".join(map(_text, SCRIPTS)),
     }
-    text = re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], _text("page.html"))
+    before, after = (
+        re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], part).encode()
+        for part in _text("page.html").split("{{splats}}")
+    )
+    written = 0
     with atomic_write(Path(path)) as file:
-        file.write(text.encode())
-    return {"splats": packed.count, "sh_degree": packed.degree, "bytes": len(text.encode())}
+        for piece in _pieces(before, packed, after):
+            written += file.write(piece)
+    return {"splats": packed.count, "sh_degree": packed.degree, "bytes": written}
+
+
+def _pieces(before: bytes, packed: Packed, after: bytes) -> Iterator[bytes]:
+    """The page, with the splats as text, piece by piece."""
+    yield before
+    rest = b""
+    for zipped in packed.zipped():
+        rest += zipped
+        whole = len(rest) // 3 * 3  # bytes that are whole letters
+        yield base64.b64encode(rest[:whole])
+        rest = rest[whole:]
+    yield base64.b64encode(rest)
+    yield after
 
 
 def _text(name: str) -> str:
