@@ -9,51 +9,84 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gs2d.config.recipe import Recipe, Stage
+    from gs2d.config.presets import get_recipe, list_recipes
+    from gs2d.config.recipe import LossTerm, Recipe, Stage
     from gs2d.core.camera import Camera, look_at
     from gs2d.core.mesh import Mesh
     from gs2d.core.splats import Splats
+    from gs2d.data.load import load_scene
+    from gs2d.data.scene import Scene
     from gs2d.errors import Gs2dError
+    from gs2d.io.splat_ply import read_splats, write_splats
+    from gs2d.losses.api import compute_losses
+    from gs2d.pipeline.in_memory import Trained, evaluate, extract_mesh, train
     from gs2d.render.api import rasterize, splat_errors
     from gs2d.render.backends import backend_report, get_backend
     from gs2d.render.tensor_api import rasterize_2dgs
     from gs2d.render.types import RasterSettings, RenderOutput
+    from gs2d.training.trainer import Trainer
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Camera",
     "Gs2dError",
+    "LossTerm",
     "Mesh",
     "RasterSettings",
     "Recipe",
     "RenderOutput",
+    "Scene",
     "Splats",
     "Stage",
+    "Trained",
+    "Trainer",
     "__version__",
     "backend_report",
+    "compute_losses",
+    "evaluate",
+    "extract_mesh",
     "get_backend",
+    "get_recipe",
+    "list_recipes",
+    "load_scene",
     "look_at",
     "rasterize",
     "rasterize_2dgs",
+    "read_splats",
     "splat_errors",
+    "train",
+    "write_splats",
 ]
 
 _HOME = {
     "Camera": "gs2d.core.camera",
     "Gs2dError": "gs2d.errors",
+    "LossTerm": "gs2d.config.recipe",
     "Mesh": "gs2d.core.mesh",
     "RasterSettings": "gs2d.render.types",
     "Recipe": "gs2d.config.recipe",
     "RenderOutput": "gs2d.render.types",
+    "Scene": "gs2d.data.scene",
     "Splats": "gs2d.core.splats",
     "Stage": "gs2d.config.recipe",
+    "Trained": "gs2d.pipeline.in_memory",
+    "Trainer": "gs2d.training.trainer",
     "backend_report": "gs2d.render.backends",
+    "compute_losses": "gs2d.losses.api",
+    "evaluate": "gs2d.pipeline.in_memory",
+    "extract_mesh": "gs2d.pipeline.in_memory",
     "get_backend": "gs2d.render.backends",
+    "get_recipe": "gs2d.config.presets",
+    "list_recipes": "gs2d.config.presets",
+    "load_scene": "gs2d.data.load",
     "look_at": "gs2d.core.camera",
     "rasterize": "gs2d.render.api",
     "rasterize_2dgs": "gs2d.render.tensor_api",
+    "read_splats": "gs2d.io.splat_ply",
     "splat_errors": "gs2d.render.api",
+    "train": "gs2d.pipeline.in_memory",
+    "write_splats": "gs2d.io.splat_ply",
 }
 
 

@@ -408,3 +408,8 @@ def get_recipe(name: str) -> Recipe:
         raise RecipeError(f"no recipe {name!r}; there is {', '.join(near)} (`gs2d recipes` lists all)")
     found = RECIPES.get(name)
     return found() if isinstance(found, NamedRecipe) else made_recipe(found, f"recipe {name!r}")
+
+
+def list_recipes() -> tuple[str, ...]:
+    """Return the names that :func:`get_recipe` takes, in the order in which ``gs2d recipes`` lists them."""
+    return tuple(RECIPES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -121,6 +122,19 @@ class Job:
         """Whether stage ``index`` or one before it can train from cached views."""
         views, stages = len(self.scene.train), self.recipe.stages[: index + 1]
         return any(is_cacheable(self.recipe, stage, backend=self.backend, views=views) for stage in stages)
+
+
+class RenderedScene(typing.Protocol):
+    """What of a Job, and of ``in_memory.Trained``, is asked for where splats are drawn from the scene's cameras."""
+
+    @property
+    def scene(self) -> Scene: ...
+    @property
+    def protocol(self) -> Protocol: ...
+    @property
+    def settings(self) -> RasterSettings: ...
+    @property
+    def backend(self) -> Backend: ...
 
 
 def build_recipe(

@@ -32,7 +32,7 @@ from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finished import checked_output, open_job
-from gs2d.pipeline.job import Job
+from gs2d.pipeline.job import Job, RenderedScene
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.report import report_again
@@ -108,15 +108,9 @@ def extract_mesh(
     ------
     ProtocolError, DiskError
     """
-    if not len(splats):
-        raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
-    check_mesh_options(options)
-    depth = options.depth or job.protocol.fused_depth
-    usable = seen is not None and seen.complete and depth == job.protocol.fused_depth
-    frames = seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
-    result = _extract(job, frames, options, on_event, subject)
+    result = fused(job, splats, options, on_event, subject=subject, seen=seen)
     trim()
     write_mesh(out, result.mesh)
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
@@ -126,7 +120,7 @@ def extract_mesh(
         "file": str(out),
         "vertices": len(result.mesh.vertices),
         "faces": len(result.mesh.faces),
-        "depth": depth,
+        "depth": options.depth or job.protocol.fused_depth,
         "unbounded": options.unbounded,
         "levels": result.levels,
         "fused_by": result.backend,
@@ -137,6 +131,30 @@ def extract_mesh(
         "faces_removed": result.faces_removed,
         **_cleaned_facts(result),
     }
+
+
+def fused(
+    job: RenderedScene,
+    splats: Splats,
+    options: MeshOptions,
+    on_event: OnEvent,
+    *,
+    subject: Subject | None = None,
+    seen: MeshFrames | None = None,
+) -> Extraction:
+    """Render depth of all training views and fuse it; arguments as of :func:`extract_mesh`, which writes the mesh.
+
+    Raises
+    ------
+    ProtocolError, DiskError
+    """
+    if not len(splats):
+        raise ProtocolError("a scene with splats was expected, got none; train longer or check the cameras")
+    check_mesh_options(options)
+    depth = options.depth or job.protocol.fused_depth
+    usable = seen is not None and seen.complete and depth == job.protocol.fused_depth
+    frames = seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
+    return _extract(job, frames, options, on_event, subject)
 
 
 def _cleaned_facts(result: Extraction) -> dict[str, Any]:
@@ -188,7 +206,11 @@ def check_mesh_options(options: MeshOptions) -> None:
 
 
 def _extract(
-    job: Job, frames: Iterable[RenderedView] | Spool, options: MeshOptions, on_event: OnEvent, subject: Subject | None
+    job: RenderedScene,
+    frames: Iterable[RenderedView] | Spool,
+    options: MeshOptions,
+    on_event: OnEvent,
+    subject: Subject | None,
 ) -> Extraction:
     fusion = job.protocol.fusion
     keep = fusion.clusters if options.keep_components is None else options.keep_components
@@ -217,7 +239,7 @@ def _extract(
     return result
 
 
-def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:
+def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:
     views, settings = job.scene.train, replace(job.settings, with_distortion=False)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
@@ -227,7 +249,7 @@ def _frames(job: Job, splats: Splats, depth: str, on_event: OnEvent) -> Iterator
     on_event(Phase("fusing", 0))
 
 
-def fusion_frame(job: Job, view: View, output: RenderOutput, depth: str) -> RenderedView:
+def fusion_frame(job: RenderedScene, view: View, output: RenderOutput, depth: str) -> RenderedView:
     """What fusion takes of a rendered view: depth ("mean" or "median") and colour where it is covered well enough."""
     valid = (output.alpha >= OPAQUE).cpu().numpy()
     mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
@@ -261,7 +283,7 @@ def one_surface(output: RenderOutput) -> np.ndarray:
     return np.asarray(((mean - median).abs() <= ONE_SURFACE * median).cpu().numpy())
 
 
-def surface_color(output: RenderOutput, job: Job) -> torch.Tensor:
+def surface_color(output: RenderOutput, job: RenderedScene) -> torch.Tensor:
     """Colour without the background that shows through, [H, W, 3] in [0, 1]."""
     alpha = output.alpha[..., None]
     background = output.color.new_tensor(job.settings.background)

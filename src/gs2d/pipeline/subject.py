@@ -25,7 +25,7 @@ from gs2d.data.subject import (
 from gs2d.errors import DataError, DiskError, ProtocolError, RunError
 from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
 from gs2d.pipeline.events import Notice, OnEvent
-from gs2d.pipeline.job import Job
+from gs2d.pipeline.job import Job, RenderedScene
 from gs2d.pipeline.options import MeshOptions
 from gs2d.render.api import rasterize
 from gs2d.report.sections.subject import IMAGE, write_subject_image
@@ -62,17 +62,28 @@ def subject_of(
     known = read_subject(run.path) if box is None else None
     if known is not None:
         return known
-    if box is not None:
-        within(splats, box, "--subject-box")
-    try:
-        cameras = [view.camera for view in job.scene.train]
-        subject = find_subject(sights(job, splats)) if box is None else given_subject(box, cameras)
-    except DataError as error:
-        raise ProtocolError(str(error)) from error
+    subject = subject_in(job, splats, box)
     write_json(run.file(SUBJECT), subject.to_json())
     on_event(Notice(subject_line(subject, meshed=box is not None or job.protocol.fusion.subject)))
     _draw(run, job, subject, on_event)
     return subject
+
+
+def subject_in(job: RenderedScene, splats: Splats, box: Sequence[float] | None = None) -> Subject:
+    """Return the subject of a scene: the given box, or what is found; nothing is read or written.
+
+    Raises
+    ------
+    ProtocolError, RunError
+        As :func:`subject_of`.
+    """
+    if box is not None:
+        within(splats, box, "--subject-box")
+    try:
+        cameras = [view.camera for view in job.scene.train]
+        return find_subject(sights(job, splats)) if box is None else given_subject(box, cameras)
+    except DataError as error:
+        raise ProtocolError(str(error)) from error
 
 
 def _draw(run: RunFolder, job: Job, subject: Subject, on_event: OnEvent) -> None:
@@ -93,12 +104,23 @@ def meshed_subject(run: RunFolder, job: Job, splats: Splats, options: MeshOption
     ------
     ProtocolError, RunError, DataError, DiskError
     """
+    wanted = wants_subject(job, options)
+    subject = subject_of(run, job, splats, on_event, box=options.subject_box)
+    return subject if wanted and subject.kind == OBJECT else None
+
+
+def wants_subject(job: RenderedScene, options: MeshOptions) -> bool:
+    """Whether the mesh is to be of the subject, if there is one.
+
+    Raises
+    ------
+    ProtocolError, DataError
+        Options that exclude each other, or a box that is none.
+    """
     given = options.subject_box
     others = {"--bbox": options.bbox is not None, "--scene": options.whole_scene, "--unbounded": options.unbounded}
     check_subject_box(given, others)
-    subject = subject_of(run, job, splats, on_event, box=given)
-    wanted = given is not None or (job.protocol.fusion.subject and not any(others.values()))
-    return subject if wanted and subject.kind == OBJECT else None
+    return given is not None or (job.protocol.fusion.subject and not any(others.values()))
 
 
 def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Splats:
@@ -133,7 +155,7 @@ def subject_line(subject: Subject, *, meshed: bool) -> str:
     return f"subject: {size} world units, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
-def sights(job: Job, splats: Splats) -> list[Sight]:
+def sights(job: RenderedScene, splats: Splats) -> list[Sight]:
     """Return what some of the training cameras see: rendered depth, and the sparse points that it does not hide."""
     views = job.scene.train
     count = min(len(views), MAX_VIEWS)
@@ -147,7 +169,7 @@ def _small(camera: Camera) -> Camera:
     return camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
 
 
-def _depth(job: Job, splats: Splats, camera: Camera) -> np.ndarray:
+def _depth(job: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
     """The median depth, 0 where little is covered: unlike the mean it lies on some surface."""
     with torch.no_grad():
         output = rasterize(splats, camera, job.settings, backend=job.backend)

@@ -109,7 +109,7 @@ def there_and_back(function, needs, *given):
     out = function.forward(ctx, *given)
     out = out if isinstance(out, tuple) else (out,)
     for gradient in function.backward(ctx, *(torch.ones_like(x) for x in out)):
-        if gradient is not None:
+        if gradient is not None and gradient.is_cuda:  # that of the intrinsics is where they are
             fill(None, gradient=gradient.contiguous())
 
 camera = front_camera(40, 24)
@@ -122,8 +122,9 @@ with FakeTensorMode():
     for sure in (False, True):
         options = cuda._Options(launcher, view, True, True, sure, rows, budget)
         for columns in (2, 4):
-            there_and_back(cuda._Rasterize, (False, *[True] * 7), options, rand(9, columns), *splats)
-        there_and_back(cuda._Rasterize, (*[False] * 6, True, True), options, None, *splats)
+            intrinsics = torch.rand(4)  # in the host's memory, where cameras are
+            there_and_back(cuda._Rasterize, (False, *[True] * 8), options, rand(9, columns), intrinsics, *splats)
+        there_and_back(cuda._Rasterize, (*[False] * 7, True, True), options, None, None, *splats)
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
     mean = ops.blur(image, launcher=launcher)
     there_and_back(ops._Photometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)

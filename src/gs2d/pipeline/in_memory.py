@@ -1,0 +1,267 @@
+"""Train, score and mesh from Python without a run folder: ``gs2d.train``, ``gs2d.evaluate``, ``gs2d.extract_mesh``.
+
+The same pieces as behind the commands, in the same order and with the same defaults; nothing is written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import Recipe
+from gs2d.core.mesh import Mesh
+from gs2d.core.splats import Splats
+from gs2d.data import Scene, load_scene
+from gs2d.data.subject import OBJECT
+from gs2d.errors import DataError
+from gs2d.evaluation.images import ImageMetrics, mean_metrics
+from gs2d.evaluation.lpips import Lpips
+from gs2d.pipeline.events import ignore
+from gs2d.pipeline.exposure import named
+from gs2d.pipeline.job import choose_backend, choose_protocol, fit_recipe, with_backdrop
+from gs2d.pipeline.mesh import fused
+from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.scoring import score_views
+from gs2d.pipeline.subject import subject_in, wants_subject
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+from gs2d.training.per_image import scene_now
+from gs2d.training.trainer import Trainer, raster_settings
+
+__all__ = ["Trained", "evaluate", "extract_mesh", "train"]
+
+OnAnyEvent = Callable[[Any], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A finished scene of splats with what it was trained with: what scoring and meshing need to know.
+
+    Attributes
+    ----------
+    splats : Splats
+    scene : Scene
+        With the poses that were learned, where the recipe learns them.
+    protocol : Protocol
+    settings : RasterSettings
+        The rasterizer's constants in training: near, far, background.
+    backend : Backend
+    recipe : Recipe or None
+        As it was trained; None for splats from elsewhere.
+    exposures : mapping of name to Tensor [3, 4]
+        Of the training images, where the recipe learns them.
+    """
+
+    splats: Splats
+    scene: Scene
+    protocol: Protocol
+    settings: RasterSettings
+    backend: Backend
+    recipe: Recipe | None = None
+    exposures: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+def train(
+    scene: Scene | str | os.PathLike[str],
+    recipe: str | Recipe = "2dgs-r",
+    *,
+    protocol: str | Protocol = "auto",
+    backend: str = "auto",
+    schedule_scale: float = 1.0,
+    overrides: tuple[str, ...] = (),
+    seed: int = 0,
+    robust: str = "auto",
+    exposure: bool | None = None,
+    on_event: OnAnyEvent = ignore,
+) -> Trained:
+    """Train splats in memory, as ``gs2d train`` does without writing a run folder.
+
+    ``gs2d.pipeline.train.train`` writes one, with checkpoints, metrics, a mesh and a report;
+    :class:`gs2d.Trainer` is the loop alone, one iteration at a time.
+
+    Parameters
+    ----------
+    scene : Scene or path
+        A capture: what :func:`gs2d.load_scene` returns, or its folder.
+    recipe : str or Recipe
+        A name of :func:`gs2d.list_recipes`, or a recipe.
+    protocol : str or Protocol
+        "auto": by the capture.
+    backend : str
+        "auto", "cpu", "cuda" or "reference".
+    schedule_scale : float
+        Length of the schedule; 0.1 is a tenth of the paper's.
+    overrides : tuple of str
+        ``stage.field=value``, applied after the schedule is scaled.
+    seed : int
+    robust : str
+        "auto", "on" or "off": help for captures that say which points their images show (``gs2d train --robust``).
+    exposure : bool, optional
+        Learn an exposure for each image; None: where the images differ.
+    on_event : callable
+        Gets the events of :mod:`gs2d.training.events`, and Notices of what was decided before.
+
+    Returns
+    -------
+    Trained
+        ``.splats``, and all that :func:`gs2d.evaluate` and :func:`gs2d.extract_mesh` need.
+
+    Raises
+    ------
+    Gs2dError
+        Anything that the user can mend: one line with expected, got and remedy.
+
+    Examples
+    --------
+    >>> scene = gs2d.load_scene("captures/garden", downscale=4)  # doctest: +SKIP
+    >>> trained = gs2d.train(scene, "2dgs-r", schedule_scale=0.1)  # doctest: +SKIP
+    >>> gs2d.write_splats("garden.ply", trained.splats)  # doctest: +SKIP
+    """
+    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    root = scene.root or Path(".")
+    options = TrainOptions(
+        scene=root,
+        out=root,  # nothing is written
+        recipe=recipe,
+        protocol=protocol,
+        schedule_scale=schedule_scale,
+        overrides=overrides,
+        seed=seed,
+        robust=robust,
+        exposure=exposure,
+    )
+    chosen = choose_backend(backend, on_event)
+    rules = choose_protocol(options, scene.format, on_event)
+    fitted = fit_recipe(options, scene, rules, on_event)
+    rules = with_backdrop(rules, fitted, scene, on_event)
+    trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=on_event)
+    trainer.run()
+    exposures = named(scene.train, trainer.state.exposures)
+    found = scene_now(trainer.state, scene)
+    return Trained(trainer.splats, found, rules, trainer.settings, chosen, trainer.recipe, exposures)
+
+
+def _finished(
+    trained: Trained | Splats, scene: Scene | None, protocol: str | Protocol, backend: str, on_event: OnAnyEvent
+) -> Trained:
+    """Return what was trained, or splats from elsewhere with the scene and the protocol that they belong to."""
+    if isinstance(trained, Trained):
+        if scene is not None:
+            raise DataError("what gs2d.train returned has a scene of its own, got another; give its .splats instead")
+        return trained
+    if scene is None:
+        raise DataError("splats must come with the scene that they are of, got none; give it as the second argument")
+    root = scene.root or Path(".")
+    chosen = choose_backend(backend, on_event)
+    rules = choose_protocol(TrainOptions(scene=root, out=root, protocol=protocol), scene.format, on_event)
+    settings = raster_settings(rules, scene.extent, trained.sh_degree)
+    return Trained(trained.to(chosen.device), scene, rules, settings, chosen)
+
+
+def evaluate(
+    trained: Trained | Splats,
+    scene: Scene | None = None,
+    *,
+    split: str = "test",
+    protocol: str | Protocol = "auto",
+    backend: str = "auto",
+    lpips: Lpips | None = None,
+    on_event: OnAnyEvent = ignore,
+) -> ImageMetrics:
+    """Return the mean PSNR, SSIM and LPIPS of views, as ``gs2d evaluate`` measures them.
+
+    Surfaces are scored by :func:`gs2d.evaluation.surface.evaluate_surface`.
+
+    Parameters
+    ----------
+    trained : Trained or Splats
+        What :func:`gs2d.train` returned; or splats, with ``scene``.
+    scene : Scene, optional
+        The capture of splats from elsewhere.
+    split : str
+        "test" or "train": the views that are scored.
+    protocol, backend
+        Of splats from elsewhere; as for :func:`gs2d.train`.
+    lpips : Lpips, optional
+        The network (``gs2d.evaluation.lpips.load_lpips``); without it LPIPS is absent, with the reason.
+    on_event : callable
+        Gets Phase and Step events.
+
+    Returns
+    -------
+    ImageMetrics
+
+    Raises
+    ------
+    DataError
+        No such views, or no scene for splats.
+    """
+    finished = _finished(trained, scene, protocol, backend, on_event)
+    if split not in ("test", "train"):
+        raise DataError(f"split must be 'test' or 'train', got {split!r}")
+    views = finished.scene.test if split == "test" else finished.scene.train
+    if not views:
+        raise DataError(
+            f"scene {finished.scene.name} has no {split} views to score; load it with test_every=8, or take "
+            "split='train'"
+        )
+    scores = score_views(
+        finished.splats,
+        views,
+        finished.settings,
+        finished.backend,
+        name=f"scoring {split} views",
+        on_event=on_event,
+        lpips=lpips,
+        exposures=with_predicted(finished.exposures, finished.scene),
+        split=split,
+    )
+    return mean_metrics(list(scores.values()))
+
+
+def extract_mesh(
+    trained: Trained | Splats,
+    scene: Scene | None = None,
+    *,
+    options: MeshOptions = MeshOptions(),  # noqa: B008 (frozen)
+    protocol: str | Protocol = "auto",
+    backend: str = "auto",
+    on_event: OnAnyEvent = ignore,
+) -> Mesh:
+    """Fuse the depth that the training cameras see into a triangle mesh, as ``gs2d mesh`` does.
+
+    Parameters
+    ----------
+    trained : Trained or Splats
+        What :func:`gs2d.train` returned; or splats, with ``scene``.
+    scene : Scene, optional
+        The capture of splats from elsewhere.
+    options : MeshOptions
+        Voxel, box, depth and so on; what is left open comes from the scene and the protocol.
+    protocol, backend
+        Of splats from elsewhere; as for :func:`gs2d.train`.
+    on_event : callable
+        Gets Phase, Step and Notice events.
+
+    Returns
+    -------
+    Mesh
+        In the capture's frame, with colours; of the subject where the protocol meshes the subject and there is one.
+
+    Raises
+    ------
+    ProtocolError, DataError, BackendError
+    """
+    finished = _finished(trained, scene, protocol, backend, on_event)
+    subject = None
+    if wants_subject(finished, options):
+        found = subject_in(finished, finished.splats, options.subject_box)
+        subject = found if found.kind == OBJECT else None
+    return fused(finished, finished.splats, options, on_event, subject=subject).mesh

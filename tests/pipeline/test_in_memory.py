@@ -1,0 +1,70 @@
+"""``gs2d.train``, ``gs2d.evaluate`` and ``gs2d.extract_mesh`` do what the commands do, without a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gs2d
+from ball_runs import SCALE, SMALL
+from gs2d.errors import DataError, RecipeError
+from gs2d.io.meshes import read_mesh
+from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline.in_memory import Trained
+from gs2d.pipeline.options import MeshOptions
+
+
+@pytest.fixture(scope="module")
+def trained(capture: Path) -> Trained:
+    """What ``undisturbed`` is, in memory."""
+    return gs2d.train(gs2d.load_scene(capture), schedule_scale=SCALE, overrides=SMALL)
+
+
+def test_training_in_memory_ends_with_the_bytes_of_a_run(
+    trained: Trained, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    gs2d.write_splats(tmp_path / "splats.ply", trained.splats)
+    assert (tmp_path / "splats.ply").read_bytes() == undisturbed.file("splats.ply").read_bytes()
+
+
+def test_the_scores_are_those_of_the_run(trained: Trained, undisturbed: RunFolder) -> None:
+    entry = undisturbed.metrics()["stages"][-1]
+    for split in ("test", "train"):
+        assert gs2d.evaluate(trained, split=split).to_json() == entry[split]
+
+
+def test_the_mesh_is_that_of_the_run(trained: Trained, undisturbed: RunFolder) -> None:
+    ours, theirs = gs2d.extract_mesh(trained), read_mesh(undisturbed.file("mesh.ply"))
+    assert len(ours.faces) > 0
+    assert np.array_equal(ours.faces, theirs.faces)
+    assert np.array_equal(np.float32(ours.vertices), np.float32(theirs.vertices))
+
+
+def test_splats_from_elsewhere_are_scored_and_meshed_with_their_scene(trained: Trained, undisturbed: RunFolder) -> None:
+    splats = gs2d.read_splats(undisturbed.file("splats.ply"))
+    with pytest.raises(DataError, match="splats must come with the scene"):
+        gs2d.evaluate(splats)
+    with pytest.raises(DataError, match="has a scene of its own"):
+        gs2d.evaluate(trained, trained.scene)
+    assert gs2d.evaluate(splats, trained.scene, backend="cpu") == gs2d.evaluate(trained)
+    options = MeshOptions(bbox=(-1.0, -1.0, 0.0, 1.0, 1.0, 1.0))
+    half = gs2d.extract_mesh(splats, trained.scene, backend="cpu", options=options)
+    assert half.vertices[:, 2].min() >= -1e-6
+
+
+def test_events_and_progress_reach_the_caller(capture: Path) -> None:
+    events: list[Any] = []
+    gs2d.train(capture, "2dgs", schedule_scale=0.001, backend="cpu", on_event=events.append)
+    names = {type(event).__name__ for event in events}
+    assert {"StageStarted", "Progress"} <= names
+
+
+def test_mistakes_are_named_before_anything_is_trained(trained: Trained) -> None:
+    scene = trained.scene
+    with pytest.raises(RecipeError, match="no recipe '2dgz'"):
+        gs2d.train(scene, "2dgz")
+    with pytest.raises(DataError, match="split must be 'test' or 'train'"):
+        gs2d.evaluate(trained, split="val")
