@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from gs2d.config.presets import RECIPES
 from tiny import write_capture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -17,28 +15,28 @@ PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "benchmarks").
 LONG_LINES = {DOCS / "architecture.md", DOCS / "decisions.md"}  # about to be split and shortened
 
 
-def test_the_program_of_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_capture(tmp_path / "capture")
-    page = DOCS / "guides" / "python.md"
+def run_blocks(page: Path, least: int) -> None:
+    """Run the blocks of Python of a page as one program, in the current folder."""
     blocks = list(re.finditer(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S))
-    assert len(blocks) >= 7
+    assert len(blocks) >= least
     names: dict[str, object] = {}
     for block in blocks:
         lines = block.string[: block.start()].count("\n") + 1
         exec(compile("\n" * lines + block.group(1), str(page), "exec"), names)  # line numbers are those of the page
+
+
+def test_the_program_of_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / "capture")
+    run_blocks(DOCS / "guides" / "python.md", 7)
     assert (tmp_path / "runs/mine/mesh.ply").is_file()
     assert (tmp_path / "runs/mine/for_viewers.ply").is_file()
 
 
-def test_the_recipes_of_the_concepts_page_are_recipes() -> None:
-    text = (DOCS / "concepts.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
-    assert blocks
-    names: dict[str, Any] = {}
-    for block in blocks:
-        exec(compile(block, "docs/concepts.md", "exec"), names)
-    assert names["two_dgs_r"].stages == RECIPES["2dgs-r"]().stages
+def test_the_program_of_the_migration_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / "capture")
+    run_blocks(DOCS / "migration.md", 6)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)

@@ -262,7 +262,7 @@ def fusion_frame(job: RenderedScene, view: View, output: RenderOutput, depth: st
     return RenderedView(view.camera, output.depth(depth).cpu().numpy(), color, valid, bare_of(job, view))
 
 
-def bare_of(job: Job, view: View) -> np.ndarray | None:
+def bare_of(job: RenderedScene, view: View) -> np.ndarray | None:
     """Return the pixels of a photograph that show nothing which could be matched, [H, W] bool.
 
     None where that is not asked for (the protocols of data sets), where the photograph itself says what is empty, or
