@@ -96,13 +96,13 @@ def leave(code: int) -> NoReturn:
 
 
 def _drop_stdout() -> None:
-    """What cannot be written is not written again when Python shuts down."""
+    """Drop what cannot be written, so that Python does not try again when it shuts down."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _answer(argv: Sequence[str]) -> list[str] | None:
-    """What is printed where nothing is done: help and the version; None where a command is asked for."""
+    """Return what is printed where nothing is done: help and the version; None where a command is asked for."""
     from gs2d.cli import help as helps
 
     words = list(argv)
@@ -124,7 +124,7 @@ def _answer(argv: Sequence[str]) -> list[str] | None:
 
 
 def parse(argv: Sequence[str]) -> Common:
-    """The command that the arguments ask for.
+    """Return the command that the arguments ask for.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def parse(argv: Sequence[str]) -> Common:
 
 
 def _one_line(box: str, argv: Sequence[str]) -> str:
-    """The first message of tyro's box, without the frame, the help texts and the advice."""
+    """Return the first message of tyro's box, without the frame, the help texts and the advice."""
     lines = [line.translate(_BOX).rstrip() for line in box.splitlines()]
     body = [line.strip() for line in lines[1:] if line.strip()]
     for stop in ("For full helptext", "Argument helptext", "Are you looking"):
@@ -200,7 +200,7 @@ def _what_is_missing(console: Console, argv: Sequence[str], command: Common) -> 
 
 
 def _resumed(argv: Sequence[str]) -> str:
-    """The same command, that goes on."""
+    """Return the same command, that goes on."""
     words = [word for word in argv if word not in ("--resume", "--overwrite")]
     return f"gs2d {shlex.join([*words, '--resume'])}"
 

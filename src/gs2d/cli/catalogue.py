@@ -118,7 +118,7 @@ def _option(kind: type, field: dataclasses.Field[Any], inner: Any, marks: tuple[
 
 
 def _metavar(name: str, value: type, choices: tuple[str, ...], *, positional: bool) -> str:
-    """What stands for a value: the values themselves, if they are few."""
+    """Return what stands for a value: the values themselves, if they are few."""
     if not choices:
         return _NAMES.get(value, "VALUE")
     listed = "|".join(choices)
@@ -126,7 +126,7 @@ def _metavar(name: str, value: type, choices: tuple[str, ...], *, positional: bo
 
 
 def _unwrapped(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A type without its annotations, and these."""
+    """Return a type without its annotations, and these."""
     marks: tuple[Any, ...] = ()
     while get_origin(hint) is Annotated:
         hint, *more = get_args(hint)
@@ -135,7 +135,7 @@ def _unwrapped(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _value(hint: Any) -> tuple[type, tuple[str, ...], int | None]:
-    """The type of a value, the values there are, and how many are taken."""
+    """Return the type of a value, the values there are, and how many are taken."""
     hint, _ = _unwrapped(hint)
     if get_origin(hint) in (Union, types.UnionType):
         return _value(next(part for part in get_args(hint) if part is not type(None)))
@@ -150,7 +150,7 @@ def _value(hint: Any) -> tuple[type, tuple[str, ...], int | None]:
 
 @functools.cache
 def _docstrings(kind: type) -> dict[str, str]:
-    """The strings below the fields of a dataclass."""
+    """Return the strings below the fields of a dataclass."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
     assert isinstance(tree, ast.ClassDef)
     found = {}

@@ -153,7 +153,7 @@ class Console:
             self._out.print(text, markup=False, style="bold")
 
     def table(self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """A table for people, on stdout; the first column is text, the others are figures."""
+        """Print a table for people on stdout; the first column is text, the others are figures."""
         if self.quiet or self.as_json:
             return
         table, needed = self._table(title, columns, rows, frame=box.SIMPLE)
@@ -169,7 +169,7 @@ class Console:
     def _table(
         self, title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, frame: box.Box | None
     ) -> tuple[Table, int]:
-        """A table, and how many columns of the terminal it needs."""
+        """Return a table, and how many columns of the terminal it needs."""
         head, gap = escape(title) or None, "" if frame else " "
         table = Table(title=head, title_justify="left", box=frame, padding=(0, 1 if frame else 0), pad_edge=False)
         for i, column in enumerate(columns):
@@ -179,7 +179,7 @@ class Console:
         return table, self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
 
     def result(self, value: Any) -> None:
-        """The result of the command, for programs: JSON on stdout, if it was asked for."""
+        """Print the result of the command for programs: JSON on stdout, if it was asked for."""
         if self.as_json:
             if self.missing and isinstance(value, dict):
                 value = {**value, "missing": [{"what": m.what, "reason": m.reason} for m in self.missing]}
@@ -198,5 +198,5 @@ def stage_line(metrics: dict[str, Any]) -> str:
 
 
 def figure(value: float | None, digits: int, unit: str = "") -> str:
-    """A number for a table; a dash where there is none."""
+    """Return a number for a table; a dash where there is none."""
     return "-" if value is None else f"{value:,.{digits}f}{unit}"

@@ -40,7 +40,7 @@ def execute(command: Common, console: Console) -> None:
 
 
 def train_options(command: c.Train) -> Any:
-    """The pipeline's options of ``gs2d train``."""
+    """Return the pipeline's options of ``gs2d train``."""
     own = ("scene", "out", "format", "downscale", "schedule_scale")
     return training_options(command, command, **{name: getattr(command, name) for name in own})
 
@@ -53,7 +53,7 @@ def reconstruct(command: c.Reconstruct, console: Console) -> None:
 
 
 def training_options(command: TrainingCommon, training: Training, **own: Any) -> Any:
-    """The pipeline's options: every field of `Training` by its name, those of every training, and a command's own."""
+    """Return the pipeline's options: each field of `Training` by name, those of every training, a command's own."""
     from gs2d.pipeline.options import TrainOptions
 
     common = ("backend", "seed", "threads", "resume", "overwrite")
@@ -131,7 +131,7 @@ def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None
 
 
 def _refuse_texture_options(command: c.Mesh) -> None:
-    """An option that would do nothing is an error."""
+    """Refuse an option that would do nothing."""
     defaults = c.Mesh(run=command.run)
     for name in ("faces", "texture_size", "texture_from", "texture_downscale"):
         if getattr(command, name) != getattr(defaults, name):

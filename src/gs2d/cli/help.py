@@ -104,7 +104,7 @@ def command_help(name: str, *, everything: bool = False) -> list[str]:
 
 
 def _first(name: str, options: Sequence[Option]) -> list[Option]:
-    """The options that are explained at once, in the order in which they are needed."""
+    """Return the options that are explained at once, in the order in which they are needed."""
     if name not in _FIRST:
         return _needed_first([option for option in options if option.group is not Common])
     by_field = {option.field: option for option in options}
@@ -130,7 +130,7 @@ def _explained(options: Sequence[Option], width: int) -> list[str]:
 
 
 def _text(option: Option) -> str:
-    """What is said of an option: its docstring, the values where there is no room for them before, and the default."""
+    """Return the help of an option: its docstring, the values where no room was before, and the default."""
     values = "" if all(choice in option.usage for choice in option.choices) else f" {', '.join(option.choices)}."
     said = "default:" in option.about or option.kind is bool or option.default in (None, (), "")
     return option.about + values + ("" if said else f" (default: {_shown(option.default)})")

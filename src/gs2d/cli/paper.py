@@ -44,7 +44,7 @@ def show_table(command: TableCommon, console: Console) -> None:
 
 
 def paper_options(command: TableCommon) -> PaperOptions:
-    """The options of the pipeline.
+    """Return the options of the pipeline.
 
     Raises
     ------

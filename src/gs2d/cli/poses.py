@@ -25,7 +25,7 @@ def poses(command: c.Poses, console: Console) -> None:
 
 
 def poses_lines(result: dict[str, Any]) -> list[str]:
-    """The outcome in lines for people."""
+    """Return the outcome in lines for people."""
     from gs2d.pipeline.sfm import placed_line
 
     lines = [

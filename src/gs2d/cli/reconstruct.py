@@ -25,7 +25,7 @@ def reconstruct(command: c.Reconstruct, console: Console) -> None:
 
 
 def reconstruct_options(command: c.Reconstruct) -> ReconstructOptions:
-    """The pipeline's options."""
+    """Return the pipeline's options."""
     own = ("photos", "out", "quality", "schedule_scale", "downscale", "texture")
     both = ("threads", "seed", "resume", "overwrite")
     fields: dict[str, Any] = {name: getattr(command, name) for name in (*own, *both)}

@@ -43,7 +43,7 @@ def _with_help(text: str, command: str) -> str:
 
 
 def _no_command(name: str, words: Sequence[str]) -> str:
-    """What is said of a first word that is no command."""
+    """Return what is said of a first word that is no command."""
     if name.startswith("-"):
         command = next((word for word in words if word in NAMES), None)
         if command is not None:
@@ -86,7 +86,7 @@ def _is_flag(word: str) -> bool:
 
 
 def _no_option(name: str, flag: str, flags: Iterable[str]) -> str:
-    """What is said of an option that the command does not have: one much like it, or a command that does."""
+    """Return what is said of an option that the command does not have: one much like it, or a command that does."""
     known = list(flags)
     wanted = flag.replace("_", "-")
     others = [

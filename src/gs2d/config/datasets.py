@@ -61,7 +61,7 @@ class DataSet:
     evaluator: str
 
     def scene(self, name: str) -> SceneFacts:
-        """The scene of a name, upper and lower case alike.
+        """Return the scene of a name, upper and lower case alike.
 
         Raises
         ------
@@ -119,7 +119,7 @@ DATASETS: Mapping[str, DataSet] = MappingProxyType(
 
 
 def get_dataset(name: str) -> DataSet:
-    """The data set of a name.
+    """Return the data set of a name.
 
     Raises
     ------

@@ -121,7 +121,7 @@ def two_dgs(nc: float = 0.05, distortion: float | None = 0.0, *, name: str = "2d
 
 
 def two_dgs_60k(nc: float = 0.05, *, name: str = "2dgs-60k") -> Recipe:
-    """The fair control: 2DGS for as many iterations as 2DGS-R in total; its first stage is that of ``2dgs``."""
+    """Return the fair control: 2DGS for as many iterations as 2DGS-R in total; its first stage is that of ``2dgs``."""
     return Recipe(name, (surface(nc), continue_training(nc)))
 
 
@@ -131,7 +131,7 @@ def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: St
 
 
 def with_silhouette(recipe: Recipe, weight: float = 0.1, *, name: str) -> Recipe:
-    """The recipe with a silhouette loss wherever opacity or geometry is trained; photographs need an alpha channel.
+    """Add a silhouette loss wherever opacity or geometry is trained; photographs need an alpha channel.
 
     Not in the paper. Colour cannot see splats that have the background's colour, and the official normal consistency
     rewards their coverage: they grow without bound (docs/results.md).
@@ -144,7 +144,7 @@ def with_silhouette(recipe: Recipe, weight: float = 0.1, *, name: str) -> Recipe
 
 
 def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
-    """The recipe with a colour transform for each training photograph (``NAME-exposure``); itself if it has them.
+    """Add a colour transform for each training photograph (``NAME-exposure``) to a recipe without one.
 
     Not in the paper. For photographs of a camera on automatic, whose exposure or white balance changes. View-dependent
     colour comes three times as late: it can feign exposures (docs/decisions.md).
@@ -158,7 +158,7 @@ def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
 def with_multiview(
     recipe: Recipe, photometric: float = MULTIVIEW_WEIGHT, geometric: float = 0.0, *, name: str | None = None
 ) -> Recipe:
-    """The recipe with losses of two views in the stages with normal consistency, once nothing is densified any more.
+    """Add losses of two views to the stages with normal consistency, once nothing is densified any more.
 
     Not in the paper. The photometric weight is the one that PGSR publishes; why the geometric term is off, and why they
     wait for the end of densification: docs/decisions.md.
@@ -178,7 +178,7 @@ def with_multiview(
 def with_depth_prior(
     recipe: Recipe, source: str = "auto", weight: float = DEPTH_WEIGHT, *, name: str | None = None
 ) -> Recipe:
-    """The recipe with a loss on known depths in the stages that train the means of all splats (``NAME-depth``).
+    """Return the recipe with a loss on known depths in the stages that train the means of all splats (``NAME-depth``).
 
     Not in the paper. For indoor rooms, walls without texture and few photographs (docs/guides/priors.md). A recipe that
     has the loss keeps it, and takes the source where one is asked for.
@@ -192,7 +192,7 @@ def with_depth_prior(
 
 
 def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: str | None = None) -> Recipe:
-    """The recipe with a loss on known normals in the stages that train the means of all splats (``NAME-normals``).
+    """Add a loss on known normals to the stages that train the means of all splats (``NAME-normals``).
 
     From where normal consistency begins: before, splats are where colours put them, and turning them does harm.
     """
@@ -220,7 +220,7 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
 
 
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
-    """The recipe with a loss in the stages that train the means of all splats; a start is that of the first stage."""
+    """Add a loss to the stages that train the means of all splats; a start is that of the first stage."""
 
     def extended(index: int, stage: Stage) -> Stage:
         added = term if index == 0 else replace(term, start=0)
@@ -238,12 +238,12 @@ def _distortion(weight: float | None, start: int) -> tuple[LossTerm, ...]:
 
 
 def _lr_after_surface() -> LearningRates:
-    """The rates at the end of stage 1: the means' final one, the others as they were."""
+    """Return the rates at the end of stage 1: the means' final one, the others as they were."""
     return LearningRates().at_end(30_000)
 
 
 def with_poses(recipe: Recipe, *, name: str | None = None) -> Recipe:
-    """The recipe with a refined pose for each training photograph (``NAME-poses``); itself if it has them.
+    """Return the recipe with a refined pose for each training photograph (``NAME-poses``); itself if it has them.
 
     Not in the paper. For cameras that are off by a pixel or more (docs/guides/poses.md).
     """
@@ -260,6 +260,7 @@ class NamedRecipe:
     build: Callable[..., Recipe]
 
     def __call__(self) -> Recipe:
+        """Build the recipe."""
         return self.build()
 
 
@@ -299,7 +300,7 @@ def _registry() -> dict[str, NamedRecipe]:
 
 
 def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> None:
-    """The other readings of what the paper leaves open."""
+    """Add the other readings of what the paper leaves open."""
     preserve = partial(two_dgs_r, stage_3=refine(clone="preserve"))
     add(
         "2dgs-r-clone-preserve",

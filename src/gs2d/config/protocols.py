@@ -121,7 +121,7 @@ class Protocol:
 
     @property
     def fused_depth(self) -> str:
-        """ "mean" or "median": the depth that becomes the mesh."""
+        """Depth that becomes the mesh, "mean" or "median"."""
         return self.depth if self.fusion.depth is None else self.fusion.depth
 
     def resolve(self, terms: Sequence[LossTerm]) -> tuple[LossTerm, ...]:
@@ -209,7 +209,7 @@ _BY_FORMAT = MappingProxyType(
 
 
 def get_protocol(name: str) -> Protocol:
-    """The protocol of a name.
+    """Return the protocol of a name.
 
     Raises
     ------

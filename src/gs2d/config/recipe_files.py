@@ -96,7 +96,7 @@ def _run(path: Path) -> ModuleType:
 
 
 def _recipes_in(module: ModuleType) -> str:
-    """The names of a file's recipes, and of the functions that are its own."""
+    """Return the names of a file's recipes, and of the functions that are its own."""
     own = [
         name
         for name, value in vars(module).items()

@@ -110,7 +110,7 @@ class Registry(Generic[T]):
         return tuple(dict.fromkeys((*self._homes, *self._things, *self._offered)))
 
     def guests(self) -> tuple[str, ...]:
-        """The names that are not gs2d's own."""
+        """Return the names that are not gs2d's own."""
         return tuple(name for name in self.names() if name not in self._homes)
 
     def working(self) -> Iterator[tuple[str, T]]:
@@ -175,5 +175,5 @@ def did_you_mean(name: str, names: Sequence[str]) -> str:
 
 
 def _package(entry: EntryPoint) -> str:
-    """The package of an entry point, with its version."""
+    """Return the package of an entry point, with its version."""
     return "a package without a name" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"

@@ -31,7 +31,7 @@ MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the key
 
 
 def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
-    """The same recipe, ``factor`` times as long; at factor 1 the recipe itself.
+    """Return the same recipe, ``factor`` times as long; at factor 1 the recipe itself.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def _scale_views(learned: OfViews, factor: float) -> OfViews:
 
 
 def _scale_poses(poses: PoseRefinement, factor: float) -> PoseRefinement:
-    """A camera moves when its photograph has its turn: with fewer turns it takes longer steps."""
+    """Scale the steps of poses: a camera moves when its image has its turn, and takes longer steps with fewer."""
     longer = 1 / math.sqrt(factor)
     return replace(_scale_views(poses, factor), rate=poses.rate * longer, rate_final=poses.rate_final * longer)
 
@@ -136,5 +136,5 @@ def count_densifications(densify: GradDensify) -> int:
 
 
 def _scaled(count: int, factor: float) -> int:
-    """A count of iterations, scaled; something stays something, and 0 (off) stays 0."""
+    """Return a count of iterations, scaled; something stays something, and 0 (off) stays 0."""
     return max(1, round(count * factor)) if count > 0 else 0

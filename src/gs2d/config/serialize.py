@@ -22,7 +22,7 @@ ACTION_KEY = "action"
 
 
 def to_json(recipe: Recipe) -> dict[str, Any]:
-    """A recipe as plain dicts, lists, numbers and strings; every field is written out."""
+    """Return a recipe as plain dicts, lists, numbers and strings; every field is written out."""
     encoded = _encode(recipe)
     assert isinstance(encoded, dict)
     return encoded
@@ -123,7 +123,7 @@ def _set_trained(train: dict[str, Any], attribute: str, rows: Any) -> None:
 
 
 def _entry(entries: list[Any], word: str, override: str) -> Any:
-    """The loss of a kind, or the action of a name."""
+    """Return the loss of a kind, or the action of a name."""
     tags = [str(entry.get("kind", entry.get(ACTION_KEY))) if isinstance(entry, dict) else "?" for entry in entries]
     if word not in tags:
         raise RecipeError(f"override {override!r}: no entry {word!r}; there is {', '.join(tags) or 'none'}")
@@ -144,7 +144,7 @@ def _encode(value: Any) -> Any:
 
 
 def _decode(value: Any, kind: Any, where: str) -> Any:
-    """A JSON value as the annotated type."""
+    """Return a JSON value as the annotated type."""
     origin = get_origin(kind)
     if origin in (Union, UnionType):
         return _decode_union(value, get_args(kind), where)

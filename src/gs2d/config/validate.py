@@ -20,7 +20,7 @@ def integer(where: str, value: object, *, low: int) -> None:
 
 
 def number(where: str, value: object, *, low: float) -> float:
-    """The finite number of at least ``low`` that is required, as a float."""
+    """Return the finite number of at least ``low`` that is required, as a float."""
     ok = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= low
     require(ok, f"{where} must be a finite number >= {low:g}, got {value!r}")
     assert isinstance(value, int | float)

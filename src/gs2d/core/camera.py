@@ -114,12 +114,12 @@ class Camera:
         return np.asarray(self.rotation[2])
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera with another image size (intrinsics scale with each axis)."""
+        """Return the same camera with another image size (intrinsics scale with each axis)."""
         sx, sy = width / self.width, height / self.height
         return self._with(width, height, (self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy), (sx, sy, sx, sy))
 
     def downscaled(self, factor: int) -> Camera:
-        """The camera of an image area-filtered by an integer factor; leftover rows and columns are cut.
+        """Return the camera of an image area-filtered by an integer factor; leftover rows and columns are cut.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class Camera:
 def look_at(
     eye: np.ndarray, target: np.ndarray, up: np.ndarray, *, width: int, height: int, fx: float, fy: float | None = None
 ) -> Camera:
-    """A camera at ``eye`` [3] that looks at ``target`` [3], ``up`` [3] towards the top of the image.
+    """Return a camera at ``eye`` [3] that looks at ``target`` [3], ``up`` [3] towards the top of the image.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from gs2d.errors import ShapeError
 
 @lru_cache(maxsize=256)
 def _parsed(pattern: str) -> tuple[tuple[str, int | None], ...]:
-    """The words of a pattern, each with its value if it is a number."""
+    """Return the words of a pattern, each with its value if it is a number."""
     return tuple((word, int(word) if word.lstrip("-").isdigit() else None) for word in pattern.split())
 
 

@@ -32,7 +32,7 @@ _REMEDIES = {
 
 
 def disk_error(path: str | os.PathLike[str], error: OSError) -> DiskError:
-    """The one-line DiskError for a failed write of ``path``."""
+    """Return the one-line DiskError for a failed write of ``path``."""
     remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
     return DiskError(f"cannot write {os.fspath(path)}: {error.strerror or error}; {remedy}", error.errno)
 

@@ -208,7 +208,7 @@ def mask_downscale(mask: np.ndarray, factor: int, *, need: float) -> np.ndarray:
 
 
 def _block_parts(image: np.ndarray, factor: int) -> list[np.ndarray]:
-    """The n x n pictures [H // n, W // n, ...] of the pixels at each place in the blocks (views, no copies)."""
+    """Return the n x n pictures [H // n, W // n, ...] of the pixels at each place in the blocks (views, no copies)."""
     height, width = image.shape[0] // factor, image.shape[1] // factor
     if factor < 1 or height < 1 or width < 1:
         raise ShapeError(f"downscale must leave at least one pixel of {image.shape[1]}x{image.shape[0]}, got {factor}")

@@ -43,7 +43,7 @@ def hold() -> bool:
 
 @cache
 def _malloc_trim() -> Callable[[int], Any] | None:
-    """The call of glibc that does it; None elsewhere."""
+    """Return the call of glibc that does it; None elsewhere."""
     try:
         return ctypes.CDLL(None).malloc_trim
     except (AttributeError, OSError, TypeError):

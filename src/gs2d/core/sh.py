@@ -28,7 +28,7 @@ def num_coefficients(degree: int) -> int:
 
 
 def sh_degree_of(coefficients: int) -> int:
-    """The degree whose coefficients number K.
+    """Return the degree whose coefficients number K.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def harmonics(x: Any, y: Any, z: Any, degree: int) -> list[Any]:
-    """The basis functions of degrees 1 to ``degree`` at unit vectors (x, y, z): arrays or tensors of one shape."""
+    """Evaluate the basis functions of degrees 1 to ``degree`` at unit vectors (x, y, z) of one shape."""
     basis = []
     if degree >= 1:
         basis += [-C1 * y, C1 * z, -C1 * x]
@@ -129,6 +129,6 @@ def sh_to_rgb(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tens
 
 
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
-    """The degree-0 coefficients [N, 1, 3] whose colour is ``rgb`` [N, 3] from every direction."""
+    """Return the degree-0 coefficients [N, 1, 3] whose colour is ``rgb`` [N, 3] from every direction."""
     check_shapes({"rgb": (rgb, "N 3")})
     return ((rgb - 0.5) / C0)[:, None, :]

@@ -67,20 +67,22 @@ class Splats:
 
     @property
     def device(self) -> torch.device:
+        """Device of all tensors."""
         return self.means.device
 
     @property
     def dtype(self) -> torch.dtype:
+        """Type of all tensors."""
         return self.means.dtype
 
     @property
     def scales(self) -> Tensor:
-        """s_u, s_v [N, 2] world units."""
+        """Scales s_u, s_v [N, 2] world units."""
         return self.log_scales.exp()
 
     @property
     def opacities(self) -> Tensor:
-        """o [N] in (0, 1)."""
+        """Opacities o [N] in (0, 1)."""
         return self.opacity_logits.sigmoid()
 
     @property
@@ -89,19 +91,19 @@ class Splats:
         return sum(t.numel() * t.element_size() for _, t in self.items())
 
     def detach(self) -> Splats:
-        """The same storage without autograd history."""
+        """Return the same storage without autograd history."""
         return Splats(**{name: tensor.detach() for name, tensor in self.items()})
 
     def clone(self) -> Splats:
-        """A deep, detached copy."""
+        """Return a deep, detached copy."""
         return Splats(**{name: tensor.detach().clone() for name, tensor in self.items()})
 
     def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Splats:
-        """A copy on another device or in another dtype; ``to(torch.float64)`` is ``to(dtype=torch.float64)``."""
+        """Return a copy on another device or in another dtype; ``to(torch.float64)`` is ``to(dtype=torch.float64)``."""
         if isinstance(device, torch.dtype):
             device, dtype = None, device
         return Splats(**{name: tensor.to(device=device, dtype=dtype) for name, tensor in self.items()})
 
     def rows(self, index: Tensor) -> Splats:
-        """The rows picked by a boolean mask or an index tensor, detached."""
+        """Return the rows picked by a boolean mask or an index tensor, detached."""
         return Splats(**{name: tensor.detach()[index] for name, tensor in self.items()})

@@ -53,7 +53,7 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
 
 
 def se3_exp(motion: Tensor) -> Tensor:
-    """The rigid motion of a twist: a rotation and a translation, exact and differentiable everywhere, 0 included.
+    """Return the rigid motion of a twist, a rotation and a translation: exact, and differentiable at 0 too.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def se3_exp(motion: Tensor) -> Tensor:
 
 
 def perturb_pose(camera: Camera, motion: Tensor) -> Camera:
-    """The camera after a motion in its own frame: ``T_cam_world = se3_exp(motion) @ camera.T_cam_world``.
+    """Return the camera after a motion in its own frame: ``T_cam_world = se3_exp(motion) @ camera.T_cam_world``.
 
     The rotation is about the camera's own centre. Where ``motion`` (or the camera) requires a gradient the result
     carries it to ``gs2d.rasterize``.
@@ -92,7 +92,7 @@ def perturb_pose(camera: Camera, motion: Tensor) -> Camera:
 
 
 def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
-    """What a small similarity of a whole scene does to each of its cameras, which stay where they are in it.
+    """Return what a small similarity of a whole scene does to each of its cameras, which stay where they are in it.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def similarity_motions(poses: np.ndarray, extent: float) -> np.ndarray:
 
 
 def common_motion(motions: np.ndarray, by_similarity: np.ndarray) -> np.ndarray:
-    """The similarity [7] whose motions of the cameras come nearest to these [V, 6], in the sense of least squares."""
+    """Fit the similarity [7] whose motions of the cameras come nearest to these [V, 6] (least squares)."""
     products = np.einsum("via,vib->ab", by_similarity, by_similarity)
     inverse = np.linalg.pinv(products, rcond=1e-9, hermitian=True)  # of one camera, or of all in one place
     return np.asarray(inverse @ np.einsum("via,vi->a", by_similarity, motions))
@@ -156,7 +156,7 @@ def nearest_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """The point nearest to all optical axes in the least-squares sense.
+    """Return the point nearest to all optical axes in the least-squares sense.
 
     Minimises the sum of squared distances to the lines ``center + t forward``. Where the axes leave it free (all
     parallel, or one camera), the free part is that of the mean camera centre.
@@ -182,7 +182,7 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """What is up [3], unit, for people who hold cameras level: across the cameras' horizontal axes.
+    """Return what is up [3], unit, for people who hold cameras level: across the cameras' horizontal axes.
 
     The direction with the least sum of squares of its products with the cameras' x axes; where these are all but
     parallel (everybody looks the same way), the mean of the cameras' own up vectors. Unlike that mean it is not tilted

@@ -38,12 +38,12 @@ class MissingFile:
     source: str
 
     def line(self) -> str:
-        """The file, what it is for and what to do, in one line."""
+        """Return the file, what it is for and what to do, in one line."""
         return f"{self.path} is missing ({self.purpose}): {self.source}"
 
 
 def whole_folders(pieces: Iterable[MissingFile]) -> tuple[MissingFile, ...]:
-    """The pieces, with one for a folder that is not there instead of one for each of its files."""
+    """Return the pieces, with one for a folder that is not there instead of one for each of its files."""
     named = (piece if piece.path.parent.is_dir() else replace(piece, path=piece.path.parent) for piece in pieces)
     return tuple(dict.fromkeys(named))
 
@@ -54,7 +54,7 @@ def has_dtu_cameras(root: Path) -> bool:
 
 
 def dtu_pieces(root: Path) -> list[MissingFile]:
-    """A DTU scan as 2DGS prepares it (``images``, ``mask``, ``sparse/0``, both archives) or as NeuS does (``image``).
+    """Check a DTU scan as 2DGS (``images``, ``mask``, ``sparse/0``, both archives) or NeuS (``image``) prepares it.
 
     With one of the two archives the other is not needed.
     """
@@ -99,14 +99,14 @@ def _numbered(folder: Path, views: set[int], digits: int, purpose: str, source: 
 
 
 def _model_files(folder: Path, source: str, *, purpose: str = TRAINING) -> list[MissingFile]:
-    """The three files of a COLMAP model, binary unless one is text."""
+    """Return the three files of a COLMAP model, binary unless one is text."""
     suffix = ".txt" if any(folder.glob("*.txt")) and not any(folder.glob("*.bin")) else ".bin"
     names = [f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
     return [MissingFile(folder / name, purpose, source) for name in names if not (folder / name).is_file()]
 
 
 def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[MissingFile]:
-    """A COLMAP model in ``sparse/0`` and the photographs that it names, in each of the folders."""
+    """Return a COLMAP model in ``sparse/0`` and the photographs that it names, in each of the folders."""
     model, flat = root / "sparse" / "0", root / "sparse"
     if not model.is_dir() and any((*flat.glob("*.bin"), *flat.glob("*.txt"))):
         model = flat
@@ -123,7 +123,7 @@ def colmap_pieces(root: Path, folders: Iterable[str], source: str) -> list[Missi
 
 
 def blender_pieces(root: Path, source: str) -> list[MissingFile]:
-    """A NeRF-Synthetic scene: three splits with the pictures that their lists name."""
+    """Return a NeRF-Synthetic scene: three splits with the pictures that their lists name."""
     missing = []
     for split, purpose in (("train", TRAINING), ("test", TESTING), ("val", NOTHING)):
         listing = root / f"transforms_{split}.json"

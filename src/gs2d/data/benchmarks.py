@@ -95,7 +95,7 @@ class SceneFolder:
 def find_scenes(
     data: Path, dataset: str, names: Sequence[str] = (), *, truth: Path | None = None
 ) -> tuple[SceneFolder, ...]:
-    """The scenes of a data set under a folder, in the order of the paper's tables.
+    """Return the scenes of a data set under a folder, in the order of the paper's tables.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def find_scenes(
 
 
 def recognise(root: Path, truth: Path | None = None) -> tuple[DataSet, SceneFacts] | None:
-    """The data set and scene that a capture's folder is, by its name and its files; None for anyone else's.
+    """Return the data set and scene that a capture's folder is, by its name and its files; None for anyone else's.
 
     A COLMAP capture needs more than a name, for many have a garden or a truck: Tanks and Temples the camera log beside
     the photographs or an official file, Mip-NeRF 360 its ``poses_bounds.npy``.
@@ -159,7 +159,7 @@ def recognise(root: Path, truth: Path | None = None) -> tuple[DataSet, SceneFact
 
 
 def describe(dataset: DataSet, facts: SceneFacts, root: Path, *, truth: Path | None = None) -> SceneFolder:
-    """The pieces of one scene: what of the ground truth is there, and all that is missing."""
+    """Return the pieces of one scene: what of the ground truth is there, and all that is missing."""
     source = _capture_source(dataset)
     pieces = {
         "dtu": lambda: dtu_pieces(root),
@@ -189,7 +189,7 @@ def missing_lines(root: Path) -> tuple[str, ...]:
 def find_truth(
     dataset: DataSet, facts: SceneFacts, root: Path, folder: Path | None = None
 ) -> tuple[dict[str, Path], tuple[MissingFile, ...]]:
-    """The pieces of a scene's ground truth that are there, and those that are not.
+    """Return the pieces of a scene's ground truth that are there, and those that are not.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def find_truth(
 
 
 def protocol_of(root: Path, scene_format: str, truth: Path | None = None) -> Protocol:
-    """What ``--protocol auto`` takes: the scene's of a known data set, else that of the format of the capture.
+    """Return what ``--protocol auto`` takes: the scene's of a known data set, else that of the format of the capture.
 
     Raises
     ------
@@ -248,7 +248,7 @@ def protocol_of(root: Path, scene_format: str, truth: Path | None = None) -> Pro
 
 
 def dtu_truth_files(scan: int) -> dict[str, str]:
-    """The three files of a DTU scan by what they are, relative to the folders that the data set comes in."""
+    """Return the three files of a DTU scan by what they are, relative to the folders that the data set comes in."""
     return {
         "scan": f"Points/stl/stl{scan:03}_total.ply",
         "mask": f"ObsMask/ObsMask{scan}_10.mat",
@@ -257,7 +257,7 @@ def dtu_truth_files(scan: int) -> dict[str, str]:
 
 
 def tnt_truth_files(scene: str) -> dict[str, str]:
-    """The four files of a scene of Tanks and Temples by what they are."""
+    """Return the four files of a scene of Tanks and Temples by what they are."""
     return {
         "scan": f"{scene}.ply",
         "crop": f"{scene}.json",
@@ -267,7 +267,7 @@ def tnt_truth_files(scene: str) -> dict[str, str]:
 
 
 def published_log(root: Path, scene: str) -> Path:
-    """The camera log beside the photographs of a scene of TNT_GOF."""
+    """Return the camera log beside the photographs of a scene of TNT_GOF."""
     return root / tnt_truth_files(scene)["log"]
 
 
@@ -319,7 +319,7 @@ def _capture_source(dataset: DataSet) -> str:
 
 
 def _folders(data: Path) -> Iterator[Path]:
-    """A folder and those below it, nearest first."""
+    """Yield a folder and those below it, nearest first."""
     level = [data]
     for _ in range(DEPTH + 1):
         yield from level
@@ -327,7 +327,7 @@ def _folders(data: Path) -> Iterator[Path]:
 
 
 def subfolders(folder: Path) -> list[Path]:
-    """The folders in a folder that are not hidden, by name; none where it cannot be read."""
+    """Return the folders in a folder that are not hidden, by name; none where it cannot be read."""
     try:
         return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
     except OSError:

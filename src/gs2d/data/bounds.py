@@ -18,7 +18,7 @@ _BLENDER_HALF = 1.3  # the initial box of NeRF-Synthetic in the 3DGS and 2DGS re
 def scene_bounds(
     cameras: Sequence[Camera], points: PointCloud | None, *, blender: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The box that the cameras look at.
+    """Return the box that the cameras look at.
 
     With sparse points, their 1st to 99th percentile on each axis, widened by a tenth. Without, the box around the
     places that most cameras see. For a NeRF-Synthetic data set the customary [-1.3, 1.3]^3, if the cameras
@@ -66,7 +66,7 @@ def _fits_blender_box(cameras: Sequence[Camera]) -> bool:
 
 
 def _axes_meet(cameras: Sequence[Camera]) -> bool:
-    """The axes fix a point (they are not nearly parallel) and it lies ahead of most cameras."""
+    """Return the axes fix a point (they are not nearly parallel) and it lies ahead of most cameras."""
     axes = np.stack([camera.forward for camera in cameras])
     spread = np.linalg.eigvalsh(np.eye(3) - axes.T @ axes / len(axes))[0]  # mean sin^2 to the best common axis
     ahead = np.mean([(focus_point(cameras) - c.center) @ c.forward > 0 for c in cameras])
@@ -74,7 +74,7 @@ def _axes_meet(cameras: Sequence[Camera]) -> bool:
 
 
 def _box_seen_by_most(cameras: Sequence[Camera]) -> np.ndarray | None:
-    """The box around grid points that are seen by nearly as many cameras as the best seen one is."""
+    """Return the box around grid points that are seen by nearly as many cameras as the best seen one is."""
     if len(cameras) < 2 or not _axes_meet(cameras):
         return None
     focus = focus_point(cameras)

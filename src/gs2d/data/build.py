@@ -106,6 +106,7 @@ class Decoder:
     lens_maps: LensMaps
 
     def __call__(self) -> DecodedImage:
+        """Decode, undistort and shrink the photograph and its masks."""
         frame, k = self.frame, self.frame.intrinsics
         image = read_image(frame.path)
         if image.shape[:2] != (k.height, k.width):
@@ -136,7 +137,7 @@ class Decoder:
         return DecodedImage(np.ascontiguousarray(image), valid if mask is None else mask, object_mask, valid)
 
     def _read_mask(self, path: Path | None, need: float) -> np.ndarray | None:
-        """A mask at the image's size: True where at least ``need`` of the pixel's area is white."""
+        """Return a mask at the image's size: True where at least ``need`` of the pixel's area is white."""
         if path is None:
             return None
         mask = read_mask(path)
@@ -188,7 +189,7 @@ def pose_from_camera_to_world(matrix: object, where: str, *, opengl: bool) -> np
 
 
 def fit_to_file(frame: PosedImage) -> PosedImage:
-    """The frame with intrinsics for the size that its file really has.
+    """Return the frame with intrinsics for the size that its file really has.
 
     Raises
     ------
@@ -217,7 +218,7 @@ def _check_aspect(what: str, got: tuple[int, int], expected: tuple[int, int], ow
 
 
 def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int | None, cache_bytes: int) -> Scene:
-    """A Scene of a Capture: sizes checked, cameras downscaled, views split, extent and bounds measured.
+    """Return a Scene of a Capture: sizes checked, cameras downscaled, views split, extent and bounds measured.
 
     Raises
     ------
@@ -261,7 +262,7 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
 
 
 def _measured_extent(cameras: Sequence[Camera], root: Path) -> tuple[float, tuple[str, ...]]:
-    """The extent, world units, and a note where 32-bit positions are coarse so far from the origin.
+    """Return the extent, world units, and a note where 32-bit positions are coarse so far from the origin.
 
     Raises
     ------
@@ -308,7 +309,7 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
 
 
 def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], tuple[str, ...]]:
-    """The frames with the maps that lie in ``depths`` and ``normals``, and a note for each such folder."""
+    """Return the frames with the maps that lie in ``depths`` and ``normals``, and a note for each such folder."""
     found: dict[str, list[Path | None]] = {}
     for what, folder, suffixes in (("depth", DEPTHS, DEPTH_SUFFIXES), ("normal", NORMALS, NORMAL_SUFFIXES)):
         if (home / folder).is_dir():

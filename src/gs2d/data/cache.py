@@ -79,7 +79,7 @@ class ImageCache:
             self._nbytes = 0
 
     def get(self, key: Hashable, decode: Callable[[], DecodedImage]) -> DecodedImage:
-        """The picture of ``key``, decoded if it is not held."""
+        """Return the picture of ``key``, decoded if it is not held."""
         with self._lock:
             held = self._images.get(key)
             if held is not None:

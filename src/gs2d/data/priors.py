@@ -143,7 +143,7 @@ class PriorMaps:
     lens_maps: LensMaps
 
     def depth(self) -> PriorDepth:
-        """The depth map at the view's pixels.
+        """Return the depth map at the view's pixels.
 
         Raises
         ------
@@ -160,7 +160,7 @@ class PriorMaps:
         return PriorDepth(sample(shrink(valid, factor), *positions), whole)
 
     def normal(self) -> np.ndarray:
-        """Normals [H, W, 3] float32 in the axes of the file, unit length; 0 where unknown.
+        """Return normals [H, W, 3] float32 in the axes of the file, unit length; 0 where unknown.
 
         Raises
         ------
@@ -193,13 +193,13 @@ class PriorMaps:
 
 
 def find_map(folder: Path, name: str, suffixes: tuple[str, ...]) -> Path | None:
-    """The map of the photograph ``name`` in a folder: its name with one of the suffixes for its own, or after it."""
+    """Find the map of the photograph ``name``: its name with one of the suffixes for its own, or after it."""
     places = [path for s in suffixes for path in ((folder / name).with_suffix(s), folder / f"{name}{s}")]
     return next((path for path in places if path.is_file()), None)
 
 
 def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
-    """The numbers of a depth map [h, w]: a grey image of 8, 16 or 32 bits, or an array of numpy.
+    """Return the numbers of a depth map [h, w]: a grey image of 8, 16 or 32 bits, or an array of numpy.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
-    """Unit normals [h, w, 3] float32 of a map, 0 where unknown: an RGB image of (n + 1) / 2, or an array of n.
+    """Return unit normals [h, w, 3] float32 of a map, 0 where unknown: an RGB image of (n + 1) / 2, or an array of n.
 
     Black, transparent, and what is no unit vector by a fifth, is unknown.
 
@@ -273,7 +273,7 @@ def _read_array(path: Path, what: str) -> np.ndarray:
 
 
 def _check_shape(what: str, path: Path, shape: tuple[int, ...], k: Intrinsics) -> None:
-    """A map has the aspect of its photograph."""
+    """Check that a map has the aspect of its photograph."""
     height, width = shape
     wrong = abs(width / height * k.height / k.width - 1)
     if wrong > max(_ASPECT, 1 / min(width, height)):
@@ -301,7 +301,7 @@ def shrink(values: np.ndarray, factor: int) -> np.ndarray:
 
 
 def sample(values: np.ndarray, positions: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """A map [h, w] at ``positions`` [H, W, 2] px, corner origin; 0 where unknown or not ``valid``.
+    """Return a map [h, w] at ``positions`` [H, W, 2] px, corner origin; 0 where unknown or not ``valid``.
 
     Bilinear where the four readings around are known and agree within ``AGREE``, else the nearest one.
     """

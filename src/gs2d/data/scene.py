@@ -55,19 +55,19 @@ class View:
         object_mask: np.ndarray | None = None,
         valid: np.ndarray | None = None,
     ) -> View:
-        """A view of arrays in memory: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
+        """Return a view of arrays in memory: image uint8 [H, W, 3 or 4], masks bool [H, W]."""
         if valid is not None:
             mask = valid if mask is None else mask & valid
         picture = DecodedImage(image, mask, object_mask, valid)
         return cls(name, camera, lambda: picture)
 
     def at(self, T_cam_world: np.ndarray) -> View:
-        """The same photograph, taken from elsewhere; its picture stays in the cache of this one."""
+        """Return the same photograph, taken from elsewhere; its picture stays in the cache of this one."""
         camera = replace(self.camera, T_cam_world=T_cam_world)
         return View(self.name, camera, self._image, path=self.path, maps=self.maps)
 
     def image(self) -> np.ndarray:
-        """The photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
+        """Return the photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
 
         Raises
         ------
@@ -112,12 +112,12 @@ class View:
         return image.image[:, :, 3] >= 128 if image.image.shape[2] == 4 else None
 
     def alpha(self) -> np.ndarray | None:
-        """The alpha channel, float32 [H, W] in [0, 1], or None if the photograph has none."""
+        """Return the alpha channel, float32 [H, W] in [0, 1], or None if the photograph has none."""
         image = self._image().image
         return np.divide(image[:, :, 3], np.float32(255), dtype=np.float32) if image.shape[2] == 4 else None
 
     def target(self, background: Sequence[float] | np.ndarray) -> np.ndarray:
-        """What a rendering over ``background`` (3 floats in [0, 1]) should look like, float32 [H, W, 3] in [0, 1]."""
+        """Return the target of a rendering over ``background`` (3 floats in [0, 1]), float32 [H, W, 3] in [0, 1]."""
         return composite(self._image().image, background)
 
     def _image(self) -> DecodedImage:
@@ -208,7 +208,7 @@ class Scene:
     observe: Callable[[], ObservedPoints] | None = None
 
     def with_poses(self, poses: Mapping[str, np.ndarray]) -> Scene:
-        """The scene with training cameras moved: T_cam_world [4, 4] by the name of the view. Pictures are shared."""
+        """Return the scene with other training cameras: T_cam_world [4, 4] by the view's name. Images are shared."""
         return replace(
             self, train=tuple(view.at(poses[view.name]) if view.name in poses else view for view in self.train)
         )

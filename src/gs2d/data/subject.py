@@ -247,13 +247,13 @@ def frame_size(cameras: Sequence[Camera], center: np.ndarray) -> float:
 
 
 def _fraction(sight: Sight, center: np.ndarray, radius: float) -> float:
-    """The part of a camera's votes in a ball."""
+    """Return the part of a camera's votes in a ball."""
     near = ((sight.points - center) ** 2).sum(axis=1) <= radius**2
     return float(sight.weights[near].sum() / sight.weights.sum())
 
 
 def _place(sights: Sequence[Sight]) -> np.ndarray:
-    """The place [3] that gets the most votes, no camera more than it may: the best of some seeds, then mean shift."""
+    """Find the place [3] with the most votes, no camera more than it may: the best of some seeds, then mean shift."""
     points = np.concatenate([sight.points for sight in sights])
     weights = np.concatenate([sight.weights for sight in sights])
     seeds = [_weighted_median(points, weights)]
@@ -282,7 +282,7 @@ def _looked_at(sights: Sequence[Sight], center: np.ndarray) -> float:
 
 
 def _weighted_median(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The median [3] along each axis."""
+    """Return the median [3] along each axis."""
     middle = []
     for values in points.T:
         order = np.argsort(values)
@@ -292,7 +292,7 @@ def _weighted_median(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _object_box(sights: Sequence[Sight], center: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """The box of the surface within a picture's reach of the middle that most of the pictures show."""
+    """Return the box of the surface within a picture's reach of the middle that most of the pictures show."""
     cameras = [sight.camera for sight in sights]
     reach = max(math.hypot(c.width, c.height) / min(c.width, c.height) for c in cameras) * size
     points = np.concatenate([sight.points for sight in sights])

@@ -96,7 +96,7 @@ class Lens:
         return np.asarray(np.arctan(2 * safe * math.tan(w / 2)) / (w * safe))
 
     def largest_radius(self) -> float:
-        """The ideal radius up to which the radial mapping grows; beyond it a polynomial folds back and is no lens."""
+        """Return the ideal radius up to which the radial mapping grows; beyond it a polynomial folds back."""
 
         def radius(r: float) -> float:
             return float(r * self._radial_scale(np.array(r)))
@@ -138,7 +138,7 @@ class Intrinsics:
     lens: Lens | None = None
 
     def scaled(self, width: int, height: int) -> Intrinsics:
-        """The same camera for another size of its images (a lens is free of scale)."""
+        """Return the same camera for another size of its images (a lens is free of scale)."""
         sx, sy = width / self.width, height / self.height
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.lens)
 

@@ -19,7 +19,7 @@ def apply(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def similarity_scale(T: np.ndarray, name: str = "T") -> float:
-    """The scale of a similarity [4, 4].
+    """Return the scale of a similarity [4, 4].
 
     Raises
     ------
@@ -42,7 +42,7 @@ def rotation_degrees(T: np.ndarray) -> float:
 
 
 def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool = True) -> np.ndarray:
-    """The similarity [4, 4] with the least sum of |target - T source|^2 over pairs (Umeyama 1991, eq. 39 to 43).
+    """Return the similarity [4, 4] with the least sum of |target - T source|^2 over pairs (Umeyama 1991, eq. 39 to 43).
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def umeyama(source: np.ndarray, target: np.ndarray, *, with_scale: bool = True) 
 
 
 def _umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Transforms [B, 4, 4] of batches of pairs [B, n, 3], and which of them are determined [B]."""
+    """Return transforms [B, 4, 4] of batches of pairs [B, n, 3], and which of them are determined [B]."""
     mean_s, mean_t = source.mean(axis=1), target.mean(axis=1)
     s, t = source - mean_s[:, None], target - mean_t[:, None]
     U, D, Vt = np.linalg.svd(np.einsum("bni,bnj->bij", t, s) / source.shape[1])
@@ -120,7 +120,7 @@ def ransac_similarity(
     confidence: float = 0.9999,
     seed: int = 0,
 ) -> RobustFit:
-    """The similarity with the most pairs within ``threshold``, among fits to random samples (Fischler and Bolles 1981).
+    """Find the similarity with most pairs within ``threshold`` among random samples (Fischler and Bolles 1981).
 
     The best sample is fitted again to all its inliers until they no longer change. Stops early once a better sample
     is less likely than 1 - confidence.
@@ -182,6 +182,6 @@ def _residuals(T: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndar
 
 
 def _needed(fraction: float, sample: int, confidence: float) -> float:
-    """Samples until one of inliers only has been seen with this confidence."""
+    """Return how many samples it takes until one of inliers only was among them with this confidence."""
     good = float(fraction) ** sample
     return math.inf if good <= 0 else 0 if good >= 1 else math.log(1 - confidence) / math.log1p(-good)

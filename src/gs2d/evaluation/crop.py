@@ -46,7 +46,7 @@ class CropVolume:
         return np.asarray(inside)
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """The points inside."""
+        """Return the points inside."""
         return np.asarray(points[self.contains(points)])
 
     def _in_polygon(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ class CropVolume:
 
 
 def box(low: np.ndarray, high: np.ndarray) -> CropVolume:
-    """The axis-aligned box between two corners [3]."""
+    """Return the axis-aligned box between two corners [3]."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     return CropVolume(2, float(z0), float(z1), np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], np.float64))
 

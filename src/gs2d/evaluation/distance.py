@@ -103,7 +103,7 @@ def point_triangle_distances(p: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def _tensor(array: np.ndarray, dtype: type = np.float64) -> Tensor:
-    """An array as a tensor, the same memory where it has that type and may be written to (torch warns of others)."""
+    """Return an array as a tensor: the same memory if it has that type and is writable (torch warns of others)."""
     return torch.from_numpy(np.require(array, dtype, ["C", "W"]))
 
 

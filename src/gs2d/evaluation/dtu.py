@@ -107,7 +107,7 @@ def evaluate_dtu(
 
 
 def _touching(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> Mesh:
-    """The faces whose boxes touch a box: what lies wholly outside it would be sampled for nothing."""
+    """Return the faces whose boxes touch a box: what lies wholly outside it would be sampled for nothing."""
     corners = mesh.vertices[mesh.faces]
     touch = (corners.max(axis=1) >= low).all(axis=1) & (corners.min(axis=1) < high).all(axis=1)
     return Mesh(mesh.vertices, mesh.faces[touch])
@@ -212,7 +212,7 @@ def _half_steps(n1: int, n2: int) -> np.ndarray:
 
 
 def thin(points: np.ndarray, radius: float, *, seed: int = 0, slab_size: int = _SLAB) -> np.ndarray:
-    """A subset of which no two points are within ``radius``, and every point left out is within it of one that is kept.
+    """Choose points of which no two are within ``radius``, so that each one left out is within it of one that is kept.
 
     Points are taken greedily: slab by slab along the longest axis, in an order shuffled from the seed within a slab.
     Within a slab all points that come before their neighbours are taken at once, again and again: the same set as one

@@ -47,7 +47,7 @@ class DtuTruth:
         return np.asarray(inside)
 
     def above_plane(self) -> np.ndarray:
-        """The scanned points above the table."""
+        """Return the scanned points above the table."""
         return np.asarray(self.points[self.points @ self.plane[:3] + self.plane[3] > 0])
 
 

@@ -18,7 +18,7 @@ CHUNK = 1 << 22  # points thinned at a time: bounds memory beside the clouds the
 
 
 def voxel_downsample(points: np.ndarray, voxel: float) -> np.ndarray:
-    """The mean of the points [P, 3] in each occupied cube of side ``voxel`` [Q, 3], float64.
+    """Return the mean of the points [P, 3] in each occupied cube of side ``voxel`` [Q, 3], float64.
 
     The grid starts half a voxel before the smallest coordinates. Means are gathered chunk by chunk.
     """
@@ -45,7 +45,7 @@ def voxel_downsample(points: np.ndarray, voxel: float) -> np.ndarray:
 def _grouped(
     keys: np.ndarray, values: np.ndarray, counts: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums [Q, 3] of values [P, 3], and of counts (None: ones), over equal keys; ordered by key."""
+    """Return sums [Q, 3] of values [P, 3], and of counts (None: ones), over equal keys; ordered by key."""
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))

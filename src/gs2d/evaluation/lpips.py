@@ -51,7 +51,7 @@ class Lpips:
         return next(iter(self.weights.values())).device
 
     def to(self, device: str | torch.device) -> Lpips:
-        """The same network on a device."""
+        """Return the same network on a device."""
         return Lpips({name: weight.to(device) for name, weight in self.weights.items()})
 
     def __call__(self, image: Tensor, target: Tensor, *, convention: str = "0..1") -> Tensor:

@@ -176,7 +176,7 @@ def evaluate_surface(
 
 
 def headline(rows: Sequence[_T], thresholds: Sequence[float] | None) -> _T:
-    """What stands at the headline threshold: the protocol's, or the middle one of those that were asked for."""
+    """Return what stands at the headline threshold: the protocol's, or the middle one of those that were asked for."""
     return rows[len(rows) // 2 if thresholds else VISIBLE_SURFACE.headline]
 
 
@@ -196,7 +196,7 @@ def _true_side(
     seed: int,
     counts: _Counts,
 ) -> _Side:
-    """True points that enough cameras see."""
+    """Return true points that enough cameras see."""
     if not isinstance(truth, Mesh):
         if seen is not None:
             raise DataError("a true mesh was expected with counts of views of each face, got a point cloud")
@@ -232,7 +232,7 @@ def _reconstructed_side(mesh: Mesh, cameras: Sequence[Camera], samples: int, see
 
 
 def _moved(truth: Mesh | np.ndarray, T: np.ndarray) -> Mesh | np.ndarray:
-    """The truth under a transform [4, 4]."""
+    """Return the truth under a transform [4, 4]."""
     if isinstance(truth, Mesh):
         return Mesh(truth.vertices @ T[:3, :3].T + T[:3, 3], truth.faces)
     return np.asarray(truth, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]

@@ -55,7 +55,7 @@ def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
 
 
 def read_transform(path: Path) -> np.ndarray:
-    """A 4x4 matrix of numbers in four lines (``SCENE_trans.txt``).
+    """Return a 4x4 matrix of numbers in four lines (``SCENE_trans.txt``).
 
     Raises
     ------

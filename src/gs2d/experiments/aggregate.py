@@ -63,7 +63,7 @@ class Row:
     commands: tuple[str, ...] = ()
 
     def of(self, data_set: str | None) -> list[Cell]:
-        """The cells of one data set, or all."""
+        """Return the cells of one data set, or all."""
         return [cell for cell in self.cells if data_set in (None, cell.data_set)]
 
 
@@ -84,7 +84,7 @@ class Results:
         return tuple(dict.fromkeys(cell.data_set for row in self.rows for cell in row.cells))
 
     def counted(self, metric: str, data_set: str | None = None) -> set[tuple[str, int]]:
-        """The (scene, seed) that means of a metric are taken over; none where there is no common mean."""
+        """Return the (scene, seed) that means of a metric are taken over; none where there is no common mean."""
         kinds = self._kinds(metric, data_set)
         one = "test views" if "test views" in kinds else next(iter(kinds), "")
         if len(kinds) > 1 and metric not in IMAGES:
@@ -105,7 +105,7 @@ class Results:
         return {measured_on(cell, metric) for cell in cells}
 
     def scenes(self, metric: str, data_set: str | None = None) -> list[str]:
-        """The scenes that means of a metric are taken over."""
+        """Return the scenes that means of a metric are taken over."""
         counted = {scene for scene, _ in self.counted(metric, data_set)}
         return [s for s in dict.fromkeys(c.scene for r in self.rows for c in r.of(data_set)) if s in counted]
 
@@ -119,7 +119,7 @@ class Results:
         return found
 
     def spread(self, row: Row, data_set: str | None = None) -> dict[str, float | None]:
-        """Standard deviation over seeds of the mean over scenes; None with fewer than two seeds that have them all."""
+        """Return the deviation over seeds of the mean over scenes; None with fewer than two seeds that have all."""
         found: dict[str, float | None] = {}
         for name in FIGURES:
             means = by_seed(self._values(row, name, data_set))
@@ -154,7 +154,7 @@ class Results:
 
 
 def measured_on(cell: Cell, metric: str) -> str:
-    """What figures must have in common to have a mean: the split of the views, the protocol and unit of surfaces."""
+    """Return what figures must share to have a mean: the split of the views, the protocol and unit of surfaces."""
     if metric in IMAGES:
         return f"{cell.details.get('views', 'test')} views"
     if metric not in ("fscore", "chamfer"):
@@ -189,7 +189,7 @@ def read_cell(
     record: dict[str, Any],
     conventions: MetricConventions = MetricConventions(),  # noqa: B008 (frozen)
 ) -> Cell:
-    """The figures of a run, from its ``metrics.json``; None with a reason where there are none.
+    """Return the figures of a run, from its ``metrics.json``; None with a reason where there are none.
 
     Parameters
     ----------
@@ -239,20 +239,20 @@ def read_cell(
 
 
 def measured_as(conventions: MetricConventions) -> dict[str, str]:
-    """The image metrics of a table -> their names in ``metrics.json``."""
+    """Return the image metrics of a table -> their names in ``metrics.json``."""
     suffix = "" if conventions.from_8bit else "_float"
     lpips = "lpips" if conventions.lpips_unit_range else "lpips_signed"
     return {"psnr": f"psnr{suffix}", "ssim": f"ssim{suffix}", "lpips": lpips}
 
 
 def surface_metric(rows: Sequence[Row], data_set: str) -> str:
-    """The headline figure of a data set's surfaces: what its protocol says."""
+    """Return the headline figure of a data set's surfaces: what its protocol says."""
     named = {c.details["headline"] for row in rows for c in row.of(data_set) if "headline" in c.details}
     return named.pop() if len(named) == 1 else "chamfer" if data_set == DTU else "fscore"
 
 
 def _backend(definition: dict[str, Any]) -> str:
-    """The backend that trained a run, by its name."""
+    """Return the backend that trained a run, by its name."""
     return str((definition.get("backend") or {}).get("name", "unknown"))
 
 

@@ -69,7 +69,7 @@ def opacity_resets(scale: float) -> int:
 
 
 def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
-    """What the paper leaves open in the recipes of a table, and where gs2d knowingly does otherwise."""
+    """Yield what the paper leaves open in the recipes of a table, and where gs2d knowingly does otherwise."""
     yield (
         "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
         "the low-pass filter wins: docs/decisions.md, Rasterizer"
@@ -172,7 +172,7 @@ def _size(scene: FoundScene) -> tuple[int, int] | None:
 
 
 def _missing_figures(results: Results) -> list[str]:
-    """Runs that failed or are not there yet, and figures that nothing has."""
+    """Return runs that failed or are not there yet, and figures that nothing has."""
     found: list[str] = []
     waiting, failed = 0, dict[tuple[str, str], list[str]]()
     for row in results.rows:

@@ -132,7 +132,7 @@ def coverage(runs: Mapping[str, Path]) -> dict[str, tuple[float, ...]]:
 
 
 def _value_at(iterations: np.ndarray, values: np.ndarray, end: int) -> float:
-    """The last value that was logged up to an iteration."""
+    """Return the last value that was logged up to an iteration."""
     return float(values[max(0, int((iterations <= end).sum()) - 1)])
 
 
@@ -202,7 +202,7 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
 
 
 def _ranked(run: RunFolder, job: Job, index: int, action: RankByError) -> tuple[Splats, Tensor | None, str]:
-    """The splats nearest to those that stage ``index`` ranked, the group that it found if they know it, and when."""
+    """Return the splats nearest to those that stage ``index`` ranked, the group it found if known, and when."""
     stages = job.recipe.stages
     before = stage_end(run, job, index - 1) if index else None
     if before is not None:
@@ -215,7 +215,7 @@ def _ranked(run: RunFolder, job: Job, index: int, action: RankByError) -> tuple[
 
 
 def _first_ranking(recipe: Recipe) -> tuple[int, RankByError]:
-    """The stage that first ranks, and how; (0, default) where none does."""
+    """Return the stage that first ranks, and how; (0, default) where none does."""
     for index, stage in enumerate(recipe.stages):
         for action in stage.on_enter:
             if isinstance(action, RankByError):

@@ -212,7 +212,7 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
 
 
 def _protocols(plan: Plan) -> dict[str, Any]:
-    """The protocols of the scenes, and those that surfaces are scored by."""
+    """Return the protocols of the scenes, and those that surfaces are scored by."""
     found: dict[str, Any] = {scene.protocol.name: scene.protocol for scene in plan.scenes}
     surfaces = {DTU: ("surface: dtu", DTU_SURFACE), TNT: ("surface: tnt", TNT_SURFACE)}
     for scene in plan.scenes:

@@ -121,7 +121,7 @@ def make_plan(options: PaperOptions) -> Plan:
 
 
 def _table(options: PaperOptions) -> PaperTable:
-    """The rows that are asked for."""
+    """Return the rows that are asked for."""
     if options.table == SWEEP:
         if not options.recipes:
             raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
@@ -196,7 +196,7 @@ def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe
 
 
 def _wanted(scene: FoundScene, options: PaperOptions) -> Iterator[str]:
-    """What is scored: a run that was scored without it is scored again."""
+    """Yield what is scored: a run that was scored without it is scored again."""
     if scene.scored:
         yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
     if options.lpips_weights is not None:
@@ -220,7 +220,7 @@ def commands_of(job: Job) -> list[str]:
 
 
 def _command(words: Sequence[str], options: Any, said: Sequence[str]) -> str:
-    """A command line: its first words, and every option that is not as it is by default, but for those ``said``."""
+    """Return a command line: its first words, and each option that is not at its default, but for those ``said``."""
     line = ["gs2d", *words]
     for field in fields(options):
         value = getattr(options, field.name)

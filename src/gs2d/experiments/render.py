@@ -152,7 +152,7 @@ def _part(table: PaperTable, results: Results, data_set: str) -> Part:
 
 
 def _best(metric: str, means: Sequence[float | None]) -> str:
-    """The best of several figures as it is shown, so that rows that look alike are marked alike; "": there is none."""
+    """Return the best of several figures as it is shown: rows that look alike are marked alike; "" without one."""
     known = [value for value in means if value is not None]
     if metric in COSTS or len(known) < 2:
         return ""
@@ -311,7 +311,7 @@ def write_page(
 
 
 def _run(row: Row, cell: Cell) -> list[str | Markup]:
-    """A row of the table of all runs, with the reason where there are no figures."""
+    """Return a row of the table of all runs, with the reason where there are no figures."""
     figures: list[str | Markup] = [shown(metric, cell.figures[metric]) for metric in RUN_METRICS]
     if cell.figures["psnr"] is None:
         figures = [Markup('-<span class="why">{}</span>').format(cell.reasons.get("psnr", "")), *"----"]
@@ -358,7 +358,7 @@ def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
 
 
 def _last_image(run: Path, file: str, what: str) -> Path:
-    """A picture after the last stage that was drawn."""
+    """Return a picture after the last stage that was drawn."""
     stages = read_json(run / RENDERS / "index.json")["stages"]
     return run / RENDERS / (stages[-1] if stages else "none") / f"{file}.{what}.png"
 

@@ -57,7 +57,7 @@ class FoundScene:
 def find_scenes(
     data: Path, names: Sequence[str] = (), *, protocol: str = "auto", truths: Path | None = None
 ) -> tuple[FoundScene, ...]:
-    """The captures at or under a folder, sorted by name.
+    """Return the captures at or under a folder, sorted by name.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def _is_capture(folder: Path) -> bool:
 
 
 def _match(want: str, captures: dict[str, Path], data: Path, broken: dict[str, str]) -> str:
-    """The capture that a name means."""
+    """Return the capture that a name means."""
     close = _named(want, list(captures))
     if len(close) != 1:
         why = "".join(f"; {name}: {broken[name]}" for name in _named(want, list(broken)))
@@ -138,7 +138,7 @@ def _match(want: str, captures: dict[str, Path], data: Path, broken: dict[str, s
 
 
 def _named(want: str, names: Sequence[str]) -> list[str]:
-    """The names that are, or else end in, what is wanted."""
+    """Return the names that are, or else end in, what is wanted."""
     close = [name for name in names if name.lower() == want.lower()]
     return close or [name for name in names if name.lower().endswith(f"_{want.lower()}")]
 
@@ -166,7 +166,7 @@ def _look_at(name: str, path: Path, named: Protocol | None, truths: Path | None)
 def _truth_of(
     dataset: DataSet, facts: SceneFacts, name: str, path: Path, truths: Path | None
 ) -> tuple[Path | None, bool]:
-    """What to give to the evaluation of a scene of a known data set, and whether it will find a ground truth."""
+    """Return what to give to the evaluation of a scene of a known data set, and whether it will find a ground truth."""
     if dataset.evaluator in OFFICIAL:
         files, lacking = find_truth(dataset, facts, path, truths)
         if files and not lacking:
@@ -176,7 +176,7 @@ def _truth_of(
 
 
 def _plain_truth(name: str, capture: Path, folder: Path | None) -> Path | None:
-    """A mesh or a cloud of points, in a folder or beside the capture."""
+    """Return a mesh or a cloud of points, in a folder or beside the capture."""
     candidates = [capture / file for file in MESH_TRUTHS]
     if folder is not None:
         own = [folder / f"{name}.ply", folder / f"{name}.obj", *(folder / name / file for file in MESH_TRUTHS)]
@@ -185,7 +185,7 @@ def _plain_truth(name: str, capture: Path, folder: Path | None) -> Path | None:
 
 
 def missing_scenes(scenes: Sequence[FoundScene]) -> dict[str, tuple[list[str], int]]:
-    """Data set -> (scenes that were not given, how many it has), for the data sets of which some were given."""
+    """Return data set -> (scenes that were not given, how many it has), for the data sets of which some were given."""
     found: dict[str, tuple[list[str], int]] = {}
     for key, data_set in PAPER_NAMES.items():
         have = {scene.scene for scene in scenes if scene.data_set == data_set}

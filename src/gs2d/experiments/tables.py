@@ -92,7 +92,7 @@ def recipe_table(recipes: Sequence[str]) -> PaperTable:
 
 
 def _read(name: str, table: Mapping[str, Any], notes: Mapping[str, str]) -> PaperTable:
-    """A table of the file."""
+    """Return a table of the file."""
     columns = {data_set: tuple(metrics) for data_set, metrics in table["columns"].items()}
     rows = []
     for line in table["rows"].splitlines():

@@ -58,7 +58,7 @@ class Gaussians:
         return cls(a["means"], a["quats"], scales, a["opacity_logits"], a["sh0"].reshape(-1, 3), a["shN"])
 
     def rows(self, index: np.ndarray) -> Gaussians:
-        """The rows of an index or a mask."""
+        """Return the rows of an index or a mask."""
         return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @property
@@ -68,7 +68,7 @@ class Gaussians:
         return bool((thickest <= math.log(_THIN)).mean() >= _FLAT) if len(self) else True
 
     def to_surfels(self, path: str | os.PathLike[str]) -> Splats:
-        """The disks of a file ``path`` that flat splats were written to.
+        """Return the disks of a file ``path`` that flat splats were written to.
 
         Raises
         ------
@@ -105,5 +105,5 @@ def logit_of_byte(alpha: np.ndarray) -> np.ndarray:
 
 
 def to_byte(x: np.ndarray) -> np.ndarray:
-    """The nearest whole number of 0 to 255."""
+    """Return the nearest whole number of 0 to 255."""
     return np.asarray(np.clip(np.floor(x + 0.5), 0, 255)).astype(np.uint8)

@@ -158,7 +158,7 @@ def read_points(path: str | os.PathLike[str]) -> Points:
 
 
 def written_files(path: Path) -> tuple[Path, ...]:
-    """The files that ``write_textured`` makes for a name.
+    """Return the files that ``write_textured`` makes for a name.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def write_glb(path: Path, mesh: TexturedMesh, *, up: np.ndarray | None = None) -
 
 
 def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> bytes:
-    """A mesh with its texture (PNG) or its vertex colours as the bytes of a glTF 2.0 binary file.
+    """Return a mesh with its texture (PNG) or its vertex colours as the bytes of a glTF 2.0 binary file.
 
     The material is unlit (KHR_materials_unlit), because the light of the photographs is in their colours; viewers that
     do not know the extension shade a rough, non-metallic surface instead. Vertex colours are linear in glTF (3.7.2.1),
@@ -264,7 +264,7 @@ def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> byt
 
 
 def glb_turn(data: bytes) -> list[float]:
-    """The rotation x, y, z, w that a .glb file written here gives its mesh.
+    """Return the rotation x, y, z, w that a .glb file written here gives its mesh.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def glb_turn(data: bytes) -> list[float]:
 
 
 def turn_to_y(up: np.ndarray) -> list[float]:
-    """The smallest rotation that takes ``up`` [3] to +y, as a quaternion x, y, z, w (glTF's order)."""
+    """Return the smallest rotation that takes ``up`` [3] to +y, as a quaternion x, y, z, w (glTF's order)."""
     x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
     if y < -1 + 1e-9:
         return [1.0, 0.0, 0.0, 0.0]  # upside down: half a turn about x
@@ -319,7 +319,7 @@ def _lines(file: Any, template: str, rows: np.ndarray, chunk: int = 10_000) -> N
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """An image [H, W, 3] uint8 as the bytes of a PNG file."""
+    """Return an image [H, W, 3] uint8 as the bytes of a PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(buffer, format="PNG")
     return buffer.getvalue()

@@ -48,7 +48,7 @@ class PlyElement:
         return column
 
     def scalars(self, *names: str) -> np.ndarray | None:
-        """The named scalar properties as float64 columns [count, len(names)], or None where one is missing."""
+        """Return the named scalar properties as float64 columns [count, len(names)], or None where one is missing."""
         columns = [self.properties.get(name) for name in names]
         arrays = [column for column in columns if isinstance(column, np.ndarray)]
         return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == len(names) else None
@@ -298,7 +298,7 @@ class _AsciiReader:
 
 
 def _native(values: np.ndarray) -> np.ndarray:
-    """A contiguous, writable copy in the machine's byte order."""
+    """Return a contiguous, writable copy in the machine's byte order."""
     return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("=")).copy()
 
 

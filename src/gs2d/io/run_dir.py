@@ -89,7 +89,7 @@ class RunFolder:
         write_json(self.file(RUN_JSON), {**extra, **definition})
 
     def definition(self) -> dict[str, Any]:
-        """What ``run.json`` holds.
+        """Return what ``run.json`` holds.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class RunFolder:
         return data
 
     def metrics(self) -> dict[str, Any]:
-        """What ``metrics.json`` holds; ``{"stages": []}`` before the first stage is finished.
+        """Return what ``metrics.json`` holds; ``{"stages": []}`` before the first stage is finished.
 
         Raises
         ------
@@ -207,7 +207,7 @@ def _is_stage(entry: Any) -> bool:
 
 
 def _object(path: Path) -> dict[str, Any]:
-    """A JSON file that holds an object."""
+    """Return a JSON file that holds an object."""
     data = read_json(path)
     if not isinstance(data, dict):
         raise RunError(f"{path} must hold a JSON object, got {type(data).__name__}; it was damaged: restore it")
@@ -220,7 +220,7 @@ def is_run(path: Path) -> bool:
 
 
 def open_run(path: str | Path) -> RunFolder:
-    """An existing run, for reading.
+    """Return an existing run, for reading.
 
     Raises
     ------
@@ -363,7 +363,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """The machine, as far as times depend on it."""
+    """Return the machine, as far as times depend on it."""
     model = platform.processor() or platform.machine()
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():

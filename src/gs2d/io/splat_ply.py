@@ -94,7 +94,7 @@ def read_gaussians(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...]) -> dict[str, torch.Tensor]:
-    """The fields of Splats of the rows of an element."""
+    """Return the fields of Splats of the rows of an element."""
     names = set(vertex.properties)
     n_rest = sum(name.startswith("f_rest_") for name in names)
     degree = round((1 + n_rest / 3) ** 0.5) - 1
@@ -119,7 +119,7 @@ def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...]) -> di
 
 
 def ply_kind(path: str | os.PathLike[str]) -> str:
-    """What a PLY file holds: "2dgs", "3dgs" or "compressed" splats, a "mesh" (any face), or "points".
+    """Return what a PLY file holds: "2dgs", "3dgs" or "compressed" splats, a "mesh" (any face), or "points".
 
     Raises
     ------
@@ -139,7 +139,7 @@ def ply_kind(path: str | os.PathLike[str]) -> str:
 
 
 def _splat_element(path: object, file: PlyFile) -> PlyElement:
-    """The vertex element of a 2DGS file, or an error that says what the file is instead."""
+    """Return the vertex element of a 2DGS file, or an error that says what the file is instead."""
     vertex = file.elements.get("vertex")
     names = set(vertex.properties) if vertex else set()
     expected = f"{path}: 2DGS splats (scale_0 and scale_1 only) were expected"

@@ -72,7 +72,7 @@ def check_update(update: AdamUpdate) -> None:
 
 
 def bias_corrections(update: AdamUpdate, beta1: float, beta2: float) -> tuple[float, float]:
-    """rate / (1 - beta1^t) and sqrt(1 - beta2^t)."""
+    """Return rate / (1 - beta1^t) and sqrt(1 - beta2^t)."""
     return update.rate / (1 - beta1**update.step), math.sqrt(1 - beta2**update.step)
 
 
@@ -136,7 +136,7 @@ def adam_step(
 
 
 def first_not_finite(tensors: Sequence[Tensor], *, library: Library | None = None) -> int | None:
-    """The number of the first tensor that holds a NaN or an infinity, None if all are finite.
+    """Return the number of the first tensor that holds a NaN or an infinity, None if all are finite.
 
     Raises
     ------

@@ -60,7 +60,7 @@ class Library:
         self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32
 
     def function(self, name: str, restype: Any, argtypes: Sequence[Any]) -> Any:
-        """The exported function ``name`` with its C signature. The GIL is released while it runs."""
+        """Return the exported function ``name`` with its C signature. The GIL is released while it runs."""
         key = (name, restype, *argtypes)  # each signature has an object of its own: callers cannot disturb each other
         function = self._functions.get(key)
         if function is None:
@@ -107,7 +107,7 @@ def _load(variant: str) -> Library:
 
 
 def load(variant: str | None = None) -> Library:
-    """The native library: the best variant of this machine, or the one that is named.
+    """Return the native library: the best variant of this machine, or the one that is named.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def load(variant: str | None = None) -> Library:
 
 @cache  # an iteration asks three times, and to look at the files again takes 0.2 ms
 def _choose(folder: Path, wanted: str | None) -> Library:
-    """The library of a name in a folder; errors are not remembered."""
+    """Return the library of a name in a folder; errors are not remembered."""
     choices = available_variants()
     if not choices:
         raise BackendError(f"expected the native CPU library in the package's kernels/lib, found none; {REMEDY}")

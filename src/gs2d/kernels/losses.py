@@ -55,7 +55,7 @@ def _call(library: Library, name: str, *arguments: Any) -> None:
 
 
 def _arrays(library: Library, **tensors: Tensor) -> list[Tensor]:
-    """The tensors, contiguous, or ShapeError if one is on another device or of another dtype than the library takes."""
+    """Return the tensors, contiguous; ShapeError if one is on another device or of another dtype than is taken."""
     for name, tensor in tensors.items():
         if tensor.dtype != library.dtype or tensor.device.type != "cpu":
             raise ShapeError(
@@ -79,7 +79,7 @@ def _mask_bytes(mask: Tensor | None) -> Tensor | None:
 
 
 def blur(image: Tensor, *, library: Library | None = None) -> Tensor:
-    """The SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
+    """Return the SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
 
     Of a target this is the ``target_mean`` that ``photometric`` takes.
 
@@ -239,7 +239,7 @@ def normal_consistency(
     expected: float = 0.05,
     library: Library | None = None,
 ) -> Tensor:
-    """Normal consistency [], the native form of the functions of the same name in ``losses.reference``.
+    """Return normal consistency [], the native form of the functions of the same name in ``losses.reference``.
 
     Parameters
     ----------

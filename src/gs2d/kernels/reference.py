@@ -85,5 +85,5 @@ def finite(tensor: Tensor) -> bool:
 
 
 def first_not_finite(tensors: Sequence[Tensor]) -> int | None:
-    """The number of the first tensor that holds a NaN or an infinity, None if all are finite."""
+    """Return the number of the first tensor that holds a NaN or an infinity, None if all are finite."""
     return next((number for number, tensor in enumerate(tensors) if not finite(tensor)), None)

@@ -91,7 +91,7 @@ def target_maps(target: Tensor, backend: str | Backend = "cpu") -> TargetMaps | 
 
 
 def _operations(backend: str | Backend, device: torch.device) -> LossOperations | None:
-    """The fused operations of a backend on a device, where it has any."""
+    """Return the fused operations of a backend on a device, where it has any."""
     chosen = get_backend(backend, device.type) if isinstance(backend, str) else backend
     return chosen.loss_operations(device)
 
@@ -394,7 +394,7 @@ def compute_losses(
 def _value(
     term: LossTerm, output: RenderOutput, view: LossView, functions: Mapping[tuple[str, str], LossFunction]
 ) -> Tensor | None:
-    """The unweighted value of a term."""
+    """Return the unweighted value of a term."""
     if view.fused is not None and term.kind in FUSED:
         return FUSED[term.kind](output, view, view.fused)
     function = functions.get(loss_of(term)) if functions else None

@@ -54,7 +54,7 @@ class PatchImage:
 
 
 def prepare_image(image: Tensor, usable: Tensor | None, settings: MultiView) -> PatchImage:
-    """The patches of a photograph.
+    """Return the patches of a photograph.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class Neighbour:
 
 
 def _on(array: np.ndarray, like: Tensor) -> Tensor:
-    """A small array where another tensor is; the host waits for nothing."""
+    """Return a small array where another tensor is; the host waits for nothing."""
     return torch.as_tensor(array, device="cpu").to(dtype=like.dtype).to(like.device, non_blocking=True)
 
 
@@ -367,7 +367,7 @@ class _Sampled:
 
 
 def _sample(image: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]:
-    """An image [h, w] at places [P, S], and what takes a gradient of that to those of u and v. No autograd.
+    """Return an image [h, w] at places [P, S], and what takes a gradient of that to those of u and v. No autograd.
 
     On a CPU by torch's own operation, which takes a fifth of the time.
     """
@@ -385,7 +385,7 @@ def _sample(image: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Callable[[Tens
 
 
 def _looked_up(flags: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """The flag [h, w] of the pixel that holds each place."""
+    """Return the flag [h, w] of the pixel that holds each place."""
     height, width = flags.shape
     i, j = (((p.detach() + 1) * (n / 2)).clamp(0, n - 1).long() for p, n in ((u, width), (v, height)))
     return flags[j, i]

@@ -167,7 +167,7 @@ def _of_points(points: PointDepths, depth: Tensor, hit: Tensor, noise: float) ->
 
 @torch.no_grad()
 def aligned(map_: RelativeDepths, depth: Tensor, hit: Tensor) -> MetricDepth:
-    """A relative map in units of the scene, by a robust fit to a rendered depth [H, W] where that was ``hit``.
+    """Return a relative map in units of the scene, by a robust fit to a rendered depth [H, W] where that was ``hit``.
 
     Nothing is known where the fit runs the other way, or where it gives no depth in front of the camera.
     """

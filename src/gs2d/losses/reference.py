@@ -30,7 +30,7 @@ def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def fill_ignored(rendered: Tensor, filler: Tensor, mask: Tensor | None) -> Tensor:
-    """``rendered`` [H, W] or [H, W, C] with the filler's value at ignored pixels (whatever is there, even NaN)."""
+    """Return ``rendered`` [H, W] or [H, W, C] with the filler's value at ignored pixels (whatever is there)."""
     if mask is None:
         return rendered
     return torch.where(mask if rendered.dim() == 2 else mask[..., None], rendered, filler)
@@ -42,14 +42,14 @@ def l1(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def gaussian_window(dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Tensor:
-    """The 11 normalised weights of the SSIM window: exp(-k^2 / (2 sigma^2)), k = -5..5."""
+    """Return the 11 normalised weights of the SSIM window: exp(-k^2 / (2 sigma^2)), k = -5..5."""
     k = torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64)
     weights = torch.exp(-(k**2) / (2 * WINDOW_SIGMA**2))
     return (weights / weights.sum()).to(dtype=dtype, device=device)
 
 
 def blur(image: Tensor) -> Tensor:
-    """The separable Gaussian window over [H, W, C], zero outside the image."""
+    """Return the separable Gaussian window over [H, W, C], zero outside the image."""
     channels = image.shape[2]
     window = gaussian_window(image.dtype, image.device)
     planes = image.permute(2, 0, 1)[None]  # [1, C, H, W]

@@ -73,7 +73,7 @@ class Texels:
 
 
 def required(module: str) -> Any:
-    """A package of the extra ``texture``.
+    """Return a package of the extra ``texture``.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def required(module: str) -> Any:
 
 
 def simplified(mesh: Mesh, faces: int) -> Mesh:
-    """The mesh with at most ``faces`` triangles, by quadric edge collapse; without vertex colours if it was changed.
+    """Simplify to at most ``faces`` triangles, by quadric edge collapse; a changed mesh has no vertex colours.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def unwrap(mesh: Mesh, size: int) -> Atlas:
 
 
 def texels_of(atlas: Atlas, size: int) -> Texels:
-    """The texels whose centres lie in a chart, drawn a band of rows at a time.
+    """Return the texels whose centres lie in a chart, drawn a band of rows at a time.
 
     The charts lie on the plane z = 1 before a camera with f = 1, so the ray caster of the demo draws them.
     """
@@ -154,7 +154,7 @@ def texels_of(atlas: Atlas, size: int) -> Texels:
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Unit normals [P, 3] float32: face normals weighted by area; (0, 0, 1) at vertices of no area."""
+    """Return unit normals [P, 3] float32: face normals weighted by area; (0, 0, 1) at vertices of no area."""
     vertices = mesh.vertices.astype(np.float64)
     a, b, c = (vertices[mesh.faces[:, k]] for k in range(3))
     areas = np.cross(b - a, c - a)

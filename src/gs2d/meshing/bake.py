@@ -70,7 +70,7 @@ class Baked:
 
 
 def texture_size(mesh: Mesh, cameras: list[Camera]) -> int:
-    """The side, a power of two, of a texture with at least two texels in the length of the pixels that see best.
+    """Return the side, a power of two, of a texture with at least two texels in the length of the pixels that see best.
 
     Of some faces (spread evenly over the list) the camera that has most pixels per unit area before it decides; what
     hides them does not.
@@ -323,7 +323,7 @@ def fill_unseen(atlas: Atlas, texels: Texels, colors: np.ndarray, seen: np.ndarr
 
 
 def spread(texels: Texels, colors: np.ndarray) -> np.ndarray:
-    """The texture [S, S, 3] uint8: texels of no chart take the colour of the nearest one that is of some.
+    """Return the texture [S, S, 3] uint8: texels of no chart take the colour of the nearest one that is of some.
 
     So neither filtering at the border of a chart nor a smaller copy of the texture mixes in a colour of nothing.
     """

@@ -45,7 +45,7 @@ def bare_pixels(image: np.ndarray, points: np.ndarray, valid: np.ndarray | None 
 
 
 def _shrunk(image: np.ndarray, factor: int) -> np.ndarray:
-    """The mean of blocks of [H, W, ...]; what is left over at two sides is cut."""
+    """Return the mean of blocks of [H, W, ...]; what is left over at two sides is cut."""
     height, width = (max(1, size // factor) for size in image.shape[:2])
     high, wide = (min(factor, size) for size in image.shape[:2])
     blocks = image[: height * high, : width * wide].reshape(height, high, width, wide, *image.shape[2:])
@@ -72,7 +72,7 @@ def _bare(image: np.ndarray, points: np.ndarray, valid: np.ndarray) -> np.ndarra
 
 
 def _large_at_rim(mask: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The connected areas of a mask that are large and touch the rim of what is known."""
+    """Return the connected areas of a mask that are large and touch the rim of what is known."""
     areas, count = label(mask)
     inner = np.zeros_like(mask)
     inner[1:-1, 1:-1] = True

@@ -164,7 +164,7 @@ def derive_limits(
 
 
 def widen_truncation(limits: FusionBounds, noise: float | None) -> FusionBounds:
-    """The limits with a truncation of 20 times the depth noise, if that is more: up to 20 voxels, a 40th of the box."""
+    """Widen the truncation to 20 times the depth noise, if that is more: up to 20 voxels, a 40th of the box."""
     if noise is None:
         return limits
     most = min(MAX_VOXELS_PER_TRUNCATION * limits.voxel, MAX_TRUNCATION_OF_SIDE * limits.side)
@@ -175,7 +175,7 @@ def widen_truncation(limits: FusionBounds, noise: float | None) -> FusionBounds:
 def _widened(
     lower: np.ndarray, upper: np.ndarray, side: float, points: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The robust box with its margin, cut to the extent of the points (with the same margin)."""
+    """Return the robust box with its margin, cut to the extent of the points (with the same margin)."""
     margin = BOX_MARGIN * side
     if points is not None and len(points):
         lower = np.maximum(lower, np.min(points, axis=0))

@@ -148,7 +148,7 @@ class Spool:
 
     @classmethod
     def of(cls, frames: Iterable[RenderedView] | Spool, folder: str | os.PathLike[str] | None = None) -> Spool:
-        """The frames in a file of their own, cleaned one by one; a spool as it is."""
+        """Return the frames in a file of their own, cleaned one by one; a spool as it is."""
         if isinstance(frames, Spool):
             return frames
         spool = cls(folder)

@@ -100,7 +100,7 @@ def _count(
 
 
 def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices of the vertices [3, P] that lie in the picture, their depths, and what the view itself sees there."""
+    """Return indices of the vertices [3, P] in the image, their depths, and what the view itself sees there."""
     camera: Camera = item.camera
     x, y, z = camera.rotation.astype(np.float32) @ vertices + camera.T_cam_world[:3, 3:].astype(np.float32)
     z[~(z > 0)] = np.nan
@@ -111,7 +111,7 @@ def _look(item: DepthMap, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def _normals(mesh: Mesh) -> np.ndarray:
-    """Unit normals [P, 3] of the vertices, by the areas of their faces."""
+    """Return unit normals [P, 3] of the vertices, by the areas of their faces."""
     vertices, flat = mesh.vertices.astype(np.float32), mesh.faces.ravel()
     of_face = np.empty((len(mesh.faces), 3), np.float32)
     for part in _parts(len(mesh.faces)):
@@ -132,7 +132,7 @@ def areas(mesh: Mesh) -> np.ndarray:
 
 
 def _crosses(corners: np.ndarray) -> np.ndarray:
-    """Normals [F, 3] of triangles [F, 3, 3], twice as long as their areas."""
+    """Return normals [F, 3] of triangles [F, 3, 3], twice as long as their areas."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 

@@ -165,7 +165,7 @@ def _blend_colors(
     weight: np.ndarray,
     pixel: np.ndarray,
 ) -> None:
-    """Running mean of colour, in the voxels near the surface of this view; the nearer, the more it counts."""
+    """Update the mean colour of the voxels near the surface of this view; the nearer, the more it counts."""
     assert view.color is not None
     near = np.flatnonzero((weight > 0) & (distance < 1))  # flat in the chunk
     flat = rows[near >> 9] * VOXELS + (near & (VOXELS - 1))
@@ -228,11 +228,11 @@ def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.devi
 
 
 def _view_arrays(view: DepthSampler, *, colored: bool) -> dict[str, np.ndarray | None]:
-    """The pixels of a view, by the names of the kernels' arguments."""
+    """Return the pixels of a view, by the names of the kernels' arguments."""
     arrays = {"depth": view.depth, "slope_x": view.slope_x, "slope_y": view.slope_y}
     return arrays | {"pixel_weight": view.weight, "pixel_color": view.color if colored else None}
 
 
 def _volume_arrays(volume: Volume) -> dict[str, np.ndarray | None]:
-    """What fusion changes, by the names of the kernels' arguments."""
+    """Return what fusion changes, by the names of the kernels' arguments."""
     return {name: getattr(volume, name) for name in ("tsdf", "weight", "color", "color_weight")}

@@ -22,7 +22,7 @@ _EDGE_GUARD = np.float32(1e-3)  # of an edge: vertices keep off its ends, so tha
 
 
 def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
-    """The zero set of a volume.
+    """Return the zero set of a volume.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def marching_cubes(volume: Volume, *, min_weight: float = 1.0) -> Mesh:
 def cell_surface(
     volume: Volume, min_weight: float, blocks: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the cells of a volume make, before it has positions.
+    """Return what the cells of a volume make, before it has positions.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def cell_surface(
 
 
 def _numbered(corners: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
-    """The edges among ``corners``, sorted, each once, and where each corner's is: ``np.unique`` without sorting.
+    """Return the edges among ``corners``, sorted, each once, and where each corner's is: ``np.unique`` without sorting.
 
     Edges are marked in a table for the blocks that have some.
     """
@@ -159,7 +159,7 @@ def _cell_edges() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _upper_ends(shifted: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """The voxel [P] at the upper end of each edge."""
+    """Return the voxel [P] at the upper end of each edge."""
     low, axis = edges // 3, edges % 3
     row, voxel = low // VOXELS, low % VOXELS
     up = np.stack(np.unravel_index(voxel, (BLOCK,) * 3), axis=1) + np.eye(3, dtype=np.int64)[axis]
@@ -202,7 +202,7 @@ def mixed_colors(
 
 
 def components(mesh: Mesh) -> np.ndarray:
-    """Number [F] of the connected component of every face (components share no vertex), by size: 0 is the largest.
+    """Label the connected component of each face [F] (components share no vertex) by size: 0 is the largest.
 
     Ties go to the component with the lowest face number.
     """
@@ -225,7 +225,7 @@ def components(mesh: Mesh) -> np.ndarray:
 
 
 def keep_components(mesh: Mesh, *, min_faces: int = 50, keep: int | None = None) -> Mesh:
-    """The mesh without small pieces: components of at least ``min_faces`` faces, and of those the ``keep`` largest.
+    """Drop small pieces: keep components of at least ``min_faces`` faces, and of those the ``keep`` largest.
 
     Faces and vertices keep their order; vertices without faces go. With no component left the mesh is empty.
     """
@@ -238,7 +238,7 @@ def keep_components(mesh: Mesh, *, min_faces: int = 50, keep: int | None = None)
 
 
 def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
-    """The faces where ``mask`` [F] is true, and only the vertices they use."""
+    """Return the faces where ``mask`` [F] is true, and only the vertices they use."""
     faces = mesh.faces[mask]
     used = np.zeros(len(mesh.vertices), bool)
     used[faces] = True
@@ -248,7 +248,7 @@ def select_faces(mesh: Mesh, mask: np.ndarray) -> Mesh:
 
 
 def inside_box(mesh: Mesh, box: np.ndarray) -> Mesh:
-    """The faces that lie in a box [2, 3] with all their corners: volumes are of whole voxels, and reach beyond it."""
+    """Keep the faces with all corners in a box [2, 3]: volumes are of whole voxels, and reach beyond it."""
     low, high = np.asarray(box, np.float64)
     inside = ((mesh.vertices >= low) & (mesh.vertices <= high)).all(axis=1)
     return select_faces(mesh, inside[mesh.faces].all(axis=1))

@@ -55,7 +55,7 @@ def _face_segments(face: tuple[int, int, int, int], case: int) -> dict[int, int]
 
 
 def _loops(case: int) -> list[list[int]]:
-    """Closed loops of edges. An edge is left by one of its two faces and reached by the other."""
+    """Return closed loops of edges. An edge is left by one of its two faces and reached by the other."""
     follow: dict[int, int] = {}
     for face in _faces():
         follow.update(_face_segments(face, case))
@@ -96,7 +96,7 @@ def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
 
 @cache
 def case_table() -> CaseTable:
-    """The table, computed once per process (milliseconds)."""
+    """Return the table, computed once per process (milliseconds)."""
     starts, edges = [0], []
     for case in range(256):
         for loop in _loops(case):

@@ -103,7 +103,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _sample_boxes(
     local: np.ndarray, faces: np.ndarray, camera: Camera, samples: int, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The triangles [n] that may cover a sample, the first (x, y) [n, 2] of each and the end of its box (exclusive).
+    """Return the triangles [n] that may cover a sample, and the first (x, y) [n, 2] and end (exclusive) of their boxes.
 
     Most faces of a fine mesh lie between two columns or two rows of samples. Bounds are rounded once a vertex.
     """
@@ -265,7 +265,7 @@ def _same_sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _frame(direction: np.ndarray) -> np.ndarray:
-    """A right-handed frame [3, 3] whose last row is the unit ``direction``."""
+    """Return a right-handed frame [3, 3] whose last row is the unit ``direction``."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     across = np.cross(helper, direction)
     across /= np.linalg.norm(across)

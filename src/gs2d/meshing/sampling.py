@@ -86,7 +86,7 @@ def make_sampler(item: DepthMap, limits: FusionBounds, truncation: np.ndarray | 
 
 
 def _minmod(depth: np.ndarray, *, axis: int, largest: float | np.ndarray) -> np.ndarray:
-    """The smaller of the two one-sided differences along an axis; 0 at unseen neighbours, sign changes and edges."""
+    """Return the smaller one-sided difference along an axis; 0 at unseen neighbours, sign changes and edges."""
     step = np.diff(depth, axis=axis)
     pad = [(0, 0), (0, 0)]
     pad[axis] = (1, 0)
@@ -117,8 +117,11 @@ def _pyramid(depth: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def block_visibility(view: DepthSampler, centers: np.ndarray, radius: float, truncation: float) -> np.ndarray:
-    """Rows [n] of the blocks that a view may change: spheres (centers [M, 3], radius) in front of the camera, in the
-    image, over some seen pixel, and not wholly behind the surface by more than the truncation."""
+    """Return rows [n] of the blocks that a view may change.
+
+    Spheres (centers [M, 3], radius) in front of the camera, in the image, over some seen pixel, and not wholly behind
+    the surface by more than the truncation.
+    """
     projected = centers @ view.projection[:, :3].T + view.projection[:, 3]
     z = projected[:, 2]
     rows = np.flatnonzero(z > 1.01 * radius)

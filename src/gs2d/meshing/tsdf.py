@@ -139,7 +139,7 @@ def fuse_blocks(
 
 
 def min_blocks(item: DepthMap, limits: FusionBounds) -> int:
-    """A number below which ``touched_blocks`` cannot stay, without its work, which grows as voxels shrink.
+    """Return a number below which ``touched_blocks`` cannot stay, without its work, which grows as voxels shrink.
 
     0 where that work is small. The bands of the pixels, one truncation before and behind what they saw, cut to the box,
     are disjoint pieces of space, z^3 / (3 fx fy) between two depths, and a block is b^3 of it. What they saw is at
@@ -224,7 +224,7 @@ def _lowest_blocks(
 
 
 def block_finder(backend: str | Backend, threads: int | None) -> Library | None:
-    """The native library for ``touched_blocks``, on so many threads; None: numpy, for the reference and without it."""
+    """Return the native library for ``touched_blocks``, on so many threads; None (numpy) for the reference."""
     if fusion_backend(backend).fusion() is None:
         return None
     from gs2d.kernels.library import available_variants, load

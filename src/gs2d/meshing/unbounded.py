@@ -101,7 +101,7 @@ def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
 
 
 def _truncations(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
-    """Truncation [H, W] world units of the level that owns what each pixel saw."""
+    """Return truncation [H, W] world units of the level that owns what each pixel saw."""
     level = np.ceil(np.log2(np.maximum(_distances(item, cascade), 1.0)))
     return cascade.levels[0].truncation * np.exp2(np.minimum(level, len(cascade.levels) - 1))
 
@@ -185,7 +185,7 @@ class _Nodes:
 def cascade_marching_cubes(
     volumes: Sequence[Volume], cascade: TsdfCascade, *, min_weight: float = 1.0, far_weight: float
 ) -> Mesh:
-    """The zero set of all levels as one mesh.
+    """Return the zero set of all levels as one mesh.
 
     Parameters
     ----------

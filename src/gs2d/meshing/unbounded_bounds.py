@@ -84,7 +84,7 @@ def derive_cascade(
     truncation: float | None = None,
     depth_limit: float | None = None,
 ) -> TsdfCascade:
-    """The nest of a scene, from samples of all views; every named limit overrides the derived one.
+    """Return the nest of a scene, from samples of all views; every named limit overrides the derived one.
 
     The innermost cube holds the 1st to 99th percentile of the nearer half of all that was seen. The outermost holds
     what is nearer than the depth limit: 1.25 times the 99.5th percentile of depth, but no farther than depth is known

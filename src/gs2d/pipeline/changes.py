@@ -24,7 +24,7 @@ class Snapshot:
 
 
 def take_snapshot(splats: Splats, iteration: int) -> Snapshot:
-    """A copy of at most ``SAMPLE`` evenly spaced splats, to compare with later."""
+    """Return a copy of at most ``SAMPLE`` evenly spaced splats, to compare with later."""
     rows = torch.arange(0, len(splats), max(1, -(-len(splats) // SAMPLE)), device=splats.device)
     return Snapshot(iteration, rows, splats.rows(rows))
 

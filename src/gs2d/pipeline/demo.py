@@ -115,7 +115,7 @@ def _check_capture(folder: Path) -> None:
 
 
 def _training(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
-    """What is trained."""
+    """Return what is trained."""
     return TrainOptions(
         scene=options.out / CAPTURE,
         out=options.out,

@@ -46,7 +46,7 @@ def estimate(job: Job) -> Estimate | None:
 
 
 def _seconds(trainer: Trainer, iterations: int) -> float | None:
-    """The median of some iterations, without the first, which compile and decode; None where there are too few."""
+    """Return the median of some iterations without the first, which compile and decode; None if too few."""
     taken: list[float] = []
     begun = time.perf_counter()
     for number in range(min(iterations, WARM_UP + MOST)):
@@ -60,7 +60,7 @@ def _seconds(trainer: Trainer, iterations: int) -> float | None:
 
 
 def estimate_text(found: Estimate, iterations: int) -> str:
-    """The estimate for people."""
+    """Return the estimate for people."""
     return (
         f"training will take about {duration(found.least)} to {duration(found.most)}: {iterations:,} iterations, "
         f"{found.iteration * 1000:.0f} ms each at the start and more as splats are added"
@@ -68,7 +68,7 @@ def estimate_text(found: Estimate, iterations: int) -> str:
 
 
 def start_text(event: Initialised) -> str:
-    """What training starts from, in words."""
+    """Return what training starts from, in words."""
     sources = {
         "points": "points of the capture",
         "sweep": "places on which neighbouring photographs agree, and points of the capture",

@@ -126,7 +126,7 @@ OnEvent = Callable[[Event], None]
 
 
 def ignore(_event: Event) -> None:
-    """The listener of those who do not listen."""
+    """Ignore every event: for those who do not listen."""
 
 
 def counted(items: Sequence[T] | Iterable[T], name: str, total: int, on_event: OnEvent) -> Iterator[T]:
@@ -138,7 +138,7 @@ def counted(items: Sequence[T] | Iterable[T], name: str, total: int, on_event: O
 
 
 def duration(seconds: float) -> str:
-    """A time as people say it: "40 s", "12 min", "3.5 h", "2.1 days"."""
+    """Return a time as people say it: "40 s", "12 min", "3.5 h", "2.1 days"."""
     for unit, size, until in (("s", 1, 90), ("min", 60, 90 * 60), ("h", 3600, 48 * 3600)):
         if seconds < until:
             digits = 1 if unit == "h" and seconds < 10 * size else 0

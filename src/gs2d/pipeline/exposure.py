@@ -32,7 +32,7 @@ GREY = 0.5
 
 
 def named(views: Sequence[View], exposures: Exposures | None) -> Transforms:
-    """The transforms of training views by their names."""
+    """Return the transforms of training views by their names."""
     if exposures is None:
         return NONE
     return {view.name: transform for view, transform in zip(views, exposures.transforms().detach(), strict=True)}
@@ -58,7 +58,7 @@ def write_exposures(run: RunFolder, transforms: Transforms, on_event: OnEvent) -
 
 
 def read_exposures(run: RunFolder, recipe: Recipe) -> Transforms:
-    """What :func:`write_exposures` wrote; none where the recipe learns none.
+    """Return what :func:`write_exposures` wrote; none where the recipe learns none.
 
     Raises
     ------
@@ -82,14 +82,14 @@ def read_exposures(run: RunFolder, recipe: Recipe) -> Transforms:
 
 
 def photographed(view: View, color: Tensor, transforms: Transforms, background: tuple[float, float, float]) -> Tensor:
-    """A picture [H, W, 3] rendered from a view, in the exposure of its photograph where that is known."""
+    """Return a picture [H, W, 3] rendered from a view, in the exposure of its photograph where that is known."""
     if view.name not in transforms:
         return color
     return expose(color, transforms[view.name].to(color), *over(view, color, background))
 
 
 def exposure_named(name: str, transforms: Transforms) -> Tensor:
-    """The transform [3, 4] of a training photograph.
+    """Return the transform [3, 4] of a training photograph.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def exposure_named(name: str, transforms: Transforms) -> Tensor:
 
 
 def exposed(output: RenderOutput, transform: Tensor | None, job: Job) -> Tensor:
-    """The picture of any view [H, W, 3], in an exposure if one is given.
+    """Return the picture of any view [H, W, 3], in an exposure if one is given.
 
     Where the photographs have an alpha channel, the background is none of them and stays as it is.
     """
@@ -120,7 +120,7 @@ def exposed(output: RenderOutput, transform: Tensor | None, job: Job) -> Tensor:
 def matched_by_halves(
     view: View, color: Tensor, target: Tensor, mask: Tensor | None, background: tuple[float, float, float]
 ) -> Tensor:
-    """A rendered picture whose colours are matched to the photograph, no pixel by itself.
+    """Return a rendered picture whose colours are matched to the photograph, no pixel by itself.
 
     The left half gets the transform that fits the right half best (least squares), the right half that of the left. So
     the photograph is looked at, but nothing is scored that was fitted to: not a score of the scene alone.

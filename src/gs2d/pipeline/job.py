@@ -78,7 +78,7 @@ class Job:
     stage2_cache_bytes: int
 
     def definition(self) -> dict[str, Any]:
-        """What ``run.json`` says and a resume compares."""
+        """Return what ``run.json`` says and a resume compares."""
         return {
             "recipe": to_json(self.recipe),
             "protocol": asdict(self.protocol),
@@ -150,7 +150,7 @@ def build_recipe(
     robust: bool = False,
     by_points: bool = False,
 ) -> Recipe:
-    """The recipe as it will be trained: found, scaled, seeded, overridden, validated.
+    """Return the recipe as it will be trained: found, scaled, seeded, overridden, validated.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def build_recipe(
 
 
 def check_train_options(options: TrainOptions) -> Recipe:
-    """The recipe, if the options mean something; nothing is read.
+    """Return the recipe, if the options mean something; nothing is read.
 
     Raises
     ------
@@ -210,7 +210,7 @@ def check_train_options(options: TrainOptions) -> Recipe:
 
 
 def _recipe_of(options: TrainOptions, *, robust: bool, exposure: bool) -> Recipe:
-    """The recipe of the options, made robust or not, with exposures or not."""
+    """Return the recipe of the options, made robust or not, with exposures or not."""
     return build_recipe(
         options.recipe,
         schedule_scale=options.schedule_scale,
@@ -296,7 +296,7 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
 
 
 def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent) -> Protocol:
-    """The protocol of a name, or of the capture, with what the options change in it.
+    """Return the protocol of a name, or of the capture, with what the options change in it.
 
     Raises
     ------
@@ -320,7 +320,7 @@ def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent)
 
 
 def choose_backend(name: str, on_event: OnEvent) -> Backend:
-    """The backend of a name; says what "auto" took where that is a GPU, not one that is here, or the slow reference."""
+    """Return the backend of a name; say what "auto" took if that is a GPU, not one that is here, or the reference."""
     backend = get_backend(name)
     if name != "auto":
         return backend
@@ -397,7 +397,7 @@ def _arrays(view: View) -> Iterator[np.ndarray]:
 
 
 def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> Job:
-    """The job of a run on disk, to mesh, render or score it again, with the cameras that it found.
+    """Return the job of a run on disk, to mesh, render or score it again, with the cameras that it found.
 
     Raises
     ------
@@ -431,7 +431,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
 
 
 def protocol_from_json(data: dict[str, Any]) -> Protocol:
-    """The protocol that ``asdict`` and JSON made of one."""
+    """Return the protocol that ``asdict`` and JSON made of one."""
     old = {"subject": data["name"] == GENERIC.name}  # for runs of before there was such a field
     fusion, metrics = FusionLimits(**{**old, **data["fusion"]}), MetricConventions(**data["metrics"])
     return Protocol(**{**data, "background": tuple(data["background"]), "fusion": fusion, "metrics": metrics})
@@ -467,7 +467,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
 
 
 def _training_facts(protocol: dict[str, Any]) -> dict[str, Any]:
-    """A protocol without what decides no byte of training: what is fused, and what the recipe says."""
+    """Return a protocol without what decides no byte of training: what is fused, and what the recipe says."""
     fusion = {name: value for name, value in protocol.get("fusion", {}).items() if name not in ("depth", "subject")}
     return {**{name: value for name, value in protocol.items() if name != "robust"}, "fusion": fusion}
 

@@ -90,7 +90,7 @@ class Live(TrainingObserver):
             self._changed.notify()
 
     def scored(self, psnr: float | None) -> None:
-        """The mean PSNR of the probe views."""
+        """Take the mean PSNR of the probe views."""
         self._psnr = "" if psnr is None else f"<br>PSNR {psnr:.2f} dB"
 
     @property

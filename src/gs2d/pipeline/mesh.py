@@ -158,7 +158,7 @@ def fused(
 
 
 def _cleaned_facts(result: Extraction) -> dict[str, Any]:
-    """What was left of the surface, where it was made to hold what the views saw."""
+    """Return what was left of the surface, where it was made to hold what the views saw."""
     if result.cleaned is None:
         return {}
     found = result.cleaned
@@ -171,7 +171,7 @@ def _cleaned_facts(result: Extraction) -> dict[str, Any]:
 
 
 def _cut_text(result: Extraction, options: MeshOptions) -> str:
-    """What was left out, and the option that brings it back."""
+    """Return what was left out, and the option that brings it back."""
     part = f"{result.limits.cut_fraction:.0%} of the depth lies"
     if options.unbounded:
         limit = result.limits.depth_limit
@@ -250,7 +250,7 @@ def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -
 
 
 def fusion_frame(job: RenderedScene, view: View, output: RenderOutput, depth: str) -> RenderedView:
-    """What fusion takes of a rendered view: depth ("mean" or "median") and colour where it is covered well enough."""
+    """Return what fusion takes of a view: depth ("mean" or "median") and colour where it is covered well enough."""
     valid = (output.alpha >= OPAQUE).cpu().numpy()
     mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
     for pixels in (mask, view.valid()):  # beyond the photograph nothing has said how far the surface is

@@ -97,7 +97,7 @@ def page_run(
 
 
 def _subject(folder: Path, on_event: OnEvent) -> Subject | None:
-    """What the run says that it is about; None where it says nothing, or its file is damaged, which is told."""
+    """Return what the run says that it is about; None where it says nothing, or its file is damaged, which is told."""
     try:
         return read_subject(folder)
     except DataError as error:

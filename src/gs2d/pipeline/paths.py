@@ -88,7 +88,7 @@ def _photographed_at(
 
 
 def flight_cameras(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A smooth flight past the photographs, at an even pace (of place and of direction together).
+    """Return a smooth flight past the photographs, at an even pace (of place and of direction together).
 
     Splines that hardly overshoot (Akima 1970) through some of the cameras: in the order of their names where that is a
     way, else the most different ones, on a short tour. Where all cameras look at about one point, distance and
@@ -205,7 +205,7 @@ def _unit_rows(vectors: np.ndarray) -> np.ndarray:
 
 
 def stops(poses: np.ndarray, count: int) -> np.ndarray:
-    """Indices of at most ``count`` of the poses [V, C], in the order in which a flight passes them.
+    """Return indices of at most ``count`` of the poses [V, C], in the order in which a flight passes them.
 
     Evenly along the way from the first to the last where that is hardly longer than a tour (a walk, a film); else those
     that are farthest from all chosen before, on a short tour from the first.
@@ -225,7 +225,7 @@ def stops(poses: np.ndarray, count: int) -> np.ndarray:
 
 
 def tour(poses: np.ndarray) -> np.ndarray:
-    """A short order in which to pass by all poses [n, C], from the first: indices [n].
+    """Return a short order in which to pass by all poses [n, C], from the first: indices [n].
 
     Always to the nearest that was not visited, and then uncrossed (2-opt: parts are reversed as long as that shortens).
     """

@@ -73,7 +73,7 @@ def score_priors(run: RunFolder, job: Job, views: Sequence[View], splats: Splats
 
 
 def _of_depth(depth: Depths, output: RenderOutput) -> tuple[float | None, dict[str, np.ndarray]]:
-    """The median error of a view, and pictures of known and rendered depth."""
+    """Return the median error of a view, and pictures of known and rendered depth."""
     valid, error = against(depth, output.depth_mean, output.alpha > 0.5)
     limits = depth_limits(valid, (valid > 0).astype(np.float32))
     there = grown(valid) if isinstance(depth, PointDepths) else valid
@@ -85,7 +85,7 @@ def _of_depth(depth: Depths, output: RenderOutput) -> tuple[float | None, dict[s
 
 
 def _of_normal(normal: NormalTarget, output: RenderOutput) -> tuple[float | None, dict[str, np.ndarray]]:
-    """The median angle of a view, degrees, and pictures of known and rendered normals."""
+    """Return the median angle of a view, degrees, and pictures of known and rendered normals."""
     cosine = (torch.nn.functional.normalize(output.normal, dim=2) * normal.directions).sum(dim=2).clamp(-1, 1)
     angles = torch.rad2deg(torch.acos(cosine))[(normal.valid > 0) & (output.alpha > 0.5)]
     images = {
@@ -111,7 +111,7 @@ def against(depths: Depths, rendered: Tensor, hit: Tensor) -> tuple[np.ndarray, 
 
 
 def grown(points: np.ndarray) -> np.ndarray:
-    """A picture of single pixels as one of squares that can be seen."""
+    """Return a picture of single pixels as one of squares that can be seen."""
     radius = max(1, round(POINT_RADIUS * points.shape[1]))
     out = np.zeros_like(points)
     for row, column in zip(*np.nonzero(points), strict=True):

@@ -51,7 +51,7 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
 
 
 def _arrays(view: View, plan: DepthPlan | None, normal: NormalTarget | None) -> Sequence[np.ndarray]:
-    """What decides the known depths and normals of a view."""
+    """Return what decides the known depths and normals of a view."""
     arrays = [] if normal is None else [normal.directions.numpy()]
     if plan is not None and plan.source != "sparse" and view.maps is not None and view.maps.files.depth is not None:
         arrays.append(view.maps.depth().values)
@@ -62,7 +62,7 @@ def _arrays(view: View, plan: DepthPlan | None, normal: NormalTarget | None) -> 
 
 
 def depth_text(plan: DepthPlan, depths: Sequence[Depths], views: int) -> str:
-    """What is known, in words."""
+    """Return what is known, in words."""
     of_views = f"{len(depths)} of {views} training views"
     points = [len(depth.depth) for depth in depths if isinstance(depth, PointDepths)]
     if points:

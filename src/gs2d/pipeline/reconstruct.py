@@ -159,7 +159,7 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
 
 
 def _title(photos: Path) -> str:
-    """What the report is called."""
+    """Return what the report is called."""
     if is_video(photos):
         return photos.stem
     return photos.parent.name if photos.name.lower() in NO_NAMES and photos.parent.name else photos.name
@@ -237,7 +237,7 @@ def _claimed(out: Path) -> Iterator[None]:
 
 
 def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
-    """What ``poses.json`` holds, if these photographs and options made it.
+    """Return what ``poses.json`` holds, if these photographs and options made it.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def _tell(poses: dict[str, Any], capture: Path, on_event: OnEvent) -> None:
 def _by_the_images(
     training: TrainOptions, options: ReconstructOptions, quality: Quality, on_event: OnEvent
 ) -> TrainOptions:
-    """What depends on the photographs that have a place: the size of the pictures, and whether some are held out."""
+    """Set what depends on the photographs that were placed: image size, and whether some are held out."""
     cameras = [view.camera for view in load_scene(training.scene, format="colmap", test_every=0).views]
     largest = max(cameras, key=lambda camera: max(camera.width, camera.height))
     side = max(largest.width, largest.height)

@@ -41,7 +41,7 @@ PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
 
 
 def found_poses(given: Scene, now: Scene) -> FoundPoses:
-    """The poses of the training views of a scene whose cameras have moved; none if it is the same."""
+    """Return the poses of the training views of a scene whose cameras have moved; none if it is the same."""
     return NONE if now is given else {view.name: view.camera.T_cam_world for view in now.train}
 
 
@@ -87,7 +87,7 @@ def _frame(view: View, root: Path | None) -> dict[str, Any]:
 
 
 def how_far(given: Camera, now: Camera, middle: np.ndarray, extent: float) -> dict[str, float]:
-    """What a camera has moved by: degrees, shift of the centre in extents, and pixels (rms over a grid of the picture).
+    """Measure a camera's motion: degrees, shift of the centre in extents, and pixels (rms over a grid of the image).
 
     Pixels are those of points as far away as ``middle`` [3], what all cameras look at (at least a tenth of the extent).
     """
@@ -106,7 +106,7 @@ def how_far(given: Camera, now: Camera, middle: np.ndarray, extent: float) -> di
 
 
 def read_poses(run: RunFolder, recipe: Recipe) -> FoundPoses:
-    """What :func:`write_poses` wrote; none where the recipe refines none, or the run is not finished.
+    """Return what :func:`write_poses` wrote; none where the recipe refines none, or the run is not finished.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def read_poses(run: RunFolder, recipe: Recipe) -> FoundPoses:
 
 
 def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
-    """The capture of a run with the training cameras that it found: for all that is done with its splats.
+    """Return the capture of a run with the training cameras that it found: for all that is done with its splats.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def aligned(
     extent: float,
     on_event: OnEvent,
 ) -> Iterator[View]:
-    """Views whose cameras are moved to where the splats, which stay, look most like their photographs.
+    """Yield views whose cameras are moved to where the splats, which stay, look most like their photographs.
 
     The photograph is looked at: a score from there says how good the scene is where its cameras are not, and no more.
     """

@@ -64,7 +64,7 @@ def choose_views(scene: Scene, count: int) -> list[tuple[str, View]]:
 
 
 def file_name(view: View) -> str:
-    """A view's name as the start of a file name; a long one is cut, and a hash of the whole tells it from others."""
+    """Return a view's name as the start of a file name; a long one is cut, and a hash of the whole is added."""
     name = Path(view.name.replace("/", "__")).stem
     whole = name.encode()
     if len(whole) <= LONGEST_NAME:
@@ -145,7 +145,7 @@ def draw_stage(
 
 
 def camera_json(camera: Camera) -> dict[str, Any]:
-    """A camera as plain numbers; ``Camera(**it)`` is the camera again."""
+    """Return a camera as plain numbers; ``Camera(**it)`` is the camera again."""
     facts = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     return {**facts, "T_cam_world": camera.T_cam_world.tolist()}
 
@@ -182,7 +182,7 @@ def fraction_of_group(
 
 
 def splatted(splats: Splats, values: Tensor, view: View, settings: RasterSettings, backend: Backend) -> np.ndarray:
-    """The sum over splats of blending weight times ``values`` [N] (>= 0) in each pixel, [H, W].
+    """Return the sum over splats of blending weight times ``values`` [N] (>= 0) in each pixel, [H, W].
 
     Drawn as a scene in which each splat is as grey as its value says, over black.
     """

@@ -50,7 +50,7 @@ class FinishedStage:
 
 
 def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> ResumePoint:
-    """The furthest valid start; the log and the metrics are cut to it.
+    """Return the furthest valid start; the log and the metrics are cut to it.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) ->
 
 
 def _from_run(job: Job, path: Path) -> FinishedStage:
-    """The furthest stage that another run has in common with this one.
+    """Return the furthest stage that another run has in common with this one.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def _from_cache(job: Job, folder: Path) -> FinishedStage | None:
 
 
 def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
-    """The state at the end of a stage: the run's own checkpoint, or that of the run or cache the stage was taken from.
+    """Return the state at the end of a stage: from the run's own checkpoint, or from where the stage was taken.
 
     None where neither is there any more.
 

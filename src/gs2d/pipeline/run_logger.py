@@ -138,7 +138,7 @@ class RunLogger:
 
     @contextmanager
     def timer_paused(self) -> Iterator[None]:
-        """What is done meanwhile is no training time, and may take long: signals act at once, after a checkpoint."""
+        """Pause the clock of training for what may take long: signals act at once, after a checkpoint."""
         self._stop_clock()
         try:
             self._signals.release()
@@ -211,7 +211,7 @@ class RunLogger:
         return _due(iteration, iterations, LOG_LINES, self.progress_every)
 
     def _log_changes(self, event: train_events.Progress) -> None:
-        """What the iterations since the last step line changed, if that was one progress ago."""
+        """Log what the iterations since the last step line changed, if that was one progress ago."""
         before, self._before = self._before, None
         if before is None:
             return
@@ -241,7 +241,7 @@ class RunLogger:
 
     # -- stages --------------------------------------------------------------------------------------------------------
     def _score_entry(self, event: train_events.StageStarted) -> None:
-        """The price of the clone: scores just after the entry actions, to compare with the stage before."""
+        """Score just after the entry actions, to compare with the stage before: the price of the clone."""
         if not any(isinstance(action, CloneInPlace) for action in self._stage(event.index).on_enter):
             return
         self._stop_clock()
@@ -308,7 +308,7 @@ class RunLogger:
         self._on_event(StageDone(entry))
 
     def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:
-        """The views that score a stage: of the training views all after the last stage, some before it."""
+        """Return the views that score a stage: of the training views all after the last stage, some before it."""
         scene = self._job.scene
         return [("train", scene.train if last else evenly(scene.train, EARLY_VIEWS)), ("test", scene.test)]
 
@@ -341,7 +341,7 @@ class RunLogger:
         return with_predicted(named(self._job.scene.train, self._state.exposures), self._job.scene)
 
     def _now(self, views: Sequence[View]) -> list[View]:
-        """Views of the capture from where their cameras are now."""
+        """Return views of the capture from where their cameras are now."""
         now = {view.name: view for view in scene_now(self._state, self._job.scene).train}
         learned = set(map(id, self._job.scene.train))
         return [now[view.name] if id(view) in learned else view for view in views]
@@ -403,5 +403,5 @@ def _storable(value: Any) -> bool:
 
 
 def _group(state: TrainState) -> Any:
-    """The rows to highlight, once they are known."""
+    """Return the rows to highlight, once they are known."""
     return state.groups.get("high_error")

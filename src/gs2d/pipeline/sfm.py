@@ -145,7 +145,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
 
 
 def _folder_of(photos: Path, on_event: OnEvent) -> list[Path]:
-    """The photographs of a folder; what is not used is told."""
+    """Return the photographs of a folder; what is not used is told."""
     paths, notes = find_photos(photos)
     for note in notes:
         on_event(Notice(note))
@@ -341,7 +341,7 @@ def _title(result: dict[str, Any]) -> str:
 
 
 def _doubts(result: dict[str, Any]) -> list[str]:
-    """What a person should look at before training."""
+    """Return what a person should look at before training."""
     doubts = []
     if result["placed"] < _DOUBTFUL_FRACTION * result["count"]:
         doubts.append(

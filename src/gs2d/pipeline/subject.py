@@ -142,7 +142,7 @@ def within(splats: Splats, box: Sequence[float], option: str = "--bbox") -> Spla
 
 
 def _numbers(box: Iterable[float]) -> str:
-    """A box as options take it."""
+    """Return a box as options take it."""
     return " ".join(f"{value:.4g}" for value in box)
 
 
@@ -170,14 +170,14 @@ def _small(camera: Camera) -> Camera:
 
 
 def _depth(job: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
-    """The median depth, 0 where little is covered: unlike the mean it lies on some surface."""
+    """Return the median depth, 0 where little is covered: unlike the mean it lies on some surface."""
     with torch.no_grad():
         output = rasterize(splats, camera, job.settings, backend=job.backend)
     return np.asarray(torch.where(output.alpha >= OPAQUE, output.depth_median, 0).cpu().numpy(), np.float64)
 
 
 def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray) -> Sight:
-    """The votes of one camera."""
+    """Return the votes of one camera."""
     rows, columns = np.nonzero(depth > 0)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     z = depth[rows, columns]
@@ -196,7 +196,7 @@ def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray) -> Sight:
 
 
 def _visible(camera: Camera, depth: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The sparse points in a camera's picture that no rendered surface hides."""
+    """Return the sparse points in a camera's picture that no rendered surface hides."""
     points = points[shown(camera, points)]
     points = points[:: max(1, -(-len(points) // MAX_POINTS))]
     pixels, z = camera.project(points)

@@ -131,7 +131,7 @@ def check_texture_options(options: TextureOptions) -> None:
 
 
 def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder: Path, on_event: OnEvent) -> Mesh:
-    """The run's mesh as it is, or one of its own for other options."""
+    """Return the run's mesh as it is, or one of its own for other options."""
     if options == MeshOptions() and run.file(MESH).exists():
         return read_mesh(run.file(MESH))
     with tempfile.TemporaryDirectory(prefix=".gs2d-", dir=folder) as temporary:
@@ -141,7 +141,7 @@ def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder
 
 
 def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
-    """The training views, in another size if one is asked for, from where those of the job are."""
+    """Return the training views, in another size if one is asked for, from where those of the job are."""
     if options.downscale in (None, job.downscale) or job.scene.root is None:
         return job.scene.train
     scene = read_scene(job.scene.root, job.scene.format, options.downscale or 1, job.protocol, on_event)
@@ -156,7 +156,7 @@ def _images(
     exposures: Transforms,
     on_event: OnEvent,
 ) -> Iterator[ColorSource]:
-    """The views, or what the splats look like from them."""
+    """Yield the views, or what the splats look like from them."""
     for view in counted(views, "colouring the texture", len(views), on_event):
         if options.source == "renders":
             output = render_view(splats, view, job.settings, job.backend)

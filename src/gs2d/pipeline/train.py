@@ -136,7 +136,7 @@ def _train_archive(options: TrainOptions, on_event: OnEvent) -> RunFolder:
 
 @contextmanager
 def watched(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEvent) -> Iterator[TrainingObserver]:
-    """The page of a training while it lasts, if one is asked for."""
+    """Serve the page of a training while it lasts, if one is asked for."""
     if not options.viewer:
         yield TrainingObserver(on_event)
         return
@@ -225,7 +225,7 @@ def train_stages(
 
 
 def pretraining_notices(job: Job) -> list[Event]:
-    """What a person wants to know before hours of training: which photographs do not train, and how long it takes."""
+    """Tell before hours of training which photographs do not train, and how long it takes."""
     from gs2d.pipeline.estimate import estimate, estimate_text
 
     found, test, views = estimate(job), len(job.scene.test), len(job.scene.views)

@@ -88,7 +88,7 @@ def read_truth(path: Path) -> Truth:
 
 
 def choose_truth(given: Path | None, root: Path, on_event: OnEvent) -> Truth | OfficialTruth | None:
-    """What a capture's surface is compared with: a folder that was given, or what lies beside the capture.
+    """Return what a capture's surface is compared with: a folder that was given, or what lies beside the capture.
 
     Beside a scene of DTU or Tanks and Temples its official files; beside any other ``mesh_gt.ply``, ``mesh_gt.obj`` or
     ``points_gt.ply``. (A file that was given is read by ``read_truth``.)
@@ -136,7 +136,7 @@ def check_thresholds(thresholds: tuple[float, ...]) -> None:
 def score_surface(
     mesh: Mesh, truth: Truth | OfficialTruth, job: Job, options: EvaluateOptions, on_event: OnEvent, *, folder: Path
 ) -> dict[str, Any]:
-    """The ``surface`` entry of ``metrics.json`` (docs/architecture.md); the coloured clouds go to ``folder``.
+    """Return the ``surface`` entry of ``metrics.json`` (docs/architecture.md); the coloured clouds go to ``folder``.
 
     Raises
     ------

@@ -55,7 +55,7 @@ def score_dtu(mesh: Mesh, scene: SceneFacts, files: Mapping[str, Path], job: Job
 
 
 def _silhouettes(job: Job) -> list[Silhouette]:
-    """The mask files at their full size; where there are none, the views' own silhouettes."""
+    """Return the mask files at their full size; where there are none, the views' own silhouettes."""
     found = dtu_silhouettes(job.scene.root) if job.scene.root is not None else ()
     if found:
         return [Silhouette(view.camera, read_mask(view.path)) for view in found]

@@ -102,7 +102,7 @@ def open_viewer(path: Path, options: ViewOptions = ViewOptions(), on_event: OnEv
 
 
 def _first_box(path: Path, centers: np.ndarray) -> np.ndarray:
-    """The box of the subject [2, 3], else that of most splats."""
+    """Return the box of the subject [2, 3], else that of most splats."""
     subject = read_subject(path) if is_run(path) else None
     if subject is not None:
         return subject.box
@@ -179,7 +179,7 @@ def settings_without_run(splats: Splats) -> RasterSettings:
 
 
 def _mesh_of(run: RunFolder, on_event: OnEvent) -> tuple[bytes, list[float]] | None:
-    """The textured mesh, else the coloured one, as a .glb file and the turn that it contains."""
+    """Return the textured mesh, else the coloured one, as a .glb file and the turn that it contains."""
     if run.file(TEXTURED).exists():
         data = run.file(TEXTURED).read_bytes()
         return data, glb_turn(data)
@@ -201,7 +201,7 @@ def _stage(content: _Content, load: Callable[[str], Splats], name: str) -> Viewe
 def drawn(
     splats: Splats, camera: Camera, kind: str, settings: RasterSettings, backend: Backend, depth_kind: str
 ) -> Drawn:
-    """The exact picture of a kind ("exact", "normals", "depth") for the viewer."""
+    """Return the exact picture of a kind ("exact", "normals", "depth") for the viewer."""
     with torch.no_grad():
         output = rasterize(splats, camera, replace(settings, with_distortion=False), backend=backend)
     alpha, depth = output.alpha.cpu().numpy(), output.depth(depth_kind).cpu().numpy()
@@ -215,7 +215,7 @@ def drawn(
 
 
 def shots(views: Sequence[View], settings: RasterSettings, on_event: OnEvent) -> list[Shot]:
-    """Some of the photographs, small."""
+    """Return some of the photographs, small."""
     some: list[Any] = list(views)
     if len(some) > MAX_CAMERAS:
         on_event(Notice(f"{MAX_CAMERAS} of {len(some)} cameras are shown"))

@@ -171,7 +171,7 @@ def splat_errors(
     mask: Tensor | None = None,
     occlusion: bool = False,
 ) -> Tensor:
-    """The inner sum of the paper's E_i (Eq. 8) for one view: colour error of each splat over its footprint (rule 17).
+    """Compute the inner sum of the paper's E_i (Eq. 8) for one view: each splat's colour error over its footprint.
 
     Parameters
     ----------

@@ -140,7 +140,7 @@ class Backend:
         return None
 
     def fusion(self) -> FusionOnHost | FusionOnDevice | None:
-        """What adds depth maps to volumes; None: numpy does."""
+        """Return what adds depth maps to volumes; None: numpy does."""
         return None
 
     # -- a training iteration ----------------------------------------------------------------------------------------
@@ -234,7 +234,7 @@ class ReferenceBackend(Backend):
 
 
 def _only_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """The same values; gradients reach only these rows."""
+    """Return the same values; gradients reach only these rows."""
     shape = (-1, *[1] * (tensor.dim() - 1))
     return torch.where(rows.reshape(shape), tensor, tensor.detach()) if tensor.requires_grad else tensor
 
@@ -292,7 +292,7 @@ class CpuBackend(Backend):
         return LossOperations(losses.photometric, losses.normal_consistency, losses.masked_mean, losses.blur)
 
     def fusion(self) -> FusionOnHost:
-        """What adds depth maps to volumes."""
+        """Return what adds depth maps to volumes."""
         return FusionOnHost(library.load())
 
     def adam_step(self, updates: Sequence[adam.AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:
@@ -378,7 +378,7 @@ class CudaBackend(Backend):
         )
 
     def fusion(self) -> FusionOnDevice:
-        """What adds depth maps to volumes."""
+        """Return what adds depth maps to volumes."""
         device = torch.device(self.device)
         return FusionOnDevice(launch.launcher_for(device), device)
 
@@ -492,7 +492,7 @@ def backend_report() -> tuple[BackendStatus, ...]:
 
 
 def _status(name: str, make: Callable[[], Backend]) -> BackendStatus:
-    """What a backend from elsewhere says of itself."""
+    """Return what a backend from elsewhere says of itself."""
     status = make.status() if isinstance(make, type) and issubclass(make, Backend) else None
     if status is None:
         return BackendStatus(name, True, "", "", BACKENDS.source(name))

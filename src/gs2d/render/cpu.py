@@ -216,8 +216,10 @@ def rasterize_with(
     *,
     exact_masks: bool = True,
 ) -> RenderOutput:
-    """:func:`rasterize` on a given variant of the library; ``exact_masks=False`` turns off culling inside tiles,
-    and all of splats that have no ellipse."""
+    """Run :func:`rasterize` on a given variant of the library.
+
+    ``exact_masks=False`` turns off culling inside tiles, and all of splats that have no ellipse.
+    """
     _check_tensors(splats, settings, library.dtype)
     if gradient_rows is not None:
         if tuple(gradient_rows.shape) != (len(splats),) or gradient_rows.dtype != torch.bool:

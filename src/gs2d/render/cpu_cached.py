@@ -69,7 +69,7 @@ class CachedView:
         return sum(array.nbytes for array in self.arrays.values())
 
     def render(self, sh0: Tensor, shN: Tensor) -> Tensor:
-        """The image [H, W, 3], differentiable in the rows' coefficients.
+        """Return the image [H, W, 3], differentiable in the rows' coefficients.
 
         Parameters
         ----------
@@ -97,7 +97,7 @@ class CachedView:
         return image
 
     def _render(self, sh0: Tensor, shN: Tensor) -> tuple[Tensor, Tensor]:
-        """The image and the rows' colours [M, 4]."""
+        """Return the image and the rows' colours [M, 4]."""
         image = torch.empty(self.height, self.width, 3, dtype=sh0.dtype)
         colors = torch.empty(self.rows, 4, dtype=sh0.dtype)
         splats = _parameters((sh0, sh0, sh0, sh0, sh0, shN))  # only the coefficients are read

@@ -28,7 +28,7 @@ __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
 
 
 def _check_tensors(splats: Splats, settings: RasterSettings) -> None:
-    """What would make a kernel read beyond its arrays."""
+    """Refuse what would make a kernel read beyond its arrays."""
     for name, tensor in splats.items():
         if tensor.dtype != torch.float32 or tensor.device != splats.device:
             raise ShapeError(

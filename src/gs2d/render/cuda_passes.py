@@ -103,7 +103,7 @@ class _Lists:
 
 
 def view_of(camera: Camera, settings: RasterSettings) -> View:
-    """The structure that every kernel takes.
+    """Return the structure that every kernel takes.
 
     Raises
     ------
@@ -159,7 +159,7 @@ PROJECTED = tuple(field.name for field in fields(_Projected))
 def _project(
     launcher: Launcher, view: View, parameters: Sequence[Tensor], *, errors: bool, exact: bool = True
 ) -> _Projected:
-    """Records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
+    """Return records and footprints: those of blending, or with ``errors`` those of rho <= error_cutoff^2."""
     count, device = parameters[0].shape[0], parameters[0].device
     if count >= MAX_SPLATS:
         raise BackendError(f"the cuda backend takes fewer than {MAX_SPLATS} splats, got {count}")
@@ -229,7 +229,7 @@ def forward(
 def _bin(
     launcher: Launcher, view: View, projected: _Projected, exact: bool, budget: PairBudget | None = None
 ) -> _Lists:
-    """A stable sort by depth, emission of candidates, a stable sort by tile."""
+    """Return a stable sort by depth, emission of candidates, a stable sort by tile."""
     device = projected.records.device
     tiles = int(view.tiles_x) * int(view.tiles_y)
     order = torch.sort(projected.depth_keys, stable=True).indices
@@ -283,6 +283,7 @@ class Wanted:
 
     @property
     def only_colors(self) -> bool:
+        """Whether nothing but colours learns."""
         return all(tensor is None for name, tensor in self.parameters.items() if name not in ("sh0", "shN"))
 
 

@@ -24,7 +24,7 @@ RIDGE = 1e-4  # of a fit, per pixel: keeps what a picture says nothing about at 
 
 
 def identity(like: Tensor) -> Tensor:
-    """The transform [3, 4] that changes nothing, of the type and on the device of ``like``."""
+    """Return the transform [3, 4] that changes nothing, of the type and on the device of ``like``."""
     return torch.eye(3, 4, dtype=like.dtype, device=like.device)
 
 
@@ -36,7 +36,7 @@ def expose(
     *,
     clipped: Tensor | None = None,
 ) -> Tensor:
-    """A rendered picture as a camera with this transform would have taken it.
+    """Return a rendered picture as a camera with this transform would have taken it.
 
     With k = ``coverage`` (1 without one) and B = ``background``: A (C - (1 - k) B) + k b + (1 - k) B. On a CPU, in
     float32, the bits of picture and gradients do not depend on the number of threads.
@@ -96,7 +96,7 @@ class _Expose(torch.autograd.Function):
 def _exposed(
     color: Tensor, transform: Tensor, coverage: Tensor | None, background: Tensor | None, clipped: Tensor | None
 ) -> tuple[Tensor, Tensor | None]:
-    """The picture, and where it was cut to 1 [H, W, 3]; by torch."""
+    """Return the picture, and where it was cut to 1 [H, W, 3]; by torch."""
     if coverage is None or background is None:
         image = _apply(color, transform[:, :3]) + transform[:, 3]
     else:
@@ -138,7 +138,7 @@ def fit_exposure(
     coverage: Tensor | None = None,
     background: Tensor | None = None,
 ) -> Tensor:
-    """The transform [3, 4] that takes a rendered picture nearest to a photograph: least squares over some pixels.
+    """Fit the transform [3, 4] that takes a rendered image nearest to a photograph (least squares, some pixels).
 
     A ridge of ``RIDGE`` a pixel towards the identity decides what the pixels leave open.
 
@@ -165,7 +165,7 @@ def fit_exposure(
 
 
 def remove_exposure(image: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    """A photograph uint8 [H, W, 3 or 4] in the exposure of the scene: A^-1 (P - b), rounded; alpha stays."""
+    """Return a photograph uint8 [H, W, 3 or 4] in the exposure of the scene: A^-1 (P - b), rounded; alpha stays."""
     back = np.linalg.inv(transform[:, :3].astype(np.float64))
     color = (image[..., :3] / 255.0 - transform[:, 3]) @ back.T
     result = image.copy()

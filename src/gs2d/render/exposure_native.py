@@ -26,7 +26,7 @@ class _Image(ctypes.Structure):
 
 
 def _plain(library: Library, **tensors: Tensor | None) -> list[Tensor | None]:
-    """The tensors, contiguous, or ShapeError for one that native code cannot read."""
+    """Return the tensors, contiguous, or ShapeError for one that native code cannot read."""
     for name, tensor in tensors.items():
         dtype = torch.bool if name in ("clipped", "over") else library.dtype
         if tensor is not None and (not tensor.is_cpu or tensor.dtype != dtype):
@@ -53,7 +53,7 @@ def exposed(
     background: Tensor | None,
     clipped: Tensor | None,
 ) -> tuple[Tensor, Tensor | None]:
-    """The picture, and where it was cut to 1 [H, W, 3]; arguments as of ``gs2d.render.exposure.expose``.
+    """Return the picture, and where it was cut to 1 [H, W, 3]; arguments as of ``gs2d.render.exposure.expose``.
 
     Raises
     ------

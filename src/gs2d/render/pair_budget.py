@@ -48,11 +48,11 @@ class PairBudget:
         return min(-(-int(SLACK * largest) // STEP) * STEP, MAX_PAIRS)
 
     def learn(self, tiles: int, pairs: int) -> None:
-        """The number of pairs of a rendering, once it is known."""
+        """Take the number of pairs of a rendering, once it is known."""
         self._largest[tiles] = max(pairs, self._largest.get(tiles, 0) * (1 - FORGET))
 
     def ask(self, tiles: int, room: int, pairs: Tensor) -> None:
-        """The number of pairs [] int64 of a rendering with ``room``, to be looked at later."""
+        """Keep the number of pairs [] int64 of a rendering with ``room``, to be looked at later."""
         lacks = (pairs > room).to(torch.int32)
         self.overflow = lacks if self.overflow is None else self.overflow | lacks
         if len(self._host) == len(self._asked):

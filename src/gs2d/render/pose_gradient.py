@@ -25,7 +25,7 @@ __all__ = ["attach_pose_grad", "normals_without_pose_grad", "with_world_normals"
 
 
 def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
-    """The same splats; what reaches their gradients also reaches that of the camera.
+    """Return the same splats; what reaches their gradients also reaches that of the camera.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
 
 
 def with_world_normals(output: RenderOutput, pose: Tensor) -> RenderOutput:
-    """The same images; the camera's gradient knows that normals stay in the world where splats would be turned."""
+    """Let the camera's gradient know that normals stay in the world where splats would be turned; same images."""
     normal = _TurnNormals.apply(pose, output.normal, -1.0)
     return replace(output, normal=normal, normal_without_pose_grad=output.normal)
 
@@ -102,7 +102,7 @@ class _TurnNormals(torch.autograd.Function):
 def _wrench(
     pose: Tensor, means: Tensor, quats: Tensor, shN: Tensor, degree: int, gradients: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Derivative by a shift [3] and by a turn about the camera's centre [3] of the scene, world axes, float64.
+    """Return derivative by a shift [3] and by a turn about the camera's centre [3] of the scene, world axes, float64.
 
     ``gradients`` are those of the means, of the quaternions and, where ``degree`` > 0, of ``sh0``.
     """
@@ -147,7 +147,7 @@ def turns_of_harmonics(degree: int) -> Tensor:
 
 
 def _of_pose(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:
-    """The gradient [4, 4] of T_cam_world whose product with each rigid motion of the scene is that of the wrench.
+    """Return the gradient [4, 4] of T_cam_world whose product with each rigid motion of the scene is the wrench's.
 
     A scene that moves by x + w x (x - center) + v is T_cam_world (1 + [w]x, v - w x center): the smallest matrix with
     the right products is R [torque about the origin]x / 2 beside R force.
@@ -163,7 +163,7 @@ def _of_pose(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:
 
 
 def _turned(vectors: Tensor, gradients: Tensor) -> Tensor:
-    """Derivative by a turn [3] of vectors [N, 3], float64 on the CPU."""
+    """Return derivative by a turn [3] of vectors [N, 3], float64 on the CPU."""
     library = library_for(vectors)
     if library is not None:
         return native.wrench(library, vectors.new_zeros(3), vectors, gradients)[1]

@@ -37,7 +37,7 @@ def wrench(
     quats: tuple[Tensor, Tensor] | None = None,
     colors: tuple[Tensor, Tensor, int] | None = None,
 ) -> Wrench:
-    """What moves the scene, from the gradients of its parts; rows that are not finite count nothing.
+    """Return what moves the scene, from the gradients of its parts; rows that are not finite count nothing.
 
     Parameters
     ----------

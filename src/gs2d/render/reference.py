@@ -141,7 +141,7 @@ def blend_weights(alpha: Tensor, settings: RasterSettings) -> tuple[Tensor, Tens
 
 
 def pair_alpha(opacity: Tensor, pairs: Pairs, settings: RasterSettings) -> Tensor:
-    """alpha [n, P] of rule 6: 0 where a pair is skipped, limited to alpha_max with a gradient that passes unchanged."""
+    """Return alpha [n, P] of rule 6: 0 where a pair is skipped; the limit alpha_max passes gradients unchanged."""
     alpha = opacity[:, None] * torch.exp(-pairs.rho / 2)
     kept = (alpha.detach() >= settings.alpha_min) & pairs.near_enough
     limited = alpha + (alpha.clamp(max=settings.alpha_max) - alpha).detach()
@@ -183,7 +183,7 @@ def _no_pixels(screen: ScreenSplats, probe: Tensor | None) -> Tensor:
 
 
 def _probe_shift(probe: Tensor, z_c: Tensor, pixels: int, camera: Camera) -> Tensor:
-    """The zero added to (Tu.z, Tv.z) of each pair [n, P, 2], whose gradient is rule 13."""
+    """Return the zero added to (Tu.z, Tv.z) of each pair [n, P, 2], whose gradient is rule 13."""
     shift = probe[:, None, :2].expand(-1, pixels, -1)
     if probe.shape[1] == 4:
         shift = shift + _PerPixel.apply(probe[:, 2:], pixels)

@@ -39,7 +39,7 @@ class ScreenSplats:
     normal: Tensor  # [M, 3] world, facing the camera
 
     def rows(self, index: Tensor) -> ScreenSplats:
-        """The splats picked by an index tensor, in its order."""
+        """Return the splats picked by an index tensor, in its order."""
         return ScreenSplats(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
@@ -190,7 +190,7 @@ def _square_boxes(screen: ScreenSplats, k2: Tensor, camera: Camera, settings: Ra
 
 
 def _dot(k2: Tensor, A: Tensor, B: Tensor) -> Tensor:
-    """<A, B> = k^2 (A.u B.u + A.v B.v) - A.1 B.1 [M] (docs/math.md, "Footprint")."""
+    """Compute <A, B> = k^2 (A.u B.u + A.v B.v) - A.1 B.1 [M] (docs/math.md, "Footprint")."""
     return k2 * (A[:, :2] * B[:, :2]).sum(dim=1) - A[:, 2] * B[:, 2]
 
 

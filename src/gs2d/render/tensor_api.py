@@ -219,7 +219,7 @@ def _render(
 
 
 def _joined(outputs: Sequence[RenderOutput], background: Tensor, channels: int) -> tuple[Tensor, ...]:
-    """The images of one camera, in the order of Rasterization: channels of all parts, the rest of the first."""
+    """Return the images of one camera, in the order of Rasterization: channels of all parts, the rest of the first."""
     first = outputs[0]
     color = first.color if channels == GROUP else torch.cat([o.color for o in outputs], dim=2)[..., :channels]
     if background.requires_grad and torch.is_grad_enabled():
@@ -237,7 +237,7 @@ def _parts(colors: Tensor, sh_degree: int | None) -> list[tuple[Tensor, Tensor]]
 
 
 def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Camera]:
-    """The cameras, with what of them learns."""
+    """Return the cameras, with what of them learns."""
     sizes = check_shapes({"viewmats": (viewmats, "C 4 4"), "Ks": (Ks, "C 3 3")})
     if sizes["C"] < 1:
         raise ShapeError("viewmats must hold at least one camera, got [0, 4, 4]")
@@ -298,7 +298,7 @@ def _check(
 
 
 def _backgrounds(backgrounds: Tensor | None, cameras: int, channels: int, like: Tensor) -> Tensor:
-    """What is behind each image [C, D]."""
+    """Return what is behind each image [C, D]."""
     if backgrounds is None:
         return like.new_zeros(cameras, channels)
     if backgrounds.dim() == 1:
@@ -399,7 +399,7 @@ def _python_options(
     with_distortion: bool,
     backend: str,
 ) -> tuple[int, int, int | None, RasterSettings, str]:
-    """The operator's numbers as :func:`_render` takes them."""
+    """Return the operator's numbers as :func:`_render` takes them."""
     given: dict[str, Any] = dict(zip(CONSTANTS, constants, strict=True))
     settings = RasterSettings(
         **given,

@@ -27,12 +27,12 @@ def _scale(anchors: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def error_scale(steps: int) -> np.ndarray:
-    """The colours of errors from 0 to :data:`ERROR_TOP`, float32 [steps, 3]."""
+    """Return the colours of errors from 0 to :data:`ERROR_TOP`, float32 [steps, 3]."""
     return _scale(_ERROR_SCALE, np.linspace(0, 1, steps))
 
 
 def depth_scale(steps: int) -> np.ndarray:
-    """The colours of depths from near to far, float32 [steps, 3]."""
+    """Return the colours of depths from near to far, float32 [steps, 3]."""
     return _scale(_DEPTH_SCALE, np.linspace(0, 1, steps))
 
 
@@ -138,7 +138,7 @@ def valid_image(photo: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
 
 
 def highlight_image(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The high-error splats in magenta over the faded grey picture.
+    """Return the high-error splats in magenta over the faded grey picture.
 
     Parameters
     ----------

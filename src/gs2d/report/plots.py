@@ -78,7 +78,7 @@ def _whole(value: Any) -> int:
 
 
 def _figures(event: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of one step, or of what changed after it, that are finite."""
+    """Return the numbers of one step, or of what changed after it, that are finite."""
     if _kind(event) == "changes":
         changes = {f"change/{name}": event.get(name) for name in _CHANGES}
         return {name: float(v) for name, v in changes.items() if isinstance(v, int | float) and np.isfinite(v)}
@@ -93,7 +93,7 @@ def _figures(event: Mapping[str, Any]) -> dict[str, float]:
 
 
 def smoothed(values: np.ndarray, count: int = 9) -> np.ndarray:
-    """A centred running mean over ``count`` values, shorter at the ends."""
+    """Return a centred running mean over ``count`` values, shorter at the ends."""
     ones = np.convolve(np.ones(len(values)), np.ones(count), mode="same")
     return np.asarray(np.convolve(values, np.ones(count), mode="same") / ones)
 
@@ -138,7 +138,7 @@ class Panel:
 
 
 def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str | None:
-    """Runs side by side: a diagram for each panel, a line for each run, one key for all.
+    """Return runs side by side: a diagram for each panel, a line for each run, one key for all.
 
     Parameters
     ----------
@@ -252,6 +252,7 @@ def plot_by_image(height: float) -> tuple[Any, Any]:
 
 
 def svg_text(figure: Any) -> str:
+    """Return a figure as SVG: the same bytes for the same figure."""
     import matplotlib
 
     text = io.StringIO()

@@ -186,7 +186,7 @@ def _name_of(value: Any) -> str:
 
 # -- figures -----------------------------------------------------------------------------------------------------------
 def figure(value: Any, digits: int) -> str:
-    """A number with fixed digits, or a dash."""
+    """Return a number with fixed digits, or a dash."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         return "-" if value is None or not isinstance(value, float) else str(value)
     return f"{value:,.{digits}f}"
@@ -212,7 +212,7 @@ def verdict(record: RunRecord) -> Markup:
 
 
 def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What the stages after the first cost in storage and time."""
+    """Return what the stages after the first cost in storage and time."""
     parts = []
     if first.get("bytes") and last.get("bytes"):
         parts.append(f"{100 * (last['bytes'] / first['bytes'] - 1):+.1f} % storage")
@@ -223,7 +223,7 @@ def _price(first: Mapping[str, Any], last: Mapping[str, Any], stages: Sequence[M
 
 
 def _middle_score(surface: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """The row of scores at the threshold that is neither the strictest nor the kindest."""
+    """Return the row of scores at the threshold that is neither the strictest nor the kindest."""
     rows = [row for row in (surface or {}).get("thresholds") or [] if isinstance(row.get("f_score"), int | float)]
     return rows[len(rows) // 2] if rows else None
 
@@ -390,7 +390,7 @@ def story(events: Sequence[Mapping[str, Any]]) -> Markup:
 
 # -- the definition ----------------------------------------------------------------------------------------------------
 def definition_facts(definition: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The definition in short; the whole of it follows in the report."""
+    """Return the definition in short; the whole of it follows in the report."""
     scene, machine = definition.get("scene"), definition.get("machine")
     backend = definition.get("backend")
     pairs = [("Recipe", _name_of(definition.get("recipe", "not said")))]

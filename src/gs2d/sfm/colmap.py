@@ -196,7 +196,7 @@ def _open(database: Path) -> sqlite3.Connection:
 
 
 def _last_words(phase: str, code: int, log: Path) -> str:
-    """The one line about a worker that died."""
+    """Return the one line about a worker that died."""
     lines = [line.strip() for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
     how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
     said = lines[-1][:300] if lines else "it said nothing"

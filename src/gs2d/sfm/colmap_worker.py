@@ -209,7 +209,7 @@ def _settle_lens(pycolmap: Any, request: dict[str, Any], piece: Any, say: Say) -
 def _second_round(
     pycolmap: Any, request: dict[str, Any], piece: Any, lens: dict[str, Any], say: Say
 ) -> tuple[Any, dict[str, str]]:
-    """The model with photographs that only less strict rules place, and why others were taken out again."""
+    """Return the model with photographs that only less strict rules place, and why others were taken out again."""
     names, placed = request["in_order"], _names(piece)
     lost = [name for name in names if name not in placed]
     if not lost:
@@ -278,7 +278,7 @@ def _write(pycolmap: Any, piece: Any, folder: Path) -> dict[str, Any]:
 
 
 def _messages() -> Say:
-    """A function that sends a message to the parent; what native code prints goes to stderr instead."""
+    """Return a function that sends a message to the parent; what native code prints goes to stderr instead."""
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 

@@ -83,7 +83,7 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> str:
 
 
 def _kept(source: Path) -> dict[str, bytes]:
-    """What Pillow's ``save`` takes of a picture's colour profile (of RGB only: pixels are RGB now) and EXIF block."""
+    """Return an image's colour profile (of RGB only: pixels are RGB now) and EXIF block for Pillow's ``save``."""
     with Image.open(source) as file:
         profile = file.info.get("icc_profile") if file.mode in ("RGB", "RGBA") else None
         kept = {"icc_profile": profile} if profile else {}

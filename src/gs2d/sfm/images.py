@@ -95,7 +95,7 @@ class Photo:
 
 
 def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
-    """The photographs in a folder and its sub-folders, in the order of people, and lines about what is not used.
+    """Return the photographs in a folder and its sub-folders, in the order of people, and lines about what is not used.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def _raw_remedy(path: Path) -> str:
 
 
 def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[Photo]:
-    """What each file says about itself; every one is decoded, so that a broken one is found before the slow part.
+    """Yield what each file says about itself; every one is decoded, so that a broken one is found before the slow part.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def _names(labels: Sequence[str]) -> list[str]:
 
 
 def turn(image: Image.Image, orientation: int) -> Image.Image:
-    """The picture as it is meant to be seen."""
+    """Return the picture as it is meant to be seen."""
     return image if orientation == 1 else image.transpose(_ORIENTATIONS[orientation])
 
 

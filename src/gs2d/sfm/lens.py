@@ -75,7 +75,7 @@ def doubts(camera: Any, limits: Believable = Believable()) -> list[str]:
 
 
 def _bends(camera: Any, limits: Believable) -> list[str]:
-    """What is implausible in the distortion: tangential, folding back within the picture, or too strong."""
+    """Return what is implausible in the distortion: tangential, folding back within the picture, or too strong."""
     found = []
     name = camera.model.name
     if name == "OPENCV" and max(map(abs, camera.params[6:8])) > limits.tangential:
@@ -210,7 +210,7 @@ def drop_outliers(pycolmap: Any, piece: Any) -> None:
 
 
 def _part(pycolmap: Any, piece: Any) -> Any:
-    """A copy of a model with at most ``MAX_PHOTOGRAPHS``, which follow each other by name."""
+    """Return a copy of a model with at most ``MAX_PHOTOGRAPHS``, which follow each other by name."""
     copy = pycolmap.Reconstruction(piece)
     placed = sorted((image for image in copy.images.values() if image.has_pose), key=lambda image: image.name)
     first = (len(placed) - MAX_PHOTOGRAPHS) // 2

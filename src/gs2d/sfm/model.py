@@ -115,7 +115,7 @@ def check_any(pieces: Sequence[SfmModel], facts: Facts, root: Path) -> None:
 
 
 def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: Facts, refused: Mapping[str, str] = _NONE) -> str:
-    """The reason, as far as it is known, why a photograph has no camera in the first piece.
+    """Return the reason, as far as it is known, why a photograph has no camera in the first piece.
 
     ``refused`` are those that found a place in the second round and lost it again, with what is known of them.
     """

@@ -58,7 +58,7 @@ def _thinned(piece: SfmModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _limits(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The box [3] and [3] that holds all cameras and all points but the farthest 2 % on each side, with a margin."""
+    """Return the box [3] and [3] of all cameras and all points but the farthest 2 % on each side, with a margin."""
     low = np.minimum(np.quantile(points, 0.02, axis=0), centers.min(axis=0))
     high = np.maximum(np.quantile(points, 0.98, axis=0), centers.max(axis=0))
     margin = 0.06 * float((high - low).max())
@@ -68,7 +68,7 @@ def _limits(points: np.ndarray, centers: np.ndarray) -> tuple[np.ndarray, np.nda
 def _wedge(
     T_cam_world: np.ndarray, center: np.ndarray, piece: SfmModel, camera_id: int, box: np.ndarray, plane: list[int]
 ) -> np.ndarray:
-    """What a camera sees, from its centre to the two ends of its picture's middle row: [4, 2], closed."""
+    """Return what a camera sees, from its centre to the two ends of its picture's middle row: [4, 2], closed."""
     camera = piece.cameras[camera_id]
     half = camera.width / (2 * focal_length(camera))
     ends = np.array([[-half, 0.0, 1.0], [half, 0.0, 1.0]]) @ T_cam_world[:3, :3]

@@ -9,7 +9,7 @@ _TOWARDS_MEAN = 0.01  # decides where all right-hand vectors are parallel, negli
 
 
 def up_direction(rotations: np.ndarray) -> np.ndarray | None:
-    """The direction that is up, as a unit vector [3] of the world; None where the cameras do not agree on one.
+    """Return the direction that is up, as a unit vector [3] of the world; None where the cameras do not agree on one.
 
     Photographers hold the camera level but tilt it up and down: up is what the cameras' x axes r_i are perpendicular
     to, the unit vector u that minimises mean((r_i . u)^2) - 0.01 (m . u)^2 with m the mean of the cameras' up vectors.
@@ -28,7 +28,7 @@ def up_direction(rotations: np.ndarray) -> np.ndarray | None:
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """The shortest rotation [3, 3] that takes the unit vector ``up`` to +z."""
+    """Return the shortest rotation [3, 3] that takes the unit vector ``up`` to +z."""
     x, y, z = up
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])

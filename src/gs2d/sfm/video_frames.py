@@ -47,7 +47,7 @@ def is_video(path: Path) -> bool:
 
 
 def look_into(path: Path) -> Video:
-    """What a video is.
+    """Return what a video is.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def sharpness_of(video: Video) -> Generator[float, None, None]:
 
 
 def choose(sharpness: Sequence[float], count: int) -> list[int]:
-    """The numbers of the frames to take, from 0, ascending: the sharpest of each of ``count`` stretches of one length.
+    """Choose frames by number, from 0, ascending: the sharpest of each of ``count`` stretches of one length.
 
     All of them where there are no more than ``count``.
     """
@@ -134,7 +134,7 @@ def take(video: Video, numbers: Sequence[int], folder: Path) -> list[Path]:
 
 @contextmanager
 def _decoding(video: Video, options: Sequence[str], into: Path | None = None) -> Iterator[IO[bytes]]:
-    """What ffmpeg writes to its standard output; it works in the folder ``into`` and ends with the block.
+    """Run ffmpeg and give what it writes to its standard output; it works in ``into`` and ends with the block.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def _decoding(video: Video, options: Sequence[str], into: Path | None = None) ->
 
 
 def _url(path: Path) -> str:
-    """A path as ffmpeg takes none for an option or a protocol."""
+    """Return a path as ffmpeg takes none for an option or a protocol."""
     return f"file:{path.resolve()}"
 
 

@@ -64,7 +64,7 @@ def hidden_workspace(out: Path) -> Path:
 
 @contextlib.contextmanager
 def workspace(out: Path) -> Iterator[Path]:
-    """The hidden folder beside the capture, empty and held against other processes; removed at the end.
+    """Hold a hidden folder beside the capture, empty, against other processes; remove it at the end.
 
     Raises
     ------

@@ -143,7 +143,7 @@ def _make_folders(root: Path, splits: tuple[str, ...]) -> None:
 
 
 def demo_mesh(scene: ToyScene) -> Mesh:
-    """The triangles that are rendered, in the same order, with the vertices on texture seams made one."""
+    """Return the triangles that are rendered, in the same order, with the vertices on texture seams made one."""
     vertices, faces = merge_vertices(scene.patch.vertices, scene.patch.faces)
     return Mesh(vertices, faces.astype(np.int32))
 
@@ -177,7 +177,7 @@ def _spiral(
 
 
 def _transforms(split: str, cameras: list[Camera]) -> dict[str, object]:
-    """The content of transforms_<split>.json: OpenGL camera-to-world matrices."""
+    """Return the content of transforms_<split>.json: OpenGL camera-to-world matrices."""
     frames = []
     for k, camera in enumerate(cameras):
         T_world_cam = np.eye(4)

@@ -21,7 +21,7 @@ def random_gains(count: int, seed: int, *, gain: float = GAIN, balance: float = 
 
 
 def with_gains(image: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """A picture uint8 [H, W, 3 or 4] times the gains [3] of its channels, clipped at 255; alpha stays."""
+    """Return a picture uint8 [H, W, 3 or 4] times the gains [3] of its channels, clipped at 255; alpha stays."""
     changed = image.copy()
     changed[..., :3] = np.rint(np.minimum(image[..., :3] * gains, 255))
     return changed

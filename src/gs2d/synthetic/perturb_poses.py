@@ -17,7 +17,7 @@ DEGREES, FRACTION = 0.5, 0.005  # root mean square of the rotations, and of the 
 def disturbed(
     cameras: Sequence[Camera], seed: int, *, degrees: float = DEGREES, fraction: float = FRACTION
 ) -> list[Camera]:
-    """The cameras after random small motions, normally distributed.
+    """Return the cameras after random small motions, normally distributed.
 
     What a similarity of the whole scene would do is taken out of them, since no photograph could show it: so the truth
     that refinement can find is in the frame of the capture.

@@ -50,7 +50,7 @@ class ToyScene:
 
 
 def build_scene(seed: int) -> ToyScene:
-    """The still life within [-1.2, 1.2]^3; ``seed`` chooses the twigs and the mottle of every texture."""
+    """Return the still life within [-1.2, 1.2]^3; ``seed`` chooses the twigs and the mottle of every texture."""
     parts = tuple(_parts(np.random.default_rng(seed)))
     sizes = [len(part.patch.faces) for part in parts]
     return ToyScene(parts, shapes.join([part.patch for part in parts]), np.repeat(np.arange(len(parts)), sizes))
@@ -95,13 +95,13 @@ def _parts(rng: np.random.Generator) -> Iterator[Part]:
 
 
 def _laid_down(patch: shapes.Patch) -> shapes.Patch:
-    """Turned by a quarter about y, so that z becomes x."""
+    """Turn by a quarter about y, so that z becomes x."""
     R = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
     return shapes.Patch(patch.vertices @ R.T, patch.normals @ R.T, patch.uvs, patch.faces)
 
 
 def _trellis(*, width: float = 0.62, height: float = 0.52, radius: float = 0.0125) -> shapes.Patch:
-    """A round-topped frame of wire in the xz plane with crossing diagonals: the occluder."""
+    """Return a round-topped frame of wire in the xz plane with crossing diagonals: the occluder."""
     half = width / 2
     arch = np.linspace(np.pi, 0, 25)
     frame = np.concatenate(

@@ -55,7 +55,7 @@ def bake(scene: ToyScene, *, sky_directions: int = 72, lamp_directions: int = 14
 def _sum(
     items: Iterable[np.ndarray], weigh: Callable[[int, np.ndarray], np.ndarray], shape: tuple[int, ...]
 ) -> np.ndarray:
-    """A sum in the order of the items, so that it does not depend on the threads."""
+    """Return a sum in the order of the items, so that it does not depend on the threads."""
     total = np.zeros(shape)
     for k, item in enumerate(items):
         total += weigh(k, item)

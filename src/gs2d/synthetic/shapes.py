@@ -29,7 +29,7 @@ class Patch:
     faces: np.ndarray
 
     def moved(self, *, offset: Sequence[float] | np.ndarray = (0, 0, 0), turn: float = 0.0) -> Patch:
-        """The patch turned about z by ``turn`` radians, then moved by ``offset`` world units."""
+        """Return the patch turned about z by ``turn`` radians, then moved by ``offset`` world units."""
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
         return Patch(self.vertices @ R.T + np.asarray(offset), self.normals @ R.T, self.uvs, self.faces)
@@ -54,7 +54,7 @@ def join(patches: Sequence[Patch]) -> Patch:
 
 
 def grid(points: np.ndarray, uvs: np.ndarray) -> Patch:
-    """A grid of points [m, n, 3] with uvs [m, n, 2] as triangles; quads that shrink to an edge give one triangle.
+    """Triangulate a grid of points [m, n, 3] with uvs [m, n, 2]; quads that shrink to an edge give one triangle.
 
     The outside is on the side of (along the first index) x (along the second).
     """
@@ -87,7 +87,7 @@ def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def lathe(profile: np.ndarray, texture_v: np.ndarray, around: int) -> Patch:
-    """A profile [m, 2] of (radius, height) turned about z; ``texture_v`` [m] goes along it, u once around.
+    """Return a profile [m, 2] of (radius, height) turned about z; ``texture_v`` [m] goes along it, u once around.
 
     Walking along the profile, the outside is on the right (so upwards on the outer wall).
     """
@@ -102,7 +102,7 @@ def lathe(profile: np.ndarray, texture_v: np.ndarray, around: int) -> Patch:
 
 
 def vase(outline: np.ndarray, *, wall: float, rows: int = 44, around: int = 72, painted: float = 0.8) -> Patch:
-    """A vase with a hollow inside: a smooth outer wall through ``outline`` [k, 2] (radius, height), bottom first.
+    """Make a hollow vase: a smooth outer wall through ``outline`` [k, 2] (radius, height), bottom first.
 
     Texture v runs from 0 at the foot to ``painted`` at the lip of the outer wall and from there to 1 inside.
     """
@@ -119,7 +119,7 @@ def vase(outline: np.ndarray, *, wall: float, rows: int = 44, around: int = 72, 
 
 
 def plinth(radius: float, thickness: float, *, rings: int = 46, around: int = 128) -> tuple[Patch, Patch]:
-    """A round plate whose upper face is z = 0: the upper face (planar texture) and the bevelled rest."""
+    """Return a round plate whose upper face is z = 0: the upper face (planar texture) and the bevelled rest."""
     bevel = thickness / 4
     r = np.linspace(0, radius - bevel, rings)
     upper = lathe(np.stack([r[::-1], np.zeros(rings)], axis=1), np.zeros(rings), around)
@@ -135,7 +135,7 @@ def plinth(radius: float, thickness: float, *, rings: int = 46, around: int = 12
 
 
 def tube(path: np.ndarray, radius: np.ndarray | float, *, around: int = 8, closed: bool = False) -> Patch:
-    """A tube along a path [m, 3] (rounded off to points at its ends unless closed); u around, v along."""
+    """Return a tube along a path [m, 3] (rounded off to points at its ends unless closed); u around, v along."""
     if closed:
         path = np.concatenate([path, path[:1]])
         tangent = np.roll(path[:-1], -1, axis=0) - np.roll(path[:-1], 1, axis=0)
@@ -164,7 +164,7 @@ def tube(path: np.ndarray, radius: np.ndarray | float, *, around: int = 8, close
 
 
 def _transported_frames(tangent: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Normals and binormals [m, 3] that turn as little as possible along the tangents (and meet, if closed)."""
+    """Return normals and binormals [m, 3] that turn as little as possible along the tangents (and meet, if closed)."""
     normal = np.empty_like(tangent)
     helper = np.eye(3)[int(np.argmin(np.abs(tangent[0])))]
     normal[0] = np.cross(helper, tangent[0])
@@ -182,21 +182,21 @@ def _transported_frames(tangent: np.ndarray, closed: bool) -> tuple[np.ndarray, 
 
 
 def smooth_path(points: Sequence[Sequence[float]], count: int) -> np.ndarray:
-    """A smooth curve [count, 3] through the points, at equal steps of chord length."""
+    """Return a smooth curve [count, 3] through the points, at equal steps of chord length."""
     p = np.asarray(points, dtype=np.float64)
     knots = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
     return np.asarray(CubicSpline(knots, p)(np.linspace(0, knots[-1], count)))
 
 
 def torus_knot(major: float, minor: float, *, p: int = 2, q: int = 3, steps: int = 180) -> np.ndarray:
-    """A closed (p, q) torus knot [steps, 3] about the z axis."""
+    """Return a closed (p, q) torus knot [steps, 3] about the z axis."""
     t = np.linspace(0, 2 * np.pi, steps, endpoint=False)
     r = major + minor * np.cos(q * t)
     return np.stack([r * np.cos(p * t), r * np.sin(p * t), -minor * np.sin(q * t)], axis=1)
 
 
 def ball(radius: float, *, stretch: float = 1.0, rows: int = 18, around: int = 32) -> Patch:
-    """A sphere about the origin, stretched along z."""
+    """Return a sphere about the origin, stretched along z."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, rows)
     profile = radius * np.stack([np.cos(angle), stretch * np.sin(angle)], axis=1)
     profile[[0, -1], 0] = 0.0
@@ -204,7 +204,7 @@ def ball(radius: float, *, stretch: float = 1.0, rows: int = 18, around: int = 3
 
 
 def box(size: Sequence[float], *, cells: int = 12) -> Patch:
-    """A box standing on z = 0. The texture is an atlas of six equal columns: +x, +y, -x, -y, top, bottom."""
+    """Return a box standing on z = 0. The texture is an atlas of six equal columns: +x, +y, -x, -y, top, bottom."""
     sx, sy, sz = (s / 2 for s in size)
     sides = [  # origin, along u, along v; outside is u x v
         ((sx, -sy, 0), (0, 2 * sy, 0), (0, 0, 2 * sz)),
@@ -228,7 +228,7 @@ def box(size: Sequence[float], *, cells: int = 12) -> Patch:
 def leaf(
     base: np.ndarray, along: np.ndarray, up: np.ndarray, *, length: float, width: float, thickness: float = 0.006
 ) -> Patch:
-    """A thin pointed leaf from ``base`` in direction ``along``, its upper side towards ``up``, bent downwards."""
+    """Make a thin pointed leaf from ``base`` along ``along``, its upper side towards ``up``, bent downwards."""
     along = along / np.linalg.norm(along)
     across = np.cross(up, along)
     across /= np.linalg.norm(across)

@@ -22,12 +22,12 @@ _LETTERS = {
 
 
 def srgb_to_linear(color: np.ndarray) -> np.ndarray:
-    """The sRGB transfer curve undone (IEC 61966-2-1)."""
+    """Return the sRGB transfer curve undone (IEC 61966-2-1)."""
     return np.where(color <= 0.04045, color / 12.92, ((np.maximum(color, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(color: np.ndarray) -> np.ndarray:
-    """The sRGB transfer curve (IEC 61966-2-1), after clipping to [0, 1]."""
+    """Return the sRGB transfer curve (IEC 61966-2-1), after clipping to [0, 1]."""
     color = np.clip(color, 0, 1)
     return np.where(color <= 0.0031308, 12.92 * color, 1.055 * np.maximum(color, 0.0031308) ** (1 / 2.4) - 0.055)
 
@@ -56,7 +56,7 @@ def _finish(image: np.ndarray, mottle: np.ndarray) -> np.ndarray:
 
 
 def tiles(rng: np.random.Generator, *, size: int = 1024, count: int = 8) -> np.ndarray:
-    """A round floor of glazed tiles with two alternating motifs, inside a ring of terrazzo."""
+    """Return a round floor of glazed tiles with two alternating motifs, inside a ring of terrazzo."""
     t = (np.arange(size) + 0.5) / size
     u, v = np.meshgrid(t, t)
     tile_x, tile_y = np.floor(u * count).astype(int), np.floor(v * count).astype(int)
@@ -115,7 +115,7 @@ def plinth_side(rng: np.random.Generator, *, aspect: float) -> np.ndarray:
 
 
 def vase(rng: np.random.Generator, *, painted: float = 0.8) -> np.ndarray:
-    """A painted pot: bands, a meander, triangles and dots over mottled clay; rows above ``painted`` are the inside."""
+    """Paint a pot: bands, a meander, triangles and dots over mottled clay; rows above ``painted`` are inside."""
     rows, columns = 640, 1024
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows / painted, (np.arange(columns) + 0.5) / columns, indexing="ij")
     image = np.empty((rows, columns, 3))
@@ -146,7 +146,7 @@ def vase(rng: np.random.Generator, *, painted: float = 0.8) -> np.ndarray:
 
 
 def _meander(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A Greek key of period 1 in x, between y = 0 and 1, drawn on a 7 x 7 raster."""
+    """Return a Greek key of period 1 in x, between y = 0 and 1, drawn on a 7 x 7 raster."""
     key = np.array(
         [[int(c) for c in row] for row in ("1111111", "0000000", "1111110", "1000010", "1011010", "1001010", "1111011")]
     )
@@ -164,7 +164,7 @@ def _write(image: np.ndarray, text: str, *, left: int, top: int, scale: int, col
 
 
 def tin(rng: np.random.Generator) -> np.ndarray:
-    """A printed tea tin: an atlas of six columns (+x, +y, -x, -y, top, bottom)."""
+    """Return a printed tea tin: an atlas of six columns (+x, +y, -x, -y, top, bottom)."""
     n = 256
     v, u = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(n) + 0.5) / n, indexing="ij")
     front, side, top = np.empty((n, n, 3)), np.empty((n, n, 3)), np.empty((n, n, 3))
@@ -209,7 +209,7 @@ def speckled(
 
 
 def foliage(rng: np.random.Generator) -> np.ndarray:
-    """A leaf with a pale midrib and side veins: u along the leaf, v across."""
+    """Return a leaf with a pale midrib and side veins: u along the leaf, v across."""
     v, u = np.meshgrid((np.arange(64) + 0.5) / 64, (np.arange(128) + 0.5) / 128, indexing="ij")
     image = np.empty((64, 128, 3))
     image[:] = (0.22, 0.42, 0.20)

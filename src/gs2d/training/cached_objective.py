@@ -41,7 +41,7 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int) 
 
 
 def choose_objective(whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int) -> Objective:
-    """Cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
+    """Return cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
     backend, views = whole.backend, len(whole.scene.train)
     if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend=backend, views=views):
         cached = CachedViews(whole, state, stage, limit_bytes, least=MIN_FRACTION * views)

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Initialised:
-    """The start: ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths"
-    (known ones too) or "random"; ``dropped``: unusable."""
+    """The start.
+
+    ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths" (known ones too) or
+    "random"; ``dropped``: unusable.
+    """
 
     splats: int
     source: str

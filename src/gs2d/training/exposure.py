@@ -64,7 +64,7 @@ class Exposures:
         return identity(self.offsets) + (self.offsets - self.offsets.mean(dim=0))
 
     def transform(self, index: int) -> Tensor:
-        """That of view ``index`` [3, 4], a tensor of its own."""
+        """Return that of view ``index`` [3, 4], a tensor of its own."""
         return identity(self.offsets) + (self.offsets[index] - self.offsets.mean(dim=0))
 
     def move_to(self, device: torch.device | str) -> None:
@@ -72,7 +72,7 @@ class Exposures:
         self.offsets, self.mean, self.square = (t.to(device) for t in (self.offsets, self.mean, self.square))
 
     def state_dict(self) -> dict[str, Any]:
-        """A deep copy in the host's memory."""
+        """Return a deep copy in the host's memory."""
         tensors = {"offsets": self.offsets, "mean": self.mean, "square": self.square}
         return {name: tensor.detach().to("cpu", copy=True) for name, tensor in tensors.items()} | {
             "steps": list(self.steps)
@@ -80,7 +80,7 @@ class Exposures:
 
     @classmethod
     def from_state_dict(cls, data: Mapping[str, Any]) -> Exposures:
-        """What :meth:`state_dict` described (KeyError, TypeError, AttributeError: something else)."""
+        """Return what :meth:`state_dict` described (KeyError, TypeError, AttributeError: something else)."""
         offsets, mean, square = (data[name].clone() for name in ("offsets", "mean", "square"))
         return cls(offsets, mean, square, [int(count) for count in data["steps"]])
 
@@ -101,7 +101,7 @@ def check_views(exposures: Exposures | None, views: int) -> None:
 
 
 def _rate(recipe: Recipe, stage: int, iteration: int) -> float:
-    """The rate at an iteration (from 1) of a stage, counted over all stages; 0 before exposures are learned."""
+    """Return the rate at an iteration (from 1) of a stage, counted over all stages; 0 before exposures are learned."""
     assert recipe.exposure is not None
     of_run = sum(earlier.iterations for earlier in recipe.stages[:stage]) + iteration
     return recipe.exposure.rate_at(of_run) if of_run > recipe.exposure.start else 0.0
@@ -154,7 +154,7 @@ def uncount(exposures: Exposures, index: int, recipe: Recipe, stage: int, iterat
 def apply_exposure(
     splats: Splats, camera: Camera, transform: Tensor, settings: RasterSettings
 ) -> tuple[Splats, RasterSettings]:
-    """The splats in the colours that a photograph of this transform shows, and settings to draw them with.
+    """Return the splats in the colours that a photograph of this transform shows, and settings to draw them with.
 
     Their colours towards the camera are worked out, transformed, and kept as constant ones (degree 0).
     """

@@ -110,13 +110,13 @@ def usable_points(points: np.ndarray, scene: Scene, near: float) -> np.ndarray:
 
 
 def random_rotations(count: int, generator: torch.Generator) -> Tensor:
-    """Unit quaternions [count, 4] float64, uniform over rotations (normalised Gaussian 4-vectors)."""
+    """Return unit quaternions [count, 4] float64, uniform over rotations (normalised Gaussian 4-vectors)."""
     quats = torch.randn(count, 4, generator=generator, dtype=torch.float64)
     return quats / quats.norm(dim=1, keepdim=True)
 
 
 def turned_to(normals: Tensor, others: Tensor) -> Tensor:
-    """Unit quaternions [P, 4] that turn the z axis, a splat's own normal, to normals; ``others`` where those are 0."""
+    """Return unit quaternions [P, 4] that turn z (a splat's normal) to normals; ``others`` where those are 0."""
     valid = (normals != 0).any(dim=1)
     n = torch.where(normals[:, 2:] < 0, -normals, normals)  # either way round: the nearer one
     quats = torch.stack([1 + n[:, 2], -n[:, 1], n[:, 0], torch.zeros_like(n[:, 0])], dim=1)

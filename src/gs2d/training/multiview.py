@@ -28,7 +28,7 @@ def is_compared(stage: Stage, iteration: int) -> bool:
 
 
 def find_neighbours(scene: Scene, settings: MultiView) -> tuple[tuple[int, ...], ...]:
-    """Indices of the neighbours of each training view, nearest first; none where there is none.
+    """Return indices of the neighbours of each training view, nearest first; none where there is none.
 
     Raises
     ------
@@ -85,7 +85,7 @@ class Turn:
 def draw_turn(
     recipe: Recipe, stage: int, iteration: int, neighbours: tuple[int, ...], settings: MultiView
 ) -> Turn | None:
-    """The draws of an iteration (from 1) of a stage; None for a view without neighbours."""
+    """Return the draws of an iteration (from 1) of a stage; None for a view without neighbours."""
     if not neighbours:
         return None
     generator = np.random.Generator(np.random.Philox(key=[recipe.seed, (stage << 40) + iteration]))
@@ -101,7 +101,7 @@ class ImageFiles:
         self._kept: dict[int, PatchImage] = {}
 
     def of(self, index: int, target: Target) -> PatchImage:
-        """That of view ``index``, whose target is given."""
+        """Return that of view ``index``, whose target is given."""
         kept = self._kept.get(index)
         if kept is not None:
             return kept

@@ -35,7 +35,7 @@ from gs2d.training.targets import Target, TargetSource
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
-    """The rasterizer's constants for a scene of this extent (world units) under a protocol."""
+    """Return the rasterizer's constants for a scene of this extent (world units) under a protocol."""
     near = protocol.near_for(extent)
     # far only scales the distortion; in a large frame it keeps the ratio to near that 0.2 and 100 have.
     far = max(RasterSettings.far, near * RasterSettings.far / RasterSettings.near)
@@ -109,13 +109,13 @@ class FullRender:
         self._priors = Priors(scene, recipe, device=backend.device) if has_priors(recipe) else None
 
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
-        """The rasterizer's constants at an iteration (1-based)."""
+        """Return the rasterizer's constants at an iteration (1-based)."""
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
         wanted = any(term.kind == "distortion" for term in stage.losses)
         return replace(raster_settings(self.protocol, self.scene.extent, degree), with_distortion=wanted)
 
     def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
-        """The camera of training view ``index`` where it is now; with ``learns`` its pose gets a gradient."""
+        """Return the camera of training view ``index`` where it is now; with ``learns`` its pose gets a gradient."""
         given = self.scene.train[index].camera
         return given if state.poses is None else state.poses.camera(index, given, learns=learns)
 
@@ -136,7 +136,7 @@ class FullRender:
 
     @torch.no_grad()
     def _neighbour_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Neighbour | None:
-        """The view that view ``index`` is compared with in an iteration, rendered; None: with none."""
+        """Return the view that view ``index`` is compared with in an iteration, rendered; None: with none."""
         settings = self.recipe.multiview
         if settings is None or not is_compared(stage, iteration):
             return None
@@ -237,7 +237,7 @@ def is_async(device: torch.device) -> bool:
 
 
 def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tensor]) -> dict[str, float]:
-    """The losses as numbers.
+    """Return the losses as numbers.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tens
 
 
 def _learning_rows(state: TrainState, stage: Stage) -> Tensor | None:
-    """The splats [N] of which the stage trains anything; None where it trains an attribute of all."""
+    """Return the splats [N] of which the stage trains anything; None where it trains an attribute of all."""
     groups = set(stage.train.values())
     if not groups or "all" in groups:
         return None
@@ -259,7 +259,7 @@ def _learning_rows(state: TrainState, stage: Stage) -> Tensor | None:
 
 
 def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
-    """The error for something that is not finite."""
+    """Return the error for something that is not finite."""
     return DivergedError(
         f"training diverged at iteration {iteration} of stage {stage.name!r}: {what} is NaN or infinite; "
         f"lower a rate (--set {stage.name}.lr.means=...) or check the cameras and photographs"
@@ -267,11 +267,11 @@ def diverged(stage: Stage, iteration: int, what: str) -> DivergedError:
 
 
 def _gradient(leaf: Tensor) -> Tensor:
-    """The gradient of a leaf; zero where nothing depends on it."""
+    """Return the gradient of a leaf; zero where nothing depends on it."""
     return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
 
 
 def first_not_finite(tensors: Mapping[str, Tensor], backend: Backend) -> str | None:
-    """The name of the first tensor that holds a NaN or an infinity; None if all are finite."""
+    """Return the name of the first tensor that holds a NaN or an infinity; None if all are finite."""
     number = backend.first_not_finite(list(tensors.values()))
     return None if number is None else list(tensors)[number]

@@ -17,7 +17,7 @@ from gs2d.training.state import TrainState
 
 
 def start(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:
-    """The state with what the recipe learns of views, at its beginning."""
+    """Return the state with what the recipe learns of views, at its beginning."""
     if recipe.exposure is not None:
         state.exposures = Exposures.start(len(scene.train), state.splats.means)
         known = point_gains(scene) if recipe.exposure.initial == "points" else None
@@ -57,14 +57,14 @@ def rollback(state: TrainState, recipe: Recipe, iteration: int, index: int) -> N
 
 
 def find_nonfinite(state: TrainState) -> str:
-    """What is not finite, in words; "" if all is."""
+    """Return what is not finite, in words; "" if all is."""
     if state.exposures is not None and not finite(state.exposures.offsets):
         return "an exposure"
     return "a pose" if state.poses is not None and not finite(state.poses.offsets) else ""
 
 
 def scene_now(state: TrainState, scene: Scene) -> Scene:
-    """The scene with its training cameras where they are now."""
+    """Return the scene with its training cameras where they are now."""
     poses = state.poses
     if poses is None:
         return scene

@@ -126,7 +126,7 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
 
 
 def _trimming(results: Iterable[T]) -> Iterator[T]:
-    """The results one by one; the holes that their making leaves between them are given back now and then."""
+    """Yield the results one by one; the holes that their making leaves between them are given back now and then."""
     for done, result in enumerate(results, start=1):
         yield result
         if done % TRIM_EVERY == 0:
@@ -178,7 +178,7 @@ def _thin(found: _Found, cell: float) -> _Found:
 
 
 def _swept(sweep: Sweep, index: int, settings: DenseStart) -> _Found:
-    """The places on which enough neighbours of a view agree."""
+    """Return the places on which enough neighbours of a view agree."""
     view, depth = sweep.views[index], sweep.depths[index]
     places = unproject(view, depth)
     kept = sweep.agreeing(index, settings.agree) >= min(settings.votes, max(1, len(sweep.neighbours[index]) - 1))
@@ -228,7 +228,7 @@ def _shrunk(view: View, observed: ObservedPoints, factor: int) -> SmallView:
 def _neighbours(
     scene: Scene, views: Sequence[SmallView], observed: ObservedPoints, settings: DenseStart
 ) -> tuple[tuple[int, ...], ...]:
-    """The views that each is compared with: many shared points, and lines of sight some ten degrees apart."""
+    """Return the views that each is compared with: many shared points, and lines of sight some ten degrees apart."""
     count = len(views)
     centers = np.stack([view.camera.center for view in scene.train])
     rows = [observed.seen.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train]

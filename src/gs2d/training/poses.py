@@ -68,7 +68,7 @@ class Poses:
         return torch.stack([self.motion(index) for index in range(len(self))])
 
     def motion(self, index: int) -> Tensor:
-        """That of one camera [6]."""
+        """Return that of one camera [6]."""
         theta, J = self.offsets.numpy(), self._by_similarity
         own = theta[index] - J[index] @ common_motion(theta, J)
         return torch.from_numpy(np.concatenate([own[:3], own[3:] * self.extent]))
@@ -78,12 +78,12 @@ class Poses:
         return se3_exp(self.motion(index)) @ self.given[index]
 
     def camera(self, index: int, given: Camera, *, learns: bool = False) -> Camera:
-        """The camera of a view as it stands now; with ``learns`` its pose gets a gradient."""
+        """Return the camera of a view as it stands now; with ``learns`` its pose gets a gradient."""
         pose: Any = self.pose(index)
         return replace(given, T_cam_world=pose.requires_grad_() if learns else pose)
 
     def gradient(self, camera: Camera) -> Tensor:
-        """That of a motion [6], rad and extents, at where the camera is, from the gradient of its pose."""
+        """Return that of a motion [6], rad and extents, at where the camera is, from the gradient of its pose."""
         pose = camera.pose
         assert pose is not None
         if pose.grad is None:  # no splat is in the picture
@@ -93,14 +93,14 @@ class Poses:
         return torch.stack([*turn, *(by[:3, 3] * self.extent)])
 
     def state_dict(self) -> dict[str, Any]:
-        """A deep copy."""
+        """Return a deep copy."""
         names = ("given", "offsets", "mean", "square")
         tensors = {name: getattr(self, name).clone() for name in names}
         return {**tensors, "extent": self.extent, "steps": list(self.steps)}
 
     @classmethod
     def from_state_dict(cls, data: Mapping[str, Any]) -> Poses:
-        """What :meth:`state_dict` described (KeyError, TypeError, AttributeError: something else)."""
+        """Return what :meth:`state_dict` described (KeyError, TypeError, AttributeError: something else)."""
         given, offsets, mean, square = (data[name].clone() for name in ("given", "offsets", "mean", "square"))
         return cls(given, float(data["extent"]), offsets, mean, square, [int(count) for count in data["steps"]])
 
@@ -121,7 +121,7 @@ def check_poses(poses: Poses | None, views: int) -> None:
 
 
 def pose_rate(recipe: Recipe, stage: int, iteration: int) -> float:
-    """The rate at an iteration (from 1) of a stage, counted over all stages; 0 where poses do not learn."""
+    """Return the rate at an iteration (from 1) of a stage, counted over all stages; 0 where poses do not learn."""
     if recipe.poses is None or not recipe.stages[stage].moves_all:
         return 0.0
     return recipe.poses.rate_at(sum(earlier.iterations for earlier in recipe.stages[:stage]) + iteration)

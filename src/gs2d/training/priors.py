@@ -89,12 +89,12 @@ def plan_depths(scene: Scene, settings: DepthPrior) -> DepthPlan:
 
 
 def _asked(mapped: list[View]) -> list[View]:
-    """Some of the views, spread evenly."""
+    """Return some of the views, spread evenly."""
     return mapped[:: max(1, -(-len(mapped) // ASKED_VIEWS))]
 
 
 def _fitted_unit(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> float | None:
-    """What brings the maps to the points; None without points.
+    """Return what brings the maps to the points; None without points.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def _fitted_unit(mapped: list[View], observed: ObservedPoints | None, settings: 
 
 
 def _fitted_space(mapped: list[View], observed: ObservedPoints | None, settings: DepthPrior) -> str:
-    """What the maps are linear in, by the median error of lines through the points; disparity without points."""
+    """Return what the maps are linear in, by the median error of lines through the points; disparity without points."""
     errors: dict[str, list[float]] = {"disparity": [], "depth": []}
     for view in _asked(mapped) if observed is not None else ():
         assert observed is not None
@@ -187,7 +187,7 @@ class Priors:
         self.axes = None if recipe.normal_prior is None else plan_normals(scene, recipe.normal_prior)
 
     def of(self, index: int, stage: int, iteration: int, dtype: torch.dtype) -> Prior:
-        """What is known of view ``index`` in an iteration (from 1) of a stage."""
+        """Return what is known of view ``index`` in an iteration (from 1) of a stage."""
         recipe = self._recipe
         depth, normal = self.at(index, dtype)
         of_run = sum(earlier.iterations for earlier in recipe.stages[:stage]) + iteration
@@ -220,7 +220,7 @@ class Priors:
 
 
 def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
-    """The scene with places on its known depth maps among its points; itself where the recipe asks for none.
+    """Return the scene with places on its known depth maps among its points; itself where the recipe asks for none.
 
     As many as the recipe's ``init_points``, of random pixels of all training views alike: the rates of means let a
     splat wander by a few per cent of the extent, not to a wall that no sparse point is near. They lie in the planes of
@@ -261,7 +261,7 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
 
 
 def plane_normals(points: np.ndarray, neighbours: int = 16) -> np.ndarray:
-    """Unit normals [P, 3] of the planes through the nearest points of each point [P, 3]; 0 where there are too few."""
+    """Fit unit normals [P, 3] of planes through the nearest points of each point [P, 3]; 0 where too few."""
     if len(points) < neighbours:
         return np.zeros_like(points)
     near = points[cKDTree(points).query(points, k=neighbours)[1]]  # [P, k, 3]
@@ -276,7 +276,7 @@ def metric_depths(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Depths | None:
-    """The known depths of a view; None where it has none."""
+    """Return the known depths of a view; None where it has none."""
 
     def tensor(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(array).to(device, dtype)
@@ -315,7 +315,7 @@ def metric_depths(
 
 
 def _around(points: PointsInView, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The four pixels around each point [M, 4], their bilinear weights, and the depths [M]."""
+    """Return the four pixels around each point [M, 4], their bilinear weights, and the depths [M]."""
     at = points.pixels - 0.5
     left, top = np.floor(at).astype(np.int64).T
     u, v = (at - np.floor(at)).T
@@ -327,7 +327,7 @@ def _around(points: PointsInView, width: int) -> tuple[np.ndarray, np.ndarray, n
 
 # -- normals -------------------------------------------------------------------------------------------------------
 def plan_normals(scene: Scene, settings: NormalPrior) -> str:
-    """The axes of a capture's normal maps: "opencv" or "opengl".
+    """Return the axes of a capture's normal maps: "opencv" or "opengl".
 
     Raises
     ------

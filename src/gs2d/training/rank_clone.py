@@ -42,7 +42,7 @@ def rank_by_error(state: TrainState, action: RankByError, errors_by_view: Iterab
 
 
 def worst(errors: Tensor, top_percent: float) -> Tensor:
-    """Indices of the ceil(top_percent / 100 * N) largest of errors [N]; of equal ones the lower index comes first."""
+    """Return indices of the ceil(top_percent / 100 * N) largest of errors [N]; of equal ones the lower first."""
     count = math.ceil(round(top_percent * len(errors) / 100, 9))  # 0.1 + 0.2 must not cost a splat
     return torch.sort(errors, descending=True, stable=True).indices[:count]
 

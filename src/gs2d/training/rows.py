@@ -68,7 +68,7 @@ class _Rows:
             self.kept = None if len(kept) == self.before else kept
 
     def of(self, old: Tensor, new: Tensor | None = None) -> Tensor:
-        """The rows of ``old`` that stay, then those of ``new``, or zeros."""
+        """Return the rows of ``old`` that stay, then those of ``new``, or zeros."""
         if self.kept is None and self.added == 0:
             return old
         stay = self.before if self.kept is None else len(self.kept)

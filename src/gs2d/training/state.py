@@ -87,7 +87,7 @@ class TrainState:
         return self.queue.pop()
 
     def state_dict(self) -> dict[str, Any]:
-        """A deep copy in the host's memory, in tensors and plain Python (``torch.load(..., weights_only=True)``)."""
+        """Return a deep copy on the host, in tensors and plain Python (``torch.load(..., weights_only=True)``)."""
         return {
             "format": FORMAT,
             "splats": {name: _copy(tensor) for name, tensor in self.splats.items()},
@@ -110,7 +110,7 @@ class TrainState:
 
     @classmethod
     def from_state_dict(cls, data: Mapping[str, Any]) -> TrainState:
-        """The state that :meth:`state_dict` described (tensors are copied).
+        """Return the state that :meth:`state_dict` described (tensors are copied).
 
         Raises
         ------
@@ -176,5 +176,5 @@ class TrainState:
 
 
 def _copy(tensor: Tensor) -> Tensor:
-    """A copy in the host's memory."""
+    """Return a copy in the host's memory."""
     return tensor.detach().to("cpu", copy=True)

@@ -110,7 +110,7 @@ class _DecodedImage:
     mask: Tensor | None  # [H, W] bool
 
     def nbytes(self, place: str) -> int:
-        """What it takes on the device or, where torch rounds each tensor up to a power of two, in pinned memory."""
+        """Return the bytes it takes on the device or (torch rounds up to powers of two) in pinned memory."""
         sizes = [self.image.nbytes, 0 if self.mask is None else self.mask.nbytes]
         return sum(1 << (size - 1).bit_length() if place == "pinned" and size else size for size in sizes)
 

@@ -228,7 +228,7 @@ class Trainer:
         return Surroundings(stage.name, self.scene, self.settings, self.protocol.white, self._learner)
 
     def _make_targets(self, limit_bytes: int | None) -> TargetSource:
-        """The photographs, where the splats are."""
+        """Return the photographs, where the splats are."""
         views, background, splats = self.scene.train, self.protocol.background, self.state.splats
         use_masks, dtype, device = self.protocol.use_mask_in_training, splats.dtype, splats.device
         if is_async(device):
@@ -265,7 +265,7 @@ class Trainer:
         return per_image.start(TrainState(initial.splats, generator), self.recipe, self.scene)
 
     def _checked(self, state: TrainState) -> TrainState:
-        """A state from outside, if it is of this recipe."""
+        """Return a state from outside, if it is of this recipe."""
         state.check()
         stages = self.recipe.stages
         if state.splats.sh_degree != self.recipe.sh_degree:
@@ -299,7 +299,7 @@ class Trainer:
         return events.Ranked(stage.name, action.writes, int(group.sum()), float(errors[group].min()), fraction)
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
-        """The inner sum of E_i [N] for each training view."""
+        """Yield the inner sum of E_i [N] for each training view."""
         for index in range(len(self.scene.train)):
             target, splats, settings = self._targets[index], self.state.splats, self.settings
             camera = self._whole.camera(self.state, index)

@@ -107,7 +107,7 @@ class ClipBox:
             self._on_change()
 
     def _segments(self) -> np.ndarray:
-        """The twelve edges [12, 2, 3] in the viewer's frame."""
+        """Return the twelve edges [12, 2, 3] in the viewer's frame."""
         low, high = self.box
         corners = np.array([np.where(bits, high, low) for bits in itertools.product((0, 1), repeat=3)])
         pairs = [(i, i | 1 << k) for i in range(8) for k in range(3) if not i >> k & 1]

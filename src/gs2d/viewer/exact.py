@@ -34,11 +34,11 @@ class ViewerFrame:
     unit: float
 
     def inside(self, point: np.ndarray) -> np.ndarray:
-        """A place in the world [3] in the viewer."""
+        """Return a place in the world [3] in the viewer."""
         return np.asarray((np.asarray(point, np.float64) - self.origin) / self.unit)
 
     def outside(self, point: np.ndarray) -> np.ndarray:
-        """A place in the viewer [3] in the world."""
+        """Return a place in the viewer [3] in the world."""
         return np.asarray(np.asarray(point, np.float64) * self.unit + self.origin)
 
 
@@ -123,7 +123,7 @@ class ExactImages:
         self._thread.join(timeout=5)
 
     def _next(self) -> tuple[_Wish, bool, str, Callable[[], Render]] | None:
-        """The next picture to draw, and whether it is a sharp one; waits for a wish. None: closed."""
+        """Return the next picture to draw, and whether it is a sharp one; waits for a wish. None: closed."""
         with self._changed:
             while not self._closed:
                 now = time.monotonic()
@@ -155,7 +155,7 @@ class ExactImages:
 
 
 def camera_of(view: Any, frame: ViewerFrame, most_pixels: int) -> Camera:
-    """The camera of a browser, with as many pixels as allowed; viser's cameras look along +z with y down, as ours.
+    """Return a browser's camera, with as many pixels as allowed; viser's look along +z with y down, as ours.
 
     ``view`` has ``wxyz``, ``position``, ``fov`` (vertical, radians), ``image_width`` and ``image_height``.
     """

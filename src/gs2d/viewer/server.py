@@ -58,7 +58,7 @@ class ViewerStage:
 
 
 def required_viser() -> Any:
-    """The package viser.
+    """Return the package viser.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def free_port(host: str, port: int | None, *, option: str = "--port") -> int:
 
 
 def thumbnail(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
-    """A photograph [H, W, 3 or 4] uint8, small and without alpha."""
+    """Return a photograph [H, W, 3 or 4] uint8, small and without alpha."""
     picture = Image.fromarray(image)
     picture.thumbnail((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
     if picture.mode == "RGBA":
@@ -220,12 +220,12 @@ class Viewer:
         self.clip = ClipBox(self._server, self._frame, box, source, show, of_run=of_run)
 
     def add_status(self, text: str) -> Callable[[str], None]:
-        """A line of text above all else, in Markdown; returns what changes it."""
+        """Return a line of text above all else, in Markdown; returns what changes it."""
         line = self._server.gui.add_markdown(text, order=-1)
         return lambda changed: setattr(line, "content", changed)
 
     def add_switch(self, label: str, on_change: Callable[[bool], None]) -> None:
-        """A box that is off at first."""
+        """Add a box that is off at first."""
         box = self._server.gui.add_checkbox(label, initial_value=False)
         box.on_update(lambda _: on_change(bool(box.value)))
 
@@ -239,7 +239,7 @@ class Viewer:
         self._server.flush()
 
     def add_mesh(self, glb: bytes, turn: Sequence[float]) -> None:
-        """A mesh as a .glb file, whose own ``turn`` (x, y, z, w) is undone: the scene is in the capture's frame."""
+        """Add a mesh (.glb) whose own ``turn`` (x, y, z, w) is undone: the scene is in the capture's frame."""
         x, y, z, w = turn
         node = self._server.scene.add_glb(
             "/mesh",
@@ -309,7 +309,7 @@ class Viewer:
 
 
 def _spacing(centers: np.ndarray) -> float:
-    """A typical distance between neighbours [V, 3]; of one camera 1."""
+    """Return a typical distance between neighbours [V, 3]; of one camera 1."""
     if len(centers) < 2:
         return 1.0
     distance = np.linalg.norm(centers[:, None] - centers[None], axis=2)
@@ -318,12 +318,12 @@ def _spacing(centers: np.ndarray) -> float:
 
 
 def field_of_view(camera: Camera) -> float:
-    """The vertical angle, radians."""
+    """Return the vertical angle, radians."""
     return float(2 * np.arctan(camera.height / 2 / camera.fy))
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """A rotation matrix [3, 3] as w, x, y, z."""
+    """Return a rotation matrix [3, 3] as w, x, y, z."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
@@ -331,7 +331,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def middle_of(cameras: Sequence[Camera], centers: np.ndarray) -> np.ndarray:
-    """What to look at first: what the cameras look at, else the middle of the splats' centres [N, 3]."""
+    """Return what to look at first: what the cameras look at, else the middle of the splats' centres [N, 3]."""
     if len(cameras) > 1:
         return focus_point(list(cameras))
     return np.asarray(np.median(centers, axis=0) if len(centers) else np.zeros(3), np.float64)

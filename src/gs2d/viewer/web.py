@@ -132,7 +132,7 @@ def pack(splats: Splats, origin: np.ndarray, degree: int, alpha_min: float) -> P
 
 
 def _seen_rows(splats: Splats, alpha_min: float) -> torch.Tensor:
-    """Indices of the splats that can be seen."""
+    """Return indices of the splats that can be seen."""
     seen = splats.opacity_logits.double().sigmoid() >= alpha_min
     seen &= splats.quats.double().norm(dim=1) > 0
     for _, tensor in splats.items():
@@ -249,7 +249,7 @@ def write_page(
 
 
 def _pieces(before: bytes, packed: Packed, after: bytes) -> Iterator[bytes]:
-    """The page, with the splats as text, piece by piece."""
+    """Yield the page, with the splats as text, piece by piece."""
     yield before
     rest = b""
     for zipped in packed.zipped():
@@ -270,7 +270,7 @@ def _part(name: str, file: str, kind: str) -> str:
 
 
 def _box_row(axis: int) -> str:
-    """The two numbers of the clip box along an axis."""
+    """Return the two numbers of the clip box along an axis."""
     name = "xyz"[axis]
     inputs = "".join(
         f'<input type="number" data-side="{side}" data-axis="{axis}" aria-label="{word} {name}">'
@@ -287,7 +287,7 @@ def _facts(
     up: np.ndarray,
     subject: Subject,
 ) -> Mapping[str, Any]:
-    """What the page is told beside the splats; places are relative to the packed origin."""
+    """Return what the page is told beside the splats; places are relative to the packed origin."""
     cameras = [view.camera for view in views]
     arc = photographed_arc(cameras, subject, up)
     return {

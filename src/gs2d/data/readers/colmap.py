@@ -19,7 +19,7 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".")
 
 
 def model_folder(root: Path) -> tuple[Path, str] | None:
-    """The folder of the model and its kind ("bin" or "txt"), or None: ``sparse/0``, ``sparse`` or ``root`` itself."""
+    """Find the model's folder and kind ("bin" or "txt"), or None: ``sparse/0``, ``sparse`` or ``root`` itself."""
     for name in MODEL_FOLDERS:
         kind = find_model(root / name)
         if kind is not None:
@@ -112,13 +112,13 @@ def observed_points(folder: Path, kind: str) -> ObservedPoints:
 
 
 def model_points(folder: Path, kind: str) -> PointCloud | None:
-    """The sparse points of a model as a PointCloud, or None."""
+    """Return the sparse points of a model as a PointCloud, or None."""
     points = read_points(folder, kind)
     return None if points is None or not len(points.xyz) else PointCloud(points.xyz, points.rgb)
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of the image ``name`` in ``folder``: ``name.png``, ``name`` with the suffix .png, or ``name``."""
+    """Return the mask of the image ``name`` in ``folder``: ``name.png``, ``name`` with the suffix .png, or ``name``."""
     candidates = (folder / f"{name}.png", (folder / name).with_suffix(".png"), folder / name)
     return next((path for path in candidates if path.is_file()), None)
 
@@ -133,7 +133,7 @@ def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage
 
 
 def _image_folder(root: Path, model: Path, images: list[ColmapImage]) -> tuple[Path, Path]:
-    """(the folder that holds images, masks and sparse; the folder of the images)."""
+    """Return (the folder that holds images, masks and sparse; the folder of the images)."""
     homes = dict.fromkeys([root, model.parent, model.parent.parent])
     for home in homes:
         if (home / "images").is_dir():
@@ -152,7 +152,7 @@ def _other_models(folder: Path) -> list[str]:
 
 
 def _check_factor(path: Path, k: Intrinsics, factor: int) -> None:
-    """A file in ``images_N`` must be 1/N of its camera's size, up to rounding."""
+    """Check that a file in ``images_N`` is 1/N of its camera's size, up to rounding."""
     got, expected = np.array(image_size(path)), np.array((k.width, k.height)) / factor
     if (np.abs(got - expected) > np.maximum(1.0, 0.01 * expected)).any():
         raise DataError(

@@ -77,7 +77,7 @@ class ColmapPoints:
 
 
 def find_model(folder: Path) -> str | None:
-    """ "bin" or "txt" if ``folder`` holds a COLMAP model of that kind (binary is preferred), else None."""
+    """Return "bin" or "txt" if ``folder`` holds a COLMAP model of that kind (binary is preferred), else None."""
     for kind in ("bin", "txt"):
         if (folder / f"cameras.{kind}").is_file() and (folder / f"images.{kind}").is_file():
             return kind
@@ -103,7 +103,7 @@ def read_images(folder: Path, kind: str, *, observations: bool = False) -> list[
 
 
 def read_points(folder: Path, kind: str) -> ColmapPoints | None:
-    """The sparse points, or None if the model has no such file. Raises DataError as the others."""
+    """Return the sparse points, or None if the model has no such file. Raises DataError as the others."""
     path = folder / f"points3D.{kind}"
     if not path.is_file():
         return None
@@ -136,7 +136,7 @@ class _Bytes:
         return struct.unpack_from("<" + layout, self.data, self.need(struct.calcsize("<" + layout), what))
 
     def count(self, what: str, smallest: int) -> int:
-        """The number of records that follow, each of at least ``smallest`` bytes."""
+        """Return the number of records that follow, each of at least ``smallest`` bytes."""
         count = int(self.unpack("Q", f"the number of {what}")[0])
         if self.at + count * smallest > len(self.data):
             raise DataError(

@@ -86,7 +86,7 @@ def read_dtu(root: Path) -> Capture:
 
 
 def _observed(model: _Model, frames: Sequence[PosedImage]) -> ObservedPoints:
-    """The model's points by the photographs of the scan, which may have another suffix there."""
+    """Return the model's points by the photographs of the scan, which may have another suffix there."""
     found = observed_points(model.folder, model.kind)
     by_stem = {Path(frame.name).stem: frame.name for frame in frames}
     seen = {by_stem[Path(name).stem]: rows for name, rows in found.seen.items() if Path(name).stem in by_stem}
@@ -131,7 +131,7 @@ class DtuSilhouette:
 
 
 def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
-    """The mask files of a scan at their full size, with the cameras of the archive, which were made for that size.
+    """Return the mask files of a scan in full size, with the archive's cameras, which were made for that size.
 
     What the official evaluation culls with, whatever the size of the photographs. Empty without mask files.
 
@@ -153,7 +153,7 @@ def dtu_silhouettes(root: Path) -> tuple[DtuSilhouette, ...]:
 
 
 def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.ndarray], dict[int, np.ndarray]]:
-    """The archive, its world_mat and its scale_mat: of two, the one whose frame is that of ``sparse/0``."""
+    """Return the archive, its world_mat and its scale_mat: of two, the one whose frame is that of ``sparse/0``."""
     paths = [root / name for name in CAMERA_FILES if (root / name).is_file()]
     if not paths:
         raise DataError(f"{root} must hold {' or '.join(CAMERA_FILES)}, got neither")
@@ -256,7 +256,7 @@ def _same_places(centers: dict[str, np.ndarray], model: _Model) -> bool:
 def _with_model(
     frames: list[PosedImage], model: _Model | None
 ) -> tuple[list[PosedImage], PointCloud | None, tuple[str, ...]]:
-    """The frames with the model's cameras where those were made for the photographs; its points; what was decided."""
+    """Return the frames with the model's cameras where those fit the photographs; its points; what was decided."""
     if model is None or (model.points is None and not model.images):
         return frames, None, ()
     if not _same_places({Path(frame.name).stem: _center(frame.T_cam_world) for frame in frames}, model):
@@ -273,7 +273,7 @@ def _with_model(
 
 
 def _of_model(frame: PosedImage, image: ColmapImage | None, model: _Model) -> PosedImage:
-    """The frame, or one with the model's camera if that has the photograph's size and another focal length or centre.
+    """Return the frame, with the model's camera if that has the photograph's size and another focal length or centre.
 
     A mask of another size than such a photograph is of the original one: the photograph's alpha channel replaces it.
     """

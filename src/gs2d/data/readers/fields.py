@@ -15,7 +15,7 @@ _HEAD = 4096  # bytes in which a file says what it is
 
 
 def head(path: Path) -> bytes:
-    """The first bytes of a file; none of what is not there, a folder, or not ours to read."""
+    """Return the first bytes of a file; none of what is not there, a folder, or not ours to read."""
     try:
         with open(path, "rb") as file:
             return file.read(_HEAD)
@@ -24,7 +24,7 @@ def head(path: Path) -> bytes:
 
 
 def real(value: Any, where: str) -> float:
-    """A finite number, which may be written as text.
+    """Return a finite number, which may be written as text.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def reals(value: Any, count: int, where: str) -> np.ndarray:
 
 
 def whole(value: Any, where: str) -> int:
-    """A whole number that is not negative.
+    """Return a whole number that is not negative.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def whole(value: Any, where: str) -> int:
 
 
 def entries(value: Any, where: str) -> Mapping[str, Any]:
-    """An object of JSON.
+    """Return an object of JSON.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def entries(value: Any, where: str) -> Mapping[str, Any]:
 
 
 def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
-    """The value of a key that must be there.
+    """Return the value of a key that must be there.
 
     Raises
     ------

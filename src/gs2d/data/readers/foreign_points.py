@@ -21,7 +21,7 @@ _LOOKED_FROM = 100  # cameras that are asked
 
 
 def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud | None, list[str]]:
-    """The points of a PLY file in ``root``, and a note where there is one that is not used.
+    """Return the points of a PLY file in ``root``, and a note where there is one that is not used.
 
     One of a usual name (``points3D.ply``, ``points.ply``, ``sparse.ply``, ``sparse_points.ply``, ``tie_points.ply``,
     ``point_cloud.ply``), else the only one. Points are exported with a coordinate system of their own choice: where
@@ -54,7 +54,7 @@ def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud 
 
 
 def _seen(points: np.ndarray, frames: Sequence[PosedImage]) -> float:
-    """The share of points that are in the pictures of two cameras (lenses that bend count as straight), and near."""
+    """Return the fraction of points that two cameras see (lenses that bend count as straight) from near."""
     some = points[np.linspace(0, len(points) - 1, min(len(points), _LOOKED_AT)).astype(int)]
     some = some[np.isfinite(some).all(axis=1)]
     if not len(some):

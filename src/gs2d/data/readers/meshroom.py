@@ -42,7 +42,7 @@ _FILES = ("cameras.sfm", "sfm.json", "cameras.json")
 
 
 def scene_file(root: Path) -> Path | None:
-    """The file of a folder that holds a scene of AliceVision with poses: ``cameras.sfm`` first; None without one."""
+    """Find the file of a folder with a scene of AliceVision with poses: ``cameras.sfm`` first; None without."""
     files = [root / name for name in _FILES] + sorted(root.glob("*.sfm"))
     return next((path for path in files if _is_scene(path)), None)
 
@@ -112,7 +112,7 @@ def _version(data: Mapping[str, Any], path: Path) -> tuple[int, ...]:
 
 
 def _list(data: Mapping[str, Any], key: str, path: Path) -> Sequence[Mapping[str, Any]]:
-    """A list of objects; an empty one is written as an empty text."""
+    """Return a list of objects; an empty one is written as an empty text."""
     value = data.get(key) or []
     if not isinstance(value, list):
         raise DataError(f"{path}: {key} must be a list, got {type(value).__name__}")

@@ -46,7 +46,7 @@ _SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def camera_file(root: Path) -> Path | None:
-    """The XML file of a folder that holds Metashape's cameras: ``cameras.xml``, else the first by name; or None."""
+    """Find the XML file with Metashape's cameras: ``cameras.xml``, else the first by name; or None."""
     files = sorted(root.glob("*.xml"), key=lambda path: (path.name.lower() != "cameras.xml", path.name))
     return next((path for path in files if b"<document" in (begins := head(path)) and b"<chunk" in begins), None)
 
@@ -96,7 +96,7 @@ def read_metashape(root: Path) -> Capture:
 
 
 def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:
-    """The chunk with most cameras, and a note where there are several."""
+    """Return the chunk with most cameras, and a note where there are several."""
     try:
         text = path.read_bytes()
         if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
@@ -131,7 +131,7 @@ def _placed(listed: Sequence[ElementTree.Element]) -> tuple[list[tuple[ElementTr
 
 
 def _component(placed: Sequence[tuple[ElementTree.Element, str]]) -> tuple[str | None, list[str]]:
-    """The component with most cameras: others have no known place relative to it."""
+    """Return the component with most cameras: others have no known place relative to it."""
     counts = Counter(camera.get("component_id") for camera, _ in placed)
     if not counts:
         return None, []
@@ -141,7 +141,7 @@ def _component(placed: Sequence[tuple[ElementTree.Element, str]]) -> tuple[str |
 
 
 def _world(chunk: ElementTree.Element, component: str | None, path: Path) -> Similarity:
-    """The similarity of a component, or of the chunk where the component has none."""
+    """Return the similarity of a component, or of the chunk where the component has none."""
     own = next((c for c in chunk.iterfind("components/component") if c.get("id") == component), None)
     transform = None if own is None else own.find("transform")
     transform = chunk.find("transform") if transform is None else transform
@@ -194,7 +194,7 @@ def _off_the_globe(poses: Poses) -> tuple[Poses, list[str]]:
 
 
 def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
-    """The adjusted calibration of a sensor, else its first."""
+    """Return the adjusted calibration of a sensor, else its first."""
     every = sensor.findall("calibration")
     calibration = next((c for c in every if c.get("class") == "adjusted"), every[0] if every else None)
     if calibration is None:

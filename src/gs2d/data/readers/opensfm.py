@@ -39,7 +39,7 @@ FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 
 
 def reconstruction_file(root: Path) -> Path | None:
-    """The file of a data set of OpenSfM, or of a project of OpenDroneMap; None where there is none."""
+    """Return the file of a data set of OpenSfM, or of a project of OpenDroneMap; None where there is none."""
     return next((root / name for name in FILES if (root / name).is_file()), None)
 
 
@@ -86,7 +86,7 @@ def read_opensfm(root: Path) -> Capture:
 
 
 def _largest(path: Path) -> tuple[Mapping[str, Any], list[str]]:
-    """The reconstruction with most shots, and a note where there are several."""
+    """Return the reconstruction with most shots, and a note where there are several."""
     data = read_json(path)
     if isinstance(data, dict) and "shots" in data:
         data = [data]
@@ -149,7 +149,7 @@ def _intrinsics(camera: Mapping[str, Any], image: Path, where: str) -> Intrinsic
 
 
 def _points(value: Any, path: Path) -> PointCloud | None:
-    """The points of a reconstruction; numbers that are not finite are found later, with those of other formats."""
+    """Return the points of a reconstruction; numbers that are not finite are found later, as for other formats."""
     if not value:
         return None
     rows = entries(value, f"{path}: points")

@@ -117,7 +117,7 @@ def _read_frames(
 
 
 def _maps_of(both: Mapping[str, Any], entry: Mapping[str, Any], root: Path, where: str) -> MapFiles | None:
-    """The maps that a frame names (nerfstudio: ``depth_file_path``; ``normal_file_path``), as far as they exist."""
+    """Return the maps that a frame names (``depth_file_path``, ``normal_file_path``), as far as they exist."""
     paths = {}
     for what in ("depth", "normal"):
         if entry.get(f"{what}_file_path") is not None:
@@ -137,14 +137,14 @@ def _required(entry: Mapping[str, Any], key: str, where: str) -> Any:
 
 
 def _relative(value: Any, where: str) -> str:
-    """A path as written in a file, with ``/`` and without a leading ``./``."""
+    """Return a path as written in a file, with ``/`` and without a leading ``./``."""
     if not isinstance(value, str) or not value:
         raise DataError(f"{where} must be a path, got {value!r}")
     return Path(value.replace("\\", "/")).as_posix()
 
 
 def _find_image(root: Path, name: str) -> Path | None:
-    """The file ``name``, which may come without its extension (NeRF-Synthetic)."""
+    """Return the file ``name``, which may come without its extension (NeRF-Synthetic)."""
     if (root / name).is_file():
         return root / name
     return next((root / (name + suffix) for suffix in _SUFFIXES if (root / (name + suffix)).is_file()), None)
@@ -219,7 +219,7 @@ def _lens(entry: Mapping[str, Any], value: Mapping[str, float], where: str) -> L
 
 
 def _named_split(path: Path, meta: dict[str, Any], frames: list[PosedImage]) -> tuple[list[PosedImage], list[str]]:
-    """The frames with the split that the file names, and sentences about frames that it does not name."""
+    """Return the frames with the split that the file names, and sentences about frames that it does not name."""
     lists: dict[str, set[str]] = {}
     for key in ("train", "val", "test"):
         names = meta.get(f"{key}_filenames")

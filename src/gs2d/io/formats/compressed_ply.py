@@ -75,7 +75,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
 
 
 def _morton_order(means: np.ndarray) -> np.ndarray:
-    """An order in which neighbours in the list are neighbours in space: bits of x, y and z in turn."""
+    """Return an order in which neighbours in the list are neighbours in space: bits of x, y and z in turn."""
     if not len(means):
         return np.zeros(0, dtype=int)
     low, high = means.min(axis=0), means.max(axis=0)

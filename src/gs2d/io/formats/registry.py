@@ -136,7 +136,7 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
 
 
 def read_disks(path: str | os.PathLike[str]) -> Splats:
-    """The flat splats of a file of any format that is written here.
+    """Return the flat splats of a file of any format that is written here.
 
     Raises
     ------

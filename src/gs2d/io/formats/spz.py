@@ -78,7 +78,7 @@ def _fractional_bits(g: Gaussians, farthest: float) -> int:
 
 
 def _streams(g: Gaussians, bits: int) -> list[np.ndarray]:
-    """The attributes in their order, uint8."""
+    """Return the attributes in their order, uint8."""
     fixed = np.rint(g.means.astype(np.float64) * _TURN * (1 << bits)).astype("<i4")
     positions = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
     sh = np.rint(g.shN * _FLIP[: g.shN.shape[1], None] * 128.0).astype(np.int64) + 128
@@ -108,7 +108,7 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def _losses(g: Gaussians) -> tuple[str, ...]:
-    """What clamping changed by more than rounding does: one sentence, with the number of splats, or nothing."""
+    """Return what clamping changed by more than rounding does: one sentence, with the number of splats, or nothing."""
     thin = (g.log_scales[:, :2] < -10.0 - 1 / 32).any(axis=1)
     wide = (g.log_scales > 255 / 16 - 10.0 + 1 / 32).any(axis=1)
     vivid = (np.abs(_COLOR * g.sh0.astype(np.float64)) > 0.5 + 0.5 / 255).any(axis=1)
@@ -167,7 +167,7 @@ def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
 
 
 def _opened(path: str | os.PathLike[str]) -> tuple[Any, bytes]:
-    """A decompressor and what it is to read."""
+    """Return a decompressor and what it is to read."""
     try:
         packed = Path(path).read_bytes()
     except OSError as error:
@@ -178,7 +178,7 @@ def _opened(path: str | os.PathLike[str]) -> tuple[Any, bytes]:
 
 
 def _unpacked(path: str | os.PathLike[str], unpack: Any, packed: bytes, size: int, *, or_end: bool = False) -> bytes:
-    """The next ``size`` bytes, or the end of the file where that will do; never more, whatever it would grow to."""
+    """Return the next ``size`` bytes, or the file's end where that will do; never more, whatever it would become."""
     try:
         data = bytes(unpack.decompress(packed, size)) if size else b""
     except zlib.error as error:

@@ -75,7 +75,7 @@ class Cubin:
     log: str
 
     def usage(self) -> dict[str, KernelUsage]:
-        """Registers, spills, stack and shared memory of each kernel, from the log."""
+        """Return registers, spills, stack and shared memory of each kernel, from the log."""
         found: dict[str, KernelUsage] = {}
         for part in self.log.split("Compiling entry function '")[1:]:
             found[part.partition("'")[0]] = KernelUsage(
@@ -108,12 +108,12 @@ def sources() -> dict[str, str]:
 
 
 def source_names() -> tuple[str, ...]:
-    """The files that hold kernels: ``cuda/project.cu`` and so on."""
+    """Return the files that hold kernels: ``cuda/project.cu`` and so on."""
     return tuple(name for name in sources() if name.endswith(".cu"))
 
 
 def kernel_sources() -> dict[str, str]:
-    """The file of each kernel: ``{"project_splats": "cuda/project.cu", ...}``."""
+    """Return the file of each kernel: ``{"project_splats": "cuda/project.cu", ...}``."""
     return {kernel: name for name, text in sources().items() if name.endswith(".cu") for kernel in KERNEL.findall(text)}
 
 
@@ -147,7 +147,7 @@ def nvrtc_version() -> tuple[int, int]:
 
 
 def architecture_for(capability: tuple[int, int]) -> str:
-    """What to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
+    """Return what to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
 
     A device newer than the compiler runs code for an older one of the same major version. Of a major version that the
     compiler does not know it gets ``"compute_120"``, PTX of the newest known one, which the driver translates.
@@ -302,7 +302,7 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
 
 
 def _read(path: Path) -> bytes | None:
-    """The code of a whole file; None where there is none, or not a whole one."""
+    """Return the code of a whole file; None where there is none, or not a whole one."""
     try:
         data = path.read_bytes()
     except OSError:

@@ -68,7 +68,7 @@ class MissingFile:
 
 
 def missing(facts: Facts) -> MissingFile | None:
-    """What keeps the backend from running; None if nothing does."""
+    """Return what keeps the backend from running; None if nothing does."""
     if facts.torch_cuda is None:
         return MissingFile(
             f"torch {facts.torch_version} is built without CUDA",
@@ -117,7 +117,7 @@ def describe(facts: Facts) -> str:
 
 
 def gather() -> Facts:
-    """The facts of this machine; only the first where torch is built without CUDA. Makes no context on a GPU."""
+    """Return the facts of this machine; only the first where torch is built without CUDA. Makes no context on a GPU."""
     cuda = torch.version.cuda
     if cuda is None:
         return Facts(torch.__version__, None)
@@ -181,6 +181,6 @@ def _dotted(version: tuple[int, int] | None) -> str:
 
 
 def _inner(error: BackendError) -> str:
-    """What lies between the brackets of an error's message: the library's own words, one line of them."""
+    """Return what lies between the brackets of an error's message: the library's own words, one line of them."""
     text = str(error.__cause__ if error.__cause__ is not None else error).strip().splitlines()
     return text[0] if text else type(error).__name__

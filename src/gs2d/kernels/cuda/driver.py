@@ -48,7 +48,7 @@ def load_driver() -> Any:
 
 
 def driver_version(driver: Any) -> tuple[int, int]:
-    """The newest CUDA version that the installed driver supports, (major, minor).
+    """Return the newest CUDA version that the installed driver supports, (major, minor).
 
     Raises
     ------
@@ -77,13 +77,13 @@ def call(driver: Any, name: str, *arguments: Any) -> Any:
 
 
 def failure(what: str, status: Any) -> BackendError:
-    """The error for a status that is not success."""
+    """Return the error for a status that is not success."""
     name = str(getattr(status, "name", status))
     remedy = REMEDIES.get(name, "check `nvidia-smi` and the driver, or use --backend cpu")
     return BackendError(f"the CUDA driver failed in {what} ({name}); {remedy}")
 
 
 def one_line(error: BaseException) -> str:
-    """The first line of an error's words."""
+    """Return the first line of an error's words."""
     words = str(error).strip().splitlines()
     return words[0] if words else type(error).__name__

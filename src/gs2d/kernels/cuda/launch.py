@@ -32,9 +32,8 @@ class Launcher(Protocol):
     ``shared_bytes`` is dynamic shared memory. A launch of no blocks does nothing.
     """
 
-    def launch(
-        self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0
-    ) -> None: ...
+    def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
+        """Queue the kernel ``name`` on the current stream."""
 
 
 def _stream_of(device: torch.device) -> int:
@@ -119,7 +118,7 @@ class GpuLauncher:
 
     @contextmanager
     def _in_context(self) -> Iterator[None]:
-        """The device's context is current: a thread that has only used torch's cached memory may have none."""
+        """Make the device's context current: a thread that has only used torch's cached memory may have none."""
         driver = self._driver
         if int(call(driver, "cuCtxGetCurrent")) == int(self._context):
             yield
@@ -131,7 +130,7 @@ class GpuLauncher:
             call(driver, "cuCtxPopCurrent")
 
     def _load(self, name: str) -> Any:
-        """The handle of a kernel, loading its file if need be."""
+        """Return the handle of a kernel, loading its file if need be."""
         with self._lock:
             if name in self._functions:
                 return self._functions[name]
@@ -162,7 +161,7 @@ def _of_device(index: int) -> GpuLauncher:
 
 
 def launcher_for(device: torch.device) -> Launcher:
-    """The launcher of the device on which tensors lie; one for each device of this process.
+    """Return the launcher of the device on which tensors lie; one for each device of this process.
 
     Raises
     ------

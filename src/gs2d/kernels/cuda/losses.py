@@ -40,7 +40,7 @@ NORMAL_W, NORMAL_H = 32, 8  # losses.cu: tile of the backward pass
 
 
 def ready(**tensors: Tensor) -> list[Tensor]:
-    """The tensors, detached and contiguous, or ShapeError unless all are float32 on the first one's device."""
+    """Return the tensors, detached and contiguous, or ShapeError unless all are float32 on the first one's device."""
     device = next(iter(tensors.values())).device
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float32 or tensor.device != device:
@@ -83,7 +83,7 @@ def _finish(launcher: Launcher, partials: Tensor, *, complement: bool = False) -
 
 
 def blur(image: Tensor, *, launcher: Launcher) -> Tensor:
-    """The SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
+    """Return the SSIM window (11x11 Gaussian, sigma 1.5, zero outside) over an image [H, W, 3]; not differentiable.
 
     Of a target this is the ``target_mean`` that ``photometric`` takes.
 
@@ -252,7 +252,7 @@ def normal_consistency(
     expected: float = 0.05,
     launcher: Launcher,
 ) -> Tensor:
-    """Normal consistency [], the form on a GPU of the functions of the same name in ``losses.reference``.
+    """Return normal consistency [], the form on a GPU of the functions of the same name in ``losses.reference``.
 
     Parameters
     ----------

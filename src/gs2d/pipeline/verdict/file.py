@@ -57,6 +57,6 @@ def _measured_before(run: RunFolder) -> Measures:
 
 
 def _subject(run: RunFolder) -> np.ndarray | None:
-    """The middle of the subject, where one was found."""
+    """Return the middle of the subject, where one was found."""
     subject = read_subject(run.path)
     return subject.center if subject is not None and subject.kind == OBJECT else None

@@ -169,7 +169,7 @@ def _why_low(measures: Measures) -> str:
 
 
 def _training_views(measures: Measures) -> Finding | None:
-    """The only result where nothing was held out."""
+    """Return the only result where nothing was held out."""
     found = _psnr(measures, "train")
     if found is None or _psnr(measures, "test") is not None:
         return None
@@ -267,7 +267,7 @@ def _psnr(measures: Measures, split: str) -> float | None:
 
 
 def _some(names: Sequence[str]) -> str:
-    """The first names in words."""
+    """Return the first names in words."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 

@@ -181,7 +181,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _stops(transform: Tensor) -> float | None:
-    """What a transform does to middle grey, as factors of two."""
+    """Return what a transform does to middle grey, as factors of two."""
     grey = float((GREY * transform[:, :3].sum(dim=1) + transform[:, 3]).mean()) / GREY
     return math.log2(grey) if grey > 0 else None
 
@@ -262,7 +262,7 @@ def _arm(camera: Camera, subject: np.ndarray) -> np.ndarray:
 
 
 def _degrees_around(directions: np.ndarray, up: np.ndarray) -> float:
-    """The circle less the widest stretch of it without a camera."""
+    """Return the circle less the widest stretch of it without a camera."""
     across = np.linalg.svd(up[None])[2][1:]  # [2, 3], the plane across what is up
     flat = directions @ across.T
     angles = np.sort(np.degrees(np.arctan2(flat[:, 1], flat[:, 0])))

@@ -53,7 +53,7 @@ def capture_section(run: Path, definition: Mapping[str, Any]) -> Markup:
 
 
 def _image(path: Path) -> tuple[np.ndarray | None, str]:
-    """The picture, or why there is none."""
+    """Return the picture, or why there is none."""
     try:
         return read_image(path)[:, :, :3], ""
     except DataError as error:

@@ -37,7 +37,7 @@ def exposure_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
 
 
 def _matched(stage: Mapping[str, Any]) -> dict[str, float] | None:
-    """The second score of the test views, where there is one."""
+    """Return the second score of the test views, where there is one."""
     plain, matched = (stage.get(name) or {} for name in ("test", "test_matched"))
     if not isinstance(matched.get("psnr"), int | float) or not isinstance(plain.get("psnr"), int | float):
         return None

@@ -51,7 +51,7 @@ class Gallery:
     stages: tuple[str, ...]
 
     def photo(self, view: ShownView) -> np.ndarray | None:
-        """The photograph of a view."""
+        """Return the photograph of a view."""
         return _read(self.folder / PHOTOS / f"{view.file}.png")
 
     def rendering(self, stage: str, view: ShownView, kind: str) -> np.ndarray | None:
@@ -68,7 +68,7 @@ def _read(path: Path) -> np.ndarray | None:
 
 
 def read_gallery(renders: Path) -> Gallery | None:
-    """The gallery by its ``index.json``; None where there is none.
+    """Return the gallery by its ``index.json``; None where there is none.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def view_sections(renders: Path, *, expected_stages: Sequence[str]) -> Markup:
 
 
 def _shown(gallery: Gallery, view: ShownView, stages: Sequence[str]) -> dict[str, Any]:
-    """What the grid of a view shows: a row for each kind of picture, a cell for each stage."""
+    """Return what the grid of a view shows: a row for each kind of picture, a cell for each stage."""
     photo = gallery.photo(view)
     limits = ("near", "far") if view.depth_limits is None else tuple(f"{limit:.3g}" for limit in view.depth_limits)
     rows = []

@@ -44,7 +44,7 @@ def poses_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
 
 
 def _aligned(stage: Mapping[str, Any]) -> dict[str, float] | None:
-    """The second score of the test views, where there is one."""
+    """Return the second score of the test views, where there is one."""
     plain, aligned = (stage.get(name) or {} for name in ("test", "test_aligned"))
     if not isinstance(aligned.get("psnr"), int | float) or not isinstance(plain.get("psnr"), int | float):
         return None

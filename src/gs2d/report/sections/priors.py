@@ -57,7 +57,7 @@ def _figures(entry: Any) -> tuple[np.ndarray, float] | None:
 
 
 def _views(folder: Path, shown: Any) -> list[dict[str, Any]]:
-    """What is known beside what is rendered: names of views, and titles and pictures of each."""
+    """Return what is known beside what is rendered: names of views, and titles and pictures of each."""
     views = []
     for view in shown if isinstance(shown, list) else ():
         paths = [(title, folder / f"{view.get('file')}.{kind}.png") for kind, title in TITLES.items()]

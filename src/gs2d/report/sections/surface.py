@@ -84,7 +84,7 @@ def surface_scores(surface: Mapping[str, Any] | None, reason: str | None, folder
 
 
 def _doubts(check: Any) -> list[str]:
-    """What the score's own check says: whether both surfaces lie in one place at all."""
+    """Return what the score's own check says: whether both surfaces lie in one place at all."""
     if not isinstance(check, Mapping):
         return []
     messages = [str(message) for message in check.get("messages") or ()]
@@ -94,7 +94,7 @@ def _doubts(check: Any) -> list[str]:
 
 
 def _image(files: Any, folder: Path | None) -> np.ndarray | None:
-    """The scored points of both sides, coloured by distance."""
+    """Return the scored points of both sides, coloured by distance."""
     name = files.get("picture") if isinstance(files, Mapping) else None
     if folder is None or name is None or not (folder / name).is_file():
         return None

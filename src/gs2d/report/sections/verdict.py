@@ -42,5 +42,5 @@ def grade_of(psnr: float, split: str) -> str:
 
 
 def scaled(value: Any, factor: float) -> float | None:
-    """A figure in another unit; None for what is no number."""
+    """Return a figure in another unit; None for what is no number."""
     return value * factor if isinstance(value, int | float) else None

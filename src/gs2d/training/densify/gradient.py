@@ -64,7 +64,7 @@ class GradientDensifier(Densifier):
         return self._options.cap_every > 0 and iteration % self._options.cap_every == 0
 
     def before_backward(self, state: TrainState, iteration: int) -> Tensor | None:
-        """The screen probe, until densification stops."""
+        """Return the screen probe, until densification stops."""
         if iteration >= self._options.stop:
             return None
         return state.splats.means.new_zeros(len(state.splats), self.columns, requires_grad=True)
@@ -216,7 +216,7 @@ def _select(state: TrainState, densify: GradDensify, sizes: Tensor, extent: floa
 
 
 def _scattered(state: TrainState, rows: Tensor) -> Tensor:
-    """A point [M, 3] world units drawn from the Gaussian of each of these splats, in its plane."""
+    """Return a point [M, 3] world units drawn from the Gaussian of each of these splats, in its plane."""
     splats = state.splats
     if len(rows) == 0:
         return splats.means[rows]
@@ -227,7 +227,7 @@ def _scattered(state: TrainState, rows: Tensor) -> Tensor:
 
 
 def _largest(scales: Tensor) -> Tensor:
-    """The larger of s_u and s_v, [M] world units."""
+    """Return the larger of s_u and s_v, [M] world units."""
     return torch.maximum(scales[:, 0], scales[:, 1])
 
 
@@ -247,7 +247,7 @@ def _prunable(
 def _counts(
     clone: Tensor, split: Tensor, ends: tuple[Tensor, Tensor], ends_of_children: tuple[Tensor, Tensor]
 ) -> DensifyCounts:
-    """What happened, of old splats, clones and children together; a faint one that is large too counts as faint."""
+    """Count what happened to old splats, clones and children together; a faint large one counts as faint."""
     faint, large = ends
     copies = (~split).long() + clone.long()  # [N] a splat that is not split and its clone have one fate
     child_faint, child_large = ends_of_children
