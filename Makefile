@@ -36,7 +36,9 @@ test-gpu: $(VENV)/installed
 
 lint: $(VENV)/installed
 	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
 	$(PY) -m mypy
+	$(PY) -m mypy --config-file tests/mypy.ini tests benchmarks
 
 install: $(VENV)/installed
 

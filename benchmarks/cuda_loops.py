@@ -145,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true")
     args = parser.parse_args(arguments)
-    document = {"compiler": compiler_version(), "architecture": ARCHITECTURE, "kernels": count()}
+    document: dict[str, Any] = {"compiler": compiler_version(), "architecture": ARCHITECTURE, "kernels": count()}
     if args.update:
         COMMITTED.write_text(json.dumps(document, indent=1) + "\n")
         return 0

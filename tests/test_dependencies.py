@@ -56,7 +56,7 @@ def unfree(metadata: Iterable[tuple[str, str]]) -> list[str]:
 
 @pytest.mark.parametrize("name", sorted(needed(DECLARED, set())))
 def test_no_dependency_is_under_the_gpl_or_for_non_commercial_use(name: str) -> None:
-    against = unfree(importlib.metadata.metadata(name).items())
+    against = unfree(importlib.metadata.metadata(name).items())  # type: ignore[attr-defined]
     assert bool(against) == (name in ALLOWED), f"{name}: {against[:3]}; look into it, then ALLOWED or another package"
 
 

@@ -26,7 +26,7 @@ def test_a_flight_becomes_pictures_and_a_video(
     assert "compressing the video (5)" in err
     assert len(list((copy / "renders" / "flight").glob("*.png"))) == 5
     with Image.open(video) as images:
-        assert (images.size, images.n_frames) == ((20, 20), 5)
+        assert (images.size, images.n_frames) == ((20, 20), 5)  # type: ignore[attr-defined]
     assert run(["render", str(copy), "--orbit", "2", "--video", str(video), "--json", "--threads", "1"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result == {

@@ -8,6 +8,7 @@ import math
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -94,7 +95,7 @@ def quaternion(T: np.ndarray) -> tuple[float, ...]:
 
 
 def small_colmap(
-    root: Path, *, count: int = 9, where: str = "sparse/0", kind: str = "bin", **model_args
+    root: Path, *, count: int = 9, where: str = "sparse/0", kind: str = "bin", **model_args: Any
 ) -> ColmapModel:
     """A ring of PINHOLE cameras with an off-centre principal point; images 0.png, 1.png ... of 40x30."""
     model = ColmapModel(cameras={7: ("PINHOLE", 40, 30, (35.0, 36.0, 18.5, 16.25))})
@@ -154,7 +155,7 @@ SCALE_MAT = np.array([[200.0, 0, 0, -30], [0, 200, 0, 10], [0, 0, 200, 640], [0,
 
 def small_dtu(
     root: Path, *, count: int = 5, digits: int = 3, images: str = "image", archive: str = "cameras_sphere.npz"
-):
+) -> Any:
     """world_mat and scale_mat of a ring, with pixel centres at whole numbers as DTU has them."""
     cameras = ring(count)
     arrays = {}

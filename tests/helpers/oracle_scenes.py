@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def hills(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.25 * np.sin(3 * x + 0.4) * np.cos(2 * y - 0.7) + 0.2 * bump + 0.1 * x * y
 
 
-def grid_mesh(cells: int, half: float, height) -> tuple[np.ndarray, np.ndarray]:
+def grid_mesh(cells: int, half: float, height: Any) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a height field over [-half, half]^2."""
     line = np.linspace(-half, half, cells + 1)
     x, y = (a.ravel() for a in np.meshgrid(line, line))

@@ -81,7 +81,7 @@ def test_a_webp_video_has_all_frames_at_its_rate(frames: list[Path], tmp_path: P
     write_video(tmp_path / "a.webp", frames, fps=30, on_frame=told.append)
     assert told == [1, 2, 3, 4, 5, 6]
     with Image.open(tmp_path / "a.webp") as video:
-        assert video.n_frames == 6
+        assert video.n_frames == 6  # type: ignore[attr-defined]
         durations = []
         for i, path in enumerate(frames):
             video.seek(i)

@@ -20,7 +20,7 @@ from gs2d.config.renamed import current_names
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.job import backend_facts
+from gs2d.render.backends import get_backend
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures" / "runs_0_1"
 OPTIONS = ["--recipe", "2dgs-r", "--exposure", "--refine-poses", "--threads", "1", "--quiet", "--no-page"]
@@ -35,7 +35,7 @@ def runs(tmp_path: Path) -> Path:
         path = tmp_path / "old" / name / "run.json"
         data = json.loads(path.read_text())
         data["scene"]["path"] = str(tmp_path / "old" / "capture")
-        data["backend"] = backend_facts(data["backend"]["name"])
+        data["backend"] = get_backend(data["backend"]["name"]).facts()
         path.write_text(json.dumps(data))
     return tmp_path / "old"
 

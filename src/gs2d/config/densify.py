@@ -24,7 +24,7 @@ register_densifier = DENSIFIERS.register
 
 @dataclass(frozen=True)
 class Densify:
-    """A densifier by its name. (``GradDensify`` is that of 2DGS and of AbsGS, with their numbers as fields.)
+    """A densifier by its name; ``GradDensify`` is that of 2DGS and of AbsGS, with their numbers as fields.
 
     Attributes
     ----------

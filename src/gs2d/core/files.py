@@ -57,7 +57,7 @@ class _RecordingFile(io.FileIO):
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a file for writing that appears under its name only when it is complete.
+    r"""Open a file for writing that appears under its name only when it is complete.
 
     The bytes go to a temporary name in the same folder (hidden, ending in ``.tmp``), reach the disk (fsync) and
     are renamed. When the body or the disk fails, the temporary file is removed and an older file stays as it was.
@@ -67,7 +67,7 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
     path : path
         The file to write. Its folder must exist.
     mode : "wb" or "w"
-        Bytes, or text in UTF-8 with ``\\n`` line ends.
+        Bytes, or text in UTF-8 with ``\n`` line ends.
 
     Raises
     ------

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -158,7 +159,7 @@ class _BinaryReader:
             return PlyElement(element.count, {p.name: _native(rows[p.name]) for p in element.properties})
         return self._equal_lists(element) or self._ragged_lists(element)
 
-    def _rows(self, element: _Element, fields: list) -> np.ndarray:
+    def _rows(self, element: _Element, fields: list[Any]) -> np.ndarray:
         dtype = np.dtype(fields)
         if element.count * dtype.itemsize > len(self.data) - self.offset:
             raise _broken(
@@ -177,7 +178,7 @@ class _BinaryReader:
             return PlyElement(0, empty)
         start = self.offset
         lengths = self._first_row_lengths(element)
-        fields: list = []
+        fields: list[Any] = []
         row = 0  # bytes; added up here, because numpy refuses a type of 2 GiB, which a broken count may ask for
         for p in element.properties:
             row += np.dtype(p.dtype).itemsize * lengths.get(p.name, 1)
@@ -329,7 +330,7 @@ def write_ply(
     bodies = []
     for name, rows in elements.items():
         lines.append(f"element {name} {len(rows)}")
-        fields: list = []
+        fields: list[Any] = []
         names = rows.dtype.names or ()
         for key in names:
             base, shape = rows.dtype[key].base, rows.dtype[key].shape

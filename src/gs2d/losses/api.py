@@ -82,7 +82,7 @@ class TargetMaps:
 
 
 def target_maps(target: Tensor, backend: str | Backend = "cpu") -> TargetMaps | None:
-    """The maps of a target [H, W, 3] for ``compute_losses(..., target_cache=...)``; None: the backend takes none."""
+    """Make a target's maps ([H, W, 3]) for ``compute_losses(..., target_cache=...)``; None: the backend takes none."""
     check_shapes({"target": (target, "H W 3")})
     operations = _operations(backend, target.device)
     if operations is None or operations.blur is None:

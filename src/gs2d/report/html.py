@@ -95,7 +95,7 @@ def image_tag(image: np.ndarray, caption: str = "", *, alt: str, width: int = 36
     full : str, optional
         The same picture in all its pixels, beside the report: what is shown enlarged where it is there.
     """
-    return macro("macros.html", "picture", image, caption, alt, width, full)
+    return macro("macros.html", "figure", image, caption, alt, width, full)
 
 
 def drawing(svg: str, title: str) -> Markup:

@@ -324,7 +324,7 @@ def _clones(record: RunRecord) -> list[dict[str, Any]]:
 
 
 def _other_conventions(record: RunRecord) -> dict[str, float | None]:
-    """The last stage's figures by the other conventions: from floats, and LPIPS fed with [-1, 1]; None: not known."""
+    """Return the last stage's figures by the other conventions: floats, and LPIPS fed with [-1, 1]; None: unknown."""
     scores = record.stages[-1].get(record.split) or {}
     psnr, ssim, signed = (
         value if isinstance(value, int | float) else None

@@ -24,13 +24,13 @@ pytestmark = pytest.mark.timeout(120)
 @contextmanager
 def fresh_memory(*, poisoned: bool) -> Iterator[None]:
     """``torch.empty`` and its kin give NaN and the largest integers, or whatever there is."""
-    before = torch.utils.deterministic.fill_uninitialized_memory
+    before = torch.utils.deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]
     torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = poisoned
+    torch.utils.deterministic.fill_uninitialized_memory = poisoned  # type: ignore[attr-defined]
     try:
         yield
     finally:
-        torch.utils.deterministic.fill_uninitialized_memory = before
+        torch.utils.deterministic.fill_uninitialized_memory = before  # type: ignore[attr-defined]
         torch.use_deterministic_algorithms(False)
 
 
