@@ -3,7 +3,7 @@
 #   make test      ruff, mypy and the tests that take minutes, not hours
 #   make test-all  the slow tests too
 #   make test-gpu  what needs an NVIDIA GPU: the contract and parity on it, streams, waiting, training; skipped without one
-#   make lint      ruff and mypy
+#   make lint      ruff, its formatter and mypy (`make types`: mypy alone)
 #   make kernels   the native library into the source tree, for development with PYTHONPATH=src
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -19,7 +19,7 @@ SOURCES := $(shell find src CMakeLists.txt pyproject.toml README.md LICENSE -typ
 # One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts.
 TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo test test-all test-gpu lint kernels install clean
+.PHONY: demo test test-all test-gpu lint types kernels install clean
 
 demo: $(VENV)/installed
 	$(VENV)/bin/gs2d demo
@@ -37,6 +37,9 @@ test-gpu: $(VENV)/installed
 lint: $(VENV)/installed
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(MAKE) --no-print-directory types
+
+types: $(VENV)/installed
 	$(PY) -m mypy
 	$(PY) -m mypy --config-file tests/mypy.ini tests benchmarks
 

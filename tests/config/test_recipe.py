@@ -254,8 +254,11 @@ def test_a_group_may_be_written_by_an_action_of_the_same_stage() -> None:
     assert validate(Recipe("r", (stage, later))).name == "r"
 
 
-def test_densification_without_resets_may_freeze_opacity() -> None:
-    validate(one(densify=GradDensify(reset_every=0), train={"means": "all"}))
+def test_densification_may_freeze_opacity_only_without_resets() -> None:
+    recipe = one(densify=GradDensify(reset_every=0), train={"means": "all"})
+    assert validate(recipe) is recipe
+    with pytest.raises(RecipeError, match="opacity"):
+        validate(one(densify=GradDensify(reset_every=100), train={"means": "all"}))
 
 
 def test_every_loss_that_a_recipe_may_name_is_there() -> None:

@@ -54,8 +54,8 @@ def test_metrics_have_an_entry_for_each_stage_with_a_reason_for_each_null(undist
         assert stage["seconds"] > 0
         assert stage["peak_memory_bytes"] > 10_000_000
         for split in ("train", "test"):
-            assert 0 < stage[split]["psnr"] < 60
-            assert -1 < stage[split]["ssim"] < 1
+            assert 5 < stage[split]["psnr"] < 25  # after 60 iterations
+            assert 0 < stage[split]["ssim"] < 1
             assert stage[split]["lpips"] is None
             assert "weights" in stage[split]["lpips_reason"]
     assert "after_clone" not in stages[0]
