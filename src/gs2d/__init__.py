@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gs2d.render.types import RasterSettings, RenderOutput
     from gs2d.training.trainer import Trainer
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"  # the one place: pyproject.toml reads it from here
 
 __all__ = [
     "Camera",

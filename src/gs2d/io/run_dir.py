@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gs2d import __version__
 from gs2d.config.renamed import current_names
 from gs2d.core.files import atomic_write, disk_error
 from gs2d.core.json_files import read_json, write_json
@@ -353,8 +354,8 @@ def load_tensors(path: Path) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Versions that decide the result."""
-    found = {"python": platform.python_version()}
-    for name in ("2dgs-r", "torch", "numpy", "scipy", "pillow"):
+    found = {"python": platform.python_version(), "2dgs-r": __version__}
+    for name in ("torch", "numpy", "scipy", "pillow"):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
