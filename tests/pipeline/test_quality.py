@@ -1,7 +1,8 @@
 """A floor under the quality of the whole way, from photographs to scores: a silent loss of 0.3 dB does not pass.
 
-The demo with 24 photographs of 64x64 at a fiftieth of the schedule (1200 iterations). Seeds 0, 1 and 2 gave 25.64, 25.72
-and 25.68 dB on test views and F-scores of 0.406, 0.429 and 0.423 (middle threshold) and 0.724, 0.743 and 0.748 (largest).
+The demo with 24 photographs of 64x64 at a fiftieth of the schedule (1200 iterations). Seeds 0, 1 and 2 gave 25.64,
+25.72 and 25.68 dB on test views and F-scores of 0.406, 0.429 and 0.423 (middle threshold) and 0.724, 0.743 and 0.748
+(largest).
 Who makes it better raises the floors.
 """
 
