@@ -8,8 +8,6 @@ Who makes it better raises the floors.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from gs2d.io.run_dir import RunFolder
