@@ -87,9 +87,9 @@ def rasterize_2dgs(
     exist); the distortion is the squared one; ``Ks`` has gradients; the densification signal is the gradient of
     ``screen_probe`` instead of an entry of a dictionary. docs/migration.md has the whole table.
 
-    Each camera, and each further three channels, is one call of :func:`gs2d.rasterize`, with the same bits: 64 channels
-    cost what 22 renderings cost. Under ``torch.compile`` and ``torch.export`` it is the operator
-    ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
+    Each camera, and each further three channels, is one call of :func:`gs2d.rasterize`, with the same bits: time and
+    memory grow with the channels (64 take about 30 times what 3 take, docs/performance.md). Under ``torch.compile`` and
+    ``torch.export`` it is the operator ``torch.ops.gs2d.rasterize_2dgs``, whose backward pass renders a second time.
 
     Parameters
     ----------
@@ -360,9 +360,16 @@ class _OverBackground(torch.autograd.Function):
 # The operator -----------------------------------------------------------------------------------------------------
 
 _TENSORS = 9  # means to screen_probe
+_ARGUMENTS = (  # written out: what torch reads from annotations differs between its versions
+    "Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor colors, Tensor viewmats, Tensor Ks, "
+    "Tensor? backgrounds, Tensor? screen_probe, SymInt width, SymInt height, int sh_degree, float[] constants, "
+    "str lowpass_depth, str crossing, bool with_distortion, str backend"
+)
+_FORWARD = f"({_ARGUMENTS}) -> ({', '.join(['Tensor'] * len(Rasterization._fields))})"
+_BACKWARD = f"(Tensor?[] upstream, bool[] wanted, {_ARGUMENTS}) -> Tensor[]"
 
 
-@torch.library.custom_op("gs2d::rasterize_2dgs", mutates_args=())
+@torch.library.custom_op("gs2d::rasterize_2dgs", mutates_args=(), schema=_FORWARD)
 def _operator(
     means: Tensor,
     quats: Tensor,
@@ -419,7 +426,7 @@ def _(*arguments: Any) -> tuple[Tensor, ...]:
     return tuple(means.new_empty(shape) for shape in (*shapes, (cameras, means.shape[0])))
 
 
-@torch.library.custom_op("gs2d::rasterize_2dgs_backward", mutates_args=())
+@torch.library.custom_op("gs2d::rasterize_2dgs_backward", mutates_args=(), schema=_BACKWARD)
 def _backward_operator(
     upstream: Sequence[Tensor | None],
     wanted: Sequence[bool],

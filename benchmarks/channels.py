@@ -1,0 +1,96 @@
+"""What further channels, learning cameras and captured graphs cost ``gs2d.rasterize_2dgs``, as ratios of CPU time.
+
+::
+
+    python -m benchmarks.channels [--splats 20000] [--size 400] [--repeats 10]
+
+Forward and backward of one view of the synthetic room on one thread of the cpu backend. Each way is timed beside
+``gs2d.rasterize`` of three plain channels in the same round, and the median of the rounds' ratios is printed, with
+their quartiles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.workload import camera, room
+from gs2d.core.splats import Splats
+from gs2d.render.api import rasterize
+from gs2d.render.tensor_api import rasterize_2dgs
+from gs2d.render.types import PLAIN_COLORS, RasterSettings
+
+CHANNELS = (1, 3, 4, 6, 16, 64)
+Row = tuple[str, float, float, float]
+"""What was timed; median, first and third quartile of its time over that of three channels of one view."""
+
+
+def ways(splats: Splats, size: int) -> dict[str, Callable[[], object]]:
+    """Forward and backward passes by name; the first is what the others are compared with."""
+    view = camera(size)
+    generator = torch.Generator().manual_seed(0)
+    colors = torch.rand(len(splats), max(CHANNELS), generator=generator)
+    pose, K = torch.tensor(view.T_cam_world)[None], torch.tensor(view.K)[None]
+    scales, opacities = splats.scales, splats.opacities
+    given = (splats.means, splats.quats, scales, opacities)
+
+    def one_view() -> None:
+        parts = {name: tensor.detach().requires_grad_() for name, tensor in splats.items()}
+        parts |= {"sh0": colors[:, None, :3].clone().requires_grad_(), "shN": splats.shN[:, :0].detach()}
+        rasterize(Splats(**parts), view, RasterSettings(sh_degree=PLAIN_COLORS), backend="cpu").color.sum().backward()
+
+    def leaves(channels: int, cameras: bool) -> list[Tensor]:
+        tensors = [tensor.detach().requires_grad_() for tensor in (*given, colors[:, :channels].clone())]
+        return [*tensors, *(tensor.detach().requires_grad_(cameras) for tensor in (pose, K))]
+
+    def loss(*tensors: Tensor) -> Tensor:
+        return rasterize_2dgs(*tensors, width=size, height=size, backend="cpu").colors.sum()  # type: ignore[misc]
+
+    def plain(channels: int, cameras: bool) -> None:
+        loss(*leaves(channels, cameras)).backward()
+
+    captured = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    return {
+        "rasterize, 3 channels": one_view,
+        **{f"{count} channels": partial(plain, count, False) for count in CHANNELS},
+        "3 channels, pose and intrinsics": partial(plain, 3, True),
+        "3 channels, captured graph": lambda: captured(*leaves(3, False)).backward(),
+    }
+
+
+def measure(splats: int, size: int, repeats: int) -> list[Row]:
+    """Ratios of CPU time, a row for each way."""
+    torch.set_num_threads(1)
+    torch._dynamo.reset()
+    found = ways(room(splats), size)
+    for work in found.values():
+        work()
+    seconds: dict[str, list[float]] = {name: [] for name in found}
+    for _ in range(repeats):
+        for name, work in found.items():
+            start = time.process_time()
+            work()
+            seconds[name].append(time.process_time() - start)
+    base = np.array(next(iter(seconds.values())))
+    return [(name, *np.percentile(np.array(times) / base, (50, 25, 75)).tolist()) for name, times in seconds.items()]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--splats", type=int, default=20_000)
+    parser.add_argument("--size", type=int, default=400, help="px, of both sides")
+    parser.add_argument("--repeats", type=int, default=10)
+    options = parser.parse_args(arguments)
+    for name, median, low, high in measure(options.splats, options.size, options.repeats):
+        print(f"{name:34} {median:6.2f}  ({low:.2f} to {high:.2f})")
+
+
+if __name__ == "__main__":
+    main()
