@@ -189,7 +189,7 @@ def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None
         (["--protocol", "tanks"], "no protocol 'tanks'"),
         (["--downscale", "0"], "--downscale"),
         (["--downscale", "1000"], "1000"),
-        (["--schedule-scale", "-1"], "schedule scale"),
+        (["--schedule-scale", "-1"], "--schedule-scale must be"),
         (["--from", "nowhere"], "expected a run folder"),
         (["--format", "colmap"], "colmap"),
         (["--subject-box", "1", "1", "1", "0", "0", "0"], "--subject-box must be a lower corner and a higher one"),
@@ -209,7 +209,7 @@ def test_options_that_make_no_sense_give_one_line_and_leave_nothing(
 
 @pytest.mark.parametrize(
     ("more", "named"),
-    [(["--schedule-scale", "0"], "schedule scale"), (["--seed", "-1"], "seed"), (["--threads", "0"], "--threads")],
+    [(["--schedule-scale", "0"], "--schedule-scale"), (["--seed", "-1"], "seed"), (["--threads", "0"], "--threads")],
 )
 def test_the_demo_refuses_what_makes_no_sense_before_it_takes_a_photograph(
     more: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

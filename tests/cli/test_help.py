@@ -17,6 +17,7 @@ from cli_runs import one_line, spawn
 from gs2d.cli import run
 from gs2d.cli.catalogue import options_of
 from gs2d.cli.help import _FIRST, _GROUPS, command_help
+from gs2d.cli.layout import message
 from gs2d.cli.usage import NAMES
 
 
@@ -138,3 +139,11 @@ def test_completions_of_a_shell_are_still_of_all_commands(capfd: pytest.CaptureF
     assert run(["--tyro-print-completion", "bash"]) == 0
     out = capfd.readouterr().out
     assert all(name in out for name in NAMES)
+
+
+def test_a_message_breaks_between_words_and_its_commands_stay_whole() -> None:
+    text = "the run is not finished, continue it with `gs2d train photographs --out runs/one --resume`, or start anew"
+    lines = message(text, 40)
+    assert "`gs2d train photographs --out runs/one --resume`," in [line.strip() for line in lines]
+    assert all(len(line) <= 40 for line in lines if "`" not in line)
+    assert " ".join(line.strip() for line in lines) == text

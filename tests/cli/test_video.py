@@ -55,7 +55,8 @@ def test_a_video_without_an_ending_is_what_can_be_made_here_and_mp4_without_ffmp
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--video", "a.webp"], "--video needs frames that move, got neither --orbit N nor --flight N"),
+        (["--video", "a.webp"], "--video needs frames that move, got none; give --orbit N or --flight N"),
+        (["--orbit", "0", "--video", "a.webp"], "frames that move, got none; give --orbit N"),
         (["--orbit", "9", "--flight", "9"], "--orbit 9 and --flight 9 exclude each other"),
         (["--flight", "-1"], "--flight must be a number of frames from 1 to 100000, got -1"),
         (["--orbit", "9", "--fps", "25"], "--fps 25 is of a video, and no --video was given"),

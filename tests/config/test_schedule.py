@@ -90,7 +90,7 @@ def test_every_recipe_scales_to_something_valid_with_the_same_stages(name: str, 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf, 1e9])
 def test_a_factor_must_be_positive_and_finite(factor: float) -> None:
-    with pytest.raises(RecipeError, match="schedule scale"):
+    with pytest.raises(RecipeError, match="--schedule-scale must be"):
         scale_schedule(get_recipe("2dgs"), factor)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,14 +11,16 @@ import numpy as np
 import pytest
 import torch
 
+from gs2d.config.presets import with_robustness
 from gs2d.config.protocols import DTU, GENERIC
 from gs2d.config.recipe import LearningRates
 from gs2d.core.camera import look_at
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import Scene, View
-from gs2d.errors import DataError, RecipeError
+from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.job import fit_recipe
+from gs2d.pipeline.job import as_begun, check_same_run, fit_recipe, reload_job
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
 
@@ -136,3 +140,20 @@ def test_where_neighbours_say_nothing_a_view_has_the_mean_exposure() -> None:
 
 def test_a_run_without_exposures_predicts_none() -> None:
     assert with_predicted({}, ring(np.ones(4), test=1)) == {}
+
+
+def test_another_robustness_is_refused_by_the_name_of_its_option(undisturbed: RunFolder) -> None:
+    job = reload_job(undisturbed, lambda _: None)
+    with pytest.raises(RunError, match="was made with --robust off, and would go on with on; resume with --robust off"):
+        check_same_run(undisturbed, replace(job, recipe=with_robustness(job.recipe)))
+
+
+def test_a_run_of_before_seen_area_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    job = reload_job(run, lambda _: None)
+    robust = replace(job, recipe=with_robustness(job.recipe))
+    assert as_begun(run, robust).recipe.seen_area is not None
+    data = json.loads(run.file("run.json").read_text())
+    del data["recipe"]["seen_area"]
+    run.file("run.json").write_text(json.dumps(data))
+    assert as_begun(run, robust).recipe == replace(robust.recipe, seen_area=None)

@@ -17,13 +17,13 @@ from gs2d.data import View
 from gs2d.data.subject import OBJECT, given_subject, read_subject
 from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
-from gs2d.io.run_dir import RunFolder
+from gs2d.io.run_dir import PAGE, RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.events import Notice
 from gs2d.pipeline.export import export_run
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import protocol_from_json, reload_job
-from gs2d.pipeline.mesh import bare_of, extract_mesh
+from gs2d.pipeline.mesh import bare_of, extract_mesh, mesh_run
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.subject import meshed_subject, subject_line, within
 from gs2d.report.sections.subject import subject_section
@@ -109,6 +109,23 @@ def test_bare_walls_are_found_in_photographs_that_say_where_their_points_are(und
     assert bare_of(replace(generic, scene=replace(wall(), observe=None)), view) is None
     opaque = np.concatenate([view.image(), np.full((*view.image().shape[:2], 1), 255, np.uint8)], axis=2)
     assert bare_of(generic, View.from_arrays(view.name, view.camera, opaque)) is None
+
+
+def test_a_new_subject_is_in_the_page_and_what_is_said_of_the_mesh_in_the_metrics(
+    undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    for options, rewritten in ((MeshOptions(voxel=0.05), False), (MeshOptions(voxel=0.05, subject_box=BOX), True)):
+        run.file(PAGE).write_text("of before")
+        result = mesh_run(run.path, options)
+        assert (run.file(PAGE).read_text() != "of before") == rewritten
+        said = run.metrics()["mesh"]
+        assert (said["faces"], said["voxel"]) == (result["faces"], 0.05)
+        assert "file" not in said
+    assert run.metrics()["stages"]
+    run.file(PAGE).unlink()
+    mesh_run(run.path, MeshOptions(voxel=0.05, subject_box=BOX))
+    assert not run.file(PAGE).exists()  # whoever wanted none gets none
 
 
 def test_runs_of_before_there_was_a_subject_still_open() -> None:

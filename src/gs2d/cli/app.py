@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 import gs2d
+from gs2d.cli import layout
 from gs2d.cli.commands import COMMANDS, Command, Demo, Doctor, Info, Recipes, Reconstruct, TableCommon, Train
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
@@ -166,8 +167,15 @@ def _one_line(box: str, argv: Sequence[str]) -> str:
 
 
 def _fail(message: str) -> int:
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    _complain(f"error: {' '.join(message.split())}")
     return EXIT_USAGE
+
+
+def _complain(text: str) -> None:
+    """Print a line on stderr; a terminal gets lines that break between words."""
+    screen = sys.stderr is not None and sys.stderr.isatty()
+    for line in layout.message(text, layout.terminal_width()) if screen else [text]:
+        print(line, file=sys.stderr)
 
 
 def _report(error: Exception, debug: bool) -> int:
@@ -182,7 +190,7 @@ def _report(error: Exception, debug: bool) -> int:
         return _fail("out of memory; use a larger --downscale, or fewer splats (--set surface.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
     hint = "" if debug else "; run again with --debug and report it with the traceback"
-    print(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}", file=sys.stderr)
+    _complain(f"fault in gs2d: {type(error).__name__}: {text[:500]}{hint}")
     return EXIT_BUG
 
 
@@ -195,7 +203,11 @@ def _what_is_missing(console: Console, argv: Sequence[str], command: Common) -> 
         if console.quiet:  # nobody has read why
             line += f" ({event.reason})"
         again = _resumed(argv) if event.command is None else event.command
-        print(f"{line}; again: {again}" if again else line, file=sys.stderr)
+        if again and sys.stderr is not None and sys.stderr.isatty():
+            _complain(f"{line}; again:")
+            print(again, file=sys.stderr)  # whole, to be copied
+        else:
+            _complain(f"{line}; again: {again}" if again else line)
     return INCOMPLETE if console.missing else OK
 
 

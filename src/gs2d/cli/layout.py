@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import textwrap
 from collections.abc import Sequence
 
 WIDEST = 100  # columns of running text; longer lines are hard to read
+_COMMAND, _HELD = re.compile(r"`[^`]*`"), "\0"  # what stays whole; a space in it
 _LEFT, _NARROW = 30, 70  # columns: most of the left column; below the second less of it
 
 
@@ -28,6 +30,12 @@ def wrapped(text: str, width: int, *, first: str = "", rest: str = "", keep_spac
         break_long_words=False,
         break_on_hyphens=False,
     ) or [first.rstrip()]
+
+
+def message(text: str, width: int, *, rest: str = "  ") -> list[str]:
+    """Return the lines of a message, broken between words; a command in backticks stays whole, to be copied."""
+    held = _COMMAND.sub(lambda found: found[0].replace(" ", _HELD), text)
+    return [line.replace(_HELD, " ") for line in wrapped(held, width, rest=rest)]
 
 
 def entries(pairs: Sequence[tuple[str, str]], width: int) -> list[str]:

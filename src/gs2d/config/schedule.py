@@ -46,7 +46,7 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
         A factor that is not in (0, ``MAX_SCALE``].
     """
     if not 0 < factor <= MAX_SCALE:
-        raise RecipeError(f"schedule scale must be a positive number up to {MAX_SCALE:g}, got {factor}")
+        raise RecipeError(f"--schedule-scale must be a positive number up to {MAX_SCALE:g}, got {factor}")
     if factor == 1:
         return recipe
     points = max(MIN_INIT_POINTS, round(recipe.init_points * math.sqrt(factor)))

@@ -437,6 +437,14 @@ def protocol_from_json(data: dict[str, Any]) -> Protocol:
     return Protocol(**{**data, "background": tuple(data["background"]), "fusion": fusion, "metrics": metrics})
 
 
+def as_begun(run: RunFolder, job: Job) -> Job:
+    """Return a job without what runs of before did not have: it goes on as it began."""
+    before = run.definition().get("recipe")
+    if isinstance(before, dict) and "seen_area" not in before:
+        return replace(job, recipe=replace(job.recipe, seen_area=None))
+    return job
+
+
 def check_same_run(run: RunFolder, job: Job) -> None:
     """Refuse to resume a run with another definition.
 
@@ -454,6 +462,12 @@ def check_same_run(run: RunFolder, job: Job) -> None:
             old = {**dict.fromkeys(LATER_FIELDS), **old}  # runs of before there were such
             if old["exposure"] is not None:
                 old["exposure"] = {"initial": "identity", **old["exposure"]}
+            was, now = ("off" if facts["free_space"] is None else "on" for facts in (old, value))
+            if was != now:
+                raise RunError(
+                    f"{run.path} was made with --robust {was}, and would go on with {now}; resume with --robust {was}, "
+                    "or choose another --out"
+                )
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]

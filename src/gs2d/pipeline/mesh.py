@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -24,26 +24,33 @@ from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.meshes import write_mesh
 from gs2d.io.run_dir import (
     MESH,
+    PAGE,
     SURFACE,
     TEXTURED,
+    RunFolder,
 )
 from gs2d.meshing.bare import bare_pixels
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
+from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finished import checked_output, open_job
 from gs2d.pipeline.job import Job, RenderedScene
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions
+from gs2d.pipeline.page import page_run
 from gs2d.pipeline.report import report_again
 from gs2d.pipeline.scoring import SeenView
-from gs2d.pipeline.subject import meshed_subject
+from gs2d.pipeline.subject import OPAQUE, meshed_subject
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 
-OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
 ONE_SURFACE = 0.02  # of the depth: where mean and median differ by more, a pixel sees several surfaces
 MIN_POINTS = 20  # sparse points in a photograph, below which it is not known where it shows anything
+KEPT = (  # of what is said of a mesh, in metrics.json
+    *("vertices", "faces", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
+    *("pixels", "faces_per_pixel", "area_unsupported", "area_apart"),
+)
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
 
@@ -312,12 +319,25 @@ def mesh_run(
     with run.locked():
         subject = meshed_subject(run, job, splats, options, on_event)
         result = extract_mesh(job, splats, options, run.file(MESH), on_event, subject=subject)
-        metrics = run.metrics()
-        if metrics.get("surface"):  # was of the mesh before
-            run.write_metrics({**metrics, "surface": None})
+        if run.metrics().get("surface"):  # was of the mesh before
+            run.write_metrics({**run.metrics(), "surface": None})
             shutil.rmtree(run.file(SURFACE), ignore_errors=True)
+        keep_facts(run, result)
         if run.file(TEXTURED).exists():
             run.file(TEXTURED).unlink()
             on_event(Notice(f"{TEXTURED} was of the mesh before: removed"))
+    if options.subject_box is not None and run.file(PAGE).exists():  # it opens at the subject
+        with attempted(PAGE, again("page", run.path), on_event):
+            page_run(run.path, on_event=on_event, job=job)
     report_again(run, on_event)
     return result
+
+
+def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:
+    """Write what is said of a run's mesh into ``metrics.json``, beside the scores.
+
+    Raises
+    ------
+    DiskError
+    """
+    run.write_metrics({**run.metrics(), "mesh": {name: result[name] for name in KEPT if name in result}})

@@ -307,7 +307,7 @@ def check_frames(orbit: int, flight: int, video: Path | None, fps: float) -> tup
         raise RunError(f"--fps {fps:g} is of a video, and no --video was given; give both")
     if video is not None:
         if not (orbit or flight):
-            raise RunError("--video needs frames that move, got neither --orbit N nor --flight N; give one")
+            raise RunError("--video needs frames that move, got none; give --orbit N or --flight N, N >= 2")
         video = check_video(video, fps, orbit or flight)
         check_writable(video)
     return "orbit" if orbit else "flight" if flight else "", video

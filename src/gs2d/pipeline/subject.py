@@ -32,7 +32,7 @@ from gs2d.report.sections.subject import IMAGE, write_subject_image
 
 MAX_VIEWS = 64  # cameras, evenly chosen, that vote
 SIDE = 56  # px, the shorter side of the depth maps that are looked at
-OPAQUE = 0.5  # as for the mesh
+OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
 BEHIND = 1.1  # times the rendered depth, beyond which a sparse point is hidden
 POINTS_PART = 0.5  # of a camera's vote is that of the sparse points it sees, where there are enough of them
 ENOUGH_POINTS = 20

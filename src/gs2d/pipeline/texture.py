@@ -25,10 +25,10 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job, read_scene
-from gs2d.pipeline.mesh import OPAQUE, extract_mesh, mesh_run
+from gs2d.pipeline.mesh import extract_mesh, mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.render import render_view
-from gs2d.pipeline.subject import meshed_subject
+from gs2d.pipeline.subject import OPAQUE, meshed_subject
 from gs2d.render.exposure import remove_exposure
 
 PACKAGES = ("xatlas",)  # of the extra `texture`

@@ -29,10 +29,10 @@ from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
-from gs2d.pipeline.job import Job, check_same_run, check_train_options, prepare_job
+from gs2d.pipeline.job import Job, as_begun, check_same_run, check_train_options, prepare_job
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release
-from gs2d.pipeline.mesh import MeshFrames, extract_mesh
+from gs2d.pipeline.mesh import MeshFrames, extract_mesh, keep_facts
 from gs2d.pipeline.observer import TrainingObserver
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
@@ -90,6 +90,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         if options.cache is not None:  # now, not when the first stage has been trained
             run.made += make_folder(options.cache)
         if is_run(run.path):
+            job = as_begun(run, job)
             check_same_run(run, job)
             if run.file(SPLATS).exists() and not run.checkpoints():
                 raise RunError(
@@ -254,7 +255,7 @@ def finish(
     with attempted(MESH, again("mesh", run.path), on_event):
         subject = meshed_subject(run, job, splats, mesh, on_event)
         if not run.file(MESH).exists():
-            extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames)
+            keep_facts(run, extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames))
     if with_page and not run.file(PAGE).exists():
         with attempted(PAGE, again("page", run.path), on_event):
             page_run(run.path, on_event=on_event, job=job)

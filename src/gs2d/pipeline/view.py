@@ -26,7 +26,7 @@ from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, load_tensors, ope
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import Job, reload_job
-from gs2d.pipeline.mesh import OPAQUE
+from gs2d.pipeline.subject import OPAQUE
 from gs2d.pipeline.threads import use_threads
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend, get_backend

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from statistics import median
+from statistics import median, quantiles
 from typing import Any
 
 from gs2d.config import grades
@@ -224,11 +224,12 @@ def _exposure(measures: Measures) -> Finding | None:
         return None
     middle = median(stops.values())
     off = {name: value - middle for name, value in stops.items()}
-    spread = max(off.values()) - min(off.values())
+    spread = _range_of_most(list(off.values()))
     lift = _lift(measures)
     grade = grades.EXPOSURE.grade(spread)
     views = tuple(sorted((n for n, v in off.items() if abs(v) > grades.OFF_STOPS), key=lambda n: -abs(off[n])))
-    text = f"From the darkest photograph to the brightest; {len(views)} differ by more than a quarter of a stop."
+    odd = f"{len(views)} differ by more than a quarter of a stop from the middle one"
+    text = f"From dark to bright photographs, without the odd one in ten at either end; {odd}."
     if lift is not None and lift > 0:
         text += f" With their colours matched, new views have {lift:.1f} dB more."
     advice = ""
@@ -237,6 +238,12 @@ def _exposure(measures: Measures) -> Finding | None:
     elif grade != GOOD:
         advice = "Train with --exposure. Next time lock exposure and white balance."
     return Finding("exposure", grade, f"{spread:.2f} stops", text, advice, views)
+
+
+def _range_of_most(values: list[float]) -> float:
+    """From the tenth to the ninetieth of a hundred values: one odd photograph says nothing of the others."""
+    cuts = quantiles(values, n=10, method="inclusive")
+    return cuts[-1] - cuts[0]
 
 
 def _lift(measures: Measures) -> float | None:
