@@ -29,12 +29,9 @@ from gs2d.meshing.bounds import derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.evidence import gather
-from gs2d.meshing.integrate import fusion_backend
 from gs2d.meshing.marching_cubes import keep_components, marching_cubes
-from gs2d.meshing.tsdf import fuse
-from gs2d.meshing.unbounded import cascade_marching_cubes, fuse_cascade
-from gs2d.meshing.unbounded_bounds import derive_cascade
-from gs2d.meshing.volume import Volume
+from gs2d.meshing.tsdf import Volume, fuse, fusion_backend
+from gs2d.meshing.unbounded import cascade_marching_cubes, derive_cascade, fuse_cascade
 
 RADIUS = 0.9
 T = TypeVar("T")

@@ -50,10 +50,10 @@ PARTS = (
     Rule("photographs", (("gs2d/core/images.py", ""), ("data/scene.py", ""), ("training/targets.py", ""))),
     Rule("fusion", (("meshing/tsdf.py", ""), ("meshing/sampling.py", ""))),
     Rule("depth maps", (("meshing/depth_maps.py", ""), ("meshing/bounds.py", ""), ("meshing/consistency.py", ""))),
-    Rule("marching cubes", (("meshing/marching_cubes.py", ""), ("meshing/marching_cubes_cases.py", ""))),
+    Rule("marching cubes", (("meshing/marching_cubes.py", ""),)),
     Rule(
         "surface score",
-        (("evaluation/surface.py", ""), ("evaluation/distance.py", ""), ("evaluation/visibility.py", "")),
+        (("evaluation/surface.py", ""), ("evaluation/visibility.py", "")),
     ),
     Rule("neighbours", (("gs2d/core/transforms.py", "nearest_distances"),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),

@@ -36,6 +36,7 @@ PHASES = (
     Rule("log of changes", (("pipeline/changes.py", ""),)),
     Rule("imports", (("importlib._bootstrap>", ""),)),
 )
+_ADDING = ("add", "_add_chunk", "_blend_colors", "_change", "_view_arrays", "_volume_arrays")  # a view to a volume
 PARTS = (
     Rule("render", (("render/cpu.py", ""), ("render/cpu_cached.py", ""))),
     Rule(
@@ -45,10 +46,10 @@ PARTS = (
     Rule("metrics", (("evaluation/images.py", ""), ("gs2d/losses/api.py", ""), ("kernels/losses.py", ""))),
     Rule("evidence", tuple(("meshing/evidence.py", name) for name in ("gather", "_count", "_look", "_normals"))),
     Rule("clean by evidence", (("meshing/evidence.py", ""),)),
+    Rule("integrate", (*(("meshing/tsdf.py", name) for name in _ADDING), ("meshing/sampling.py", ""))),
     Rule("blocks", (("meshing/tsdf.py", ""),)),
-    Rule("integrate", (("meshing/integrate.py", ""), ("meshing/sampling.py", ""))),
     Rule("depth maps", (("meshing/depth_maps.py", ""), ("meshing/bounds.py", ""), ("meshing/consistency.py", ""))),
-    Rule("marching cubes", (("meshing/marching_cubes.py", ""), ("meshing/marching_cubes_cases.py", ""))),
+    Rule("marching cubes", (("meshing/marching_cubes.py", ""),)),
 )
 
 

@@ -25,8 +25,8 @@ from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.data import View
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run
-from gs2d.meshing.bake import bilinear
 from gs2d.meshing.raycast import Hits, cast_camera
+from gs2d.meshing.texture import bilinear
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import read_scene, reload_job
 from gs2d.pipeline.options import TextureOptions

@@ -51,7 +51,6 @@ INSIDE = {
         "archive": 9,
         "load subject": 8,
         "benchmarks": 7,
-        "benchmark_pieces": 6,
         "readers": 5,
         "build": 4,
         "bounds": 3,

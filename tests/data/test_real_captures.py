@@ -13,8 +13,7 @@ from capture_writers import tree_hash
 from gs2d.core.camera import Camera
 from gs2d.core.images import read_image
 from gs2d.data import Scene, load_scene
-from gs2d.data.readers.colmap import model_folder
-from gs2d.data.readers.colmap_model import ColmapImage, read_images, read_points
+from gs2d.data.readers.colmap import ColmapImage, model_folder, read_images, read_points
 from gs2d.data.undistort import colmap_intrinsics
 
 Shared = Callable[[str], Path]

@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from gs2d.errors import DataError
-from gs2d.evaluation.alignment import apply, ransac_similarity, rotation_degrees, similarity_scale, umeyama
-from gs2d.evaluation.icp import icp, uniform_downsample, voxel_downsample
+from gs2d.evaluation.alignment import (
+    apply,
+    icp,
+    ransac_similarity,
+    rotation_degrees,
+    similarity_scale,
+    umeyama,
+    uniform_downsample,
+    voxel_downsample,
+)
 from gs2d.evaluation.nearest import Cloud
 from oracle_scenes import moved, rotation, similarity
 
@@ -106,7 +114,7 @@ def test_voxels_hold_the_mean_of_their_points_and_start_half_a_voxel_before_the_
 def test_voxels_do_not_depend_on_how_the_points_are_chunked(monkeypatch: pytest.MonkeyPatch) -> None:
     points = cube(5000)
     whole = voxel_downsample(points, 0.3)
-    monkeypatch.setattr("gs2d.evaluation.icp.CHUNK", 100)
+    monkeypatch.setattr("gs2d.evaluation.alignment.CHUNK", 100)
     np.testing.assert_allclose(voxel_downsample(points, 0.3), whole, atol=1e-12)
     distances, index = Cloud(whole).nearest(points)
     np.testing.assert_allclose(np.linalg.norm(points - whole[index[:, 0]], axis=1), distances[:, 0])

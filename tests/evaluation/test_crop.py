@@ -10,8 +10,15 @@ import pytest
 
 from gs2d.data.benchmarks import tnt_truth_files
 from gs2d.errors import DataError
-from gs2d.evaluation.crop import CropVolume, box, read_crop
-from gs2d.evaluation.tanks_and_temples_files import match_cameras, read_tnt_truth, read_trajectory, read_transform
+from gs2d.evaluation.tanks_and_temples import (
+    CropVolume,
+    box,
+    match_cameras,
+    read_crop,
+    read_tnt_truth,
+    read_trajectory,
+    read_transform,
+)
 
 ARROW = [[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]]  # not convex: the notch reaches down to (2, 1)
 

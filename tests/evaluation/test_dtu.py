@@ -15,8 +15,15 @@ from gs2d.core.camera import look_at
 from gs2d.core.mesh import Mesh
 from gs2d.data.benchmarks import dtu_truth_files
 from gs2d.errors import DataError
-from gs2d.evaluation.dtu import Silhouette, evaluate_dtu, inside_silhouettes, mesh_points, thin
-from gs2d.evaluation.dtu_files import DtuTruth, read_dtu_truth
+from gs2d.evaluation.dtu import (
+    DtuTruth,
+    Silhouette,
+    evaluate_dtu,
+    inside_silhouettes,
+    mesh_points,
+    read_dtu_truth,
+    thin,
+)
 from gs2d.io.ply_format import write_ply
 from oracle_scenes import grid_mesh, similarity
 

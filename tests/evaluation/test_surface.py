@@ -13,8 +13,13 @@ import trimesh
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluation.distance import distances_to_mesh, face_areas, point_triangle_distances, sample_surface
-from gs2d.evaluation.surface import evaluate_surface
+from gs2d.evaluation.surface import (
+    distances_to_mesh,
+    evaluate_surface,
+    face_areas,
+    point_triangle_distances,
+    sample_surface,
+)
 from gs2d.evaluation.visibility import frustum_counts, visible_counts
 from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import cast_camera

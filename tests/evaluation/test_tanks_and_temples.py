@@ -11,10 +11,8 @@ import pytest
 from gs2d.config.surface_protocols import TNT_SURFACE
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluation.crop import CropVolume, box
-from gs2d.evaluation.surface_clouds import FAR, GOOD, OUT, ScoredClouds, distance_colors, draw_clouds, write_clouds
-from gs2d.evaluation.tanks_and_temples import TntScore, evaluate_tnt, f_score, point_set
-from gs2d.evaluation.tanks_and_temples_files import TntTruth
+from gs2d.evaluation.surface import FAR, GOOD, OUT, ScoredClouds, distance_colors, draw_clouds, write_clouds
+from gs2d.evaluation.tanks_and_temples import CropVolume, TntScore, TntTruth, box, evaluate_tnt, f_score, point_set
 from gs2d.io.meshes import read_points
 from oracle_scenes import TAU, TntScene, grid_mesh, hills, moved, similarity, tnt_scene
 

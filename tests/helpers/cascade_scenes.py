@@ -9,8 +9,8 @@ import numpy as np
 from gs2d.core.camera import look_at
 from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import RenderedView
-from gs2d.meshing.unbounded_bounds import TsdfCascade
-from gs2d.meshing.volume import BLOCK, VOXELS, Volume
+from gs2d.meshing.tsdf import BLOCK, VOXELS, Volume
+from gs2d.meshing.unbounded import TsdfCascade
 from surface_shapes import rays, sphere_depth
 
 GROUND, BALL = -0.6, 0.6  # height of the plane, radius of the ball on it

@@ -8,9 +8,8 @@ import numpy as np
 
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.atlas import Atlas
-from gs2d.meshing.bake import ColorSource
 from gs2d.meshing.raycast import cast_camera
+from gs2d.meshing.texture import Atlas, ColorSource
 
 Paint = Callable[[np.ndarray], np.ndarray]  # places [n, 3] to colours [n, 3] in [0, 1]
 

@@ -14,12 +14,19 @@ from gs2d.kernels.library import available_variants, load
 from gs2d.kernels.tsdf import arguments_of
 from gs2d.meshing.bounds import sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
-from gs2d.meshing.integrate import add_natively, fusion_backend, integrator
 from gs2d.meshing.sampling import make_sampler
-from gs2d.meshing.tsdf import block_finder, fuse, touched_blocks
-from gs2d.meshing.unbounded import fuse_cascade
-from gs2d.meshing.unbounded_bounds import derive_cascade
-from gs2d.meshing.volume import Volume, block_grid, invalid_volume
+from gs2d.meshing.tsdf import (
+    Volume,
+    add_natively,
+    block_finder,
+    block_grid,
+    fuse,
+    fusion_backend,
+    integrator,
+    invalid_volume,
+    touched_blocks,
+)
+from gs2d.meshing.unbounded import derive_cascade, fuse_cascade
 from surface_shapes import limits, orbit, sphere_depth
 
 ARRAYS = ("keys", "tsdf", "weight", "color", "color_weight")

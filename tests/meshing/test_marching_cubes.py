@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.marching_cubes import _numbered, components, keep_components, marching_cubes, select_faces
-from gs2d.meshing.marching_cubes_cases import CORNERS, EDGES, case_table
-from gs2d.meshing.volume import BLOCK, Volume
+from gs2d.meshing.marching_cubes import (
+    CORNERS,
+    EDGES,
+    _numbered,
+    case_table,
+    components,
+    keep_components,
+    marching_cubes,
+    select_faces,
+)
+from gs2d.meshing.tsdf import BLOCK, Volume
 from surface_shapes import area, dense, edge_uses, is_closed_manifold, limits, signed_volume, volume_of
 
 

@@ -17,8 +17,7 @@ from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.library import available_variants
-from gs2d.meshing.integrate import Add, integrator
-from gs2d.meshing.volume import Volume
+from gs2d.meshing.tsdf import Add, Volume, integrator
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import check_same_run, reload_job
 from gs2d.pipeline.mesh import extract_mesh, mesh_run

@@ -9,8 +9,7 @@ from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, depth_map
 from gs2d.meshing.marching_cubes import marching_cubes
 from gs2d.meshing.slabs import fused_surface, slabs
-from gs2d.meshing.tsdf import find_blocks, fuse, fuse_blocks
-from gs2d.meshing.volume import block_bytes
+from gs2d.meshing.tsdf import block_bytes, find_blocks, fuse, fuse_blocks
 from surface_shapes import orbit, sphere_depth
 
 

@@ -15,9 +15,8 @@ from benchmarks.texture import image, psnr
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import BackendError, DataError, DiskError, ProtocolError
 from gs2d.io.meshes import read_mesh, turn_to_y, write_textured
-from gs2d.meshing import atlas as atlas_module
-from gs2d.meshing.atlas import simplified, texels_of, unwrap, vertex_normals
-from gs2d.meshing.bake import (
+from gs2d.meshing import texture as atlas_module
+from gs2d.meshing.texture import (
     FEATHER,
     MIN_FEATHER,
     ColorSource,
@@ -25,8 +24,12 @@ from gs2d.meshing.bake import (
     bilinear,
     feather,
     fill_unseen,
+    simplified,
     spread,
+    texels_of,
     texture_size,
+    unwrap,
+    vertex_normals,
 )
 from texture_shapes import above, box, checkers, flat_atlas, grid_plane, join, photograph, ring
 

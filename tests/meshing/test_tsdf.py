@@ -13,10 +13,8 @@ from gs2d.errors import DiskError, ProtocolError, ShapeError
 from gs2d.meshing.bounds import derive_limits, sample_depths
 from gs2d.meshing.depth_maps import DepthMap, RenderedView, Spool, depth_map
 from gs2d.meshing.extract import extract
-from gs2d.meshing.integrate import FULL_WEIGHT_BEHIND
 from gs2d.meshing.marching_cubes import components, marching_cubes
-from gs2d.meshing.tsdf import fuse, min_blocks, touched_blocks
-from gs2d.meshing.volume import BLOCK, block_bytes, block_grid
+from gs2d.meshing.tsdf import BLOCK, FULL_WEIGHT_BEHIND, block_bytes, block_grid, fuse, min_blocks, touched_blocks
 from surface_shapes import (
     box_depth,
     edge_uses,
@@ -177,7 +175,7 @@ def test_skipping_blocks_that_a_view_cannot_change_changes_nothing(monkeypatch: 
     )
     fast = fuse(frames, LIMITS, threads=1)
     monkeypatch.setattr(
-        "gs2d.meshing.integrate.block_visibility",
+        "gs2d.meshing.tsdf.block_visibility",
         lambda view, centers, radius, truncation: np.flatnonzero(
             centers @ view.projection[2, :3] + view.projection[2, 3] > 1.01 * radius
         ),

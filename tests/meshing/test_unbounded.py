@@ -14,9 +14,8 @@ from gs2d.meshing.bounds import sample_depths
 from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.meshing.marching_cubes import components
-from gs2d.meshing.unbounded import cascade_marching_cubes, fuse_cascade
-from gs2d.meshing.unbounded_bounds import STEP, derive_cascade, valid_depth
-from gs2d.meshing.volume import BLOCK, VOXELS, block_bytes
+from gs2d.meshing.tsdf import BLOCK, VOXELS, block_bytes
+from gs2d.meshing.unbounded import STEP, cascade_marching_cubes, derive_cascade, fuse_cascade, valid_depth
 from surface_shapes import edge_uses, is_closed_manifold, orbit, rays, signed_volume, sphere_depth
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.data.readers.colmap_model import ColmapCamera, ColmapImage, ColmapPoints
+from gs2d.data.readers.colmap import ColmapCamera, ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.sfm import PosesOptions, find_poses

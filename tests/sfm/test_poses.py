@@ -22,7 +22,7 @@ from gs2d.cli import run
 from gs2d.core.camera import look_at
 from gs2d.core.images import read_image
 from gs2d.data import load_scene
-from gs2d.data.readers.colmap_model import read_images
+from gs2d.data.readers.colmap import read_images
 from gs2d.errors import RunError
 from gs2d.pipeline.events import Event, Phase
 from gs2d.pipeline.sfm import PosesOptions, find_poses

@@ -17,8 +17,7 @@ from gs2d.core.splats import Splats
 from gs2d.data.subject import Subject
 from gs2d.render.api import rasterize
 from gs2d.render.types import RasterSettings
-from gs2d.viewer.web import Seen, write_page
-from gs2d.viewer.web_start import guessed_subject, home_camera, photographed_arc
+from gs2d.viewer.web import Seen, guessed_subject, home_camera, photographed_arc, write_page
 
 ORIGIN = np.array([100.0, -200.0, 50.0])
 UP = np.array([0.0, 0.0, 1.0])

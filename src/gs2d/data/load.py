@@ -12,11 +12,11 @@ from pathlib import Path
 from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
+from gs2d.data.readers.common import SUFFIXES
 from gs2d.data.readers.dtu import CAMERA_FILES, read_dtu
 from gs2d.data.readers.meshroom import read_alicevision, scene_file
 from gs2d.data.readers.metashape import camera_file, read_metashape
 from gs2d.data.readers.opensfm import read_opensfm, reconstruction_file
-from gs2d.data.readers.photographs import SUFFIXES
 from gs2d.data.readers.registry import READERS, Reader, register_reader
 from gs2d.data.readers.transforms import read_blender, read_nerfstudio
 from gs2d.data.scene import Scene

@@ -9,6 +9,7 @@ import numpy as np
 
 from gs2d.core.checks import check_shapes
 from gs2d.errors import DataError
+from gs2d.evaluation.nearest import Cloud
 
 _BATCH = 256  # samples fitted at a time
 
@@ -185,3 +186,130 @@ def _needed(fraction: float, sample: int, confidence: float) -> float:
     """Return how many samples it takes until one of inliers only was among them with this confidence."""
     good = float(fraction) ** sample
     return math.inf if good <= 0 else 0 if good >= 1 else math.log(1 - confidence) / math.log1p(-good)
+
+
+# -- iterative closest points ------------------------------------------------------------------------------------------
+# Written after the definitions of Open3D (``registration_icp``, ``voxel_down_sample``, ``uniform_down_sample``), which
+# the official Tanks and Temples script calls; ``scripts/oracle_open3d.py`` compares the two.
+CHUNK = 1 << 22  # points thinned at a time: bounds memory beside the clouds themselves
+
+
+def voxel_downsample(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Return the mean of the points [P, 3] in each occupied cube of side ``voxel`` [Q, 3], float64.
+
+    The grid starts half a voxel before the smallest coordinates. Means are gathered chunk by chunk.
+    """
+    if not len(points):
+        return np.zeros((0, 3))
+    low = points.min(axis=0).astype(np.float64) - voxel / 2
+    size = np.floor((points.max(axis=0) - low) / voxel).astype(np.int64) + 1
+    if math.prod(size.tolist()) >= 1 << 63:  # cells cannot be numbered: finer than anyone scans
+        return np.asarray(points, np.float64)
+    keys: list[np.ndarray] = []
+    sums: list[np.ndarray] = []
+    counts: list[np.ndarray] = []
+    for start in range(0, len(points), CHUNK):
+        part = np.asarray(points[start : start + CHUNK], np.float64)
+        cell = np.floor((part - low) / voxel).astype(np.int64)
+        key, total, count = _grouped((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], part, None)
+        keys.append(key)
+        sums.append(total)
+        counts.append(count)
+    key, total, count = _grouped(np.concatenate(keys), np.concatenate(sums), np.concatenate(counts))
+    return np.asarray(total / count[:, None])
+
+
+def _grouped(
+    keys: np.ndarray, values: np.ndarray, counts: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return sums [Q, 3] of values [P, 3], and of counts (None: ones), over equal keys; ordered by key."""
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+    weight = np.ones(len(keys)) if counts is None else counts[order]
+    return keys[first], np.add.reduceat(values[order], first, axis=0), np.add.reduceat(weight, first)
+
+
+def uniform_downsample(points: np.ndarray, limit: int) -> np.ndarray:
+    """Every k-th point where there are more than ``limit``, k = round(P / limit); else all of them."""
+    if len(points) <= limit:
+        return points
+    return points[:: max(1, round(len(points) / limit))]
+
+
+@dataclass(frozen=True, eq=False)
+class IcpResult:
+    """What an alignment found.
+
+    Attributes
+    ----------
+    T_target_source : ndarray [4, 4]
+    fraction_before, share : float
+        Part of the source with a target within the threshold, at the start and at the end.
+    rms_before, rms : float or None
+        Of the distances of those; None where there are none.
+    iterations : int
+    converged : bool
+        Whether it stopped because nothing changed.
+    """
+
+    T_target_source: np.ndarray
+    fraction_before: float
+    fraction: float
+    rms_before: float | None
+    rms: float | None
+    iterations: int
+    converged: bool
+
+
+def icp(
+    source: np.ndarray,
+    target: np.ndarray,
+    *,
+    threshold: float,
+    iterations: int,
+    with_scale: bool = True,
+    fraction_change: float = 1e-6,
+    rms_change: float = math.inf,
+    workers: int | None = None,
+) -> IcpResult:
+    """Move ``source`` [P, 3] onto ``target`` [Q, 3]: pair with the nearest, fit, repeat (Besl and McKay 1992).
+
+    Parameters
+    ----------
+    threshold : float
+        Pairs farther apart do not count.
+    iterations : int
+        At most.
+    with_scale : bool
+        A similarity rather than a rigid motion.
+    fraction_change, rms_change : float
+        It has converged when the share of paired points and their rms change by less, both. The official Tanks and
+        Temples script leaves the rms out in effect (it passes 20).
+    """
+    cloud = Cloud(target, workers=workers)
+    T = np.eye(4)
+    moved = np.asarray(source, np.float64)
+    fraction, rms, index, paired = _paired(cloud, moved, threshold)
+    first, done, converged = (fraction, rms), 0, False
+    for done in range(1, iterations + 1):  # noqa: B007
+        if paired.sum() < 3:
+            break
+        step = umeyama(moved[paired], cloud.points[index[paired]], with_scale=with_scale)
+        T, moved = step @ T, apply(step, moved)
+        before = (fraction, rms)
+        fraction, rms, index, paired = _paired(cloud, moved, threshold)
+        if abs(before[0] - fraction) < fraction_change and abs(before[1] - rms) < rms_change:
+            converged = True
+            break
+    return IcpResult(T, first[0], fraction, first[1] if first[0] else None, rms if fraction else None, done, converged)
+
+
+def _paired(cloud: Cloud, points: np.ndarray, threshold: float) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """Share and rms of the points with a neighbour within the threshold, the neighbours, and which points those are."""
+    if not len(points):
+        return 0.0, 0.0, np.zeros(0, np.int64), np.zeros(0, bool)
+    distances, index = (found[:, 0] for found in cloud.nearest(points, limit=threshold))
+    paired = np.isfinite(distances)
+    rms = float(np.sqrt(np.square(distances[paired]).mean())) if paired.any() else 0.0
+    return float(paired.mean()), rms, index, paired

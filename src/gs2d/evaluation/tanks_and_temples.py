@@ -12,22 +12,229 @@ The self-check says whether the alignment can be believed; a wrong log or transf
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from gs2d.config.surface_protocols import TNT_SURFACE, IcpStage, TntSurface
+from gs2d.core.checks import check_shapes
 from gs2d.core.images import natural_key
+from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
-from gs2d.evaluation.alignment import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
-from gs2d.evaluation.icp import IcpResult, icp, uniform_downsample, voxel_downsample
+from gs2d.evaluation.alignment import (
+    IcpResult,
+    RobustFit,
+    apply,
+    icp,
+    ransac_similarity,
+    rotation_degrees,
+    similarity_scale,
+    uniform_downsample,
+    voxel_downsample,
+)
 from gs2d.evaluation.nearest import Cloud
-from gs2d.evaluation.surface_clouds import ScoredClouds
-from gs2d.evaluation.tanks_and_temples_files import TntTruth, match_cameras
+from gs2d.evaluation.surface import ScoredClouds
+from gs2d.io.meshes import read_points
+
+# -- the crop volume ---------------------------------------------------------------------------------------------------
+_PLANES = {0: (1, 2), 1: (0, 2), 2: (0, 1)}  # the two axes of the polygon, by the axis it is drawn out along
+_CHUNK = 1 << 21
 
 
+@dataclass(frozen=True, eq=False)
+class CropVolume:
+    """What counts, in the frame of the ground truth.
+
+    Attributes
+    ----------
+    axis : int
+        0, 1 or 2: the axis that the polygon is drawn out along.
+    low, high : float
+        Range along it, both ends included.
+    polygon : ndarray [n, 2]
+        Corners in the two other axes, in ascending order of axis; even-odd rule.
+    """
+
+    axis: int
+    low: float
+    high: float
+    polygon: np.ndarray
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Which points [P, 3] lie inside, bool [P]."""
+        check_shapes({"points": (points, "P 3")})
+        u, v = _PLANES[self.axis]
+        inside = (points[:, self.axis] >= self.low) & (points[:, self.axis] <= self.high)
+        rows = np.flatnonzero(inside)
+        for start in range(0, len(rows), _CHUNK):
+            part = rows[start : start + _CHUNK]
+            inside[part] = self._in_polygon(points[part, u].astype(np.float64), points[part, v].astype(np.float64))
+        return np.asarray(inside)
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Return the points inside."""
+        return np.asarray(points[self.contains(points)])
+
+    def _in_polygon(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Whether an odd number of edges is crossed on the way from (u, v) to u = -infinity."""
+        odd = np.zeros(len(u), bool)
+        for (u0, v0), (u1, v1) in zip(self.polygon, np.roll(self.polygon, -1, axis=0), strict=True):
+            crosses = (v0 < v) != (v1 < v)
+            if not crosses.any():
+                continue
+            odd[crosses] ^= u0 + (v[crosses] - v0) / (v1 - v0) * (u1 - u0) < u[crosses]
+        return odd
+
+
+def box(low: np.ndarray, high: np.ndarray) -> CropVolume:
+    """Return the axis-aligned box between two corners [3]."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    return CropVolume(2, float(z0), float(z1), np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], np.float64))
+
+
+def read_crop(path: Path) -> CropVolume:
+    """Read ``SCENE.json`` of Tanks and Temples (Open3D's SelectionPolygonVolume).
+
+    Raises
+    ------
+    DataError
+    """
+    data = read_json(path)
+    try:
+        axis = "XYZ".index(str(data["orthogonal_axis"]).upper())
+        low, high = float(data["axis_min"]), float(data["axis_max"])
+        corners = np.asarray(data["bounding_polygon"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{path} must hold orthogonal_axis (X, Y or Z), axis_min, axis_max and bounding_polygon, "
+            f"got another entry ({error}); copy it again from the ground truth"
+        ) from error
+    if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 3 or not np.isfinite(corners).all():
+        raise DataError(f"{path}: bounding_polygon must hold three corners [x, y, z] or more, got {corners.shape}")
+    if not low < high:
+        raise DataError(f"{path}: axis_min must be below axis_max, got {low:g} and {high:g}")
+    return CropVolume(axis, low, high, corners[:, list(_PLANES[axis])])
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class TntTruth:
+    """What a mesh of one scene is compared with.
+
+    Attributes
+    ----------
+    scene : str
+    points : ndarray [P, 3]
+        The laser scan, m.
+    crop : CropVolume
+        In the scan's frame.
+    T_truth_log : ndarray [4, 4]
+        ``SCENE_trans.txt``: from the frame of the log to that of the scan.
+    trajectory : ndarray [n, 4, 4]
+        ``SCENE_COLMAP_SfM.log``: camera-to-world matrices of all photographs, in order.
+    """
+
+    scene: str
+    points: np.ndarray
+    crop: CropVolume
+    T_truth_log: np.ndarray
+    trajectory: np.ndarray
+
+
+def read_tnt_truth(scene: str, files: Mapping[str, Path]) -> TntTruth:
+    """Read the ground truth of a scene from its four ``files`` (keys as ``data.benchmarks.tnt_truth_files``).
+
+    Raises
+    ------
+    DataError
+        A file is missing or broken; names it.
+    """
+    points = np.asarray(read_points(files["scan"]).points)
+    crop = read_crop(files["crop"])
+    if not crop.contains(points).any():
+        raise DataError(f"{files['crop']} must hold part of the scan {files['scan'].name}, got none; copy both again")
+    return TntTruth(scene, points, crop, read_transform(files["transform"]), read_trajectory(files["log"]))
+
+
+def read_transform(path: Path) -> np.ndarray:
+    """Return a 4x4 matrix of numbers in four lines (``SCENE_trans.txt``).
+
+    Raises
+    ------
+    DataError
+    """
+    rows = _number_rows(path)
+    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+        raise DataError(f"{path} must hold four lines of four numbers, got {len(rows)} lines; copy it again")
+    T = np.array(rows)
+    if not np.isfinite(T).all() or abs(np.linalg.det(T)) < 1e-12:
+        raise DataError(f"{path} must hold a finite transform, got {T.round(4).tolist()}; copy it again")
+    return T
+
+
+def read_trajectory(path: Path) -> np.ndarray:
+    """Camera-to-world matrices [n, 4, 4] of a ``.log`` file: a line of three whole numbers, then the matrix, each.
+
+    Raises
+    ------
+    DataError
+    """
+    rows = _number_rows(path)
+    if not rows or len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, row in enumerate(rows)):
+        raise DataError(
+            f"{path} must hold a line of three numbers and four of four for each camera, "
+            f"got {len(rows)} lines; copy it again"
+        )
+    poses = np.array([row for i, row in enumerate(rows) if i % 5], dtype=np.float64).reshape(-1, 4, 4)
+    if not np.isfinite(poses).all():
+        raise DataError(f"{path} must hold finite cameras, got NaN or infinity; copy it again")
+    return poses
+
+
+def _number_rows(path: Path) -> list[list[float]]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        return [[float(word) for word in line.split()] for line in lines if line.strip()]
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DataError(f"{path} must hold numbers only, got: {error}; copy it again") from error
+
+
+def match_cameras(names: Sequence[str], count: int, where: str = "the log") -> tuple[np.ndarray, np.ndarray]:
+    """Which of the named photographs belong to which of ``count`` entries of a log: indices [m], [m].
+
+    As many as entries: in order of their names (``frame_2`` before ``frame_10``). Else by the number in the name, the
+    first photograph being 1 (``000001.jpg``) as Tanks and Temples counts, or 0 if there is a number 0.
+
+    Raises
+    ------
+    DataError
+        Neither is possible.
+    """
+    order = np.array(sorted(range(len(names)), key=lambda i: natural_key(names[i])), np.int64)
+    if len(names) == count:
+        return order, np.arange(count)
+    numbers = [re.search(r"(\d+)\D*$", Path(names[i]).stem) for i in order]
+    if not all(numbers):
+        raise DataError(f"{where} has {count} cameras, the capture {len(names)}, and their names have no numbers")
+    counted = np.array([int(number.group(1)) for number in numbers if number], np.int64)
+    first = min(1, int(counted.min()))
+    entries = counted - first
+    inside = (entries >= 0) & (entries < count)
+    if inside.sum() < 3 or len(np.unique(entries)) < len(entries):
+        raise DataError(
+            f"{where} has {count} cameras, the capture {len(names)}, numbered {counted.min()} to "
+            f"{counted.max()}; take the log of the same photographs"
+        )
+    return order[inside], entries[inside]
+
+
+# -- the score ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class StageReport:
     """One stage of the alignment: distances in m; None where nothing was paired."""

@@ -13,13 +13,10 @@ from gs2d.meshing.bounds import FusionBounds, derive_limits, sample_depths, wide
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import Cleaned, clean
-from gs2d.meshing.integrate import fusion_backend
 from gs2d.meshing.marching_cubes import components, inside_box, keep_components
 from gs2d.meshing.slabs import fused_surface
-from gs2d.meshing.tsdf import find_blocks
-from gs2d.meshing.unbounded import FAR_VIEWS, cascade_marching_cubes, fuse_cascade
-from gs2d.meshing.unbounded_bounds import derive_cascade
-from gs2d.meshing.volume import Volume
+from gs2d.meshing.tsdf import Volume, find_blocks, fusion_backend
+from gs2d.meshing.unbounded import FAR_VIEWS, cascade_marching_cubes, derive_cascade, fuse_cascade
 from gs2d.render.backends import Backend
 
 

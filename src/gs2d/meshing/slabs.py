@@ -15,8 +15,7 @@ from gs2d.core.mesh import Mesh
 from gs2d.meshing.bounds import FusionBounds
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import EDGES_OF_BLOCK, cell_surface, edge_vertices
-from gs2d.meshing.tsdf import Blocks, fuse_blocks
-from gs2d.meshing.volume import block_bytes
+from gs2d.meshing.tsdf import Blocks, block_bytes, fuse_blocks
 from gs2d.render.backends import Backend
 
 SLAB_BYTES = 192 << 20  # of the volume: much less and its views are prepared too often, much more and it is the peak

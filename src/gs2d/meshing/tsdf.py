@@ -10,23 +10,380 @@ the two sides of a thin plate do not fight.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
 from gs2d.errors import ProtocolError
+from gs2d.kernels.tsdf import FusionOnHost
 from gs2d.meshing.bounds import FusionBounds, backproject
 from gs2d.meshing.depth_maps import DepthMap
-from gs2d.meshing.integrate import fusion_backend, integrator
-from gs2d.meshing.sampling import make_sampler
-from gs2d.meshing.volume import BLOCK, Budget, Volume, block_bytes, block_grid, check_truncation, invalid_volume
-from gs2d.render.backends import Backend
+from gs2d.meshing.sampling import DepthSampler, block_visibility, make_sampler
+from gs2d.render.backends import Backend, get_backend
+
+if TYPE_CHECKING:
+    import torch
+
+    from gs2d.kernels.cuda.launch import Launcher
+    from gs2d.kernels.library import Library
 
 if TYPE_CHECKING:
     from gs2d.kernels.library import Library
 
+
+# -- the volume --------------------------------------------------------------------------------------------------------
+BLOCK = 8  # voxels along the side of a block
+VOXELS = BLOCK**3
+_ALL_OF_LEAST = 16  # all blocks of a scene, in units of the least that one view needs: 5 to 15 were met
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """The fused field. Voxel (i, j, k) of block b is the point ``lower + (8 blocks[b] + (i, j, k)) * voxel``.
+
+    Attributes
+    ----------
+    limits : FusionLimits
+    dims : tuple of 3 ints
+        Blocks that the box would hold along x, y, z.
+    keys : ndarray [M] int64
+        Sorted: (x * dims[1] + y) * dims[2] + z of each block.
+    tsdf : ndarray [M, 512] float32
+        In units of the truncation, positive towards the cameras; voxels in x, y, z order, z fastest.
+    weight : ndarray [M, 512] float32
+        0: unknown.
+    color, color_weight : ndarray [M, 512, 3] and [M, 512] float32, or None
+        0 to 255, from views that saw the voxel near their surface.
+    frames : int
+        How many depth maps were fused.
+    """
+
+    limits: FusionBounds
+    dims: tuple[int, int, int]
+    keys: np.ndarray
+    tsdf: np.ndarray
+    weight: np.ndarray
+    color: np.ndarray | None
+    color_weight: np.ndarray | None
+    frames: int
+
+    @property
+    def blocks(self) -> np.ndarray:
+        """Block coordinates [M, 3] int64."""
+        return np.stack(np.unravel_index(self.keys, self.dims), axis=1)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        arrays = (self.keys, self.tsdf, self.weight, self.color, self.color_weight)
+        return sum(a.nbytes for a in arrays if a is not None)
+
+
+def block_bytes(colored: bool) -> int:
+    """Bytes of one block in a Volume."""
+    return 8 + VOXELS * 4 * (6 if colored else 2)
+
+
+def invalid_volume(
+    limits: FusionBounds, dims: tuple[int, int, int], keys: np.ndarray, *, colored: bool, frames: int
+) -> Volume:
+    """Blocks of which nothing is known yet."""
+    m = len(keys)
+    return Volume(
+        limits=limits,
+        dims=dims,
+        keys=keys,
+        tsdf=np.zeros((m, VOXELS), np.float32),
+        weight=np.zeros((m, VOXELS), np.float32),
+        color=np.zeros((m, VOXELS, 3), np.float32) if colored else None,
+        color_weight=np.zeros((m, VOXELS), np.float32) if colored else None,
+        frames=frames,
+    )
+
+
+def check_truncation(limits: FusionBounds) -> None:
+    """Raise ProtocolError for a truncation beyond the box and many voxels: all of it would be near a surface."""
+    if not limits.truncation <= max(limits.side, 20 * limits.voxel):
+        raise ProtocolError(
+            f"a truncation of at most the side of the box, {limits.side:.4g} world units, was expected, "
+            f"got {limits.truncation:.4g}; leave it out, or give a larger bbox"
+        )
+
+
+def block_grid(limits: FusionBounds) -> tuple[int, int, int]:
+    """How many blocks the box holds along x, y, z.
+
+    Raises
+    ------
+    ProtocolError
+        If the box is so large that blocks cannot be numbered: the voxel is far too small for it.
+    """
+    size = np.subtract(limits.upper, limits.lower)
+    dims = np.ceil(size / (BLOCK * limits.voxel)) + 1
+    if not np.isfinite(dims).all() or np.prod(dims) > 2**60:
+        raise ProtocolError(
+            f"a voxel that fits the box of {size.max():.4g} world units was expected, got {limits.voxel:.4g}"
+        )
+    return int(dims[0]), int(dims[1]), int(dims[2])
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The bound on memory, and the advice when it is reached."""
+
+    limits: FusionBounds
+    max_bytes: int
+    side: float | None = None  # world units, of a cube that is made of whole steps of blocks
+    step: int = 1  # voxels
+
+    def check(self, blocks: int, colored: bool, *, partial: bool) -> None:
+        """Stop when over the bound. While frames still come, count on (keys are small) up to 16 times the bound."""
+        need = blocks * block_bytes(colored)
+        if need <= self.max_bytes or (partial and need <= 16 * self.max_bytes):
+            return
+        self._refuse(need, need, "at least " if partial else "")
+
+    def check_least(self, blocks: int, colored: bool) -> None:
+        """Stop when blocks that one view alone needs for sure are over the bound: to count them could take for ever.
+
+        The voxel that is named is a guess; where it is still too small, it can be counted.
+        """
+        need = blocks * block_bytes(colored)
+        if need > self.max_bytes:
+            self._refuse(need, _ALL_OF_LEAST * need, "at least ")
+
+    def _refuse(self, need: int, expected: int, least: str) -> NoReturn:
+        voxel = self.limits.voxel * (expected / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
+        if self.side is not None:
+            voxel = 1.005 * self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
+        raise ProtocolError(
+            f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} "
+            "world units "
+            f"need {least}{need / 2**30:.3g} GiB; use a voxel of about {voxel:.3g} or more, a smaller bbox, or "
+            "more memory"
+        )
+
+
+# -- one view ----------------------------------------------------------------------------------------------------------
+# numpy is the reference, and runs everywhere. Which of the three adds a view is the matter of a backend.
+FULL_WEIGHT_BEHIND = 0.75  # of the truncation: the weight falls from 1 here to 0 at the truncation
+_CHUNK = 48  # blocks at a time in numpy: the temporaries of a chunk fit the second-level cache
+
+Add = Callable[[DepthSampler], None]
+
+
+def fusion_backend(backend: str | Backend) -> Backend:
+    """Return what will add views: "auto" is the processor's, the native library where it was built, else numpy.
+
+    Raises
+    ------
+    BackendError
+        If the name is unknown, or that backend cannot run here.
+    """
+    return get_backend(backend, "cpu") if isinstance(backend, str) else backend
+
+
+def integrator(
+    volumes: Sequence[Volume], backend: str | Backend, threads: int | None = None
+) -> AbstractContextManager[Add]:
+    """Return a context in which views can be added to all volumes; their arrays hold the result after it.
+
+    Parameters
+    ----------
+    volumes : sequence of Volume
+    backend : str or Backend
+        "auto", "cpu", "cuda", "reference", or another's name.
+    threads : int, optional
+        Default: as many as the machine has. The result does not depend on it.
+
+    Raises
+    ------
+    BackendError
+        If the backend is unknown or cannot run here.
+    """
+    threads = threads or os.cpu_count() or 1
+    fusion = fusion_backend(backend).fusion()
+    if fusion is None:
+        return add_in_numpy(volumes, threads)
+    if isinstance(fusion, FusionOnHost):
+        return add_natively(volumes, fusion.library, threads)
+    return add_on_gpu(volumes, fusion.launcher, fusion.device)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Where the blocks of a volume lie."""
+
+    volume: Volume
+    origins: np.ndarray  # [M, 3] world units, of each block's first voxel
+    local: np.ndarray  # [512, 3] world units, of a voxel from there
+
+
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """The blocks that a view may change, and where it sees them."""
+
+    rows: np.ndarray  # [n] int64
+    bases: np.ndarray  # [n, 3] float32 (x z, y z, z) of each block's first voxel
+    offsets: np.ndarray  # [3, 512] float32, of a voxel from there
+
+
+def _grids(volumes: Sequence[Volume]) -> list[_Grid]:
+    found = []
+    for volume in volumes:
+        voxel = volume.limits.voxel
+        origins = np.asarray(volume.limits.lower) + volume.blocks * (BLOCK * voxel)
+        local = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK,) * 3), axis=1) * voxel
+        if len(volume.keys):
+            found.append(_Grid(volume, origins, local))
+    return found
+
+
+def _change(grid: _Grid, view: DepthSampler) -> _Change:
+    limits = grid.volume.limits
+    size = BLOCK * limits.voxel
+    radius = 0.5 * np.sqrt(3.0) * size
+    rows = block_visibility(view, grid.origins + 0.5 * (size - limits.voxel), radius, limits.truncation)
+    rotation, shift = view.projection[:, :3].T, view.projection[:, 3]
+    offsets = np.ascontiguousarray((grid.local @ rotation).T, dtype=np.float32)
+    bases = (grid.origins[rows] @ rotation + shift).astype(np.float32)
+    return _Change(rows, bases, offsets)
+
+
+@contextmanager
+def add_in_numpy(volumes: Sequence[Volume], threads: int) -> Iterator[Add]:
+    """By numpy, on so many threads; the reference of the others."""
+    grids = _grids(volumes)
+    with ThreadPoolExecutor(threads) as pool:
+
+        def add(view: DepthSampler) -> None:
+            for grid in grids:
+                change = _change(grid, view)
+                starts = range(0, len(change.rows), _CHUNK)
+                chunks = [
+                    replace(change, rows=change.rows[i : i + _CHUNK], bases=change.bases[i : i + _CHUNK])
+                    for i in starts
+                ]
+                for done in pool.map(lambda chunk, volume=grid.volume: _add_chunk(volume, view, chunk), chunks):
+                    assert done is None  # exhausts the map: an exception in a thread is raised here
+
+        yield add
+
+
+def _add_chunk(volume: Volume, view: DepthSampler, chunk: _Change) -> None:
+    """Add one view to some blocks; chunks share no block, so threads do not meet."""
+    rows, bases, offsets = chunk.rows, chunk.bases, chunk.offsets
+    truncation = np.float32(volume.limits.truncation)
+    z = bases[:, 2:] + offsets[2]  # [n, 512]
+    x = (bases[:, :1] + offsets[0]) / z
+    y = (bases[:, 1:2] + offsets[1]) / z
+    distance, pixel = view.signed_distance(x, y, z)  # hugely negative where the pixel saw nothing
+    distance /= truncation
+    weight = (distance + np.float32(1)) / np.float32(1 - FULL_WEIGHT_BEHIND)
+    np.clip(weight, 0, 1, out=weight)
+    if view.weight is not None:
+        weight *= view.weight[pixel]
+    if volume.color is not None and volume.color_weight is not None and view.color is not None:
+        _blend_colors(volume.color, volume.color_weight, view, rows, distance, weight, pixel)
+    np.minimum(distance, 1, out=distance)
+    old = volume.weight[rows]
+    total = old + weight
+    tsdf = volume.tsdf[rows]
+    step = weight / np.maximum(total, np.float32(1e-20))
+    distance -= tsdf
+    distance *= step
+    tsdf += distance
+    volume.tsdf[rows] = tsdf
+    volume.weight[rows] = total
+
+
+def _blend_colors(
+    color: np.ndarray,
+    color_weight: np.ndarray,
+    view: DepthSampler,
+    rows: np.ndarray,
+    distance: np.ndarray,
+    weight: np.ndarray,
+    pixel: np.ndarray,
+) -> None:
+    """Update the mean colour of the voxels near the surface of this view; the nearer, the more it counts."""
+    assert view.color is not None
+    near = np.flatnonzero((weight > 0) & (distance < 1))  # flat in the chunk
+    flat = rows[near >> 9] * VOXELS + (near & (VOXELS - 1))
+    w = weight.reshape(-1)[near] * (1 - np.abs(distance.reshape(-1)[near]))
+    colors, weights = color.reshape(-1, 3), color_weight.reshape(-1)
+    total = weights[flat] + w
+    old = colors[flat]
+    old += (view.color[pixel.reshape(-1)[near]] - old) * (w / np.maximum(total, np.float32(1e-20)))[:, None]
+    colors[flat] = old
+    weights[flat] = total
+
+
+@contextmanager
+def add_natively(volumes: Sequence[Volume], library: Library, threads: int) -> Iterator[Add]:
+    """By the native library, on so many threads."""
+    from gs2d.kernels.tsdf import arguments_of, fuse_on_cpu
+
+    grids = _grids(volumes)
+
+    def add(view: DepthSampler) -> None:
+        library.use_threads(threads)
+        for grid in grids:
+            volume, change = grid.volume, _change(grid, view)
+            arrays = _view_arrays(view, colored=volume.color is not None)
+            arrays |= {"rows": change.rows, "bases": change.bases, "offsets": change.offsets}
+            arrays |= _volume_arrays(volume)
+            fuse_on_cpu(library, arguments_of((view.height, view.width), volume.limits.truncation, arrays))
+
+    yield add
+
+
+@contextmanager
+def add_on_gpu(volumes: Sequence[Volume], launcher: Launcher, device: torch.device) -> Iterator[Add]:
+    """On a device: the volumes lie there until the end; each view and its list of blocks go there."""
+    import torch
+
+    from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
+
+    def to_device(arrays: dict[str, np.ndarray | None]) -> dict[str, torch.Tensor | None]:
+        return {name: None if a is None else torch.from_numpy(a).to(device) for name, a in arrays.items()}
+
+    grids = _grids(volumes)
+    held = [to_device(_volume_arrays(grid.volume)) for grid in grids]
+
+    def add(view: DepthSampler) -> None:
+        colored = any(grid.volume.color is not None for grid in grids)
+        image = to_device(_view_arrays(view, colored=colored))
+        for grid, volume in zip(grids, held, strict=True):
+            change = _change(grid, view)
+            blocks = to_device({"rows": change.rows, "bases": change.bases, "offsets": change.offsets})
+            size, truncation = (view.height, view.width), grid.volume.limits.truncation
+            fuse_on_gpu(launcher, arguments_of(size, truncation, image | blocks | volume))
+
+    yield add
+    for grid, tensors in zip(grids, held, strict=True):
+        for name, array in _volume_arrays(grid.volume).items():
+            tensor = tensors[name]
+            if array is not None and tensor is not None:
+                array[...] = tensor.cpu().numpy()
+
+
+def _view_arrays(view: DepthSampler, *, colored: bool) -> dict[str, np.ndarray | None]:
+    """Return the pixels of a view, by the names of the kernels' arguments."""
+    arrays = {"depth": view.depth, "slope_x": view.slope_x, "slope_y": view.slope_y}
+    return arrays | {"pixel_weight": view.weight, "pixel_color": view.color if colored else None}
+
+
+def _volume_arrays(volume: Volume) -> dict[str, np.ndarray | None]:
+    """Return what fusion changes, by the names of the kernels' arguments."""
+    return {name: getattr(volume, name) for name in ("tsdf", "weight", "color", "color_weight")}
+
+
+# -- all views ---------------------------------------------------------------------------------------------------------
 _MAX_MARKS = 1 << 27  # bytes
 _FEW_SAMPLES = 1e8  # of one depth map: seconds
 

@@ -15,7 +15,7 @@ from gs2d.core.json_files import read_json
 from gs2d.data import detect_format, load_scene
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
-from gs2d.meshing.atlas import required
+from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Plan, ignore
 from gs2d.pipeline.job import check_train_options

@@ -19,8 +19,17 @@ from gs2d.data import View
 from gs2d.errors import ProtocolError, RunError
 from gs2d.io.meshes import read_mesh, write_textured, written_files
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder
-from gs2d.meshing.atlas import required, simplified, unwrap
-from gs2d.meshing.bake import MAX_SIZE, MIN_SIZE, Baked, ColorSource, bake, texture_size
+from gs2d.meshing.texture import (
+    MAX_SIZE,
+    MIN_SIZE,
+    Baked,
+    ColorSource,
+    bake,
+    required,
+    simplified,
+    texture_size,
+    unwrap,
+)
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.finished import open_job

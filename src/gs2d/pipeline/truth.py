@@ -15,8 +15,7 @@ from gs2d.config.surface_protocols import VISIBLE_SURFACE
 from gs2d.core.mesh import Mesh
 from gs2d.data.benchmarks import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
-from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, headline
-from gs2d.evaluation.surface_clouds import write_clouds
+from gs2d.evaluation.surface import SurfaceScore, evaluate_surface, headline, write_clouds
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.run_dir import make_folder
 from gs2d.io.splat_ply import ply_kind

@@ -16,11 +16,9 @@ from gs2d.core.mesh import Mesh
 from gs2d.data.benchmarks import published_log
 from gs2d.data.readers.dtu import dtu_silhouettes
 from gs2d.errors import DataError
-from gs2d.evaluation.dtu import Silhouette, evaluate_dtu
-from gs2d.evaluation.dtu_files import read_dtu_truth
-from gs2d.evaluation.surface_clouds import write_clouds
-from gs2d.evaluation.tanks_and_temples import Alignment, evaluate_tnt
-from gs2d.evaluation.tanks_and_temples_files import read_tnt_truth, read_trajectory
+from gs2d.evaluation.dtu import Silhouette, evaluate_dtu, read_dtu_truth
+from gs2d.evaluation.surface import write_clouds
+from gs2d.evaluation.tanks_and_temples import Alignment, evaluate_tnt, read_tnt_truth, read_trajectory
 from gs2d.pipeline.job import Job
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gs2d.data.readers.colmap_model import (
+from gs2d.data.readers.colmap import (
     ColmapCamera,
     ColmapImage,
     ColmapPoints,

@@ -11,10 +11,8 @@ import torch
 import emulate
 from depth_waves import waves
 from gs2d.meshing.bounds import derive_limits, sample_depths
-from gs2d.meshing.integrate import add_in_numpy, add_on_gpu
 from gs2d.meshing.sampling import make_sampler
-from gs2d.meshing.tsdf import touched_blocks
-from gs2d.meshing.volume import Volume, block_grid, invalid_volume
+from gs2d.meshing.tsdf import Volume, add_in_numpy, add_on_gpu, block_grid, invalid_volume, touched_blocks
 
 pytestmark = pytest.mark.timeout(120)
 

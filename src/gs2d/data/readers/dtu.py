@@ -16,8 +16,15 @@ from gs2d.core.camera import Camera
 from gs2d.core.images import image_size, natural_key
 from gs2d.data.build import Capture, PosedImage
 from gs2d.data.priors import ObservedPoints
-from gs2d.data.readers.colmap import model_points, observed_points
-from gs2d.data.readers.colmap_model import ColmapCamera, ColmapImage, find_model, read_cameras, read_images
+from gs2d.data.readers.colmap import (
+    ColmapCamera,
+    ColmapImage,
+    find_model,
+    model_points,
+    observed_points,
+    read_cameras,
+    read_images,
+)
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
 from gs2d.errors import DataError

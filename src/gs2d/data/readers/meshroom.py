@@ -19,9 +19,7 @@ import numpy as np
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
 from gs2d.data.readers.colmap import find_mask
-from gs2d.data.readers.fields import entries, head, real, reals, required, whole
-from gs2d.data.readers.foreign_points import points_beside
-from gs2d.data.readers.photographs import ImageFiles
+from gs2d.data.readers.common import ImageFiles, entries, head, points_beside, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError

@@ -22,9 +22,7 @@ import numpy as np
 
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
 from gs2d.data.readers.colmap import find_mask
-from gs2d.data.readers.fields import head, real, reals, whole
-from gs2d.data.readers.foreign_points import points_beside
-from gs2d.data.readers.photographs import ImageFiles
+from gs2d.data.readers.common import ImageFiles, head, points_beside, real, reals, whole
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 

@@ -19,8 +19,7 @@ from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage
 from gs2d.data.readers.colmap import find_mask
-from gs2d.data.readers.fields import entries, real, reals, required, whole
-from gs2d.data.readers.photographs import ImageFiles
+from gs2d.data.readers.common import ImageFiles, entries, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError

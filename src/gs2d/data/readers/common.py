@@ -1,0 +1,231 @@
+"""What readers of other tools' cameras share: checked numbers, images found by name, points that lie beside."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.data.build import PosedImage
+from gs2d.data.scene import PointCloud
+from gs2d.errors import DataError
+from gs2d.io.meshes import read_points
+from gs2d.io.splat_ply import ply_kind
+
+# -- numbers in files --------------------------------------------------------------------------------------------------
+_LARGEST = 1e300  # JSON has whole numbers of any size
+_HEAD = 4096  # bytes in which a file says what it is
+
+
+def head(path: Path) -> bytes:
+    """Return the first bytes of a file; none of what is not there, a folder, or not ours to read."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(_HEAD)
+    except OSError:
+        return b""
+
+
+def real(value: Any, where: str) -> float:
+    """Return a finite number, which may be written as text.
+
+    Raises
+    ------
+    DataError
+        Anything else; names ``where``.
+    """
+    try:
+        if isinstance(value, bool) or not isinstance(value, int | float | str) or not abs(float(value)) <= _LARGEST:
+            raise ValueError
+        return float(value)
+    except (ValueError, OverflowError) as error:
+        raise DataError(f"{where} must be a finite number, got {str(value)[:40]!r}") from error
+
+
+def reals(value: Any, count: int, where: str) -> np.ndarray:
+    """So many finite numbers [count] of a list, or of a text with white space between them.
+
+    Raises
+    ------
+    DataError
+        Another count, or something that is no finite number.
+    """
+    items = value.split() if isinstance(value, str) else value
+    if not isinstance(items, Sequence) or len(items) != count:
+        got = f"{len(items)}" if isinstance(items, Sequence) else type(value).__name__
+        raise DataError(f"{where} must be {count} numbers, got {got}")
+    return np.array([real(item, where) for item in items])
+
+
+def whole(value: Any, where: str) -> int:
+    """Return a whole number that is not negative.
+
+    Raises
+    ------
+    DataError
+    """
+    number = real(value, where)
+    if number != int(number) or number < 0:
+        raise DataError(f"{where} must be a whole number >= 0, got {str(value)[:40]!r}")
+    return int(number)
+
+
+def entries(value: Any, where: str) -> Mapping[str, Any]:
+    """Return an object of JSON.
+
+    Raises
+    ------
+    DataError
+    """
+    if not isinstance(value, dict):
+        raise DataError(f"{where} must be an object, got {type(value).__name__}; is the file of another tool?")
+    return value
+
+
+def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
+    """Return the value of a key that must be there.
+
+    Raises
+    ------
+    DataError
+    """
+    if key not in entry:
+        raise DataError(f'{where} must have the key "{key}", got {sorted(map(str, entry))[:12]}')
+    return entry[key]
+
+
+# -- images by their names ---------------------------------------------------------------------------------------------
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic")
+_NO_IMAGES = {"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"}  # of the same names
+
+
+class ImageFiles:
+    """Finds photographs by what a camera file calls them: a path of another machine, a name, a name without its ending.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Where they may be, most likely first; sub-folders count too. Folders that do not exist are passed over.
+    """
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self._folders = [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
+        self._known: dict[Path, dict[str, list[Path]]] = {}
+
+    def find(self, name: str, where: str) -> tuple[str, Path] | None:
+        """(path below the folder of photographs with ``/``, file) of a photograph, or None.
+
+        Of several files of that name the one whose folders agree with those of ``name``.
+
+        Raises
+        ------
+        DataError
+            Two files fit equally well.
+        """
+        parts = [part.lower() for part in name.replace("\\", "/").split("/") if part not in ("", ".")]
+        if not parts:
+            return None
+        for folder in self._folders:
+            known = self._index(folder)
+            found = known.get(parts[-1]) or [p for end in SUFFIXES for p in known.get(parts[-1] + end, ())]
+            if not found:
+                continue
+            fit = [_agreement(path.relative_to(folder), parts) for path in found]
+            best = [path for path, agreed in zip(found, fit, strict=True) if agreed == max(fit)]
+            if len(best) > 1:
+                raise DataError(
+                    f"{where} must name one photograph, got {name}, which may be {best[0]} or {best[1]}; "
+                    "keep only one of them below the capture, or let the camera's name tell its folder"
+                )
+            return best[0].relative_to(folder).as_posix(), best[0]
+        return None
+
+    def _index(self, folder: Path) -> dict[str, list[Path]]:
+        """Photographs below a folder by their names in lower case."""
+        if folder not in self._known:
+            names: dict[str, list[Path]] = {}
+            for path in sorted(_below(folder)):
+                names.setdefault(path.name.lower(), []).append(path)
+            self._known[folder] = names
+        return self._known[folder]
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    for at, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".") and name.lower() not in _NO_IMAGES]
+        yield from (Path(at, name) for name in files if os.path.splitext(name)[1].lower() in SUFFIXES)
+
+
+def _agreement(path: Path, parts: Sequence[str]) -> int:
+    """Folders above the file that both have, counted from the file upwards; the file as it was named is more."""
+    own = [part.lower() for part in path.parts]
+    agreed = 0
+    for a, b in zip(reversed(own[:-1]), reversed(parts[:-1]), strict=False):
+        if a != b:
+            break
+        agreed += 1
+    return agreed
+
+
+# -- points beside -----------------------------------------------------------------------------------------------------
+_NAMES = ("points3D.ply", "points.ply", "sparse.ply", "sparse_points.ply", "tie_points.ply", "point_cloud.ply")
+_TRUTHS = ("mesh_gt.ply", "points_gt.ply")  # what a result is scored against is no place to start from
+_FEWEST = 0.5  # share of the points that two cameras must see
+_FARTHEST = 100.0  # extents of the cameras within which they must be
+_LOOKED_AT = 2000  # points and
+_LOOKED_FROM = 100  # cameras that are asked
+
+
+def points_beside(root: Path, frames: Sequence[PosedImage]) -> tuple[PointCloud | None, list[str]]:
+    """Return the points of a PLY file in ``root``, and a note where there is one that is not used.
+
+    One of a usual name (``points3D.ply``, ``points.ply``, ``sparse.ply``, ``sparse_points.ply``, ``tie_points.ply``,
+    ``point_cloud.ply``), else the only one. Points are exported with a coordinate system of their own choice: where
+    fewer than half are in the pictures of two cameras they are in another frame, and are left out.
+
+    Raises
+    ------
+    DataError
+        The file of that name is broken.
+    """
+    beside = sorted(path for path in root.glob("*.ply") if path.name not in _TRUTHS)
+    named = [root / name for name in _NAMES if (root / name) in beside]
+    if not beside or not frames:
+        return None, []
+    if not named and len(beside) > 1:
+        names = ", ".join(path.name for path in beside[:4])
+        return None, [f"no sparse points: {names} are there; call the one to start from {_NAMES[1]}"]
+    path = (named or beside)[0]
+    if ply_kind(path) != "points":
+        return None, [f"no sparse points: {path.name} is no point cloud"]
+    cloud = read_points(path)
+    points = PointCloud(np.asarray(cloud.points, dtype=np.float64), cloud.colors)
+    fraction = _seen(points.points, frames)
+    if fraction < _FEWEST:
+        return None, [
+            f"no sparse points: two cameras see {fraction:.0%} of those of {path.name}, which are in another frame; "
+            "export them in the coordinates of the cameras"
+        ]
+    return points, []
+
+
+def _seen(points: np.ndarray, frames: Sequence[PosedImage]) -> float:
+    """Return the fraction of points that two cameras see (lenses that bend count as straight) from near."""
+    some = points[np.linspace(0, len(points) - 1, min(len(points), _LOOKED_AT)).astype(int)]
+    some = some[np.isfinite(some).all(axis=1)]
+    if not len(some):
+        return 0.0
+    centers = np.stack([-frame.T_cam_world[:3, :3].T @ frame.T_cam_world[:3, 3] for frame in frames])
+    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    near = np.linalg.norm(some - centers.mean(axis=0), axis=1) <= _FARTHEST * extent
+    seen = np.zeros(len(some), dtype=int)
+    for index in np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_FROM)).astype(int):
+        k, T = frames[index].intrinsics, frames[index].T_cam_world
+        x = some @ T[:3, :3].T + T[:3, 3]
+        z = np.where(x[:, 2] > 0, x[:, 2], np.nan)
+        u, v = k.fx * x[:, 0] / z + k.cx, k.fy * x[:, 1] / z + k.cy
+        seen += (u >= 0) & (u <= k.width) & (v >= 0) & (v <= k.height)  # comparisons with NaN are False
+    return float((near & (seen >= 2)).mean())
