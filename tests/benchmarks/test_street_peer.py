@@ -15,6 +15,7 @@ from gs2d.core.camera import Camera, look_at
 from gs2d.data import View, load_scene
 from gs2d.data.scene import PointCloud, Scene
 from gs2d.errors import DataError
+from gs2d.render.backends import get_backend
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -138,7 +139,7 @@ def test_the_peers_own_pictures_of_test_views_are_scored_once_it_is_trained(
     tmp_path: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = SimpleNamespace(
-        scene=scene, settings=SimpleNamespace(background=(0.0, 0.0, 0.0)), backend=SimpleNamespace(name="reference")
+        scene=scene, settings=SimpleNamespace(background=(0.0, 0.0, 0.0)), backend=get_backend("reference")
     )
     monkeypatch.setattr(street_peer, "open_job", lambda *_: (None, job, None))
     drawn = street_peer.draw_test_views

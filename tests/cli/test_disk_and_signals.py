@@ -55,12 +55,12 @@ def test_a_full_disk_stops_training_with_one_line_and_leaves_nothing(capture: Pa
 def test_a_fault_of_ours_is_exit_code_1_with_a_traceback_only_for_debug(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import jobs
+    from gs2d.pipeline import report
 
     def broken(_path: Path, _on_event: object) -> Path:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(jobs, "report_run", broken)
+    monkeypatch.setattr(report, "report_run", broken)
     assert run(["report", str(trained)]) == 1
     err = capsys.readouterr().err
     assert err.splitlines() == [
@@ -209,12 +209,12 @@ def test_ctrl_c_before_the_first_iteration_leaves_nothing_and_says_so(
 def test_out_of_memory_names_the_remedy(
     error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import jobs
+    from gs2d.pipeline import report
 
     def hungry(_path: Path, _on_event: object) -> Path:
         raise error
 
-    monkeypatch.setattr(jobs, "report_run", hungry)
+    monkeypatch.setattr(report, "report_run", hungry)
     assert run(["report", str(trained)]) == 2
     assert "--downscale" in one_line(capsys.readouterr().err)
 
@@ -222,12 +222,12 @@ def test_out_of_memory_names_the_remedy(
 def test_an_os_error_that_the_user_can_mend_is_one_line(
     trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gs2d.pipeline import jobs
+    from gs2d.pipeline import report
 
     def denied(path: Path, _on_event: object) -> Path:
         raise PermissionError(13, "Permission denied", str(path / "report.html"))
 
-    monkeypatch.setattr(jobs, "report_run", denied)
+    monkeypatch.setattr(report, "report_run", denied)
     assert run(["report", str(trained)]) == 2
     assert "Permission denied" in one_line(capsys.readouterr().err)
     assert app_module.EXIT_BUG == 1

@@ -23,7 +23,7 @@ from gs2d.pipeline.job import check_same_run, reload_job
 from gs2d.pipeline.mesh import extract_mesh, mesh_run
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.train import train
-from gs2d.render.backends import get_backend
+from gs2d.render.backends import Backend, get_backend
 from tiny import RADIUS, write_capture
 
 
@@ -98,8 +98,10 @@ def test_a_run_is_fused_by_its_own_backend_and_says_so(
 ) -> None:
     asked: list[str] = []
 
-    def recorded(volumes: Sequence[Volume], backend: str, threads: int | None = None) -> AbstractContextManager[Add]:
-        asked.append(backend)
+    def recorded(
+        volumes: Sequence[Volume], backend: Backend, threads: int | None = None
+    ) -> AbstractContextManager[Add]:
+        asked.append(backend.name)
         return integrator(volumes, backend, threads)
 
     job, splats = reload_job(RunFolder(run), lambda _event: None), finished_splats(RunFolder(run))

@@ -256,16 +256,16 @@ def test_a_rendering_is_not_written_over_a_photograph(
 def test_a_rendering_that_fails_leaves_none_of_its_pictures_and_no_folder(
     undisturbed: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gs2d.pipeline import jobs
+    from gs2d.pipeline import render
 
-    write = jobs.write_image
+    write = render.write_image
 
     def full(path: Path, image: np.ndarray) -> None:
         if path.name.startswith("0003"):
             raise DiskError("no space left")
         write(path, image)
 
-    monkeypatch.setattr(jobs, "write_image", full)
+    monkeypatch.setattr(render, "write_image", full)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "0001.png").write_text("an older picture")
     for folder in (tmp_path / "new" / "deep", tmp_path / "mine"):

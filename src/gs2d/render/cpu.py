@@ -38,7 +38,7 @@ class _View(ctypes.Structure):
         *((name, ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
         *((name, ctypes.c_double) for name in CONSTANTS),
         ("background", ctypes.c_double * 3),
-        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks", "crossing")),
+        *((name, ctypes.c_int32) for name in ("width", "height", "sh_degree", "exact_masks", "near_plane_policy")),
     )
 
 

@@ -125,7 +125,10 @@ def view_of(camera: Camera, settings: RasterSettings) -> View:
         setattr(view, name, getattr(settings, name))
     view.inv_lowpass2 = 1 / settings.lowpass_px**2
     view.log2_alpha_min = math.log2(settings.alpha_min)
-    view.error_k2, view.crossing = settings.error_cutoff**2, NEAR_PLANE_POLICIES.index(settings.near_plane_policy)
+    view.error_k2, view.near_plane_policy = (
+        settings.error_cutoff**2,
+        NEAR_PLANE_POLICIES.index(settings.near_plane_policy),
+    )
     view.distortion_scale = (settings.far * settings.near / (settings.far - settings.near)) ** 2
     view.tiles_x, view.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     return view

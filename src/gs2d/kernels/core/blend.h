@@ -8,7 +8,7 @@ namespace gs2d {
 
 // Constants of the contract, as values of V.
 template <class V> struct BlendLimits {
-    V inv_lowpass2;      // 1 / lowpass_px^2
+    V inv_lowpass2;  // 1 / lowpass_px^2
     V near;
     V log2_alpha_min;
     V alpha_max, transmittance_min;
@@ -26,10 +26,10 @@ template <class V> GS2D_HD PlaneAt<V> plane_at(const Record<V>& s, V dx, V dy) {
 
 // A splat at a pixel. Where the low-pass filter decides, u = v = 0 and the depth is z_c; skipped pairs have alpha = 0.
 template <class V> struct Hit {
-    V u, v;      // plane coordinates
+    V u, v;  // plane coordinates
     V depth, inverse_depth;
     V rho;
-    V alpha;     // not yet limited to alpha_max
+    V alpha;        // not yet limited to alpha_max
     mask_t<V> ray;  // the plane decides
 };
 
@@ -82,7 +82,8 @@ template <class V> GS2D_HD V log2_alpha_of(V log2_opacity, const Hit<V>& h, cons
 }
 
 // Both.
-template <class V> GS2D_HD Hit<V> intersect(const Record<V>& s, const PlaneAt<V>& p, V zc, V dx, V dy, const BlendLimits<V>& k) {
+template <class V>
+GS2D_HD Hit<V> intersect(const Record<V>& s, const PlaneAt<V>& p, V zc, V dx, V dy, const BlendLimits<V>& k) {
     Hit<V> h = meet(p, s.iz, zc, dx, dy, k);
     h.alpha = alpha_of(log2_alpha_of(s.log2_opacity, h, k), k);
     return h;
@@ -109,7 +110,8 @@ template <bool Early, class V>
 GS2D_HD V composite_weight(V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
     const V alpha = min(raw_alpha, k.alpha_max);
     const V after = fnma(alpha, p.T, p.T);
-    p.live = p.live & (after >= k.transmittance_min);  // T of a live pixel never is below: only a seen splat can stop it
+    // T of a live pixel never is below: only a seen splat can stop it
+    p.live = p.live & (after >= k.transmittance_min);
     const V w = keep(p.live, alpha * p.T);
     if constexpr (Early) {
         p.inverse_depth0 = select(p.alpha <= V(0), inverse_depth, p.inverse_depth0);
@@ -133,7 +135,8 @@ template <class V> GS2D_HD void accumulate(const Record<V>& s, V w, V depth, Pix
 
 // Both; returns where a live pixel saw the splat (also where that pixel stops).
 template <class V>
-GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k, Pixel<V>& p) {
+GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_depth, const BlendLimits<V>& k,
+                            Pixel<V>& p) {
     const auto seen = (raw_alpha > V(0)) & p.live;
     accumulate(s, composite_weight<true>(raw_alpha, depth, inverse_depth, k, p), depth, p);
     return seen;
@@ -144,9 +147,9 @@ GS2D_HD mask_t<V> composite(const Record<V>& s, V raw_alpha, V depth, V inverse_
 // buffer per channel.
 template <class V> struct PixelGradient {
     V red, green, blue;
-    V alpha;   // of sum w; background and the quotient of depth_mean are folded in
+    V alpha;  // of sum w; background and the quotient of depth_mean are folded in
     V nx, ny, nz;
-    V depth;   // of sum w z
+    V depth;  // of sum w z
     V median;
     V median_below;  // the median pair is the one that brings T from above 1/2 to this: max(1/2, T_final)
     // The distortion's part of s: g (q^2 sum w - 2 q M1 + M2) with g its gradient. The last term is folded into alpha.
@@ -184,7 +187,8 @@ GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, 
     const V after = fnma(alpha, T, T);
     const auto goes_on = after >= k.transmittance_min;
     const V w = keep(goes_on, alpha * T);
-    V along = fma(s.red, g.red, fma(s.green, g.green, fma(s.blue, g.blue, g.alpha)));  // s = dL/dw, transmittance held
+    // s = dL/dw, transmittance held
+    V along = fma(s.red, g.red, fma(s.green, g.green, fma(s.blue, g.blue, g.alpha)));
     V gI = V(0);
     if constexpr (Geo) {
         along = along + fma(s.nx, g.nx, fma(s.ny, g.ny, fma(s.nz, g.nz, depth * g.depth)));
@@ -205,10 +209,13 @@ GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, 
 }
 
 // Adds that pair to the sums: first what follows from the weight and from alpha alone, then the geometry.
-template <bool Geo, class V> GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, PairSums<V>& sums) {
+template <bool Geo, class V>
+GS2D_HD void add_colors(const PixelGradient<V>& g, const PairGradient<V>& p, PairSums<V>& sums) {
     sums.ln_alpha = sums.ln_alpha + p.ln_alpha;
-    sums.red = fma(p.w, g.red, sums.red), sums.green = fma(p.w, g.green, sums.green), sums.blue = fma(p.w, g.blue, sums.blue);
-    if constexpr (Geo) sums.nx = fma(p.w, g.nx, sums.nx), sums.ny = fma(p.w, g.ny, sums.ny), sums.nz = fma(p.w, g.nz, sums.nz);
+    sums.red = fma(p.w, g.red, sums.red), sums.green = fma(p.w, g.green, sums.green),
+    sums.blue = fma(p.w, g.blue, sums.blue);
+    if constexpr (Geo)
+        sums.nx = fma(p.w, g.nx, sums.nx), sums.ny = fma(p.w, g.ny, sums.ny), sums.nz = fma(p.w, g.nz, sums.nz);
 }
 
 // Abs: the AbsGS signal is wanted. Filtered: the low-pass filter may have decided one of the pairs (if not: the same sums).

@@ -25,7 +25,9 @@ template <class V> GS2D_HD void expose(const V* color, V coverage, const Exposur
 }
 
 // The gradient of the colour; those of A and b, row by row, are added to `sums`.
-template <class V> GS2D_HD void expose_vjp(const V* upstream, const V* color, V coverage, const Exposure<V>& e, V* to_color, V (*sums)[4]) {
+template <class V>
+GS2D_HD void expose_vjp(const V* upstream, const V* color, V coverage, const Exposure<V>& e, V* to_color,
+                        V (*sums)[4]) {
     V light[3];
     remove_background(color, coverage, e, light);
     for (int j = 0; j < 3; ++j)

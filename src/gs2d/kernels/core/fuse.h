@@ -13,14 +13,16 @@ constexpr double FUSE_NO_WEIGHT = 1e-20;   // a sum of weights below this is tak
 
 // One view over some blocks of a volume, for kernels/tsdf.py. R is the type of the arrays.
 template <class R> struct FuseArguments {
-    long long blocks;      // that the view may change
-    const long long* rows; // [blocks] of the volume
-    const R* bases;        // [blocks, 3] (x z, y z, z) of each block's first voxel: px times wu, and wu
-    const R* offsets;      // [3, 512] of a voxel from its block's first
+    long long blocks;       // that the view may change
+    const long long* rows;  // [blocks] of the volume
+    // [blocks, 3] (x z, y z, z) of each block's first voxel: world units times px, and world units
+    const R* bases;
+    const R* offsets;  // [3, 512] of a voxel from its block's first
     long long width, height;
-    const R *depth, *slope_x, *slope_y;  // [height, width] wu, wu/px; the depth is hugely negative where unseen
-    const R *pixel_weight, *pixel_color; // [height, width], [height, width, 3]; or null
-    R truncation;                        // wu
+    // [height, width] world units, and their change per px; the depth is hugely negative where unseen
+    const R *depth, *slope_x, *slope_y;
+    const R *pixel_weight, *pixel_color;      // [height, width], [height, width, 3]; or null
+    R truncation;                             // world units
     R *tsdf, *weight, *color, *color_weight;  // [M, 512], [M, 512, 3]; the colours null where there are none
 };
 
@@ -29,8 +31,8 @@ template <class R> struct FuseArguments {
 struct MarkArguments {
     long long count, steps;   // rays; samples along each
     const double* rays;       // [3, count], to depth 1
-    const double* depth;      // [count] wu
-    const double* offsets;    // [steps] wu, of a sample from the depth
+    const double* depth;      // [count] world units
+    const double* offsets;    // [steps] world units, of a sample from the depth
     double start[3], end[3];  // of the rays; of the grid, which begins at 0
     long long padded[3];      // blocks, with a border of one
     unsigned char* marks;     // [padded]: of the lower of the two nearest blocks along each axis

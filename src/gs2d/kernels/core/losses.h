@@ -10,7 +10,7 @@ constexpr double SSIM_C2 = 0.03 * 0.03;
 
 // The window: exp(-k^2 / 4.5), k = 0..5, divided by the sum over k = -5..5.
 constexpr int SSIM_RADIUS = 5, SSIM_TAPS = 2 * SSIM_RADIUS + 1;
-constexpr double SSIM_WINDOW[SSIM_RADIUS + 1] = {0.2660117248617943,   0.21300553771125366,   0.1093606895097,
+constexpr double SSIM_WINDOW[SSIM_RADIUS + 1] = {0.2660117248617943,  0.21300553771125366,  0.1093606895097,
                                                  0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
 
 // SSIM of one pixel and channel, and its derivatives by the blurred moments that depend on the rendered image x:
@@ -30,9 +30,9 @@ template <class V> GS2D_HD SsimPoint<V> ssim_point(V a, V b, V s, V p) {
     const V b2 = (s - means) + V(SSIM_C2);
     const V inverse = V(1.0f) / (b1 * b2);
     const V value = (a1 * a2) * inverse;
-    const V d_squares = -(value * (b1 * inverse));                         // -value / b2
-    const V d_product = two * (a1 * inverse);                              // 2 a1 / (b1 b2)
-    const V same = value * (b1 - b2);                                      // value (1/b2 - 1/b1) b1 b2
+    const V d_squares = -(value * (b1 * inverse));  // -value / b2
+    const V d_product = two * (a1 * inverse);       // 2 a1 / (b1 b2)
+    const V same = value * (b1 - b2);               // value (1/b2 - 1/b1) b1 b2
     const V d_mean = (two * inverse) * fma(b, a2 - a1, a * same);
     return {value, d_mean, d_squares, d_product};
 }
@@ -49,9 +49,10 @@ template <class V> GS2D_HD V l1_sign(V x, V y) {
 // with the positive factor (zr + zl)(zd + zu) / (fx fy). Its product with the pixel's ray is -1 before scaling: it faces
 // the camera and is never 0, so nothing is guarded here but the depths being positive.
 template <class V> struct DepthNormal {
-    Vec3<V> direction;                 // unit, camera frame
-    V inverse_length;                  // 1 / |n|
-    V slope_x, slope_y;                // 2 / (zr + zl)^2, 2 / (zd + zu)^2: d gx/d zr = slope_x zl, d gx/d zl = -slope_x zr
+    Vec3<V> direction;  // unit, camera frame
+    V inverse_length;   // 1 / |n|
+    // 2 / (zr + zl)^2, 2 / (zd + zu)^2: d gx/d zr = slope_x zl, d gx/d zl = -slope_x zr
+    V slope_x, slope_y;
 };
 
 template <class V>

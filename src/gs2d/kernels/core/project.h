@@ -50,12 +50,12 @@ constexpr int GRADIENT = RECORD, GRADIENT_EXTRA = 4;  // the latter: lowpass_cx 
 
 // What both directions need.
 template <class V> struct Frame3 {
-    V qw, qx, qy, qz, inverse_norm;       // unit quaternion, 1 / |quat|
-    Vec3<V> tu, tv, n_world;              // world
-    Vec3<V> p, a, b, n;                   // camera frame: centre, s_u t_u, s_v t_v, normal
-    Vec3<V> row0, row1, row2;             // of P^-1
-    V sign;                               // +1, or -1 where t_w looks away from the camera
-    Vec3<V> to_splat;                     // unit, world
+    V qw, qx, qy, qz, inverse_norm;  // unit quaternion, 1 / |quat|
+    Vec3<V> tu, tv, n_world;         // world
+    Vec3<V> p, a, b, n;              // camera frame: centre, s_u t_u, s_v t_v, normal
+    Vec3<V> row0, row1, row2;        // of P^-1
+    V sign;                          // +1, or -1 where t_w looks away from the camera
+    Vec3<V> to_splat;                // unit, world
     V inverse_distance;
 };
 
@@ -82,7 +82,8 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     Frame3<V> f;
     const V one = V(S(1)), two = V(S(2)), tiny = V(S(1e-18));
     f.inverse_norm = one / sqrt(fma(s.qw, s.qw, fma(s.qx, s.qx, fma(s.qy, s.qy, s.qz * s.qz))));
-    f.qw = s.qw * f.inverse_norm, f.qx = s.qx * f.inverse_norm, f.qy = s.qy * f.inverse_norm, f.qz = s.qz * f.inverse_norm;
+    f.qw = s.qw * f.inverse_norm, f.qx = s.qx * f.inverse_norm, f.qy = s.qy * f.inverse_norm,
+    f.qz = s.qz * f.inverse_norm;
     const V xx = f.qx * f.qx, yy = f.qy * f.qy, zz = f.qz * f.qz;
     const V xy = f.qx * f.qy, xz = f.qx * f.qz, yz = f.qy * f.qz, wx = f.qw * f.qx, wy = f.qw * f.qy, wz = f.qw * f.qz;
     f.tu = {one - two * (yy + zz), two * (xy + wz), two * (xz - wy)};
@@ -110,8 +111,8 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
 // Finite only if every parameter is, and if the scales and the inverse norm of the quaternion are: a sum of absolute values.
 // (gcc 12 folds 0 * x to 0 with -fno-signed-zeros.)
 template <class V> GS2D_HD V parameter_size(const SplatParameters<V>& p, const Frame3<V>& f) {
-    return abs(p.mean.x) + abs(p.mean.y) + abs(p.mean.z) + abs(p.logit) + abs(p.qw) + abs(p.qx) + abs(p.qy) + abs(p.qz) +
-           abs(p.log_su) + abs(p.log_sv) + exp(p.log_su) + exp(p.log_sv) + f.inverse_norm;
+    return abs(p.mean.x) + abs(p.mean.y) + abs(p.mean.z) + abs(p.logit) + abs(p.qw) + abs(p.qx) + abs(p.qy) +
+           abs(p.qz) + abs(p.log_su) + abs(p.log_sv) + exp(p.log_su) + exp(p.log_sv) + f.inverse_norm;
 }
 
 // All of the record but the colour.
@@ -187,10 +188,12 @@ template <class V> struct IntrinsicsGradient {
     V fx, fy, cx, cy;
 };
 template <class V, class S>
-GS2D_HD IntrinsicsGradient<V> intrinsics_vjp(const Frame3<V>& f, const Record<V>& r, const RecordGradient<V>& g, const PinholeCamera<S>& cam) {
+GS2D_HD IntrinsicsGradient<V> intrinsics_vjp(const Frame3<V>& f, const Record<V>& r, const RecordGradient<V>& g,
+                                             const PinholeCamera<S>& cam) {
     const V cx = g.cx + g.lowpass_cx, cy = g.cy + g.lowpass_cy;
     const V kx = V(S(1) / cam.fx), ky = V(S(1) / cam.fy);
-    const V along_x = fma(g.au, r.au, fma(g.av, r.av, g.ai * r.ai)), along_y = fma(g.bu, r.bu, fma(g.bv, r.bv, g.bi * r.bi));
+    const V along_x = fma(g.au, r.au, fma(g.av, r.av, g.ai * r.ai)),
+            along_y = fma(g.bu, r.bu, fma(g.bv, r.bv, g.bi * r.bi));
     return {fnma(kx, along_x, cx * (f.p.x * r.iz)), fnma(ky, along_y, cy * (f.p.y * r.iz)), cx, cy};
 }
 
@@ -199,15 +202,15 @@ template <class V> struct Footprint {
     // |pixel - e| in the metric (a, b, c) is at most 1 inside the ellipse; slightly widened against rounding.
     V ex, ey, a, b, c;
     V slope, half, inv_y2, y_right;  // the same ellipse by rows: see Chords in tile.h
-    V disc2;                     // low-pass disc: radius^2, widened
-    V k;                         // radius of the disc on the splat's plane, widened
-    V x_min, y_min, x_max, y_max;  // exact box of both, px, not clipped
-    mask_t<V> crosses;           // the disc reaches the camera plane: no ellipse, no box
-    mask_t<V> unbounded;         // crosses, or so nearly that the ellipse cannot be trusted
+    V disc2;                         // low-pass disc: radius^2, widened
+    V k;                             // radius of the disc on the splat's plane, widened
+    V x_min, y_min, x_max, y_max;    // exact box of both, px, not clipped
+    mask_t<V> crosses;               // the disc reaches the camera plane: no ellipse, no box
+    mask_t<V> unbounded;             // crosses, or so nearly that the ellipse cannot be trusted
 };
 
 // Rule 19: what becomes of a splat whose disc rho3d <= error_cutoff^2 reaches the camera plane.
-constexpr int CROSSING_DRAW = 0, CROSSING_CULL = 1, CROSSING_BOX = 2;
+constexpr int NEAR_PLANE_DRAW = 0, NEAR_PLANE_CULL = 1, NEAR_PLANE_BOX = 2;
 
 // The disc rho3d <= k^2 reaches the camera plane.
 template <class V> GS2D_HD mask_t<V> reaches_camera_plane(const Frame3<V>& f, V k2) {
@@ -221,8 +224,8 @@ template <class V> struct ScreenAxes {
 
 template <class V, class S> GS2D_HD ScreenAxes<V> screen_axes(const Frame3<V>& f, const PinholeCamera<S>& cam) {
     const V inv_z = V(S(1)) / f.p.z, rx = f.p.x * inv_z, ry = f.p.y * inv_z;
-    return {V(cam.fx) * fnma(rx, f.a.z, f.a.x), V(cam.fx) * fnma(rx, f.b.z, f.b.x),
-            V(cam.fy) * fnma(ry, f.a.z, f.a.y), V(cam.fy) * fnma(ry, f.b.z, f.b.y)};
+    return {V(cam.fx) * fnma(rx, f.a.z, f.a.x), V(cam.fx) * fnma(rx, f.b.z, f.b.x), V(cam.fy) * fnma(ry, f.a.z, f.a.y),
+            V(cam.fy) * fnma(ry, f.b.z, f.b.y)};
 }
 
 // Rule 19, "box": centre and half side, px, of the official square around a disc that reaches the camera plane: the
@@ -232,16 +235,19 @@ template <class V> struct Square {
 };
 
 template <class V, class S>
-GS2D_HD Square<V> official_square(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px, const PinholeCamera<S>& cam) {
+GS2D_HD Square<V> official_square(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px,
+                                  const PinholeCamera<S>& cam) {
     const ScreenAxes<V> s = screen_axes(f, cam);
     const V scale = -k2 / fnma(f.p.z, f.p.z, k2 * fma(f.a.z, f.a.z, f.b.z * f.b.z));  // < 0
     const V ex = -scale * fma(s.xu, f.a.z, s.xv * f.b.z), ey = -scale * fma(s.yu, f.a.z, s.yv * f.b.z);
-    const V sxx = fma(ex, ex, scale * fma(s.xu, s.xu, s.xv * s.xv)), syy = fma(ey, ey, scale * fma(s.yu, s.yu, s.yv * s.yv));
+    const V sxx = fma(ex, ex, scale * fma(s.xu, s.xu, s.xv * s.xv)),
+            syy = fma(ey, ey, scale * fma(s.yu, s.yu, s.yv * s.yv));
     return {r.cx + ex, r.cy + ey, max(sqrt(max(max(sxx, syy), V(S(1e-4)))), V(lowpass_px) * sqrt(k2))};
 }
 
 template <class V, class S>
-GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px, const PinholeCamera<S>& cam) {
+GS2D_HD Footprint<V> footprint(const Frame3<V>& f, const Record<V>& r, V k2, S lowpass_px,
+                               const PinholeCamera<S>& cam) {
     Footprint<V> o;
     const V zero = V(S(0)), one = V(S(1));
     const ScreenAxes<V> s = screen_axes(f, cam);

@@ -68,12 +68,13 @@ template <class V> GS2D_HD Vec3<V> sh_basis_vjp(Vec3<V> d, int degree, const V* 
     const V a3 = V(0.5900435899266435), b3 = V(2.890611442640554), c3 = V(0.4570457994644658);
     const V d3 = V(0.3731763325901154), e3 = V(1.445305721320277);
     const V two = V(2.0), three = V(3.0), four = V(4.0), six = V(6.0), eight = V(8.0);
-    r.x += b3 * yz * g[10] + two * c3 * xy * g[11] - six * d3 * xz * g[12] - c3 * (four * zz - three * xx - yy) * g[13] +
-           two * e3 * xz * g[14] - six * a3 * xy * g[9] - three * a3 * (xx - yy) * g[15];
+    r.x += b3 * yz * g[10] + two * c3 * xy * g[11] - six * d3 * xz * g[12] -
+           c3 * (four * zz - three * xx - yy) * g[13] + two * e3 * xz * g[14] - six * a3 * xy * g[9] -
+           three * a3 * (xx - yy) * g[15];
     r.y += b3 * xz * g[10] - three * a3 * (xx - yy) * g[9] - c3 * (four * zz - xx - three * yy) * g[11] -
            six * d3 * yz * g[12] + two * c3 * xy * g[13] - two * e3 * yz * g[14] + six * a3 * xy * g[15];
-    r.z += b3 * xy * g[10] - eight * c3 * yz * g[11] + three * d3 * (two * zz - xx - yy) * g[12] - eight * c3 * xz * g[13] +
-           e3 * (xx - yy) * g[14];
+    r.z += b3 * xy * g[10] - eight * c3 * yz * g[11] + three * d3 * (two * zz - xx - yy) * g[12] -
+           eight * c3 * xz * g[13] + e3 * (xx - yy) * g[14];
     return r;
 }
 

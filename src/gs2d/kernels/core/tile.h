@@ -58,7 +58,8 @@ template <class V> struct HalfPlane {
     V a, b, c;
 };
 constexpr int DIRECTIONS = 8, SIDES = DIRECTIONS + 1;
-constexpr double OUTLINE_SLACK = 1e-5;  // of the sum of the absolute terms: the kernels' X, Y and I are off by some 1e-6 of it
+// of the sum of the absolute terms: the kernels' X, Y and I are off by some 1e-6 of it
+constexpr double OUTLINE_SLACK = 1e-5;
 template <class V> struct Outline {
     HalfPlane<V> sides[SIDES];
     V disc2;
@@ -67,10 +68,12 @@ template <class V> struct Outline {
 
 // Of the planes X, Y, I of a record where (X^2 + Y^2) / I^2 <= k^2 and 0 < I <= 1 / near, in an image of that size.
 template <class V>
-GS2D_HD Outline<V> outline_of(V au, V bu, V av, V bv, V ai, V bi, V iz, V cx, V cy, V k, V disc2, V near, V width, V height) {
+GS2D_HD Outline<V> outline_of(V au, V bu, V av, V bv, V ai, V bi, V iz, V cx, V cy, V k, V disc2, V near, V width,
+                              V height) {
     // (cos, sin) of multiples of 45 degrees: X cos + Y sin <= |(X, Y)| <= k I
     const V h = V(0.70710678f), zero = V(0), one = V(1), eps = V(float(OUTLINE_SLACK));
-    const V cosines[DIRECTIONS] = {one, h, zero, -h, -one, -h, zero, h}, sines[DIRECTIONS] = {zero, h, one, h, zero, -h, -one, -h};
+    const V cosines[DIRECTIONS] = {one, h, zero, -h, -one, -h, zero, h},
+            sines[DIRECTIONS] = {zero, h, one, h, zero, -h, -one, -h};
     const V reach_x = max(abs(cx), abs(width - cx)) + V(TILE_PX), reach_y = max(abs(cy), abs(height - cy)) + V(TILE_PX);
     const V size_i = fma(abs(ai), reach_x, fma(abs(bi), reach_y, abs(iz)));
     const V size = fma(abs(au) + abs(av), reach_x, fma(abs(bu) + abs(bv), reach_y, k * size_i)), inv_near = one / near;
@@ -99,7 +102,8 @@ template <class V> GS2D_HD void reach_in_rows(const Outline<V>& s, V y0, V y1, V
     const auto none = left > right;
     const V dy = min(max(zero, y0), y1), d2 = fnma(dy, dy, s.disc2), d = sqrt(max(d2, zero));
     const auto near = d2 >= zero;
-    left = min(select(none, far, left), select(near, -d, far)), right = max(select(none, -far, right), select(near, d, -far));
+    left = min(select(none, far, left), select(near, -d, far)),
+    right = max(select(none, -far, right), select(near, d, -far));
     left = select(s.unknown, -far, left), right = select(s.unknown, far, right);
 }
 
@@ -108,14 +112,16 @@ template <class S> struct PixelBox {
     S x_min, y_min, x_max, y_max;
 };
 
-template <class S> GS2D_HD int tile_floor(S px, int tiles) {  // first tile that reaches px; px may be anything but NaN
+// first tile that reaches px; px may be anything but NaN
+template <class S> GS2D_HD int tile_floor(S px, int tiles) {
     const S t = px * S(1.0 / TILE_PX);
     return t <= S(0) ? 0 : t >= S(tiles) ? tiles : static_cast<int>(t);
 }
 
 // Tiles whose pixel centres the widened box of a footprint can reach.
 template <class S>
-GS2D_HD TileRectangle tile_rectangle(const PixelBox<S>& o, bool unbounded, int width, int height, int tiles_x, int tiles_y) {
+GS2D_HD TileRectangle tile_rectangle(const PixelBox<S>& o, bool unbounded, int width, int height, int tiles_x,
+                                     int tiles_y) {
     if (unbounded) return {0, 0, (unsigned short)tiles_x, (unsigned short)tiles_y};
     const S margin = S(0.05), half = S(0.5);
     const S x0 = o.x_min - margin, y0 = o.y_min - margin, x1 = o.x_max + margin, y1 = o.y_max + margin;
@@ -138,7 +144,8 @@ template <class S> GS2D_HD bool tiles_between(S left, S right, int width, int ti
 // The rectangle that holds all of the rows so far and tiles x0 to x1 of row y; start with {0, 0, 0, 0}.
 GS2D_HD TileRectangle with_row(const TileRectangle& r, int x0, int x1, int y) {
     if (r.x1 <= r.x0) return {(unsigned short)x0, (unsigned short)y, (unsigned short)x1, (unsigned short)(y + 1)};
-    return {(unsigned short)(x0 < r.x0 ? x0 : r.x0), r.y0, (unsigned short)(x1 > r.x1 ? x1 : r.x1), (unsigned short)(y + 1)};
+    return {(unsigned short)(x0 < r.x0 ? x0 : r.x0), r.y0, (unsigned short)(x1 > r.x1 ? x1 : r.x1),
+            (unsigned short)(y + 1)};
 }
 
 // Rule 19, "box": the tiles that a square (centre and half side, px) touches; none where it is not finite.
@@ -153,7 +160,8 @@ template <class S> GS2D_HD TileRectangle square_tiles(S x, S y, S half, int tile
 // Half the longer side of some tiles, clipped to the image; 0 for none.
 template <class S> GS2D_HD S tiles_radius(const TileRectangle& t, int width, int height) {
     if (t.x1 <= t.x0 || t.y1 <= t.y0) return S(0);
-    const int right = t.x1 * TILE_PX < width ? t.x1 * TILE_PX : width, bottom = t.y1 * TILE_PX < height ? t.y1 * TILE_PX : height;
+    const int right = t.x1 * TILE_PX < width ? t.x1 * TILE_PX : width,
+              bottom = t.y1 * TILE_PX < height ? t.y1 * TILE_PX : height;
     const int w = right - t.x0 * TILE_PX, h = bottom - t.y0 * TILE_PX;
     return S(w > h ? w : h) / S(2);
 }

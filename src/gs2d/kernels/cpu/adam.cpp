@@ -12,9 +12,9 @@ constexpr int64_t PIECE = 8192;  // elements a thread takes at a time: 160 KB ar
 
 // kernels/adam.py has the same.
 struct AdamAttribute {
-    real *parameter, *mean, *square;  // [N, columns]
-    const real* gradient;             // [N, columns], or [M, columns] with `compact`
-    const int64_t* rows;              // [M]: only these; or null
+    real *parameter, *mean, *square;          // [N, columns]
+    const real* gradient;                     // [N, columns], or [M, columns] with `compact`
+    const int64_t* rows;                      // [M]: only these; or null
     int64_t height, count, columns, compact;  // N; M or N
     double step_size, root_2;
 };
@@ -65,7 +65,8 @@ bool all_finite(const real* x, int64_t n) {
     int64_t i = 0;
     for (; i + 4 * LANES <= n; i += 4 * LANES)
         for (int j = 0; j < 4; ++j) so_far[j] = so_far[j] & finite(load(x + i + j * LANES));
-    for (; i < n; i += LANES) so_far[0] = so_far[0] & finite(load_first(x + i, n - i < LANES ? static_cast<int>(n - i) : LANES));
+    for (; i < n; i += LANES)
+        so_far[0] = so_far[0] & finite(load_first(x + i, n - i < LANES ? static_cast<int>(n - i) : LANES));
     return all((so_far[0] & so_far[1]) & (so_far[2] & so_far[3]));
 }
 
@@ -81,21 +82,27 @@ GS2D_EXPORT int gs2d_adam(const AdamAttribute* attributes, int n, double beta1, 
         for (int64_t k = 0; attributes[i].rows && k < attributes[i].count; ++k)
             if (attributes[i].rows[k] < 0 || attributes[i].rows[k] >= attributes[i].height) return 1;
     const auto elements = [&](int i) { return attributes[i].count * attributes[i].columns; };
-    for_pieces(n, elements, [&](int i) { return attributes[i].columns; }, [&](int i, int64_t begin, int64_t end) {
-        const AdamAttribute& a = attributes[i];
-        const auto v = [](double x) { return V(real(x)); };
-        step_piece(a, begin, end, {v(1 - beta1), v(beta2), v(1 - beta2), v(eps), v(a.step_size), v(a.root_2)});
-    });
+    for_pieces(
+        n, elements, [&](int i) { return attributes[i].columns; },
+        [&](int i, int64_t begin, int64_t end) {
+            const AdamAttribute& a = attributes[i];
+            const auto v = [](double x) { return V(real(x)); };
+            step_piece(a, begin, end, {v(1 - beta1), v(beta2), v(1 - beta2), v(eps), v(a.step_size), v(a.root_2)});
+        });
     return 0;
 }
 
 // The number of the first of n arrays that holds a NaN or an infinity; n if none does.
 GS2D_EXPORT int gs2d_first_not_finite(const real* const* arrays, const int64_t* sizes, int n) {
     int first = n;
-    for_pieces(n, [&](int i) { return sizes[i]; }, [](int) { return int64_t(1); }, [&](int i, int64_t begin, int64_t end) {
-        if (all_finite(arrays[i] + begin, end - begin)) return;
-        int seen = __atomic_load_n(&first, __ATOMIC_RELAXED);
-        while (i < seen && !__atomic_compare_exchange_n(&first, &seen, i, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
-    });
+    for_pieces(
+        n, [&](int i) { return sizes[i]; }, [](int) { return int64_t(1); },
+        [&](int i, int64_t begin, int64_t end) {
+            if (all_finite(arrays[i] + begin, end - begin)) return;
+            int seen = __atomic_load_n(&first, __ATOMIC_RELAXED);
+            while (i < seen &&
+                   !__atomic_compare_exchange_n(&first, &seen, i, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+            }
+        });
     return first;
 }

@@ -14,7 +14,8 @@ int free_count = 0;
 constexpr int KEEP = 2;  // frames whose memory is kept for the next view
 
 template <class F> void for_each_buffer(Frame& f, F&& visit) {
-    visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.taken), visit(f.saved), visit(f.scratch);
+    visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.taken), visit(f.saved),
+        visit(f.scratch);
     visit(f.histogram), visit(f.slot_begin), visit(f.chunks), visit(f.own_sums);
     visit(f.target), visit(f.splat_begin), visit(f.splat_slots);
 }
@@ -93,8 +94,10 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
 // Gradients of the parameters of the same call's splats; `images` are that call's outputs. `intrinsics` [N, 4], or null: what each
 // splat says of fx, fy, cx and cy.
 GS2D_EXPORT int gs2d_raster_backward_intrinsics(Frame* frame, const Parameters* splats, const Images* images,
-                                                const ImageGradients* upstream, const ParameterGradients* out, real* intrinsics) {
-    if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out, intrinsics || wants_geometry(*out))) return NO_MEMORY;
+                                                const ImageGradients* upstream, const ParameterGradients* out,
+                                                real* intrinsics) {
+    if (!blend_tiles_vjp(*frame, *images, *upstream, splats->sh_rest, *out, intrinsics || wants_geometry(*out)))
+        return NO_MEMORY;
     StageClock clock;
     project_splats_vjp(*frame, *splats, *out, intrinsics);
     clock.done(PROJECT_BACKWARD);
@@ -112,8 +115,9 @@ GS2D_EXPORT int gs2d_splat_errors(const View* view, const Parameters* splats, co
     Frame* f = take_frame();
     if (!f) return NO_MEMORY;
     set_view(*f, *view);
-    const bool ok = project_splats(*f, *splats, occlusion ? Reach::ERRORS_OCCLUDED : Reach::ERRORS, nullptr) &&
-                    (occlusion ? occluded_splat_errors(*f, image, mask, errors) : splat_errors(*f, image, mask, errors));
+    const bool ok =
+        project_splats(*f, *splats, occlusion ? Reach::ERRORS_OCCLUDED : Reach::ERRORS, nullptr) &&
+        (occlusion ? occluded_splat_errors(*f, image, mask, errors) : splat_errors(*f, image, mask, errors));
     give_back(f);
     return ok ? OK : NO_MEMORY;
 }

@@ -10,15 +10,13 @@ namespace gs2d {
 namespace {
 
 // Per pixel of the tile, in block order: state, then what PixelGradient<V> holds.
-enum Plane {
-    T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST2, DIST1, DEPTH0, PLANES
-};
+enum Plane { T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST2, DIST1, DEPTH0, PLANES };
 using Planes = real (*)[PIXELS];
 
 inline PixelGradient<V> load_gradient(const Planes s, int b) {
     const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
-    return {at(RED), at(GREEN), at(BLUE), at(ALPHA), at(NX), at(NY), at(NZ), at(DEPTH), at(MEDIAN), at(MEDIAN_BELOW),
-            at(DIST2), at(DIST1), at(DEPTH0)};
+    return {at(RED),   at(GREEN),  at(BLUE),         at(ALPHA), at(NX),    at(NY),    at(NZ),
+            at(DEPTH), at(MEDIAN), at(MEDIAN_BELOW), at(DIST2), at(DIST1), at(DEPTH0)};
 }
 
 // Upstream gradients as PixelGradient wants them, and S = the sum over all splats of w s, from the image's totals.
@@ -82,7 +80,8 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
 RowLines images_read(const Frame& f, const Images& images, const ImageGradients& g) {
     const int64_t pixels = int64_t(f.view.width) * f.view.height;
     RowLines lines(f.view);
-    lines.add(g.color, 3), lines.add(g.normal, 3), lines.add(images.color, 3), lines.add(g.normal ? images.normal : nullptr, 3);
+    lines.add(g.color, 3), lines.add(g.normal, 3), lines.add(images.color, 3),
+        lines.add(g.normal ? images.normal : nullptr, 3);
     lines.add(g.alpha, 1), lines.add(g.depth_mean, 1), lines.add(g.depth_median, 1), lines.add(g.distortion, 1);
     lines.add(images.alpha, 1), lines.add(g.depth_mean ? images.depth_mean : nullptr, 1), lines.add(&f.saved[0], 1);
     if (!g.distortion) return lines;
@@ -107,14 +106,15 @@ struct Interest {
         }
     }
     void passed(const Entry& entry, int32_t i) {
-        for (uint32_t left = entry.blocks; left; left &= left - 1) blocks &= ~(uint32_t(last[__builtin_ctz(left)] == i) << __builtin_ctz(left));
+        for (uint32_t left = entry.blocks; left; left &= left - 1)
+            blocks &= ~(uint32_t(last[__builtin_ctz(left)] == i) << __builtin_ctz(left));
     }
 };
 
 // A splat without gradients: only T and S move on. The same arithmetic as below, so the splats behind it get the same bits.
 template <bool Geo, bool Dist>
-__attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t blocks, Planes s, const Centres& centres,
-                                       const BlendLimits<V>& limits) {
+__attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t blocks, Planes s,
+                                       const Centres& centres, const BlendLimits<V>& limits) {
     const Record<V> splat = broadcast(record);
     const V zc = reciprocal(splat.iz);
     SplatPlanes planes;
@@ -135,18 +135,19 @@ constexpr bool COLORS_FIT = REGISTERS >= 32;  // the registers hold them beside 
 // those of many pairs overlap, and with little enough to remember for the registers: the planes; alphas; what moves T and S
 // on; and the sums, splat by splat.
 struct Batch {
-    static constexpr int PAIRS = BLOCKS;  // as many as a splat may have; more would push the pixels out of the first cache
+    // as many as a splat may have; more would push the pixels out of the first cache
+    static constexpr int PAIRS = BLOCKS;
     alignas(64) real depth[PAIRS][LANES], inverse_depth[PAIRS][LANES], rho[PAIRS][LANES];
-    real alpha[PAIRS][LANES];                      // in the end dL/d ln(alpha)
-    real I[PAIRS][LANES];                          // dL/d(1 / z)
-    real w[COLORS_FIT ? 1 : PAIRS][LANES];         // weight
-    M ray[PAIRS];                                  // of splats that are not plain
+    real alpha[PAIRS][LANES];                              // in the end dL/d ln(alpha)
+    real I[PAIRS][LANES];                                  // dL/d(1 / z)
+    real w[COLORS_FIT ? 1 : PAIRS][LANES];                 // weight
+    M ray[PAIRS];                                          // of splats that are not plain
     uint8_t block[PAIRS + BLOCKS], splat[PAIRS + BLOCKS];  // `splat` counts within the batch
     // Of each splat. Its pairs are those before `end`; filtered: the low-pass filter decided one of them.
     SplatPlanes planes[PAIRS];
     const real* record[PAIRS];
     uint8_t end[PAIRS], filtered[PAIRS];
-    uint32_t others = 0;                           // a bit for each splat that is not plain
+    uint32_t others = 0;  // a bit for each splat that is not plain
     int pairs = 0, splats = 0;
 
     bool has_room(uint32_t blocks) const { return pairs + __builtin_popcount(blocks) <= PAIRS; }
@@ -211,8 +212,8 @@ inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const
 
 // Of one splat, whose pairs these are.
 template <bool Geo, bool Abs, bool Filtered>
-inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>& splat, const Planes s, const Centres& centres,
-                      PairSums<V>& sums) {
+inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>& splat, const Planes s,
+                      const Centres& centres, PairSums<V>& sums) {
     const auto pair = [&](int i) -> PairGradient<V> {
         return {COLORS_FIT ? V(0) : load(w.w[COLORS_FIT ? 0 : i]), load(w.alpha[i]), Geo ? load(w.I[i]) : V(0)};
     };
@@ -224,8 +225,9 @@ inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>
         V tu = tz * plane.X, tv = tz * plane.Y;
         M ray;
         if constexpr (Filtered) ray = w.ray[i], tu = keep(ray, tu), tv = keep(ray, tv);
-        add_geometry<Geo, Abs, Filtered, false>(splat, centres.at_x(b) - splat.cx, centres.at_y(b) - splat.cy, t, tu, tv,
-                                                load(w.rho[i]), Abs ? load(w.inverse_depth[i]) : V(0), ray, p, sums);
+        add_geometry<Geo, Abs, Filtered, false>(splat, centres.at_x(b) - splat.cx, centres.at_y(b) - splat.cy, t, tu,
+                                                tv, load(w.rho[i]), Abs ? load(w.inverse_depth[i]) : V(0), ray, p,
+                                                sums);
     };
     for (int i = first; i < end; ++i) geometry(i);
     if constexpr (!COLORS_FIT)
@@ -233,10 +235,11 @@ inline void sum_pairs(const Batch& w, int j, int first, int end, const Record<V>
 }
 
 template <bool Abs>
-inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool filtered, const Slots& to, const BlendLimits<V>& limits) {
+inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool filtered, const Slots& to,
+                       const BlendLimits<V>& limits) {
     RecordGradient<V> g = finish(splat, Abs ? reciprocal(splat.iz) : V(0), sums, limits);
     if (!to.extras) g.cx = g.cx + g.lowpass_cx, g.cy = g.cy + g.lowpass_cy;  // nobody asks for them apart
-    const V fields[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.ai, g.bi,
+    const V fields[16] = {g.cx, g.cy,         g.au,  g.bu,    g.av,   g.bv, g.ai, g.bi,
                           g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
     transpose_reduce<GRADIENT>(fields, to.gradients);
     if (!to.extras) return;
@@ -247,7 +250,8 @@ inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool fil
 
 // Empties the batch; returns where the next splat's slot is.
 template <bool Geo, bool Dist, bool Abs>
-__attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const Centres& centres, const BlendLimits<V>& limits) {
+__attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const Centres& centres,
+                                             const BlendLimits<V>& limits) {
     find_hits<Dist || Abs>(w, centres, limits);
     if constexpr (!COLORS_FIT)
         for (int i = 0; i < w.pairs; ++i) {
@@ -336,7 +340,8 @@ void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows,
     }
 }
 
-using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&, RowsAhead);
+using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&,
+                         RowsAhead);
 
 TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
     if (color_only) return tile_color_vjp;
@@ -347,8 +352,8 @@ TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
 
 }  // namespace
 
-bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t sh_rest, const ParameterGradients& out,
-                     bool geometry) {
+bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, int64_t sh_rest,
+                     const ParameterGradients& out, bool geometry) {
     StageClock clock;
     GradientSums sums(f, sh_rest, out);
     if (!sums.prepare()) return false;

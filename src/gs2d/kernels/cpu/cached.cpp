@@ -111,7 +111,8 @@ void render_tile(const CachedView& c, int64_t tile, const real* colors, real* im
     for (int64_t e = c.tile_entries[tile]; e < c.tile_entries[tile + 1]; ++e) {
         const real* color = colors + int64_t(c.entry_row[e]) * COLOR;
         const V red = V(color[0]), green = V(color[1]), blue = V(color[2]);
-        for (uint32_t blocks = static_cast<uint32_t>(c.entry_blocks[e]); blocks; blocks &= blocks - 1, weights += LANES) {
+        for (uint32_t blocks = static_cast<uint32_t>(c.entry_blocks[e]); blocks;
+             blocks &= blocks - 1, weights += LANES) {
             real* const p = planes + __builtin_ctz(blocks) * LANES;
             const V w = load(weights);
             store(p, fma(w, red, load(p)));
@@ -131,7 +132,8 @@ void gather_tile(const CachedView& c, int64_t tile, const real* gradient, real* 
     const real* weights = c.weights + c.tile_blocks[tile] * LANES;
     for (int64_t e = first; e < last; ++e) {
         Vec3<V> sum = {V(0), V(0), V(0)};
-        for (uint32_t blocks = static_cast<uint32_t>(c.entry_blocks[e]); blocks; blocks &= blocks - 1, weights += LANES) {
+        for (uint32_t blocks = static_cast<uint32_t>(c.entry_blocks[e]); blocks;
+             blocks &= blocks - 1, weights += LANES) {
             const real* const p = planes + __builtin_ctz(blocks) * LANES;
             sum = axpy(load(weights), Vec3<V>{load(p), load(p + PIXELS), load(p + 2 * PIXELS)}, sum);
         }
@@ -146,7 +148,8 @@ void gather_tile(const CachedView& c, int64_t tile, const real* gradient, real* 
 using namespace gs2d;
 
 // After a forward pass: how much a cached view holds. `row_of` [N]: the row of a splat that learns, or -1.
-GS2D_EXPORT void gs2d_cached_measure(const Frame* frame, const int32_t* row_of, int64_t* tile_entries, int64_t* tile_blocks) {
+GS2D_EXPORT void gs2d_cached_measure(const Frame* frame, const int32_t* row_of, int64_t* tile_entries,
+                                     int64_t* tile_blocks) {
     const Frame& f = *frame;
     parallel_ranges(f.tiles, 16, [&](int64_t first, int64_t last) {
         for (int64_t tile = first; tile < last; ++tile) {
@@ -165,7 +168,8 @@ GS2D_EXPORT void gs2d_cached_measure(const Frame* frame, const int32_t* row_of, 
 }
 
 // Fills a view whose arrays are as large as measured; `splats` are the rows that learn.
-GS2D_EXPORT void gs2d_cached_fill(const Frame* frame, const int32_t* row_of, const Parameters* splats, const CachedView* view) {
+GS2D_EXPORT void gs2d_cached_fill(const Frame* frame, const int32_t* row_of, const Parameters* splats,
+                                  const CachedView* view) {
     const CachedView& c = *view;
     const BlendLimits<V> limits = limits_of(frame->view);
     parallel_for(c.tiles, [&](int64_t tile) { fill_tile(*frame, tile, row_of, c, limits); });
@@ -173,7 +177,8 @@ GS2D_EXPORT void gs2d_cached_fill(const Frame* frame, const int32_t* row_of, con
     for_each_group(c, [&](int64_t i, int lanes) {
         V basis[SH_MAX];
         for (V& b : basis) b = V(0);
-        sh_basis(frame_of(load_parameters(*splats, i, lanes), frame->camera).to_splat, static_cast<int>(c.degree), basis);
+        sh_basis(frame_of(load_parameters(*splats, i, lanes), frame->camera).to_splat, static_cast<int>(c.degree),
+                 basis);
         for (int k = 0; k < SH_MAX; ++k) store(c.basis + (i * SH_MAX + k * LANES), basis[k]);
     });
 }
@@ -195,8 +200,8 @@ GS2D_EXPORT void gs2d_cached_render(const CachedView* view, const Parameters* sp
 }
 
 // Gradients of the rows' coefficients from that of the image [H, W, 3]; `slots` [entries, 4] is scratch.
-GS2D_EXPORT void gs2d_cached_gradients(const CachedView* view, const real* gradient, const real* colors, int64_t sh_rest,
-                                       real* slots, const ParameterGradients* out) {
+GS2D_EXPORT void gs2d_cached_gradients(const CachedView* view, const real* gradient, const real* colors,
+                                       int64_t sh_rest, real* slots, const ParameterGradients* out) {
     const CachedView& c = *view;
     parallel_ranges(c.tiles, 4, [&](int64_t first, int64_t last) {
         for (int64_t tile = first; tile < last; ++tile) gather_tile(c, tile, gradient, slots);

@@ -51,7 +51,8 @@ Vec3<V> turn_of_colors(const Moved& s, int64_t i, int lanes, Vec3<V> to_splat) {
     if (s.degree == 3) load_rows<45>(s.shN + i * stride, stride, lanes, rest);
     const Vec3<V> g = V(real(1 / 0.28209479177387814)) * load_vector(s.to_sh0, i, lanes);
     along[0] = V(real(0));
-    for (int k = 1; k < sh_count(int(s.degree)); ++k) along[k] = dot(g, {rest[3 * k - 3], rest[3 * k - 2], rest[3 * k - 1]});
+    for (int k = 1; k < sh_count(int(s.degree)); ++k)
+        along[k] = dot(g, {rest[3 * k - 3], rest[3 * k - 2], rest[3 * k - 1]});
     const Vec3<V> d = V(real(1)) / sqrt(dot(to_splat, to_splat)) * to_splat;
     const Vec3<V> turn = cross(d, sh_basis_vjp(d, int(s.degree), along));
     // Where nothing comes in there is nothing, whatever the coefficients are.

@@ -44,7 +44,8 @@ bool list_entries(Frame& f) {
     for (int64_t e = 0; e < entries; ++e) ++begin[f.entries[e].splat() + 2];
     for (int64_t i = 0; i < f.count; ++i) begin[i + 2] += begin[i + 1];
     for (int64_t e = 0; e < entries; ++e) f.splat_slots[begin[f.entries[e].splat() + 1]++] = static_cast<uint32_t>(e);
-    return true;  // filling has moved every begin to its end, which is the next one's begin: begin[i] is right again
+    // filling has moved every begin to its end, which is the next one's begin: begin[i] is right again
+    return true;
 }
 
 }  // namespace
@@ -89,7 +90,8 @@ bool splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors
 }
 
 bool occluded_splat_errors(Frame& f, const real* image, const uint8_t* mask, real* errors) {
-    if (!bin_splats(f) || !list_entries(f) || !load_target(f, image, mask) || !f.saved.reserve(f.tile_begin[f.tiles])) return false;
+    if (!bin_splats(f) || !list_entries(f) || !load_target(f, image, mask) || !f.saved.reserve(f.tile_begin[f.tiles]))
+        return false;
     const BlendLimits<V> limits = limits_of(f.view);
     const V cutoff2 = V(real(f.view.error_cutoff * f.view.error_cutoff));
     parallel_for(f.tiles, [&](int64_t tile) {

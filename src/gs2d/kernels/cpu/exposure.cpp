@@ -17,10 +17,10 @@ constexpr int SUMS = 12;
 
 // render/exposure_native.py has the same.
 struct Picture {
-    const real* color;        // [pixels, 3]
-    const real* coverage;     // [pixels], or null: 1
+    const real* color;     // [pixels, 3]
+    const real* coverage;  // [pixels], or null: 1
     int64_t pixels;
-    double transform[3][4];   // A, b
+    double transform[3][4];  // A, b
     double background[3];
 };
 
@@ -77,7 +77,8 @@ GS2D_EXPORT void gs2d_expose(const Picture* picture, const uint8_t* clipped, rea
 }
 
 // sums: those of the transform's gradient [3, 4]. `over` may be null. Returns 1 where memory is short.
-GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const uint8_t* over, const real* upstream, real* to_color, double* sums) {
+GS2D_EXPORT int gs2d_expose_vjp(const Picture* picture, const uint8_t* over, const real* upstream, real* to_color,
+                                double* sums) {
     const int64_t pieces = (picture->pixels + PIECE - 1) / PIECE;
     auto* const of_pieces = static_cast<double*>(std::malloc(static_cast<size_t>(pieces * SUMS + 1) * sizeof(double)));
     if (!of_pieces) return 1;

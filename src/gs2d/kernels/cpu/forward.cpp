@@ -33,20 +33,23 @@ struct TileWork {
     TileState state;
 
     // The lists of blocks hold bytes from the first one, so that nothing is left to work out.
-    Candidate& at(uint32_t offset) { return *reinterpret_cast<Candidate*>(reinterpret_cast<char*>(candidates) + offset); }
+    Candidate& at(uint32_t offset) {
+        return *reinterpret_cast<Candidate*>(reinterpret_cast<char*>(candidates) + offset);
+    }
     const Candidate& at(uint32_t offset) const { return const_cast<TileWork*>(this)->at(offset); }
 };
 
 inline Pixel<V> load_pixel(const TileState& s, int b) {
     const auto at = [&](Plane p) { return load(&s.planes[p][b * LANES]); };
-    return {at(T), at(ALPHA), at(RED), at(GREEN), at(BLUE), at(NX), at(NY), at(NZ), at(DEPTH), at(MEDIAN),
-            at(DEPTH0), at(M1_TWICE), at(M2), at(DISTORTION), s.live[b]};
+    return {at(T),     at(ALPHA),  at(RED),    at(GREEN),    at(BLUE), at(NX),         at(NY),   at(NZ),
+            at(DEPTH), at(MEDIAN), at(DEPTH0), at(M1_TWICE), at(M2),   at(DISTORTION), s.live[b]};
 }
 
 inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
     const auto at = [&](Plane k, V v) { store(&s.planes[k][b * LANES], v); };
     at(T, p.T), at(ALPHA, p.alpha), at(RED, p.red), at(GREEN, p.green), at(BLUE, p.blue), at(NX, p.nx), at(NY, p.ny);
-    at(NZ, p.nz), at(DEPTH, p.depth), at(MEDIAN, p.median), at(DEPTH0, p.inverse_depth0), at(M1_TWICE, p.M1_twice), at(M2, p.M2);
+    at(NZ, p.nz), at(DEPTH, p.depth), at(MEDIAN, p.median), at(DEPTH0, p.inverse_depth0), at(M1_TWICE, p.M1_twice),
+        at(M2, p.M2);
     at(DISTORTION, p.distortion);
     s.live[b] = p.live;
     s.finished[b] = !any(p.live);
@@ -55,7 +58,8 @@ inline void store_pixel(TileState& s, int b, const Pixel<V>& p) {
 // Splats are first intersected BATCH at a time and then composited: the long chain of an intersection does not depend
 // on the pixel's state, and so many of them overlap; the state stays in registers while it is used.
 constexpr int BATCH = 8;
-constexpr int UNROLL = REGISTERS >= 32 ? 2 : 1;  // gcc would unroll all 8 rounds: with 16 registers the state goes to memory in each
+// gcc would unroll all 8 rounds: with 16 registers the state goes to memory in each
+constexpr int UNROLL = REGISTERS >= 32 ? 2 : 1;
 
 // What the intersections leave: one row per splat.
 struct Batch {
@@ -63,13 +67,17 @@ struct Batch {
 };
 
 template <bool Early>
-inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b, Batch& batch, const BlendLimits<V>& limits, Pixel<V>& p) {
+inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b, Batch& batch,
+                            const BlendLimits<V>& limits, Pixel<V>& p) {
     const auto weigh = [&](int i) {
         const V log2_alpha = load(batch.log2_alpha[i]);
         w.at(list[i]).seen[b] = LaneBits(bits(p.live & (log2_alpha >= limits.log2_alpha_min)));
-        return composite_weight<Early>(alpha_of(log2_alpha, limits), load(batch.depth[i]), load(batch.inverse_depth[i]), limits, p);
+        return composite_weight<Early>(alpha_of(log2_alpha, limits), load(batch.depth[i]), load(batch.inverse_depth[i]),
+                                       limits, p);
     };
-    const auto add = [&](int i, V weight) { accumulate(broadcast(w.at(list[i]).record), weight, load(batch.depth[i]), p); };
+    const auto add = [&](int i, V weight) {
+        accumulate(broadcast(w.at(list[i]).record), weight, load(batch.depth[i]), p);
+    };
     if constexpr (REGISTERS >= 32) {
 #pragma GCC unroll UNROLL
         for (int i = 0; i < count; ++i) add(i, weigh(i));
@@ -82,8 +90,8 @@ inline void composite_batch(TileWork& w, const uint32_t* list, int count, int b,
 }
 
 // All of them as if they were plain, which most are; then those that are not once more.
-inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, int b, const Centres& centres, Batch& batch,
-                            const BlendLimits<V>& limits) {
+inline void intersect_batch(const TileWork& w, const uint32_t* list, int count, int b, const Centres& centres,
+                            Batch& batch, const BlendLimits<V>& limits) {
     uint32_t others = 0;
 #pragma GCC unroll UNROLL
     for (int i = 0; i < count; ++i) {

@@ -32,7 +32,8 @@ template <class T> struct Buffer {
         data = posix_memalign(&memory, alignment, bytes) == 0 ? static_cast<T*>(memory) : nullptr;
         capacity = data ? bytes / sizeof(T) : 0;
 #if defined(MADV_HUGEPAGE)
-        if (data && alignment == HUGE_PAGE) madvise(data, bytes, MADV_HUGEPAGE);  // access is scattered; a wish, not a need
+        // access is scattered; a wish, not a need
+        if (data && alignment == HUGE_PAGE) madvise(data, bytes, MADV_HUGEPAGE);
 #endif
         return data != nullptr;
     }
@@ -50,8 +51,9 @@ struct View {
     double fx, fy, cx, cy;
     double near, far, alpha_min, alpha_max, transmittance_min, error_cutoff, lowpass_px;
     double background[3];
-    int32_t width, height, sh_degree, exact_masks;  // exact_masks = 0: no culling inside tiles, none of what has no ellipse (tests)
-    int32_t crossing;                               // rule 19: CROSSING_*
+    // exact_masks = 0: no culling inside tiles, none of what has no ellipse (tests)
+    int32_t width, height, sh_degree, exact_masks;
+    int32_t near_plane_policy;  // rule 19: NEAR_PLANE_*
 };
 
 struct Parameters {
@@ -60,8 +62,9 @@ struct Parameters {
 };
 
 struct Images {
-    real *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;  // color and normal [H, W, 3], else [H, W]
-    real* radii;                                                            // [N]
+    // color and normal [H, W, 3], else [H, W]
+    real *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;
+    real* radii;  // [N]
 };
 
 struct ImageGradients {  // null where there is no gradient
@@ -82,7 +85,8 @@ inline bool wants_geometry(const ParameterGradients& g) {
 // Box tests per (tile, splat), in pixels: see Footprint.
 struct CullRecord {
     real ex, ey, slope, half;
-    real inv_y2, y_right, disc2, plain_from;  // disc2 < 0: no ellipse but an outline, and ex is its k; plain_from: see is_plain
+    // disc2 < 0: no ellipse but an outline, and ex is its k; plain_from: see is_plain
+    real inv_y2, y_right, disc2, plain_from;
 };
 
 using TileRect = TileRectangle;
@@ -91,7 +95,8 @@ constexpr uint32_t ALL_BLOCKS = BLOCKS == 32 ? 0xffffffffu : (1u << (BLOCKS % 32
 
 // One splat in one tile.
 struct Entry {
-    uint32_t word;    // the splat; the highest bit, after the forward pass: it is plain there (is_plain in core/blend.h)
+    // the splat; the highest bit, after the forward pass: it is plain there (is_plain in core/blend.h)
+    uint32_t word;
     uint32_t blocks;  // bit b: some live pixel of block b saw the splat (before the forward pass: undefined)
     uint32_t splat() const { return word & 0x7fffffffu; }
     bool plain() const { return word >> 31; }
@@ -117,9 +122,10 @@ struct GradientChunk {
 
 // Sums of the gradients of each splat's record over the tiles.
 struct Sums {
-    real* data;     // [N, GRADIENT]
-    real* extras;   // [N, columns]: those of GRADIENT_EXTRA that the densification signal wants, where its gradient will be
-    int columns;    // 0, 2 or 4
+    real* data;  // [N, GRADIENT]
+    // [N, columns]: those of GRADIENT_EXTRA that the densification signal wants, where its gradient will be
+    real* extras;
+    int columns;              // 0, 2 or 4
     int64_t coefficient_row;  // 0, or `data` is the beginning of shN's gradient, whose rows have this many reals
     real* row(int64_t splat) const { return data + splat * GRADIENT; }
     real* extra(int64_t splat) const { return extras + splat * columns; }
@@ -151,11 +157,11 @@ struct Frame {
 
     // One piece of memory for what a single pass needs: in the forward pass the arrays below, in the backward pass slots.
     Buffer<char> scratch;
-    CullRecord* cull = nullptr;       // [N]
-    TileRect* rects = nullptr;        // [N]
-    DepthItem* order = nullptr;       // [visible], by depth; projection leaves the keys of all
+    CullRecord* cull = nullptr;         // [N]
+    TileRect* rects = nullptr;          // [N]
+    DepthItem* order = nullptr;         // [visible], by depth; projection leaves the keys of all
     TileRect* ordered_rects = nullptr;  // [visible], like order
-    Buffer<uint32_t> histogram;       // [chunks, tiles]
+    Buffer<uint32_t> histogram;         // [chunks, tiles]
 
     // Backward pass.
     Buffer<int64_t> slot_begin;    // [tiles + 1]

@@ -83,7 +83,8 @@ void mark_rays(const MarkArguments& a, int64_t begin, int64_t end) {
             const double z = a.start[2] + depth * a.rays[2 * a.count + i];
             const bool inside = x >= 0 && x < a.end[0] && y >= 0 && y < a.end[1] && z >= 0 && z < a.end[2];
             if (!inside) continue;
-            const int64_t block_x = (int64_t(x) + 1) >> 1, block_y = (int64_t(y) + 1) >> 1, block_z = (int64_t(z) + 1) >> 1;
+            const int64_t block_x = (int64_t(x) + 1) >> 1, block_y = (int64_t(y) + 1) >> 1,
+                          block_z = (int64_t(z) + 1) >> 1;
             const int64_t flat = block_x * stride_x + block_y * stride_y + block_z;
             if (flat == last) continue;  // neighbours mostly share a block
             last = flat;

@@ -9,7 +9,9 @@ constexpr int BATCH = 256;             // entries looked at before their slots a
 // The gradients of the coefficients are written last, and read by nobody else: the sums wait there, side by side.
 bool fits_in_coefficients(const ParameterGradients& out, int64_t sh_rest) { return out.shN && 3 * sh_rest >= GRADIENT; }
 
-constexpr size_t slot_bytes(bool extras) { return GRADIENT * sizeof(real) + (extras ? GRADIENT_EXTRA * sizeof(real) + 1 : 0); }
+constexpr size_t slot_bytes(bool extras) {
+    return GRADIENT * sizeof(real) + (extras ? GRADIENT_EXTRA * sizeof(real) + 1 : 0);
+}
 
 size_t chunk_bytes(int64_t slots, bool extras) { return (size_t(slots) * slot_bytes(extras) + LINE - 1) / LINE * LINE; }
 
@@ -105,7 +107,8 @@ void GradientSums::add(int64_t c, uint32_t part) const {
                 __builtin_prefetch(f.sums.row(splats[i + AHEAD]), 1);
                 real* const row = f.sums.row(splats[i]);
                 const Slots s = from.from(slots[i]);
-                for (int k = 0; k < VECTORS; ++k) store(row + k * LANES, load(row + k * LANES) + load(s.gradients + k * LANES));
+                for (int k = 0; k < VECTORS; ++k)
+                    store(row + k * LANES, load(row + k * LANES) + load(s.gradients + k * LANES));
                 if (s.extras && *s.has_extra)
                     for (int k = 0; k < f.sums.columns; ++k) f.sums.extra(splats[i])[k] += s.extras[k];
             }

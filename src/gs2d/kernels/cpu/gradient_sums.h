@@ -16,13 +16,15 @@ struct Slots {
     real* extras;        // [slots, GRADIENT_EXTRA], only where has_extra
     uint8_t* has_extra;  // [slots]
     Slots from(int64_t slot) const {
-        return {gradients + slot * GRADIENT, extras ? extras + slot * GRADIENT_EXTRA : nullptr, extras ? has_extra + slot : nullptr};
+        return {gradients + slot * GRADIENT, extras ? extras + slot * GRADIENT_EXTRA : nullptr,
+                extras ? has_extra + slot : nullptr};
     }
 };
 
 class GradientSums {
   public:
-    GradientSums(Frame& frame, int64_t sh_rest, const ParameterGradients& out) : f_(frame), out_(out), sh_rest_(sh_rest) {}
+    GradientSums(Frame& frame, int64_t sh_rest, const ParameterGradients& out)
+        : f_(frame), out_(out), sh_rest_(sh_rest) {}
 
     // Cuts the tiles into chunks and sets f.sums to 0; false when memory is short.
     bool prepare();
@@ -35,7 +37,8 @@ class GradientSums {
         parallel_for(threads_, [&](int64_t) {
             for (int64_t c = 0; c <= chunks_; ++c) {
                 if (c < chunks_)
-                    share_out(first_group(c), first_group(c + 1), f_.taken.data, [&](int64_t group) { blend_group(c, group, blend); });
+                    share_out(first_group(c), first_group(c + 1), f_.taken.data,
+                              [&](int64_t group) { blend_group(c, group, blend); });
                 if (c > 0) add_parts(c - 1);
             }
         });
@@ -48,7 +51,8 @@ class GradientSums {
     int64_t chunks_ = 0, threads_ = 1;
     uint32_t parts_ = 1;  // pieces in which a chunk is added, each some of the splats; a power of two
 
-    int64_t first_group(int64_t c) const { return (f_.chunks[c].first_tile + GROUP - 1) / GROUP; }  // chunks hold whole groups
+    // chunks hold whole groups
+    int64_t first_group(int64_t c) const { return (f_.chunks[c].first_tile + GROUP - 1) / GROUP; }
     int64_t tile_slots(int64_t tile) const { return f_.slot_begin[tile + 1] - f_.slot_begin[tile]; }
     void cut_into_chunks();
     Slots slots(int64_t c) const;

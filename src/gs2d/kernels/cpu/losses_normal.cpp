@@ -30,7 +30,7 @@ struct Images {
 
 // One piece of rows [begin, end).
 class Piece {
-   public:
+  public:
     Piece(const Images& images, int64_t begin, int64_t end)
         : im(images),
           begin(begin),
@@ -56,7 +56,7 @@ class Piece {
         return true;
     }
 
-   private:
+  private:
     // Padded rows by image row: depth, and the pullbacks to the horizontal and vertical differences.
     real* depth_row(int64_t y) const { return scratch.row(y - begin + HALO, stride); }
     real* pull_x(int64_t y) const { return scratch.row(depths + y - begin + 1, stride); }
@@ -164,8 +164,20 @@ GS2D_EXPORT int gs2d_normal_consistency(const real* normal, const real* depth, c
     if (rows == nullptr) return 1;
     const int64_t valid = count_valid(mask, height * width);
     const double count = static_cast<double>(valid > 0 ? valid : 1);
-    const Images images{normal,    depth,           alpha,          mask,           intrinsics, rotation, height, width, cotangent / count,
-                        per_splat != 0, normal_gradient, depth_gradient, alpha_gradient, rows};
+    const Images images{normal,
+                        depth,
+                        alpha,
+                        mask,
+                        intrinsics,
+                        rotation,
+                        height,
+                        width,
+                        cotangent / count,
+                        per_splat != 0,
+                        normal_gradient,
+                        depth_gradient,
+                        alpha_gradient,
+                        rows};
     int failed = 0;
     parallel_ranges(height, rows_per_piece(height, HALO), [&](int64_t begin, int64_t end) {
         if (!Piece(images, begin, end).run()) __atomic_store_n(&failed, 1, __ATOMIC_RELAXED);

@@ -27,9 +27,10 @@ void blur_row(const real* in, real* out, int64_t length) {
     V before = load(in - LANES), here = load(in);
     for (int64_t i = 0; i < length; i += LANES) {
         const V next = load(in + i + LANES);
-        const V taps[TAPS] = {after<1>(before, here), after<4>(before, here), after<7>(before, here), after<10>(before, here),
-                              after<13>(before, here), here, after<3>(here, next), after<6>(here, next), after<9>(here, next),
-                              after<12>(here, next), after<15>(here, next)};
+        const V taps[TAPS] = {after<1>(before, here),  after<4>(before, here),  after<7>(before, here),
+                              after<10>(before, here), after<13>(before, here), here,
+                              after<3>(here, next),    after<6>(here, next),    after<9>(here, next),
+                              after<12>(here, next),   after<15>(here, next)};
         store(out + i, window([&](int k) { return taps[RADIUS + k]; }));
         before = here, here = next;
     }
@@ -38,8 +39,8 @@ void blur_row(const real* in, real* out, int64_t length) {
 #endif
 }
 
-constexpr int ROWS = 4;                    // finished together
-constexpr int NEEDED = TAPS - 1 + ROWS;    // blurred from so many
+constexpr int ROWS = 4;                  // finished together
+constexpr int NEEDED = TAPS - 1 + ROWS;  // blurred from so many
 
 // The horizontally blurred rows around y of `MAPS` maps: row y of map m is row (y mod NEEDED) * MAPS + m.
 struct Ring {
@@ -59,7 +60,7 @@ struct Ring {
         for (int r = 0; r < count; ++r) blur_rows<1>(rows + r, length, out + r * stride);
     }
 
-   private:
+  private:
     template <int R> void blur_rows(const real* const* rows, int64_t length, real* out) const {
         for (int64_t i = 0; i < length; i += LANES) {
             V v[TAPS - 1 + R];
@@ -85,7 +86,7 @@ enum Derivative { D_MEAN, D_SQUARES, D_PRODUCT, DERIVATIVES };
 
 // One piece of rows [begin, end).
 class Piece {
-   public:
+  public:
     Piece(const Images& images, int64_t begin, int64_t end)
         : im(images),
           begin(begin),
@@ -119,7 +120,7 @@ class Piece {
         return true;
     }
 
-   private:
+  private:
     bool inside(int64_t y) const { return y >= 0 && y < im.height; }
     bool mine(int64_t y) const { return y >= begin && y < end; }
     const uint8_t* mask_row(int64_t y) const { return im.mask ? im.mask + y * im.width : nullptr; }
@@ -180,7 +181,8 @@ class Piece {
         V total = V(real(0));
         for (int64_t i = 0; i < length; i += LANES) {
             const V b = known ? mean.load(i) : blurred_at(TARGET_MEAN, r, i);
-            const SsimPoint<V> point = ssim_point<V>(blurred_at(MEAN, r, i), b, blurred_at(SQUARES, r, i), blurred_at(PRODUCT, r, i));
+            const SsimPoint<V> point =
+                ssim_point<V>(blurred_at(MEAN, r, i), b, blurred_at(SQUARES, r, i), blurred_at(PRODUCT, r, i));
             const V valid = load(validity + i);
             total = fma(valid, point.value, total);
             store(to[D_MEAN] + i, valid * point.d_mean);
@@ -203,7 +205,8 @@ class Piece {
         real* out = im.gradient + y * n;
         for (int64_t i = 0; i < n; i += LANES) {
             const V u = x.load(i), v = target.load(i);
-            const V ssim = fma(two * u, blurred_at(D_SQUARES, r, i), fma(v, blurred_at(D_PRODUCT, r, i), blurred_at(D_MEAN, r, i)));
+            const V ssim = fma(two * u, blurred_at(D_SQUARES, r, i),
+                               fma(v, blurred_at(D_PRODUCT, r, i), blurred_at(D_MEAN, r, i)));
             const V both = load(validity + i) * fma(ssim_scale, ssim, l1_scale * l1_sign(u, v));
             if (n - i >= LANES) {
                 store(out + i, both);
@@ -218,7 +221,7 @@ class Piece {
     const bool known;  // the target's blur is given
     const int maps;
     const Scratch scratch;
-    real *rendered = nullptr, *validity = nullptr;  // all 1 without a mask
+    real *rendered = nullptr, *validity = nullptr;                         // all 1 without a mask
     real *products = nullptr, *derivatives = nullptr, *blurred = nullptr;  // row r of map m: m * ROWS + r
     Ring moments{}, pullbacks{};
 };
@@ -245,8 +248,9 @@ GS2D_EXPORT int gs2d_photometric(const real* rendered, const real* target, const
     if (rows == nullptr) return 1;
     const int64_t valid = count_valid(mask, height * width);
     const double scale = 1.0 / static_cast<double>(valid > 0 ? 3 * valid : 1);
-    const Images images{rendered, target, target_mean, mask, height, width, l1_cotangent * scale, ssim_cotangent * scale,
-                        gradient, rows, rows + height};
+    const Images images{rendered, target, target_mean,          mask,
+                        height,   width,  l1_cotangent * scale, ssim_cotangent * scale,
+                        gradient, rows,   rows + height};
     int failed = 0;
     parallel_ranges(height, rows_per_piece(height, 2 * RADIUS), [&](int64_t begin, int64_t end) {
         if (!Piece(images, begin, end).run()) __atomic_store_n(&failed, 1, __ATOMIC_RELAXED);

@@ -76,7 +76,8 @@ struct PlanesByBlock {
 // Whether each splat is plain all over a tile.
 inline M plain_over_tile(const Frame& f, const Footprints& s, V tile_x, V tile_y) {
     const V half = V(real(TILE / 2));  // half a pixel to spare
-    return is_plain(tile_x + half - s.cx, tile_y + half - s.cy, s.ai, s.bi, s.iz, s.plain_from, V(real(f.view.near)), half);
+    return is_plain(tile_x + half - s.cx, tile_y + half - s.cy, s.ai, s.bi, s.iz, s.plain_from, V(real(f.view.near)),
+                    half);
 }
 
 // A splat at block b, where its plane is `plane`. Plain: as `Entry` says.

@@ -34,7 +34,8 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     for (int k = 0; k < 3 * sh_count(degree); ++k) size = size + abs(sh[k]);
     g.alive = g.alive & is_finite(size);
     const Vec3<V> c = sh_color(sh, basis, degree);
-    g.record.red = clamped_color(c.x, degree), g.record.green = clamped_color(c.y, degree), g.record.blue = clamped_color(c.z, degree);
+    g.record.red = clamped_color(c.x, degree), g.record.green = clamped_color(c.y, degree),
+    g.record.blue = clamped_color(c.z, degree);
 }
 
 // Rectangles and radii of the splats `boxed` (a bit each) of a group: rule 19, "box".
@@ -54,8 +55,9 @@ void box_group(Frame& f, const Group& g, int64_t i, uint32_t boxed, V k2, real* 
 TileRect outlined_rectangle(const Frame& f, int64_t splat) {
     const real* const r = &f.records[splat * RECORD];
     const View& v = f.view;
-    const Outline<V> outline = outline_of(V(r[2]), V(r[3]), V(r[4]), V(r[5]), V(r[6]), V(r[7]), V(r[8]), V(r[0]), V(r[1]), V(f.cull[splat].ex),
-                                          V(-f.cull[splat].disc2), V(real(v.near)), V(real(v.width)), V(real(v.height)));
+    const Outline<V> outline =
+        outline_of(V(r[2]), V(r[3]), V(r[4]), V(r[5]), V(r[6]), V(r[7]), V(r[8]), V(r[0]), V(r[1]), V(f.cull[splat].ex),
+                   V(-f.cull[splat].disc2), V(real(v.near)), V(real(v.width)), V(real(v.height)));
     TileRect rect = {0, 0, 0, 0};
     for (int y = 0; y < f.tiles_y; y += LANES) {
         alignas(64) real left[LANES], right[LANES];
@@ -79,14 +81,15 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
     f.rects = reinterpret_cast<TileRect*>(f.cull + n);
     f.order = reinterpret_cast<DepthItem*>(f.rects + n);
     const bool blending = reach == Reach::BLEND;
-    const V error_k2 = V(real(f.view.error_cutoff * f.view.error_cutoff)), log2_alpha_min = V(real(log2(f.view.alpha_min)));
+    const V error_k2 = V(real(f.view.error_cutoff * f.view.error_cutoff)),
+            log2_alpha_min = V(real(log2(f.view.alpha_min)));
     parallel_ranges(n, 64 * LANES, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i += LANES) {
             const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
             if (i + 2 * LANES <= n) ask_for(s.shN + (i + LANES) * 3 * s.sh_rest, LANES * 3 * s.sh_rest);
             Group g = project_group(f, s, i, lanes, blending);
             const M reaches = reaches_camera_plane(g.frame, error_k2);
-            if (f.view.crossing == CROSSING_CULL) g.alive = g.alive & invert(reaches);
+            if (f.view.near_plane_policy == NEAR_PLANE_CULL) g.alive = g.alive & invert(reaches);
             if (any(g.alive)) color_group(f, s, i, lanes, g);
             const uint32_t alive = bits(g.alive);
             for (int l = 0; l < lanes; ++l) f.rects[i + l] = {0, 0, 0, 0};
@@ -97,25 +100,32 @@ bool project_splats(Frame& f, const Parameters& s, Reach reach, real* radii) {
             const V blend_k2 = V(real(2 * LN2)) * (r.log2_opacity - log2_alpha_min);
             const V k2 = blending ? max(blend_k2, V(0)) : reach == Reach::ERRORS ? error_k2 : max(blend_k2, error_k2);
             const Footprint<V> o = footprint(g.frame, r, k2, real(f.view.lowpass_px), f.camera);
-            const V fields[RECORD] = {r.cx, r.cy, r.au, r.bu, r.av, r.bv, r.ai, r.bi,
+            const V fields[RECORD] = {r.cx, r.cy,           r.au,  r.bu,    r.av,   r.bv, r.ai, r.bi,
                                       r.iz, r.log2_opacity, r.red, r.green, r.blue, r.nx, r.ny, r.nz};
             store_rows<RECORD>(&f.records[i * RECORD], RECORD, lanes, fields);
-            const V cull[8] = {select(o.unbounded, o.k, o.ex), o.ey, o.slope, o.half, o.inv_y2, o.y_right,
-                               select(o.unbounded, -o.disc2, o.disc2), plain_from(r, V(real(f.view.lowpass_px)))};
+            const V cull[8] = {select(o.unbounded, o.k, o.ex),
+                               o.ey,
+                               o.slope,
+                               o.half,
+                               o.inv_y2,
+                               o.y_right,
+                               select(o.unbounded, -o.disc2, o.disc2),
+                               plain_from(r, V(real(f.view.lowpass_px)))};
             store_rows<8>(reinterpret_cast<real*>(&f.cull[i]), 8, lanes, cull);
             alignas(64) real box[4][LANES], depth[LANES];
             store(depth, g.frame.p.z);
             for (int l = 0; l < lanes; ++l) memcpy(&f.order[i + l].key, &depth[l], sizeof(real));
             store(box[0], o.x_min), store(box[1], o.y_min), store(box[2], o.x_max), store(box[3], o.y_max);
             const uint32_t unbounded = bits(o.unbounded), crosses = bits(o.crosses);
-            const uint32_t boxed = f.view.crossing == CROSSING_BOX ? alive & bits(reaches) : 0;
+            const uint32_t boxed = f.view.near_plane_policy == NEAR_PLANE_BOX ? alive & bits(reaches) : 0;
             if (boxed) box_group(f, g, i, boxed, error_k2, radii);
             for (int l = 0; l < lanes; ++l) {
                 if (!((alive & ~boxed) >> l & 1)) continue;
                 const PixelBox<real> o_l = {box[0][l], box[1][l], box[2][l], box[3][l]};
                 const bool outlined = f.view.exact_masks && unbounded >> l & 1;
                 f.rects[i + l] = outlined ? outlined_rectangle(f, i + l)
-                                          : tile_rectangle(o_l, unbounded >> l & 1, f.view.width, f.view.height, f.tiles_x, f.tiles_y);
+                                          : tile_rectangle(o_l, unbounded >> l & 1, f.view.width, f.view.height,
+                                                           f.tiles_x, f.tiles_y);
                 if (radii) radii[i + l] = clipped_radius(o_l, crosses >> l & 1, f.view.width, f.view.height);
             }
         }
@@ -141,7 +151,8 @@ inline M not_all_zero(const V* fields, const V* extras) {
     return ~(size <= V(0));
 }
 
-void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradients& out, real* intrinsics, int64_t begin, int64_t end) {
+void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradients& out, real* intrinsics,
+                       int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += LANES) {
         const int lanes = end - i < LANES ? static_cast<int>(end - i) : LANES;
         if (i + 2 * LANES <= s.count) {
@@ -152,12 +163,14 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
         load_sums(f.sums, i, lanes, g, e);  // before anything is written: they may lie in the rows of out.shN
         const M seen = not_all_zero(g, e) & first(lanes);
         if (!any(seen)) {
-            zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes), zero_rows(out.log_scales, i, 2, lanes);
+            zero_rows(out.means, i, 3, lanes), zero_rows(out.quats, i, 4, lanes),
+                zero_rows(out.log_scales, i, 2, lanes);
             zero_rows(out.opacity_logits, i, 1, lanes), zero_rows(out.sh0, i, 3, lanes);
-            zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes), zero_rows(intrinsics, i, 4, lanes);
+            zero_rows(out.shN, i, 3 * s.sh_rest, lanes), zero_rows(out.probe, i, out.probe_columns, lanes),
+                zero_rows(intrinsics, i, 4, lanes);
             continue;
         }
-        const RecordGradient<V> gr = {g[0], g[1], g[2],  g[3],  g[4],  g[5],  g[6],  g[7],  g[8],  g[9],
+        const RecordGradient<V> gr = {g[0],  g[1],  g[2],  g[3],  g[4],  g[5],  g[6], g[7], g[8], g[9],
                                       g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
         const SplatParameters<V> p = load_parameters(s, i, lanes);
         const Frame3<V> frame = frame_of(p, f.camera);
@@ -168,7 +181,8 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
         load_sh(s, i, lanes, degree, sh);
         sh_basis(frame.to_splat, degree, basis);
         const Vec3<V> c = sh_color(sh, basis, degree);
-        const Vec3<V> g_color = {keep(seen, clamped_color_vjp(c.x, degree, gr.red)), keep(seen, clamped_color_vjp(c.y, degree, gr.green)),
+        const Vec3<V> g_color = {keep(seen, clamped_color_vjp(c.x, degree, gr.red)),
+                                 keep(seen, clamped_color_vjp(c.y, degree, gr.green)),
                                  keep(seen, clamped_color_vjp(c.z, degree, gr.blue))};
         for (int k = 0; k < sh_count(degree); ++k) {
             basis[k] = keep(seen, basis[k]);
@@ -177,15 +191,17 @@ void project_range_vjp(const Frame& f, const Parameters& s, const ParameterGradi
         write_sh(degree, s.sh_rest, out, i, lanes, g_color, basis);
         if (!wants_geometry(out) && !intrinsics) continue;
 
-        const ParameterGradient<V> d = project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
-        const auto write = [&]<int K>(real* to, V (&values)[K]) {
+        const ParameterGradient<V> d =
+            project_vjp(p, frame, r, gr, sh_basis_vjp(frame.to_splat, degree, along), f.camera);
+        const auto write = [&]<int K>(real* to, V(&values)[K]) {
             if (!to) return;
             for (V& v : values) v = keep(seen, v);
             store_rows<K>(to + K * i, K, lanes, values);
         };
         V means[] = {d.mean.x, d.mean.y, d.mean.z}, quats[] = {d.qw, d.qx, d.qy, d.qz};
         V scales[] = {d.log_su, d.log_sv}, logit[] = {d.logit};
-        write(out.means, means), write(out.quats, quats), write(out.log_scales, scales), write(out.opacity_logits, logit);
+        write(out.means, means), write(out.quats, quats), write(out.log_scales, scales),
+            write(out.opacity_logits, logit);
         const V half_w = V(real(f.view.width / 2.0)), half_h = V(real(f.view.height / 2.0));
         V probe[] = {d.probe_x * half_w, d.probe_y * half_h, gr.abs_x * half_w, gr.abs_y * half_h};
         V probe2[] = {probe[0], probe[1]};
@@ -209,11 +225,13 @@ void project_splats_vjp(Frame& f, const Parameters& s, const ParameterGradients&
     for (int64_t end = s.count, first = 0; end > 0; end = first) {
         first = 0;
         if (f.sums.coefficient_row) {
-            const int64_t free = (GRADIENT * end + f.sums.coefficient_row - 1) / f.sums.coefficient_row, last_group = (end - 1) / LANES * LANES;
+            const int64_t free = (GRADIENT * end + f.sums.coefficient_row - 1) / f.sums.coefficient_row,
+                          last_group = (end - 1) / LANES * LANES;
             first = (free + LANES - 1) / LANES * LANES;
             if (first > last_group) first = last_group;
         }
-        parallel_ranges(end - first, 16 * LANES, [&](int64_t a, int64_t b) { project_range_vjp(f, s, out, intrinsics, first + a, first + b); });
+        parallel_ranges(end - first, 16 * LANES,
+                        [&](int64_t a, int64_t b) { project_range_vjp(f, s, out, intrinsics, first + a, first + b); });
     }
 }
 

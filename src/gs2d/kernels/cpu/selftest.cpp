@@ -93,7 +93,8 @@ GS2D_EXPORT uint32_t gs2d_selftest_nonzero(const uint32_t* in) {
 GS2D_EXPORT void gs2d_selftest_outline(const real* in, const real* image, real y0, real y1, real* left, real* right) {
     V v[11], from, to;
     for (int k = 0; k < 11; ++k) v[k] = load(in + k * LANES);
-    const Outline<V> outline = outline_of(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], V(image[0]), V(image[1]), V(image[2]));
+    const Outline<V> outline = outline_of(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10],
+                                          V(image[0]), V(image[1]), V(image[2]));
     reach_in_rows(outline, V(y0) - v[8], V(y1) - v[8], from, to);
     store(left, from), store(right, to);
 }

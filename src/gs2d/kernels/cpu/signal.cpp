@@ -21,7 +21,8 @@ template <int COLUMNS> void add_vector(const Signal& s, int64_t i) {
     load_packed<COLUMNS>(s.signal + COLUMNS * i, signal);
     const M seen = load(s.radii + i) > V(real(0));
     store(s.signed_sum + i, load(s.signed_sum + i) + keep(seen, norm(signal[0], signal[1])));
-    if constexpr (COLUMNS == 4) store(s.absolute_sum + i, load(s.absolute_sum + i) + keep(seen, norm(signal[2], signal[3])));
+    if constexpr (COLUMNS == 4)
+        store(s.absolute_sum + i, load(s.absolute_sum + i) + keep(seen, norm(signal[2], signal[3])));
     store(s.count + i, load(s.count + i) + keep(seen, V(real(1))));
 }
 

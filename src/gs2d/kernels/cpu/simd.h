@@ -68,7 +68,8 @@ template <int LOG_N> struct Exp2Table {
             for (int n = 0; n < 40; ++n) r = 0.5 * (r + root / r);
             root = r;
         }
-        for (int k = 0; k < N; ++k, power *= root) of[k] = __builtin_bit_cast(uint32_t, float(power)) - (uint32_t(k) << SHIFT);
+        for (int k = 0; k < N; ++k, power *= root)
+            of[k] = __builtin_bit_cast(uint32_t, float(power)) - (uint32_t(k) << SHIFT);
     }
 };
 
@@ -121,7 +122,8 @@ GS2D_HD uint32_t nonzero(const LaneBits* p) {
 #endif
 
 // Rows of K < LANES reals, one after the other, to K vectors and back, LANES rows at a time: K - 1 shuffles a vector.
-template <int K, int I, int S> constexpr int packed_source(int lane) {  // element of (what there is so far, vector S) for vector I
+// element of (what there is so far, vector S) for vector I
+template <int K, int I, int S> constexpr int packed_source(int lane) {
     const int e = lane * K + I, vector = e / LANES, at = e % LANES;
     return vector == S ? LANES + at : S > 1 ? lane : vector == 0 ? at : 0;
 }
@@ -141,7 +143,8 @@ template <int K, int I, bool Load, int S = 1> GS2D_HD V gather_packed(const V* v
     if constexpr (S == K)
         return sofar;
     else
-        return gather_packed<K, I, Load, S + 1>(v, merge_packed<K, I, S, Load>(sofar, v[S], std::make_integer_sequence<int, LANES>()));
+        return gather_packed<K, I, Load, S + 1>(
+            v, merge_packed<K, I, S, Load>(sofar, v[S], std::make_integer_sequence<int, LANES>()));
 }
 template <int K, bool Load, int... I> GS2D_HD void repack(const V* from, V* to, std::integer_sequence<int, I...>) {
     ((to[I] = gather_packed<K, I, Load>(from, from[0])), ...);

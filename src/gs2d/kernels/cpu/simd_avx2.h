@@ -128,7 +128,8 @@ template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int 
         const __m256i m = _mm256_sll_epi32(_mm256_loadu_si256(reinterpret_cast<const __m256i*>(masks + i)), shift);
         uint32_t k = static_cast<uint32_t>(_mm256_movemask_ps(_mm256_castsi256_ps(m)));
         if (n - i < 8) k &= (1u << (n - i)) - 1u;
-        const __m256i bits = _mm256_cvtepu16_epi32(_mm_load_si128(reinterpret_cast<const __m128i*>(BIT_MULTIPLES<STRIDE>.of[k])));
+        const __m256i bits =
+            _mm256_cvtepu16_epi32(_mm_load_si128(reinterpret_cast<const __m128i*>(BIT_MULTIPLES<STRIDE>.of[k])));
         _mm256_storeu_si256(reinterpret_cast<__m256i*>(out + count), _mm256_add_epi32(index, bits));
         count += __builtin_popcount(k);
     }

@@ -96,8 +96,10 @@ GS2D_HD void transpose(V* v) {
         r[i + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d)), r[i + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
     }
     for (int j = 0; j < 4; ++j) {
-        const __m512 e = _mm512_shuffle_f32x4(r[j], r[4 + j], 0x88), f = _mm512_shuffle_f32x4(r[8 + j], r[12 + j], 0x88);
-        const __m512 g = _mm512_shuffle_f32x4(r[j], r[4 + j], 0xdd), h = _mm512_shuffle_f32x4(r[8 + j], r[12 + j], 0xdd);
+        const __m512 e = _mm512_shuffle_f32x4(r[j], r[4 + j], 0x88),
+                     f = _mm512_shuffle_f32x4(r[8 + j], r[12 + j], 0x88);
+        const __m512 g = _mm512_shuffle_f32x4(r[j], r[4 + j], 0xdd),
+                     h = _mm512_shuffle_f32x4(r[8 + j], r[12 + j], 0xdd);
         v[j] = _mm512_shuffle_f32x4(e, f, 0x88), v[8 + j] = _mm512_shuffle_f32x4(e, f, 0xdd);
         v[4 + j] = _mm512_shuffle_f32x4(g, h, 0x88), v[12 + j] = _mm512_shuffle_f32x4(g, h, 0xdd);
     }
@@ -109,7 +111,8 @@ GS2D_HD void columns_of_8(const float* const* rows, V* v) {
     __m512 r[8];
     for (int i = 0; i < 8; ++i) {  // 4 rows and the 4 that follow, two times
         const int first = i % 4 + i / 4 * 8;
-        r[i] = _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(rows[first])), _mm256_loadu_ps(rows[first + 4]), 1);
+        r[i] = _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(rows[first])),
+                                  _mm256_loadu_ps(rows[first + 4]), 1);
     }
     __m512 q[8];
     for (int i = 0; i < 8; i += 4) {  // q[i + j]: columns j and 4 + j of 4 rows, of the 4 that follow
@@ -135,7 +138,8 @@ GS2D_HD void store(uint32_t* p, LaneInts i) { _mm512_storeu_si512(p, i); }
 // Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.
 template <int STRIDE> GS2D_HD int multiples_with_bit(const uint32_t* masks, int n, int bit, uint32_t* out) {
     const __m512i wanted = _mm512_set1_epi32(1 << bit), step = _mm512_set1_epi32(16 * STRIDE);
-    __m512i index = _mm512_mullo_epi32(_mm512_set1_epi32(STRIDE), _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
+    __m512i index = _mm512_mullo_epi32(_mm512_set1_epi32(STRIDE),
+                                       _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
     int count = 0;
     for (int i = 0; i < n; i += 16, index = _mm512_add_epi32(index, step)) {
         const __mmask16 inside = static_cast<__mmask16>(n - i >= 16 ? 0xffffu : (1u << (n - i)) - 1u);
@@ -165,8 +169,10 @@ template <int K> GS2D_HD void transpose_reduce(const V* v, float* p) {
         q[i] = _mm512_add_ps(_mm512_shuffle_ps(ab, cd, 0x44), _mm512_shuffle_ps(ab, cd, 0xee));
     }
     if constexpr (K == 16) {
-        const __m512 s01 = _mm512_add_ps(_mm512_shuffle_f32x4(q[0], q[1], 0x88), _mm512_shuffle_f32x4(q[0], q[1], 0xdd));
-        const __m512 s23 = _mm512_add_ps(_mm512_shuffle_f32x4(q[2], q[3], 0x88), _mm512_shuffle_f32x4(q[2], q[3], 0xdd));
+        const __m512 s01 =
+            _mm512_add_ps(_mm512_shuffle_f32x4(q[0], q[1], 0x88), _mm512_shuffle_f32x4(q[0], q[1], 0xdd));
+        const __m512 s23 =
+            _mm512_add_ps(_mm512_shuffle_f32x4(q[2], q[3], 0x88), _mm512_shuffle_f32x4(q[2], q[3], 0xdd));
         _mm512_storeu_ps(p, _mm512_add_ps(_mm512_shuffle_f32x4(s01, s23, 0x88), _mm512_shuffle_f32x4(s01, s23, 0xdd)));
     } else {
         const __m256 h = _mm256_add_ps(_mm512_castps512_ps256(q[0]), _mm512_extractf32x8_ps(q[0], 1));

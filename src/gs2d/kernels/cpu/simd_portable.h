@@ -124,9 +124,8 @@ GS2D_HD V sqrt(V a) {
 }
 GS2D_HD V round(V a) { return (a + V(12582912.f)) - V(12582912.f); }  // |a| < 2^22; needs value-safe floating point
 GS2D_HD V scale2(V a, V n) {
-    return per_part<V>([&](int k) {
-        return a.of[k] * (Part)(((PartMask)(n.of[k] + 12582912.f) - 0x4b400000 + 127) << 23);
-    });
+    return per_part<V>(
+        [&](int k) { return a.of[k] * (Part)(((PartMask)(n.of[k] + 12582912.f) - 0x4b400000 + 127) << 23); });
 }
 GS2D_HD V split2(V x, V& e) {
     const auto exponent = [](Part part) { return ((PartMask)part - 0x3f3504f3) >> 23; };

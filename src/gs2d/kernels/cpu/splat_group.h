@@ -77,8 +77,8 @@ inline void zero_rows(real* p, int64_t first, int64_t stride, int lanes) {
 }
 
 // Gradients of the coefficients of LANES splats from those of their colours.
-inline void write_sh(int degree, int64_t sh_rest, const ParameterGradients& out, int64_t i, int lanes, const Vec3<V>& g_color,
-                     const V* basis) {
+inline void write_sh(int degree, int64_t sh_rest, const ParameterGradients& out, int64_t i, int lanes,
+                     const Vec3<V>& g_color, const V* basis) {
     V g[3 * SH_MAX];
     const int count = sh_count(degree);
     for (int k = 0; k < count; ++k)

@@ -15,12 +15,13 @@ constexpr int64_t LOOK_NS = 50000;
 
 struct Pool {
     pthread_mutex_t run_lock = PTHREAD_MUTEX_INITIALIZER;  // one parallel_for at a time
-    pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;      // guards everything below; busy and job are also read without it
+    // guards everything below; busy and job are also read without it
+    pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
     pthread_cond_t wake = PTHREAD_COND_INITIALIZER, done = PTHREAD_COND_INITIALIZER;
-    int wanted = 1;   // threads asked for, the caller included
-    int started = 0;  // pool threads alive
-    int seats = 0;    // pool threads that may still join the current job
-    std::atomic<int> busy{0};     // pool threads inside it
+    int wanted = 1;            // threads asked for, the caller included
+    int started = 0;           // pool threads alive
+    int seats = 0;             // pool threads that may still join the current job
+    std::atomic<int> busy{0};  // pool threads inside it
     std::atomic<uint64_t> job{0};
     Task task = nullptr;
     void* context = nullptr;

@@ -65,7 +65,8 @@ template <int C> inline void read_planes(const real* image, int image_width, con
     if (!image || a.width < TILE || a.height < TILE) memset(out, 0, sizeof(real) * C * PIXELS);
     if (!image) return;
     const real* from = image + (int64_t(a.y0) * image_width + a.x0) * C;
-    if (a.width == TILE && a.height == TILE) {  // the bounds known: little code, so that many rows are waited for at once
+    // the bounds known: little code, so that many rows are waited for at once
+    if (a.width == TILE && a.height == TILE) {
         for (int y = 0; y < TILE; ++y, from += int64_t(image_width) * C)
             for (int x = 0; x < TILE; x += 4) split4<C>(from + x * C, out + block_order(x, y));
         return;
@@ -105,7 +106,8 @@ struct RowLines {
         if (!image) return;
         constexpr int FETCH = LINE / sizeof(real);
         for (int i = 0; i < channels * TILE; i += FETCH) lines[count++] = {image + i, channels};
-        const bool aligned = reinterpret_cast<uintptr_t>(image) % LINE == 0 && size_t(width) * channels * sizeof(real) % LINE == 0;
+        const bool aligned =
+            reinterpret_cast<uintptr_t>(image) % LINE == 0 && size_t(width) * channels * sizeof(real) % LINE == 0;
         if (!aligned) lines[count++] = {image + channels * TILE - 1, channels};
     }
 };
@@ -142,7 +144,8 @@ struct Footprints {
     // Of splats[0 .. LANES).
     Footprints(const Frame& f, const uint32_t* splats) {
         const real *rows[LANES], *records[LANES];
-        for (int i = 0; i < LANES; ++i) rows[i] = &f.cull[splats[i]].ex, records[i] = &f.records[size_t(splats[i]) * RECORD];
+        for (int i = 0; i < LANES; ++i)
+            rows[i] = &f.cull[splats[i]].ex, records[i] = &f.records[size_t(splats[i]) * RECORD];
         V c[8], r[RECORD];
         columns_of_8(rows, c);
         for (int k = 0; k < RECORD; k += LANES) {
@@ -155,10 +158,11 @@ struct Footprints {
 };
 
 // As blocks_touched, for the splats without an ellipse: only their masks are written.
-__attribute__((noinline)) inline void outlined_blocks(const Frame& f, const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
+__attribute__((noinline)) inline void outlined_blocks(const Frame& f, const Footprints& s, V tile_x, V tile_y,
+                                                      uint32_t* masks) {
     const View& v = f.view;
-    const Outline<V> outline = outline_of(s.au, s.bu, s.av, s.bv, s.ai, s.bi, s.iz, s.cx, s.cy, s.ex, -s.disc2, V(real(v.near)),
-                                          V(real(v.width)), V(real(v.height)));
+    const Outline<V> outline = outline_of(s.au, s.bu, s.av, s.bv, s.ai, s.bi, s.iz, s.cx, s.cy, s.ex, -s.disc2,
+                                          V(real(v.near)), V(real(v.width)), V(real(v.height)));
     LaneInts touched = {};
     for (int y = BLOCKS / BLOCKS_X - 1; y >= 0; --y) {
         const V first = tile_y + V(real(y * BLOCK_H) + real(0.5)) - s.cy;
@@ -172,14 +176,15 @@ __attribute__((noinline)) inline void outlined_blocks(const Frame& f, const Foot
     }
     alignas(64) uint32_t found[LANES];
     store(found, touched);
-    for (uint32_t left = bits(s.disc2 < V(0)); left; left &= left - 1) masks[__builtin_ctz(left)] = found[__builtin_ctz(left)];
+    for (uint32_t left = bits(s.disc2 < V(0)); left; left &= left - 1)
+        masks[__builtin_ctz(left)] = found[__builtin_ctz(left)];
 }
 
 // Bit b of masks[i]: the ellipse or the low-pass disc of splat i reaches a pixel centre of block b, or nearly so. A footprint
 // reaches each row of blocks in one interval. tile_x, tile_y: the tile's first pixel.
 inline void blocks_touched(const Frame& f, const Footprints& s, V tile_x, V tile_y, uint32_t* masks) {
-    const Chords<V> chords = {s.ex - tile_x, s.ey - tile_y, s.slope,       s.half, s.inv_y2, s.y_right,
-                              s.cx - tile_x, s.cy - tile_y, s.disc2};
+    const Chords<V> chords = {s.ex - tile_x, s.ey - tile_y, s.slope,       s.half, s.inv_y2,
+                              s.y_right,     s.cx - tile_x, s.cy - tile_y, s.disc2};
     LaneInts touched = {};
     V last = V(real(TILE) - real(0.5));  // pixel centres of a row of blocks
 #pragma GCC unroll 1

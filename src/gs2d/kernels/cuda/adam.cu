@@ -20,14 +20,15 @@ struct AdamAttribute {
 
 struct AdamArguments {
     AdamAttribute attributes[ATTRIBUTES];
-    int count;               // attributes in use
+    int count;                             // attributes in use
     float weight_1, beta2, weight_2, eps;  // weight_k = 1 - beta_k
-    const int* skip;         // not 0 there: do nothing; or null
+    const int* skip;                       // not 0 there: do nothing; or null
 };
 
 __device__ __forceinline__ void update(const AdamAttribute& p, const AdamArguments& a, int64 at, float g) {
     float parameter = p.parameter[at], mean = p.mean[at], square = p.square[at];
-    adam(g, parameter, mean, square, AdamConstants<float>{a.weight_1, a.beta2, a.weight_2, a.eps, p.step_size, p.root_2});
+    adam(g, parameter, mean, square,
+         AdamConstants<float>{a.weight_1, a.beta2, a.weight_2, a.eps, p.step_size, p.root_2});
     p.mean[at] = mean, p.square[at] = square, p.parameter[at] = parameter;
 }
 
@@ -47,8 +48,10 @@ extern "C" __global__ void __launch_bounds__(128) adam_step(AdamArguments a) {
         int64 at = first + i;
         if (p.trained || p.rows) {
             const int down = (first_column + i) / p.columns, column = first_column + i - down * p.columns;
-            if (p.rows) at = p.rows[first_row + down] * p.columns + column;
-            else if (!p.trained[first_row + down]) continue;
+            if (p.rows)
+                at = p.rows[first_row + down] * p.columns + column;
+            else if (!p.trained[first_row + down])
+                continue;
         }
         update(p, a, at, p.gradient[p.compact ? first + i : at]);
     }

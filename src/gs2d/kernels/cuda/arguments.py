@@ -60,7 +60,7 @@ class View(ctypes.Structure):
         *_all(ctypes.c_float, "near", "lowpass_px", "inv_lowpass2", "log2_alpha_min", "alpha_max", "transmittance_min"),
         *_all(ctypes.c_float, "error_k2", "distortion_scale"),
         ("background", ctypes.c_float * 3),
-        *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y", "sh_degree", "crossing"),
+        *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y", "sh_degree", "near_plane_policy"),
     )
 
 

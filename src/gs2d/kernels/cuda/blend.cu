@@ -14,9 +14,10 @@ struct BlendArguments {
     const int64* ranges;   // [tiles + 1, 2]
     const int* tiles;      // [tiles]: which tile a block takes, or null
     float *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;  // [H, W (, 3)]
-    float* final_T;        // [H, W]
-    float* moments;        // [H, W, 3]: M1, M2, inverse depth of the first pair; written with the distortion
-    uint* seen;            // [words, 8] or null: bit j of a word: some live pixel of the sub-block saw entry j of the chunk
+    float* final_T;                                                          // [H, W]
+    float* moments;  // [H, W, 3]: M1, M2, inverse depth of the first pair; written with the distortion
+    // [words, 8] or null: bit j of a word: some live pixel of the sub-block saw entry j of the chunk
+    uint* seen;
 };
 
 template <bool DIST>

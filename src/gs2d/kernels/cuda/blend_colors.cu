@@ -24,10 +24,10 @@ struct ProjectColorsArguments {
     View view;
     int64 count, sh_rest;
     const float *means, *sh0, *shN;
-    const int* tile_counts;   // [N]; 0: not drawn
-    const uchar* learns;      // or null
-    const float* gradients;   // [N, 4]
-    float *g_sh0, *g_shN;     // null where not wanted
+    const int* tile_counts;  // [N]; 0: not drawn
+    const uchar* learns;     // or null
+    const float* gradients;  // [N, 4]
+    float *g_sh0, *g_shN;    // null where not wanted
 };
 
 extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendColorsArguments a) {
@@ -96,7 +96,8 @@ extern "C" __global__ void __launch_bounds__(128) project_colors_vjp(ProjectColo
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.count) return;
     const int rest = int(a.sh_rest);
-    const CoefficientGradients to = {a.g_sh0 ? a.g_sh0 + 3 * i : nullptr, a.g_shN ? a.g_shN + 3 * a.sh_rest * i : nullptr};
+    const CoefficientGradients to = {a.g_sh0 ? a.g_sh0 + 3 * i : nullptr,
+                                     a.g_shN ? a.g_shN + 3 * a.sh_rest * i : nullptr};
     if (a.tile_counts[i] == 0 || (a.learns && !a.learns[i])) {
         if (to.first) to.first[0] = to.first[1] = to.first[2] = 0.f;
         for (int k = 0; to.rest && k < 3 * rest; ++k) to.rest[k] = 0.f;
@@ -104,7 +105,8 @@ extern "C" __global__ void __launch_bounds__(128) project_colors_vjp(ProjectColo
     }
     const float *m = a.means + 3 * i, *g = a.gradients + 4 * i;
     float inverse_distance;
-    const Vec3<float> direction = direction_of(Vec3<float>{m[0], m[1], m[2]} - center_of<float>(a.view.camera), inverse_distance);
+    const Vec3<float> direction =
+        direction_of(Vec3<float>{m[0], m[1], m[2]} - center_of<float>(a.view.camera), inverse_distance);
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
     color_vjp(a.view.sh_degree, sh, rest, to, direction, {g[0], g[1], g[2]});
 }

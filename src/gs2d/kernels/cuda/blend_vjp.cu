@@ -15,12 +15,12 @@ struct BlendVjpArguments {
     const int64* ranges;
     const int* tiles;
     const uint* seen;
-    const float *color, *alpha, *normal, *depth_mean, *distortion, *final_T, *moments;  // of the forward pass
+    const float *color, *alpha, *normal, *depth_mean, *distortion, *final_T, *moments;         // of the forward pass
     const float *g_color, *g_alpha, *g_normal, *g_depth_mean, *g_depth_median, *g_distortion;  // null: no gradient
-    const uchar* learns; // [N], 0 = no gradient; or null: all
-    const int64* slots;  // [entries]: the candidate that each was, or null
-    float* gradients;    // [N, 16], zeros on entry; with slots [4 * candidates, 16]
-    float* extras;       // the same rows of 4: low-pass centre, absolute densification signal
+    const uchar* learns;  // [N], 0 = no gradient; or null: all
+    const int64* slots;   // [entries]: the candidate that each was, or null
+    float* gradients;     // [N, 16], zeros on entry; with slots [4 * candidates, 16]
+    float* extras;        // the same rows of 4: low-pass centre, absolute densification signal
 };
 
 // One value of a plane that may be absent.
@@ -32,7 +32,8 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
     const float* bg = a.view.background;
     const float T = a.final_T[i], alpha = a.alpha[i];
     PixelGradient<float> g = {};
-    g.red = at_or_zero(a.g_color, 3 * i), g.green = at_or_zero(a.g_color, 3 * i + 1), g.blue = at_or_zero(a.g_color, 3 * i + 2);
+    g.red = at_or_zero(a.g_color, 3 * i), g.green = at_or_zero(a.g_color, 3 * i + 1),
+    g.blue = at_or_zero(a.g_color, 3 * i + 2);
     g.alpha = fnma(g.red, bg[0], fnma(g.green, bg[1], fnma(g.blue, bg[2], at_or_zero(a.g_alpha, i))));
     S = fma(g.red, fnma(T, bg[0], a.color[3 * i]),
             fma(g.green, fnma(T, bg[1], a.color[3 * i + 1]), g.blue * fnma(T, bg[2], a.color[3 * i + 2])));
@@ -58,8 +59,10 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
 
 // `row` is the splat's, or with slots the one of this entry and warp.
 template <bool ABS, bool PLAIN>
-__device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 row, const RecordGradient<float>& g, int lane) {
-    float v[16] = {g.cx, g.cy, g.au, g.bu, g.av, g.bv, g.ai, g.bi, g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
+__device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 row, const RecordGradient<float>& g,
+                                             int lane) {
+    float v[16] = {g.cx, g.cy,         g.au,  g.bu,    g.av,   g.bv, g.ai, g.bi,
+                   g.iz, g.ln_opacity, g.red, g.green, g.blue, g.nx, g.ny, g.nz};
     const float sum = transpose_reduce<16>(v, lane);
     if (!(lane & 1)) atomicAdd(a.gradients + 16 * row + (lane >> 1), sum);
     if constexpr (PLAIN && !ABS) return;  // no low-pass filter
@@ -76,9 +79,9 @@ __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 r
 
 // What the inner loop needs of a pixel's upstream gradient, in shared memory: each thread reads what it wrote itself.
 template <bool GEO> struct Upstream {
-    float4 color[HALVES][128];               // red, green, blue, alpha
-    float4 normal[HALVES][GEO ? 128 : 1];    // and depth
-    float2 median[HALVES][GEO ? 128 : 1];    // and the transmittance behind the median pair
+    float4 color[HALVES][128];             // red, green, blue, alpha
+    float4 normal[HALVES][GEO ? 128 : 1];  // and depth
+    float2 median[HALVES][GEO ? 128 : 1];  // and the transmittance behind the median pair
     __device__ __forceinline__ void put(int h, const PixelGradient<float>& g) {
         color[h][threadIdx.x] = {g.red, g.green, g.blue, g.alpha};
         if constexpr (!GEO) return;

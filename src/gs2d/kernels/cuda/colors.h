@@ -21,7 +21,8 @@ template <int DEGREE> struct Basis {
 #pragma unroll
         for (int k = 0; k < 3 * COUNT; ++k) sh[k] = k < 3 ? from.first[k] : from.rest[k - 3];
     }
-    __device__ __forceinline__ Vec3<float> color() const { return sh_color(sh, values, DEGREE); }  // + 1/2, not clamped
+    // + 1/2, not clamped
+    __device__ __forceinline__ Vec3<float> color() const { return sh_color(sh, values, DEGREE); }
 };
 
 // Calls f with the degree as a type.
@@ -39,24 +40,27 @@ template <class F> __device__ __forceinline__ Vec3<float> with_degree(int degree
 }
 
 // The colour + 1/2, not clamped; `size` is finite only if every coefficient is.
-__device__ __forceinline__ Vec3<float> color_of(int degree, const Coefficients& from, Vec3<float> direction, float& size) {
+__device__ __forceinline__ Vec3<float> color_of(int degree, const Coefficients& from, Vec3<float> direction,
+                                                float& size) {
     return with_degree(degree, [&](auto d) {
         const Basis<decltype(d)::value> b(from, direction);
         size = 0.f;
 #pragma unroll
-        for (int k = 0; k < b.COUNT; ++k) size = size + (abs(b.sh[3 * k]) + abs(b.sh[3 * k + 1]) + abs(b.sh[3 * k + 2]));
+        for (int k = 0; k < b.COUNT; ++k)
+            size = size + (abs(b.sh[3 * k]) + abs(b.sh[3 * k + 1]) + abs(b.sh[3 * k + 2]));
         return b.color();
     });
 }
 
 // Writes the gradients of the coefficients, zeros for those beyond the degree; returns that of the unit vector to the splat.
-__device__ __forceinline__ Vec3<float> color_vjp(int degree, const Coefficients& from, int rest, const CoefficientGradients& to,
-                                                 Vec3<float> direction, Vec3<float> g) {
+__device__ __forceinline__ Vec3<float> color_vjp(int degree, const Coefficients& from, int rest,
+                                                 const CoefficientGradients& to, Vec3<float> direction, Vec3<float> g) {
     return with_degree(degree, [&](auto d) {
         constexpr int DEGREE = decltype(d)::value;
         const Basis<DEGREE> b(from, direction);
         const Vec3<float> c = b.color();
-        g = {clamped_color_vjp(c.x, DEGREE, g.x), clamped_color_vjp(c.y, DEGREE, g.y), clamped_color_vjp(c.z, DEGREE, g.z)};
+        g = {clamped_color_vjp(c.x, DEGREE, g.x), clamped_color_vjp(c.y, DEGREE, g.y),
+             clamped_color_vjp(c.z, DEGREE, g.z)};
         float along[b.COUNT];
 #pragma unroll
         for (int k = 0; k < b.COUNT; ++k) {

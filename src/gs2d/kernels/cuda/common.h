@@ -24,7 +24,7 @@ struct View {
     float distortion_scale;  // (far near / (far - near))^2
     float background[3];
     int width, height, tiles_x, tiles_y;
-    int sh_degree, crossing;
+    int sh_degree, near_plane_policy;
 };
 
 __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
@@ -46,24 +46,27 @@ struct Culling {
         test = {lo.x - x, lo.y - y, a, b, c, hi.y - x, hi.z - y, hi.w, -b / c, -b / a};
         unbounded = hi.w < 0.f;
     }
-    __device__ __forceinline__ bool reaches_block(int block) const {  // columns (block & 1) * 8, rows (block >> 1) * 4
+    // columns (block & 1) * 8, rows (block >> 1) * 4
+    __device__ __forceinline__ bool reaches_block(int block) const {
         const float x = float((block & 1) * 8) + 0.5f, y = float((block >> 1) * 4) + 0.5f;
         return unbounded | reaches(test, x, y, x + 7.f, y + 3.f);
     }
 };
 
 // The sub-blocks of the tile at (left, top) that an outline reaches, a bit each. r: the record of that splat.
-__device__ __forceinline__ uint blocks_outlined(const float* cull, const float* r, int left, int top, float near, int width, int height) {
+__device__ __forceinline__ uint blocks_outlined(const float* cull, const float* r, int left, int top, float near,
+                                                int width, int height) {
     const float4* from = reinterpret_cast<const float4*>(r);
     const float4 lo = from[0], hi = from[1];
-    const Outline<float> outline =
-        outline_of(lo.z, lo.w, hi.x, hi.y, hi.z, hi.w, r[8], lo.x, lo.y, cull[0], -cull[7], near, float(width), float(height));
+    const Outline<float> outline = outline_of(lo.z, lo.w, hi.x, hi.y, hi.z, hi.w, r[8], lo.x, lo.y, cull[0], -cull[7],
+                                              near, float(width), float(height));
     const float cx = lo.x - float(left), cy = lo.y - float(top);
     uint mask = 0;
     for (int row = 0; row < 4; ++row) {
         float first, last;
         reach_in_rows(outline, float(4 * row) + 0.5f - cy, float(4 * row) + 3.5f - cy, first, last);
-        mask |= (uint(last >= 0.5f - cx && first <= 7.5f - cx) | uint(last >= 8.5f - cx && first <= 15.5f - cx) << 1) << 2 * row;
+        mask |= (uint(last >= 0.5f - cx && first <= 7.5f - cx) | uint(last >= 8.5f - cx && first <= 15.5f - cx) << 1)
+                << 2 * row;
     }
     return mask;
 }

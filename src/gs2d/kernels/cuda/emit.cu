@@ -10,24 +10,24 @@ namespace gs2d {
 struct EmitArguments {
     int width, height, tiles_x, tiles_y;
     float near;
-    int64 candidates;    // ends[visible - 1], or the room for them: then what has none is left out
+    int64 candidates;  // ends[visible - 1], or the room for them: then what has none is left out
     int64 visible;
     const int64* order;  // [visible]: splats by depth
     const int64* ends;   // [visible]: running sum of tile_counts in that order
     const float *cull, *records;
     const ushort* rects;
-    void* keys;          // [candidates] int16 or int32: tile, or the sentinel
-    uint* payloads;      // [candidates]: splat << 8 | mask of sub-blocks
-    int exact;           // 0: all sub-blocks of every candidate (tests)
+    void* keys;      // [candidates] int16 or int32: tile, or the sentinel
+    uint* payloads;  // [candidates]: splat << 8 | mask of sub-blocks
+    int exact;       // 0: all sub-blocks of every candidate (tests)
 };
 
 struct RangeArguments {
     int64 candidates;
-    const void* keys;        // sorted
+    const void* keys;          // sorted
     const int64* permutation;  // of the sort
     const uint* payloads;
-    uint* entries;           // [candidates]: payloads in sorted order
-    int64* ranges;           // [tiles + 1, 2]: begin and end of each tile's entries; zeros on entry
+    uint* entries;  // [candidates]: payloads in sorted order
+    int64* ranges;  // [tiles + 1, 2]: begin and end of each tile's entries; zeros on entry
 };
 
 // First splat in depth order whose candidates end behind `candidate`.

@@ -8,14 +8,14 @@
 
 namespace gs2d {
 
-constexpr int MEAN_PIXELS = 1024;             // of a block; losses.py has the same
-constexpr int NORMAL_W = 32, NORMAL_H = 8;    // tile of a block in the backward pass; losses.py has the same
-constexpr int HALO = 2;                       // depths that a depth's gradient depends on, on each side
+constexpr int MEAN_PIXELS = 1024;           // of a block; losses.py has the same
+constexpr int NORMAL_W = 32, NORMAL_H = 8;  // tile of a block in the backward pass; losses.py has the same
+constexpr int HALO = 2;                     // depths that a depth's gradient depends on, on each side
 
 struct NormalArguments {
     int64 height, width;
     float fx, fy, cx, cy;
-    float rotation[9];    // world to camera
+    float rotation[9];  // world to camera
     int per_splat;
     const float *normal, *depth, *alpha;  // [H, W, 3] world frame, [H, W], [H, W]
     const uchar* mask;                    // or null
@@ -28,7 +28,7 @@ struct MeanArguments {
     int64 height, width;
     const float* values;  // [H, W]
     const uchar* mask;
-    float* partials;      // [2, blocks]: valid pixels, sum
+    float* partials;  // [2, blocks]: valid pixels, sum
 };
 
 struct FinishArguments {
@@ -56,7 +56,8 @@ struct Centre {
     float offset_x, offset_y, alpha, cosine;
 };
 
-__device__ __forceinline__ Centre centre_of(const NormalArguments& a, int64 x, int64 y, float left, float right, float up, float down) {
+__device__ __forceinline__ Centre centre_of(const NormalArguments& a, int64 x, int64 y, float left, float right,
+                                            float up, float down) {
     Centre c;
     const int64 at = y * a.width + x;
     c.defined = was_hit(left) && was_hit(right) && was_hit(up) && was_hit(down) && (!a.mask || a.mask[at]);
@@ -73,7 +74,8 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency(NormalArgum
         const int64 at = int64(blockIdx.x) * MEAN_PIXELS + i + threadIdx.x;
         if (at >= a.height * a.width || (a.mask && !a.mask[at])) continue;
         const int64 x = at % a.width, y = at / a.width;
-        const Centre c = centre_of(a, x, y, depth_at(a, x - 1, y), depth_at(a, x + 1, y), depth_at(a, x, y - 1), depth_at(a, x, y + 1));
+        const Centre c = centre_of(a, x, y, depth_at(a, x - 1, y), depth_at(a, x + 1, y), depth_at(a, x, y - 1),
+                                   depth_at(a, x, y + 1));
         sums[0] = sums[0] + 1.f;
         sums[1] = sums[1] + keep(c.defined, a.per_splat ? c.alpha - c.cosine : c.alpha * c.cosine);
     }
@@ -94,9 +96,11 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
         const int64 x = left + cx - 1, y = top + cy - 1, at = y * a.width + x;
         DepthNormalGrad<float> pull = {0.f, 0.f};
         if (x >= 0 && y >= 0 && x < a.width && y < a.height) {
-            const Centre c = centre_of(a, x, y, depth[cy + 1][cx], depth[cy + 1][cx + 2], depth[cy][cx + 1], depth[cy + 2][cx + 1]);
+            const Centre c =
+                centre_of(a, x, y, depth[cy + 1][cx], depth[cy + 1][cx + 2], depth[cy][cx + 1], depth[cy + 2][cx + 1]);
             const float weight = a.per_splat ? -scale : -(scale * c.alpha);
-            if (c.defined) pull = depth_normal_vjp(c.from_depth, weight * c.rendered, c.offset_x, c.offset_y, a.fx, a.fy);
+            if (c.defined)
+                pull = depth_normal_vjp(c.from_depth, weight * c.rendered, c.offset_x, c.offset_y, a.fx, a.fy);
             if (cx > 0 && cx <= NORMAL_W && cy > 0 && cy <= NORMAL_H) {
                 const Vec3<float> n = rotate_back(a.rotation, weight * c.from_depth.direction);
                 if (a.g_normal) {
@@ -111,10 +115,13 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
     __syncthreads();
     if (!a.g_depth) return;
     for (int i = threadIdx.x; i < NORMAL_H * NORMAL_W; i += MEAN_THREADS) {
-        const int dx = i % NORMAL_W, dy = i / NORMAL_W;  // its own depth is depth[dy + 2][dx + 2], its pull pull[dy + 1][dx + 1]
+        // its own depth is depth[dy + 2][dx + 2], its pull pull[dy + 1][dx + 1]
+        const int dx = i % NORMAL_W, dy = i / NORMAL_W;
         if (left + dx >= a.width || top + dy >= a.height) continue;
-        const float from_left = pull_x[dy + 1][dx] * depth[dy + 2][dx], from_right = pull_x[dy + 1][dx + 2] * depth[dy + 2][dx + 4];
-        const float from_above = pull_y[dy][dx + 1] * depth[dy][dx + 2], from_below = pull_y[dy + 2][dx + 1] * depth[dy + 4][dx + 2];
+        const float from_left = pull_x[dy + 1][dx] * depth[dy + 2][dx],
+                    from_right = pull_x[dy + 1][dx + 2] * depth[dy + 2][dx + 4];
+        const float from_above = pull_y[dy][dx + 1] * depth[dy][dx + 2],
+                    from_below = pull_y[dy + 2][dx + 1] * depth[dy + 4][dx + 2];
         a.g_depth[(top + dy) * a.width + left + dx] = (from_left - from_right) + (from_above - from_below);
     }
 }
@@ -145,7 +152,8 @@ extern "C" __global__ void __launch_bounds__(128) finish_means(FinishArguments a
         const double total = sums[0];
         __syncthreads();
         if (row == 0) raw_count = total, count = total > 0. ? total : 1.;
-        if (threadIdx.x == 0) a.means[row] = float(row == 0 ? 1. / count : (a.complement ? raw_count - total : total) / count);
+        if (threadIdx.x == 0)
+            a.means[row] = float(row == 0 ? 1. / count : (a.complement ? raw_count - total : total) / count);
     }
 }
 

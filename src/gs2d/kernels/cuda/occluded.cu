@@ -13,9 +13,9 @@ struct OccludedArguments {
     const uint* entries;
     const int64* ranges;
     const int* tiles;
-    const float* image;    // [H, W, 3]
-    const uchar* mask;     // [H, W], 0 = ignore; or null
-    uint64* errors;        // [N], in units of ERROR_UNIT; zeros on entry
+    const float* image;  // [H, W, 3]
+    const uchar* mask;   // [H, W], 0 = ignore; or null
+    uint64* errors;      // [N], in units of ERROR_UNIT; zeros on entry
 };
 
 constexpr float ERROR_UNIT = 1.f / (1 << 24);  // cuda_passes.py has the same
@@ -36,7 +36,8 @@ extern "C" __global__ void __launch_bounds__(128) splat_errors_occluded(Occluded
         const int64 pixel = int64(at.y + 4 * h) * v.width + at.x;
         T[h] = at.inside[h] ? 1.f : 0.f;
         counts[h] = at.inside[h] && (!a.mask || a.mask[pixel]);
-        target[h] = counts[h] ? Vec3<float>{a.image[3 * pixel], a.image[3 * pixel + 1], a.image[3 * pixel + 2]} : Vec3<float>{};
+        target[h] =
+            counts[h] ? Vec3<float>{a.image[3 * pixel], a.image[3 * pixel + 1], a.image[3 * pixel + 2]} : Vec3<float>{};
     }
     const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
     const int64 begin = a.ranges[2 * int64(at.tile)], end = a.ranges[2 * int64(at.tile) + 1];

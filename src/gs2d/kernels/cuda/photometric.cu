@@ -8,7 +8,7 @@
 
 namespace gs2d {
 
-constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;            // reals and rows of a block; losses.py has the same
+constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;              // reals and rows of a block; losses.py has the same
 constexpr int SIDE = 3 * SSIM_RADIUS, STAGED = STRIP + 2 * SIDE;  // reals of a row that a block reads
 
 struct PhotometricArguments {
@@ -24,9 +24,9 @@ struct PhotometricVjpArguments {
     int64 height, width;
     const float *rendered, *target;
     const uchar* mask;
-    const float *maps, *means;    // means[0] = 1 / valid reals
-    const float *g_l1, *g_ssim;   // cotangents of both values, or null
-    float* gradient;              // [H, W, 3]
+    const float *maps, *means;   // means[0] = 1 / valid reals
+    const float *g_l1, *g_ssim;  // cotangents of both values, or null
+    float* gradient;             // [H, W, 3]
 };
 
 struct BlurArguments {
@@ -91,7 +91,8 @@ struct RunningBlur {
 __device__ __forceinline__ float blur_row(const float* row) {
     float sum = 0.f;
 #pragma unroll
-    for (int k = -SSIM_RADIUS; k <= SSIM_RADIUS; ++k) sum = fma(window_weight(k), row[int(threadIdx.x) + SIDE + 3 * k], sum);
+    for (int k = -SSIM_RADIUS; k <= SSIM_RADIUS; ++k)
+        sum = fma(window_weight(k), row[int(threadIdx.x) + SIDE + 3 * k], sum);
     return sum;
 }
 
@@ -113,7 +114,7 @@ template <bool KNOWN> __device__ __forceinline__ void photometric(const Photomet
     float sums[3] = {0.f, 0.f, 0.f};  // valid reals, L1, SSIM
     next.load(s, s.begin - SSIM_RADIUS, read(s.begin - SSIM_RADIUS));
     for (int64 y = s.begin - SSIM_RADIUS; y < s.end + SSIM_RADIUS; ++y) {
-        float(*row)[STAGED] = rows[y & 1];
+        float (*row)[STAGED] = rows[y & 1];
         next.store(row);
         __syncthreads();  // also: nobody is still at the row before the last one, whose place the next one takes
         next.load(s, y + 1, read(y + 1));
@@ -144,7 +145,9 @@ template <bool KNOWN> __device__ __forceinline__ void photometric(const Photomet
 }
 
 extern "C" __global__ void __launch_bounds__(128) photometric_forward(PhotometricArguments a) { photometric<false>(a); }
-extern "C" __global__ void __launch_bounds__(128) photometric_forward_known(PhotometricArguments a) { photometric<true>(a); }
+extern "C" __global__ void __launch_bounds__(128) photometric_forward_known(PhotometricArguments a) {
+    photometric<true>(a);
+}
 
 // dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product) for SSIM, the sign of x - y for L1.
 extern "C" __global__ void __launch_bounds__(128) photometric_vjp(PhotometricVjpArguments a) {
@@ -161,7 +164,7 @@ extern "C" __global__ void __launch_bounds__(128) photometric_vjp(PhotometricVjp
     Staging<3> next;
     next.load(s, s.begin - SSIM_RADIUS, read(s.begin - SSIM_RADIUS));
     for (int64 y = s.begin - SSIM_RADIUS; y < s.end + SSIM_RADIUS; ++y) {
-        float(*row)[STAGED] = rows[y & 1];
+        float (*row)[STAGED] = rows[y & 1];
         next.store(row);
         __syncthreads();
         next.load(s, y + 1, read(y + 1));
@@ -190,7 +193,7 @@ extern "C" __global__ void __launch_bounds__(128) blur_image(BlurArguments a) {
     Staging<1> next;
     next.load(s, s.begin - SSIM_RADIUS, read(s.begin - SSIM_RADIUS));
     for (int64 y = s.begin - SSIM_RADIUS; y < s.end + SSIM_RADIUS; ++y) {
-        float(*row)[STAGED] = rows[y & 1];
+        float (*row)[STAGED] = rows[y & 1];
         next.store(row);
         __syncthreads();
         next.load(s, y + 1, read(y + 1));

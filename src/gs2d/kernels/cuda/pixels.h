@@ -8,7 +8,9 @@ namespace gs2d {
 constexpr int HALVES = 2;  // pixels per thread: the second lies four rows below the first
 
 // Chunk c of a tile's entries owns the 8 words at this place: unique, without a scan.
-__device__ __forceinline__ int64 word_of(int64 begin, int tile, int64 chunk) { return 8 * ((begin >> 5) + tile + chunk); }
+__device__ __forceinline__ int64 word_of(int64 begin, int tile, int64 chunk) {
+    return 8 * ((begin >> 5) + tile + chunk);
+}
 
 __device__ __forceinline__ uint or_over_warp(uint bits) {
 #pragma unroll
@@ -21,7 +23,7 @@ __device__ __forceinline__ uint uniform(uint word, int lane) { return __ballot_s
 
 struct Place {  // of a thread
     int lane, warp, tile;
-    int x, y;              // first pixel
+    int x, y;  // first pixel
     uint sub_block[HALVES];
     bool inside[HALVES];
 };
@@ -47,9 +49,11 @@ __device__ __forceinline__ void fetch_record(const float* records, int64 splat, 
 
 // Whether the splat whose record this lane has fetched is plain (core/blend.h) at all 8x8 pixels of the warp.
 __device__ __forceinline__ bool plain_for_warp(const View& v, const Place& at, float4 (*records)[32]) {
-    const Record<float> s = record_of(records[0][at.lane], records[1][at.lane], records[2][at.lane], records[3][at.lane]);
+    const Record<float> s =
+        record_of(records[0][at.lane], records[1][at.lane], records[2][at.lane], records[3][at.lane]);
     const float x = float(at.x - (at.lane & 7) + 4), y = float(at.y - (at.lane >> 3) + 4);
-    return is_plain(x - s.cx, y - s.cy, s.ai, s.bi, s.iz, plain_from(s, v.lowpass_px), v.near, 4.f);  // half a pixel to spare
+    // half a pixel to spare
+    return is_plain(x - s.cx, y - s.cy, s.ai, s.bi, s.iz, plain_from(s, v.lowpass_px), v.near, 4.f);
 }
 
 // The splat's plane at the pixels of a thread; dx, dy: of the first.
@@ -59,7 +63,8 @@ __device__ __forceinline__ void planes_of(const Record<float>& s, float dx, floa
 }
 
 template <bool PLAIN>
-__device__ __forceinline__ Hit<float> hit_of(const Record<float>& s, const PlaneAt<float>& p, float dx, float dy, const BlendLimits<float>& k) {
+__device__ __forceinline__ Hit<float> hit_of(const Record<float>& s, const PlaneAt<float>& p, float dx, float dy,
+                                             const BlendLimits<float>& k) {
     if constexpr (!PLAIN) return intersect(s, p, reciprocal(s.iz), dx, dy, k);
     Hit<float> hit = meet_plane(p);
     hit.alpha = plain_alpha_of(s.log2_opacity, hit.rho, k);

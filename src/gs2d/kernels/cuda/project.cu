@@ -19,8 +19,8 @@ struct ProjectArguments {
 
 // The tiles that an outline reaches.
 __device__ TileRectangle outlined_rectangle(const View& v, const Record<float>& r, float k, float disc2) {
-    const Outline<float> outline =
-        outline_of(r.au, r.bu, r.av, r.bv, r.ai, r.bi, r.iz, r.cx, r.cy, k, disc2, v.near, float(v.width), float(v.height));
+    const Outline<float> outline = outline_of(r.au, r.bu, r.av, r.bv, r.ai, r.bi, r.iz, r.cx, r.cy, k, disc2, v.near,
+                                              float(v.width), float(v.height));
     TileRectangle rect = {0, 0, 0, 0};
     for (int y = 0; y < v.tiles_y; ++y) {
         const float top = float(y * TILE_PX) + 0.5f - r.cy;
@@ -48,13 +48,14 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     Record<float> r = project(p, frame, v.camera);
     if (!is_finite(parameter_size(p, frame)) || !(frame.p.z > v.near)) return;
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
-    const bool crossing = v.crossing != CROSSING_DRAW && reaches_camera_plane(frame, v.error_k2);
-    if (crossing && v.crossing == CROSSING_CULL) return;
+    const bool crossing = v.near_plane_policy != NEAR_PLANE_DRAW && reaches_camera_plane(frame, v.error_k2);
+    if (crossing && v.near_plane_policy == NEAR_PLANE_CULL) return;
     float sh_size;
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
     const Vec3<float> c = color_of(v.sh_degree, sh, frame.to_splat, sh_size);
     if (!is_finite(sh_size)) return;
-    r.red = clamped_color(c.x, v.sh_degree), r.green = clamped_color(c.y, v.sh_degree), r.blue = clamped_color(c.z, v.sh_degree);
+    r.red = clamped_color(c.x, v.sh_degree), r.green = clamped_color(c.y, v.sh_degree),
+    r.blue = clamped_color(c.z, v.sh_degree);
 
     const float k2 = a.errors ? v.error_k2 : max(float(2 * LN2) * (r.log2_opacity - v.log2_alpha_min), 0.f);
     const Footprint<float> o = footprint(frame, r, k2, v.lowpass_px, v.camera);

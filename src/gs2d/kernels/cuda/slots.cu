@@ -8,7 +8,8 @@ struct SlotArguments {
     int64 count;
     int64 candidates;    // that there are slots for: pairs beyond were left out for want of room
     const int64* order;  // [N]: splats by depth
-    const int64* ends;   // [N]: running sum of candidates in that order; four slots each, one for each warp of a tile
+    // [N]: running sum of candidates in that order; four slots each, one for each warp of a tile
+    const int64* ends;
     const float *slots, *extra_slots;  // [4 * candidates, 16] or null, [4 * candidates, 4]
     float *gradients, *extras;         // [N, 16] or null, [N, 4]
 };
@@ -22,7 +23,8 @@ extern "C" __global__ void __launch_bounds__(128) sum_slots(SlotArguments a) {
     const int64 first = place > 0 ? 4 * a.ends[place - 1] : 0, last = 4 * end;
     float sum = 0.f, extra = 0.f;
     for (int64 row = first + (lane >> 4); a.slots && row < last; row += 2) sum = sum + a.slots[16 * row + (lane & 15)];
-    for (int64 row = first + (lane >> 2); lane < 16 && row < last; row += 4) extra = extra + a.extra_slots[4 * row + (lane & 3)];
+    for (int64 row = first + (lane >> 2); lane < 16 && row < last; row += 4)
+        extra = extra + a.extra_slots[4 * row + (lane & 3)];
     sum = sum + __shfl_xor_sync(FULL_MASK, sum, 16);
 #pragma unroll
     for (int step = 8; step >= 4; step >>= 1) extra = extra + __shfl_xor_sync(FULL_MASK, extra, step);
