@@ -171,6 +171,12 @@ class TimingLauncher:
         )
 
 
+class EmulatedBackend(CudaBackend):
+    """The backend "cuda" on the CPU's memory."""
+
+    device = "cpu"
+
+
 @contextmanager
 def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
     """The bench; with ``dry`` every launcher and the backend "cuda" are the emulator's until the end."""
@@ -185,8 +191,7 @@ def opened(dry: bool, minutes: float = math.inf) -> Iterator[Bench]:
 
     with tempfile.TemporaryDirectory() as folder:
         emulator = Emulator(Path(folder))
-        backend = CudaBackend()
-        backend.device = "cpu"
+        backend = EmulatedBackend()
         before = launch.launcher_for, BACKENDS._things["cuda"]
         launch.launcher_for = lambda device: emulator
         BACKENDS._things["cuda"] = lambda: backend

@@ -63,7 +63,7 @@ def _views(folder: Path, shown: Any) -> list[dict[str, Any]]:
         paths = [(title, folder / f"{view.get('file')}.{kind}.png") for kind, title in TITLES.items()]
         images = [(title, read_image(path)) for title, path in paths if path.is_file()]
         if images:
-            views.append({"name": str(view.get("name")), "pictures": images})
+            views.append({"name": str(view.get("name")), "images": images})
     return views
 
 
