@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import gs2d
+from gs2d.cli.commands import COMMANDS
+from gs2d.config.presets import RECIPES
 from tiny import write_capture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 ROOT = DOCS.parent
 PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "benchmarks").rglob("*.md")])
-LONG_LINES = {DOCS / "architecture.md", DOCS / "decisions.md"}  # about to be split and shortened
+LONG_LINES = {DOCS / "decisions.md"}  # about to be split
 
 
-def run_blocks(page: Path, least: int) -> None:
+def run_blocks(page: Path, least: int) -> dict[str, Any]:
     """Run the blocks of Python of a page as one program, in the current folder."""
     blocks = list(re.finditer(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S))
     assert len(blocks) >= least
-    names: dict[str, object] = {}
+    names: dict[str, Any] = {}
     for block in blocks:
         lines = block.string[: block.start()].count("\n") + 1
         exec(compile("\n" * lines + block.group(1), str(page), "exec"), names)  # line numbers are those of the page
+    return names
 
 
 def test_the_program_of_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,6 +44,22 @@ def test_the_program_of_the_migration_page_runs(tmp_path: Path, monkeypatch: pyt
     run_blocks(DOCS / "migration.md", 6)
 
 
+def test_the_program_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / "capture")
+    page = tmp_path / "README.md"
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "schedule_scale=0.1)" in text
+    page.write_text(text.replace("schedule_scale=0.1)", "schedule_scale=0.001)"), encoding="utf-8")  # seconds
+    run_blocks(page, 1)
+    assert len(gs2d.read_splats(tmp_path / "splats.ply")) > 0
+
+
+def test_the_recipes_of_the_concepts_page_are_recipes() -> None:
+    names = run_blocks(DOCS / "concepts.md", 1)
+    assert names["two_dgs_r"].stages == RECIPES["2dgs-r"]().stages
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_links_to_files_of_the_repository_lead_somewhere(page: Path) -> None:
     text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
@@ -51,3 +72,9 @@ def test_links_to_files_of_the_repository_lead_somewhere(page: Path) -> None:
 def test_no_line_of_a_page_has_more_than_120_characters(page: Path) -> None:
     lines = page.read_text(encoding="utf-8").splitlines()
     assert [f"{page.name}:{number}" for number, line in enumerate(lines, 1) if len(line) > 120] == []
+
+
+def test_one_page_names_every_command() -> None:
+    text = (DOCS / "guides" / "commands.md").read_text(encoding="utf-8")
+    names = {command.__name__.lower() for command in COMMANDS}
+    assert {name for name in names if f"gs2d {name}" not in text} == set()

@@ -135,7 +135,7 @@ def check_thresholds(thresholds: tuple[float, ...]) -> None:
 def score_surface(
     mesh: Mesh, truth: Truth | OfficialTruth, job: Job, options: EvaluateOptions, on_event: OnEvent, *, folder: Path
 ) -> dict[str, Any]:
-    """Return the ``surface`` entry of ``metrics.json`` (docs/architecture.md); the coloured clouds go to ``folder``.
+    """Return the ``surface`` entry of ``metrics.json`` (docs/guides/runs.md); the coloured clouds go to ``folder``.
 
     Raises
     ------
