@@ -74,6 +74,12 @@ def test_no_line_of_a_page_has_more_than_120_characters(page: Path) -> None:
     assert [f"{page.name}:{number}" for number, line in enumerate(lines, 1) if len(line) > 120] == []
 
 
+def test_files_that_the_architecture_names_are_there() -> None:
+    named = set(re.findall(r"[\w/]+\.py\b", (DOCS / "architecture.md").read_text(encoding="utf-8")))
+    there = [path.as_posix() for folder in ("src", "tests") for path in (ROOT / folder).rglob("*.py")]
+    assert {name for name in named if not any(path.endswith("/" + name) for path in there)} == set()
+
+
 def test_one_page_names_every_command() -> None:
     text = (DOCS / "guides" / "commands.md").read_text(encoding="utf-8")
     names = {command.__name__.lower() for command in COMMANDS}
