@@ -73,6 +73,7 @@ def test_resuming_a_finished_run_changes_nothing(capture: Path, undisturbed: Run
     mesh = (copy / "mesh.ply").read_bytes()
     assert comparable(train(options(capture, copy, resume=True))) == before
     assert (copy / "mesh.ply").read_bytes() == mesh
+    assert RunFolder(copy).metrics()["mesh"] == undisturbed.metrics()["mesh"]
 
 
 def test_resume_goes_back_one_checkpoint_when_the_last_is_damaged_and_says_so(
