@@ -102,7 +102,7 @@ def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> ResumePoint:
         finished = checkpoint.stage_index + (checkpoint.iteration is None)
         metrics = run.metrics()
         unchanged = finished == len(job.recipe.stages)  # then what is said of the mesh still holds
-        of_mesh = {name: metrics[name] for name in ("surface", "mesh") if unchanged and name in metrics}
+        of_mesh: dict[str, Any] = {name: metrics[name] for name in ("surface", "mesh") if unchanged and name in metrics}
         run.write_metrics({"stages": metrics["stages"][:finished], "surface": None, **of_mesh})
         on_event(Notice(f"resuming after {checkpoint.path.stem}"))
         extra = json.loads(payload["extra"])
