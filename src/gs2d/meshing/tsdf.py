@@ -409,7 +409,7 @@ def fuse(
         Default: as many as the machine has. The result does not depend on it.
     backend : str or Backend
         What adds the views: "reference" (numpy), "cpu" (native, the same bits), "cuda", or "auto" (see
-        ``integrate.fusion_backend``).
+        ``fusion_backend``).
 
     Raises
     ------
