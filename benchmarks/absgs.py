@@ -29,7 +29,8 @@ from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
 from gs2d.experiments.aggregate import Cell, read_cell
 from gs2d.experiments.execute import Job, execute
-from gs2d.experiments.plan import PaperOptions, make_job, trained_recipe
+from gs2d.experiments.options import PaperOptions
+from gs2d.experiments.plan import make_job, trained_recipe
 from gs2d.experiments.scenes import FoundScene, find_scenes
 from gs2d.io.run_dir import machine, versions
 from gs2d.pipeline.events import Event, Notice

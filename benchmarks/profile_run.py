@@ -31,8 +31,8 @@ from benchmarks.run_phases import LOOP, RUN_LOGGER, RUN_PHASES
 from benchmarks.sampler import Rule, Sampler, Seconds
 from benchmarks.timing import machine, peak_probe
 from gs2d.kernels.library import load
-from gs2d.pipeline.demo import SCHEDULE_SCALE, DemoOptions, demo
-from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.demo import SCHEDULE_SCALE, demo
+from gs2d.pipeline.options import DemoOptions, TrainOptions
 from gs2d.pipeline.train import train
 
 PHASES = (

@@ -99,7 +99,9 @@ def main() -> None:
         scene = read_scene(scene.root, scene.format, shrink, job.protocol, lambda _event: None)
     meshes: dict[str, Mesh | TexturedMesh] = {"vertex colours": mesh}
     for source in ("photographs", "renders"):
-        options = TextureOptions(faces=arguments.faces, size=arguments.size, source=source, downscale=shrink)
+        options = TextureOptions(
+            faces=arguments.faces, texture_size=arguments.size, texture_from=source, texture_downscale=shrink
+        )
         start, cpu = time.perf_counter(), time.process_time()
         baked = textured_mesh(job, splats, mesh, options)
         took = f"{time.perf_counter() - start:.1f} s ({time.process_time() - cpu:.1f} s of CPU)"

@@ -9,7 +9,7 @@ from benchmarks.absgs import CANDIDATES, Candidate, choose, make_jobs, markdown
 from gs2d.config.presets import ABSGS_ADJUSTED, ABSGS_DEFAULT, get_recipe
 from gs2d.config.serialize import apply_overrides
 from gs2d.experiments.aggregate import FIGURES, Cell
-from gs2d.experiments.plan import PaperOptions
+from gs2d.experiments.options import PaperOptions
 from gs2d.experiments.scenes import find_scenes
 from tiny import write_capture
 

@@ -13,7 +13,8 @@ import pytest
 
 from cli_runs import one_line
 from gs2d.cli import run
-from gs2d.pipeline.view import ViewOptions, open_viewer
+from gs2d.pipeline.options import ViewOptions
+from gs2d.pipeline.view import open_viewer
 from tiny import write_ball_mesh
 
 pytest.importorskip("viser", reason="viser is not installed (extra `view`)")

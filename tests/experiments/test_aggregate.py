@@ -12,16 +12,16 @@ import pytest
 
 from gs2d.cli.app import parse
 from gs2d.cli.commands import Train
-from gs2d.cli.handlers import train_options
-from gs2d.cli.paper import parse_seeds
 from gs2d.config.protocols import MetricConventions
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.experiments.aggregate import Cell, Results, judge_order, read_cell
 from gs2d.experiments.deviations import deviations_of, opacity_resets
+from gs2d.experiments.options import PaperOptions, parse_seeds
 from gs2d.experiments.paper import check_folder, paper
-from gs2d.experiments.plan import PaperOptions, commands_of, make_plan, paper_command
+from gs2d.experiments.plan import commands_of, make_plan, paper_command
 from gs2d.experiments.scenes import find_scenes
 from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Order
+from gs2d.pipeline.options import TrainOptions, values
 from paper_cells import make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 
@@ -207,7 +207,7 @@ def test_the_printed_commands_are_the_ones_that_were_run(tmp_path: Path) -> None
         assert words[0] == "gs2d"
         command = parse(words[1:])
         assert isinstance(command, Train)
-        assert train_options(command) == replace(job.train, resume=False)
+        assert values(TrainOptions, command) == values(TrainOptions, replace(job.train, resume=False))
 
 
 @pytest.mark.parametrize("seeds", [(0,), (1,), (7,), (0, 1, 2), (4, 2)])

@@ -17,12 +17,12 @@ from typing import Any
 import pytest
 
 from gs2d.cli import run
-from gs2d.cli.paper import parse_seeds
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.experiments import execute as execute_module
 from gs2d.experiments.aggregate import FIGURES, Results, Row, judge_order, read_cell
+from gs2d.experiments.options import PaperOptions, parse_seeds
 from gs2d.experiments.paper import paper
-from gs2d.experiments.plan import PaperOptions, canonical_recipe, make_plan
+from gs2d.experiments.plan import canonical_recipe, make_plan
 from gs2d.experiments.render import parts_of, shown, to_csv, to_latex, to_markdown
 from gs2d.experiments.scenes import find_scenes, missing_scenes
 from gs2d.experiments.tables import DTU, PAPER_TABLES, TNT, Order, recipe_table

@@ -14,13 +14,13 @@ import pytest
 from gs2d.cli import run
 from gs2d.cli.app import parse
 from gs2d.cli.commands import Sweep
-from gs2d.cli.paper import paper_options
 from gs2d.experiments import execute as execute_module
 from gs2d.experiments.aggregate import Results
 from gs2d.experiments.deviations import deviations_of
+from gs2d.experiments.options import SweepOptions
 from gs2d.experiments.paper import paper
-from gs2d.experiments.plan import PaperOptions, make_plan, paper_command
-from gs2d.experiments.tables import SWEEP
+from gs2d.experiments.plan import make_plan, paper_command
+from gs2d.pipeline.options import values
 from paper_cells import TINY, draw_nothing
 from tiny import write_capture
 
@@ -92,7 +92,7 @@ def test_the_table_of_what_is_there_can_be_written_while_a_command_trains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_capture(tmp_path / "ball", train=2, test=1, size=8)
-    mine = PaperOptions(table=SWEEP, recipes=("2dgs",), data=tmp_path / "ball", out=tmp_path / "out")
+    mine = SweepOptions(recipes=("2dgs",), data=tmp_path / "ball", out=tmp_path / "out")
     found: list[int] = []
 
     def train(*_: object) -> dict[str, str]:
@@ -107,7 +107,7 @@ def test_the_table_of_what_is_there_can_be_written_while_a_command_trains(
 def test_recipes_that_train_the_same_are_trained_once_and_named_twice(tmp_path: Path) -> None:
     write_capture(tmp_path / "ball", train=2, test=1, size=8)
     recipes = ("2dgs-r-k1", "2dgs-r", "2dgs-r-k1")
-    plan = make_plan(PaperOptions(table=SWEEP, recipes=recipes, data=tmp_path, out=tmp_path / "out", seeds=(0, 4)))
+    plan = make_plan(SweepOptions(recipes=recipes, data=tmp_path, out=tmp_path / "out", seeds=(0, 4)))
     assert [row.name for row in plan.table.rows] == ["2dgs-r-k1", "2dgs-r"]
     assert [job.name for job in plan.jobs] == ["ball-2dgs-r-s0", "ball-2dgs-r-s4"]
 
@@ -145,8 +145,7 @@ def test_a_folder_holds_a_sweep_or_a_table_of_the_paper(
 
 
 def test_the_printed_command_is_the_one_that_was_given() -> None:
-    options = PaperOptions(
-        table=SWEEP,
+    options = SweepOptions(
         recipes=("2dgs", "2dgs-r"),
         data=Path("a b"),
         out=Path("out"),
@@ -160,12 +159,12 @@ def test_the_printed_command_is_the_one_that_was_given() -> None:
     )
     command = parse(shlex.split(paper_command(options))[1:])
     assert isinstance(command, Sweep)
-    assert paper_options(command) == options
+    assert values(SweepOptions, command) == values(SweepOptions, options)
 
 
 def test_scenes_that_only_the_paper_would_need_are_not_missed(tmp_path: Path) -> None:
     write_capture(tmp_path / "lego", train=2, test=1, size=8)
-    options = PaperOptions(table=SWEEP, recipes=("2dgs-r",), data=tmp_path, out=tmp_path / "out")
+    options = SweepOptions(recipes=("2dgs-r",), data=tmp_path, out=tmp_path / "out")
     plan = make_plan(options)
     lines = deviations_of(options, plan.scenes, plan.table, Results(()))
     assert not any("of its 8 scenes are not here" in line or "the paper does not say" in line for line in lines)

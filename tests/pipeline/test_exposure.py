@@ -19,18 +19,18 @@ from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import RunError
 from gs2d.experiments.figures import rank_run
 from gs2d.io.run_dir import EXPOSURE, RunFolder
-from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.demo import demo
 from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.exposure import matched_by_halves, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import build_recipe, prepare_job
-from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.paths import orbit_cameras
 from gs2d.pipeline.render import render_run, render_view
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.scoring import score_views
-from gs2d.pipeline.texture import TextureOptions, _images
+from gs2d.pipeline.texture import _images
 from gs2d.pipeline.train import train
 from gs2d.synthetic import capture as toy
 from gs2d.synthetic.perturb_exposure import GAINS, random_gains, with_gains

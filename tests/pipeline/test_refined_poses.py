@@ -19,12 +19,12 @@ from gs2d.data import load_scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.evaluation.images import mean_metrics
 from gs2d.io.run_dir import POSES, RunFolder
-from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.demo import demo
 from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import build_recipe, prepare_job, reload_job
-from gs2d.pipeline.options import EvaluateOptions, TextureOptions, TrainOptions
+from gs2d.pipeline.options import DemoOptions, EvaluateOptions, TextureOptions, TrainOptions
 from gs2d.pipeline.refined_poses import aligned, how_far
 from gs2d.pipeline.render import render_run, render_view, shown_cameras
 from gs2d.pipeline.report import report_run
@@ -136,7 +136,7 @@ def test_everybody_takes_the_cameras_that_were_found(run: RunFolder, capture: Pa
     assert evaluate_run(run.path)["train"]["psnr"] == psnr
     render_run(run.path, split="train", out=tmp_path)
     assert len(list(tmp_path.glob("*.png"))) == 6
-    texture = _views(job, TextureOptions(downscale=2), ignore)
+    texture = _views(job, TextureOptions(texture_downscale=2), ignore)
     assert np.array_equal(texture[0].camera.T_cam_world, job.scene.train[0].camera.T_cam_world)
     assert texture[0].camera.width == job.scene.train[0].camera.width // 2
 

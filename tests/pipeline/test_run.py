@@ -15,10 +15,11 @@ from ball_runs import Stop, comparable, options
 from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
-from gs2d.pipeline.demo import DemoOptions, demo
+from gs2d.pipeline.demo import demo
 from gs2d.pipeline.estimate import duration
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.job import prepare_job
+from gs2d.pipeline.options import DemoOptions
 from gs2d.pipeline.train import train
 from tiny import write_capture
 

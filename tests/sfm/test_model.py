@@ -17,7 +17,8 @@ from gs2d.cli import run
 from gs2d.data.readers.colmap import ColmapCamera, ColmapImage, ColmapPoints
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.io.run_dir import RunFolder
-from gs2d.pipeline.sfm import PosesOptions, find_poses
+from gs2d.pipeline.options import PosesOptions
+from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, solve
 from gs2d.sfm.model import SfmModel, camera_line, check_any, why_not_placed
 from gs2d.sfm.workspace import check_out, put_in_place, workspace

@@ -25,7 +25,8 @@ from gs2d.data import load_scene
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import RunError
 from gs2d.pipeline.events import Event, Phase
-from gs2d.pipeline.sfm import PosesOptions, find_poses
+from gs2d.pipeline.options import PosesOptions
+from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm.lens import MODELS
 from gs2d.sfm.workspace import workspace
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,17 @@ import pytest
 from cli_runs import TINY, one_line
 from gs2d.cli import commands, run
 from gs2d.cli.app import parse
-from gs2d.cli.options import Training
 from gs2d.io.run_dir import open_run
+from gs2d.pipeline import options as options_module
 from gs2d.pipeline import reconstruct as module
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.reconstruct import FEW, QUALITIES, ReconstructOptions, reconstruct
+from gs2d.pipeline.options import ReconstructOptions, Training, values
+from gs2d.pipeline.reconstruct import FEW, QUALITIES, poses_options, reconstruct, train_options
 from room_photos import Room, write_room
 from tiny import write_capture
 
 SMALL = {"threads": 1, "quality": "draft", "schedule_scale": 0.0005, "downscale": 8}
-TRAINING = {"overrides": ("init_points=100", "surface.densify.max_splats=150")}
+TRAINING = Training(overrides=("init_points=100", "surface.densify.max_splats=150"))
 
 
 def words_for(photos: Path, out: Path, *words: str) -> list[str]:
@@ -259,20 +260,14 @@ def test_every_option_of_train_is_one_of_reconstruct() -> None:
     words = ["--recipe", "2dgs", "--exposure", "--test-every", "5", "--set", "init_points=9", "--cameras", "each"]
     command = parse(["reconstruct", "photos", "--out", "run", *words])
     assert isinstance(command, commands.Reconstruct)
-    from gs2d.cli.reconstruct import reconstruct_options
-
-    options = reconstruct_options(command)
-    for field in fields(Training):
-        if field.name == "no_exposure":  # with --exposure one field of the pipeline's
-            continue
-        assert getattr(options.train_options, field.name) == getattr(command.training, field.name)
-    assert options.train_options.recipe == "2dgs"
-    assert options.train_options.test_every == 5
-    assert options.poses_options.cameras == "each"
+    training = train_options(command)
+    assert values(Training, training) == values(Training, command.training)
+    assert (training.recipe, training.test_every, training.learns_exposure) == ("2dgs", 5, True)
+    assert poses_options(command).cameras == "each"
 
 
 def test_the_help_states_the_qualities_that_are_there() -> None:
-    text = (Path(commands.__file__)).read_text(encoding="utf-8")
+    text = (Path(options_module.__file__)).read_text(encoding="utf-8")
     stated = re.search(r'quality: Literal\["draft", "normal", "full"\].*?"""(.*?)"""', text, re.DOTALL)
     assert stated is not None
     assert list(QUALITIES) == ["draft", "normal", "full"]
@@ -306,7 +301,7 @@ def test_the_size_of_the_pictures_is_by_the_quality(
 
 def test_test_views_are_as_many_as_asked_for(room: Room, tmp_path: Path) -> None:
     out = started(room, tmp_path)
-    training = {**TRAINING, "test_every": 4}
+    training = replace(TRAINING, test_every=4)
     options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=training, **SMALL)  # type: ignore[arg-type]
     assert "3 of 12 photographs do not train, they score the result (--test-every 0 trains on all)" in notices(options)
     definition = open_run(out).definition()

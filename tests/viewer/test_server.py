@@ -26,7 +26,8 @@ from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, DataError
 from gs2d.io.formats.registry import LAYOUTS, write_layout
 from gs2d.io.meshes import glb_bytes, glb_turn, write_textured
-from gs2d.pipeline.view import ViewOptions, open_viewer
+from gs2d.pipeline.options import ViewOptions
+from gs2d.pipeline.view import open_viewer
 from gs2d.viewer.exact import Drawn, ExactImages, ViewerFrame, camera_of
 from gs2d.viewer.server import free_port, quaternion, thumbnail
 from gs2d.viewer.splats import preview

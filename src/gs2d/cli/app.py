@@ -20,12 +20,13 @@ from typing import NoReturn
 
 import gs2d
 from gs2d.cli import layout
-from gs2d.cli.commands import COMMANDS, Command, Demo, Doctor, Info, Recipes, Reconstruct, TableCommon, Train
+from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Doctor, Info, Recipes, Reconstruct, Train
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
-from gs2d.cli.options import Common, TrainingCommon
 from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
 from gs2d.errors import Gs2dError
+from gs2d.experiments.options import TableOptions
+from gs2d.pipeline.options import HowItRuns
 
 OK, EXIT_BUG, EXIT_USAGE, INCOMPLETE, NOBODY_READS = 0, 1, 2, 3, 141
 _MENDABLE = {
@@ -44,10 +45,7 @@ _MENDABLE = {
     errno.EIO,
 }
 _HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info))
-_MARKUP = re.compile(r"\[/?bold\]")  # tyro shows its own markup in one of its messages
 _NO_MEMORY = re.compile("can't allocate memory|out of memory")  # how torch says it, on the CPU and on a GPU
-_ASCII_BOX = re.compile(r"(?<!\S)(?:[-+]{3,}|\|)(?!\S)")  # the same frame where the terminal has no other
-_BOX = str.maketrans(dict.fromkeys("╭╮╰╯│─", " "))
 
 
 def run(argv: Sequence[str]) -> int:
@@ -62,7 +60,7 @@ def run(argv: Sequence[str]) -> int:
     except BrokenPipeError:  # `gs2d train --help | head`
         _drop_stdout()
         return NOBODY_READS
-    except UsageError as error:
+    except (UsageError, Gs2dError) as error:
         return _fail(str(error))
     interruptible = Interruptible()
     console = Console(quiet=command.quiet, as_json=command.json, before_each=interruptible.check)
@@ -140,30 +138,18 @@ def parse(argv: Sequence[str]) -> Common:
     if argv[0].startswith("--tyro-"):  # completions of a shell are of all commands
         return tyro.cli(Command, prog="gs2d", args=list(argv), config=config)
     check(argv)
-    complaint = io.StringIO()
     try:
-        with contextlib.redirect_stderr(complaint):  # one command alone is ready ten times as soon as all of them
+        with contextlib.redirect_stderr(io.StringIO()):  # one command alone is ready ten times as soon as all of them
             command: Common = tyro.cli(NAMES[argv[0]], prog=f"gs2d {argv[0]}", args=list(argv[1:]), config=config)
     except SystemExit as exit_:
         if not exit_.code:
             raise
-        raise UsageError(_one_line(complaint.getvalue(), argv)) from None
-    if isinstance(command, TrainingCommon) and command.resume and command.overwrite:
+        # `check` has said of all that can be wrong what it is; tyro's own words for the rest are a box of twenty lines.
+        words = shlex.join(argv[1:])
+        raise UsageError(f"gs2d {argv[0]} does not take {words}; see `gs2d {argv[0]} --help`") from None
+    if isinstance(command, HowItRuns) and command.resume and command.overwrite:
         raise UsageError("--resume and --overwrite exclude each other; give one")
     return command
-
-
-def _one_line(box: str, argv: Sequence[str]) -> str:
-    """Return the first message of tyro's box, without the frame, the help texts and the advice."""
-    lines = [line.translate(_BOX).rstrip() for line in box.splitlines()]
-    body = [line.strip() for line in lines[1:] if line.strip()]
-    for stop in ("For full helptext", "Argument helptext", "Are you looking"):
-        for i, line in enumerate(body):
-            if line.startswith(stop):
-                body = body[:i]
-                break
-    words = " ".join(_ASCII_BOX.sub("", _MARKUP.sub("", " ".join(body))).split()) or "the arguments do not parse"
-    return f"{words}; see `gs2d {argv[0]} --help`".replace(" (required)", "")
 
 
 def _fail(message: str) -> int:
@@ -227,7 +213,7 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
             line += f"; {'' if trained else kept}resume with: {_resumed(argv)}"
         else:
             line += "; nothing was kept, because training had not begun"
-    if isinstance(command, TableCommon) and not command.no_train:
+    if isinstance(command, TableOptions) and command.train:
         line += f"; go on with: gs2d {shlex.join(argv)}"
     print(line, file=sys.stderr)
     return INTERRUPTED

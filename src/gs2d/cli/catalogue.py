@@ -21,6 +21,7 @@ import tyro
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 _APPEND = get_args(tyro.conf.UseAppendAction[int])[1]
 _NO_PREFIX = get_args(tyro.conf.OmitArgPrefixes[int])[1]
+_FIXED = get_args(tyro.conf.Fixed[int])[1]
 _NAMES = {int: "N", float: "NUMBER", Path: "PATH", str: "NAME"}  # what stands for a value in help
 _MANY = 24  # columns of choices, from which they are listed in the text and not before it
 
@@ -89,7 +90,7 @@ def options_of(kind: type) -> tuple[Option, ...]:
         inner, marks = _unwrapped(hints[field.name])
         if _NO_PREFIX in marks:
             found += options_of(inner)
-        else:
+        elif _FIXED not in marks:  # of Python only
             found.append(_option(kind, field, inner, marks))
     return tuple(found)
 
@@ -97,7 +98,8 @@ def options_of(kind: type) -> tuple[Option, ...]:
 def _option(kind: type, field: dataclasses.Field[Any], inner: Any, marks: tuple[Any, ...]) -> Option:
     settings = next((mark for mark in marks if hasattr(mark, "metavar")), None)  # what `tyro.conf.arg` made
     name = (settings and settings.name) or field.name
-    value, choices, count = _value(inner)
+    parsed = settings and settings.constructor_factory  # as what tyro reads it, where that is not its type
+    value, choices, count = _value(parsed() if parsed else inner)
     switched_off = "no-" if value is bool and field.default is True else ""  # what is on is switched off
     written = "--" + switched_off + name.replace("_", "-")
     flags = () if _POSITIONAL in marks else (written, *((settings and settings.aliases) or ()))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from gs2d.cli import commands as c
+from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
-from gs2d.cli.options import Common, Training, TrainingCommon, training_values, values
 from gs2d.cli.tables import score_rows, show_run, show_surface
 from gs2d.errors import DataError, ProtocolError, RecipeError
+from gs2d.pipeline.options import MeshOptions, TextureOptions, values
 
 
 def execute(command: Common, console: Console) -> None:
@@ -39,58 +41,20 @@ def execute(command: Common, console: Console) -> None:
         console.close()
 
 
-def train_options(command: c.Train) -> Any:
-    """Return the pipeline's options of ``gs2d train``."""
-    own = ("scene", "out", "format", "downscale", "schedule_scale")
-    return training_options(command, command, **{name: getattr(command, name) for name in own})
-
-
-def reconstruct(command: c.Reconstruct, console: Console) -> None:
-    """``gs2d reconstruct``."""
-    from gs2d.cli.reconstruct import reconstruct as run_all
-
-    run_all(command, console)
-
-
-def training_options(command: TrainingCommon, training: Training, **own: Any) -> Any:
-    """Return the pipeline's options: each field of `Training` by name, those of every training, a command's own."""
-    from gs2d.pipeline.options import TrainOptions
-
-    common = ("backend", "seed", "threads", "resume", "overwrite")
-    return TrainOptions(**training_values(training), **{name: getattr(command, name) for name in common}, **own)
-
-
 def train(command: c.Train, console: Console) -> None:
     """``gs2d train``."""
     from gs2d.pipeline.train import train as run_training
 
-    run = run_training(train_options(command), console.on_event)
+    run = run_training(command, console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console)
 
 
 def demo(command: c.Demo, console: Console) -> None:
     """``gs2d demo``."""
-    from gs2d.pipeline.demo import DemoOptions
     from gs2d.pipeline.demo import demo as run_demo
 
-    options = DemoOptions(
-        out=command.out,
-        backend=command.backend,
-        seed=command.seed,
-        threads=command.threads,
-        resume=command.resume,
-        overwrite=command.overwrite,
-        schedule_scale=command.schedule_scale,
-        vary_exposure=command.vary_exposure,
-        exposure=command.exposure,
-        viewer=command.viewer,
-        viewer_port=command.viewer_port,
-        vary_poses=command.vary_poses,
-        refine_poses=command.refine_poses,
-        page=command.page,
-    )
-    run = run_demo(options, console.on_event)
+    run = run_demo(command, console.on_event)
     console.close()
     show_run(run.path, run.metrics(), console)
 
@@ -98,7 +62,6 @@ def demo(command: c.Demo, console: Console) -> None:
 def mesh(command: c.Mesh, console: Console) -> None:
     """``gs2d mesh``."""
     from gs2d.pipeline.mesh import mesh_run
-    from gs2d.pipeline.options import MeshOptions
 
     options = MeshOptions(**values(MeshOptions, command))
     if command.texture:
@@ -113,16 +76,9 @@ def mesh(command: c.Mesh, console: Console) -> None:
 
 
 def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None:
-    from gs2d.pipeline.options import TextureOptions
     from gs2d.pipeline.texture import texture_run
 
-    options = TextureOptions(
-        faces=command.faces,
-        size=command.texture_size,
-        source=command.texture_from,
-        downscale=command.texture_downscale,
-    )
-    result = texture_run(command.run, options, mesh_options, console.on_event, out=command.out, threads=command.threads)
+    result = texture_run(command.run, command, mesh_options, console.on_event, out=command.out, threads=command.threads)
     console.close()
     size, unseen = result["texture_size"], result["texels_unseen"] / max(result["texels"], 1)
     console.say(f"{result['files'][0]}: {result['faces']:,} triangles, {result['bytes'] / 1e6:.1f} MB")
@@ -132,9 +88,8 @@ def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None
 
 def _refuse_texture_options(command: c.Mesh) -> None:
     """Refuse an option that would do nothing."""
-    defaults = c.Mesh(run=command.run)
-    for name in ("faces", "texture_size", "texture_from", "texture_downscale"):
-        if getattr(command, name) != getattr(defaults, name):
+    for name, default in values(TextureOptions, TextureOptions()).items():
+        if getattr(command, name) != default:
             raise ProtocolError(f"--{name.replace('_', '-')} belongs to --texture, which was not given; give both")
 
 
@@ -163,10 +118,9 @@ def render(command: c.Render, console: Console) -> None:
 
 def view(command: c.View, console: Console) -> None:
     """``gs2d view``: until Ctrl-C."""
-    from gs2d.pipeline.view import ViewOptions, open_viewer, serve
+    from gs2d.pipeline.view import open_viewer, serve
 
-    options = ViewOptions(**values(ViewOptions, command))
-    viewer = open_viewer(command.path, options, console.on_event)
+    viewer = open_viewer(command.path, command, console.on_event)
     try:
         console.close()
         console.say(f"{viewer.url}  (Ctrl-C ends it)")
@@ -190,10 +144,8 @@ def page(command: c.Page, console: Console) -> None:
 def evaluate(command: c.Evaluate, console: Console) -> None:
     """``gs2d evaluate``."""
     from gs2d.pipeline.evaluate import evaluate_run
-    from gs2d.pipeline.options import EvaluateOptions
 
-    options = EvaluateOptions(**values(EvaluateOptions, command))
-    result = evaluate_run(command.run, options, console.on_event, threads=command.threads)
+    result = evaluate_run(command.run, command, console.on_event, threads=command.threads)
     console.close()
     rows = [row for split in ("train", "test") for row in score_rows(split, result.get(split))]
     if command.match_exposure:
@@ -255,18 +207,37 @@ def recipes(command: c.Recipes, console: Console) -> None:
     console.result(to_json(recipe))
 
 
-def table(command: c.TableCommon, console: Console) -> None:
+def table(command: c.Paper | c.Sweep, console: Console) -> None:
     """``gs2d paper`` and ``gs2d sweep``."""
     from gs2d.cli.paper import show_table
 
     show_table(command, console)
 
 
+def reconstruct(command: c.Reconstruct, console: Console) -> None:
+    """``gs2d reconstruct``: then the figures, the files and the next command."""
+    from gs2d.core.json_files import read_json
+    from gs2d.io.run_dir import PAGE
+    from gs2d.pipeline.reconstruct import CAPTURE
+    from gs2d.pipeline.reconstruct import reconstruct as run_all
+    from gs2d.sfm.workspace import POSES_JSON
+
+    run = run_all(command, console.on_event)
+    console.close()
+    show_run(run.path, run.metrics(), console, extra={"poses": read_json(run.path / CAPTURE / POSES_JSON)})
+    console.say(f"look at it: open {PAGE} in a browser, or gs2d view {shlex.quote(str(run.path))}")
+
+
 def poses(command: c.Poses, console: Console) -> None:
     """``gs2d poses``."""
-    from gs2d.cli.poses import poses as find
+    from gs2d.cli.poses import poses_lines
+    from gs2d.pipeline.sfm import find_poses
 
-    find(command, console)
+    result = find_poses(command, console.on_event)
+    console.close()
+    for line in poses_lines(result):
+        console.say(line)
+    console.result(result)
 
 
 def doctor(command: c.Doctor, console: Console) -> None:

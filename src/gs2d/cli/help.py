@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import gs2d
 from gs2d.cli.catalogue import Option, about, options_of
+from gs2d.cli.commands import Common
 from gs2d.cli.layout import entries, terminal_width, wrapped
-from gs2d.cli.options import Common, Finding, Training, TrainingCommon
 from gs2d.cli.usage import NAMES
+from gs2d.pipeline.options import Finding, HowItRuns, Training
 
 _SLOGAN = "Photographs in; a surface mesh and a scene of 2D Gaussian splats out."
 _FIRST_DAY = (
@@ -40,14 +41,14 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
     "mesh": ("run", "out", "texture", "voxel", "bbox", "unbounded"),
     "render": ("run", "split", "orbit", "flight", "video", "out"),
     "evaluate": ("run", "ground_truth", "thresholds", "lpips_weights"),
-    "paper": ("table", "data", "out", "scenes", "schedule_scale", "no_train"),
-    "sweep": ("recipes", "data", "out", "seeds", "schedule_scale", "no_train"),
+    "paper": ("table", "data", "out", "scenes", "schedule_scale", "train"),
+    "sweep": ("recipes", "data", "out", "seeds", "schedule_scale", "train"),
 }  # fmt: skip
 _OWN = "Of this command"
 _TITLES = {  # in the order in which they are shown
     Finding: "Cameras of photographs",
     Training: "Training",
-    TrainingCommon: "How it runs",
+    HowItRuns: "How it runs",
     Common: "What is printed",
 }
 

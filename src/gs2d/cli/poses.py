@@ -5,23 +5,7 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-from gs2d.cli import commands as c
-from gs2d.cli.console import Console
-from gs2d.cli.options import values
-
 _MAX_LINES = 12  # of photographs without a place; poses.json has them all
-
-
-def poses(command: c.Poses, console: Console) -> None:
-    """``gs2d poses``."""
-    from gs2d.pipeline.sfm import PosesOptions, find_poses
-
-    options = PosesOptions(**values(PosesOptions, command))
-    result = find_poses(options, console.on_event)
-    console.close()
-    for line in poses_lines(result):
-        console.say(line)
-    console.result(result)
 
 
 def poses_lines(result: dict[str, Any]) -> list[str]:

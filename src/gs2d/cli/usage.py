@@ -112,17 +112,20 @@ def _check_values(option: Option, values: Sequence[str], *, given: bool) -> None
         many = f"{option.count} numbers, got {len(values)}" if option.count > 1 else f"a value: {option.usage}"
         raise UsageError(f"{option.name} needs {many}")
     for value in values:
-        if option.choices and value not in (*option.choices, "None"):
+        if option.choices and value not in option.choices and not _is_default(option, value):
             meant = _meant(value, option.choices)
             raise UsageError(f"{option.name} must be {_listed(option.choices, 'or')}, got {value!r}{meant}")
-        if option.kind in (int, float) and not option.choices and not _converts(option.kind, value):
+        if option.kind in (int, float) and not _is_default(option, value) and not _converts(option.kind, value):
             what = "a whole number" if option.kind is int else "a number"
             raise UsageError(f"{option.name} must be {what}, got {value!r}")
 
 
+def _is_default(option: Option, value: str) -> bool:
+    """Whether a value is tyro's word for a default that is no value."""
+    return value == "None" and option.default is None
+
+
 def _converts(kind: type, value: str) -> bool:
-    if value == "None":  # tyro's word for the default
-        return True
     try:
         kind(value)
     except ValueError:

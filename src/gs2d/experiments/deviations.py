@@ -10,7 +10,7 @@ from gs2d.config.schedule import scale_schedule
 from gs2d.core.images import image_size
 from gs2d.errors import Gs2dError
 from gs2d.experiments.aggregate import NOT_YET, Results, surface_metric
-from gs2d.experiments.plan import PaperOptions
+from gs2d.experiments.options import TableOptions
 from gs2d.experiments.scenes import FoundScene, missing_scenes, unreadable
 from gs2d.experiments.tables import DTU, METRICS, NERF_SYNTHETIC, TNT, PaperTable
 from gs2d.io.run_dir import machine, versions
@@ -21,7 +21,7 @@ OFFICIAL_EVALUATORS = {DTU: "dtu", TNT: "tnt"}  # of the paper's surfaces, by da
 
 
 def deviations_of(
-    options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTable, results: Results
+    options: TableOptions, scenes: Sequence[FoundScene], table: PaperTable, results: Results
 ) -> list[str]:
     """Every difference that is known, the most important first."""
     found = []
@@ -133,7 +133,7 @@ def _surfaces(results: Results) -> Iterator[str]:
         yield f"{scene}: do not believe the surface scores of {', '.join(runs)}: {why}"
 
 
-def _scenes(options: PaperOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
+def _scenes(options: TableOptions, scenes: Sequence[FoundScene], table: PaperTable) -> Iterator[str]:
     """Other photographs, other scenes, pieces of them that are missing."""
     if table.of_paper:
         yield from _other_scenes(scenes, table)

@@ -16,10 +16,11 @@ from gs2d.errors import RunError
 from gs2d.experiments.aggregate import FIGURES, Results, Row, Verdict, judge, read_cell
 from gs2d.experiments.deviations import deviations_of
 from gs2d.experiments.execute import execute, failures
-from gs2d.experiments.plan import PaperOptions, Plan, commands_of, make_plan, paper_command
+from gs2d.experiments.options import PaperOptions, SweepOptions, TableOptions
+from gs2d.experiments.plan import Plan, commands_of, make_plan, paper_command
 from gs2d.experiments.render import to_csv, to_latex, to_markdown, write_page
 from gs2d.experiments.scenes import FoundScene
-from gs2d.experiments.tables import DTU, SWEEP, TNT, PaperRow, PaperTable
+from gs2d.experiments.tables import DTU, TNT, PaperRow, PaperTable
 from gs2d.io.run_dir import machine, make_folder, versions
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 
@@ -51,7 +52,7 @@ class PaperResult:
     unfinished: int
 
 
-def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
+def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> PaperResult:
     """Train what a table needs and is not there, and write the table.
 
     A run that fails leaves its cells empty, with the reason; the others go on.
@@ -64,7 +65,7 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
     asked = make_plan(options)
     check_folder(asked)
     plan = with_other_rows(asked)
-    others = [name for name in plan.options.recipes if name not in options.recipes]
+    others = [row.name for row in plan.table.rows if row not in asked.table.rows]
     if others:
         on_event(Notice(f"{options.out} has rows of earlier commands, which stay: {', '.join(others)}"))
     if options.train:
@@ -87,14 +88,14 @@ def paper(options: PaperOptions, on_event: OnEvent = ignore) -> PaperResult:
 
 def with_other_rows(plan: Plan) -> Plan:
     """Return a sweep's plan with the rows of earlier commands too: none takes them away."""
-    path = plan.options.out / ABOUT
-    if plan.options.table != SWEEP or not path.exists():
+    options, path = plan.options, plan.options.out / ABOUT
+    if not isinstance(options, SweepOptions) or not path.exists():
         return plan
     found = read_json(path).get("recipes")
     if not isinstance(found, list):
         raise RunError(f"{path} must list the recipes of its sweep, got {found!r}; choose another --out")
-    names = tuple(dict.fromkeys([*map(str, found), *plan.options.recipes]))
-    return plan if names == plan.options.recipes else make_plan(replace(plan.options, recipes=names))
+    names = tuple(dict.fromkeys([*map(str, found), *options.recipes]))
+    return plan if names == options.recipes else make_plan(replace(options, recipes=names))
 
 
 def check_folder(plan: Plan) -> None:
@@ -120,7 +121,7 @@ def check_folder(plan: Plan) -> None:
             )
 
 
-def _defining(options: PaperOptions) -> dict[str, Any]:
+def _defining(options: TableOptions) -> dict[str, Any]:
     return {name: getattr(options, name) for name in FIXED}
 
 

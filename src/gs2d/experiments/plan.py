@@ -10,7 +10,6 @@ import itertools
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 from gs2d.config.presets import RECIPES, get_recipe
@@ -19,70 +18,18 @@ from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
 from gs2d.errors import RecipeError
 from gs2d.experiments.execute import Job, stage_keys
+from gs2d.experiments.options import PaperOptions, SweepOptions, TableOptions
 from gs2d.experiments.scenes import FoundScene, find_scenes
-from gs2d.experiments.tables import PAPER_TABLES, SWEEP, PaperTable, recipe_table
+from gs2d.experiments.tables import PAPER_TABLES, PaperTable, recipe_table
 from gs2d.io.run_dir import versions
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperOptions:
-    """Which table, of which scenes, how.
-
-    Attributes
-    ----------
-    table : str
-        A key of ``PAPER_TABLES``, or ``SWEEP``: the rows are ``recipes``.
-    recipes : tuple of str
-        Names; only for ``SWEEP``.
-    data, out : Path
-        Captures; where runs, table and page go.
-    scenes : tuple of str
-        Names; empty = all that are found.
-    protocol, backend : str
-    schedule_scale : float
-    downscale : int or None
-        None = what the protocol of each scene says (DTU and TnT: 2).
-    seeds : tuple of int
-    overrides : tuple of str
-        ``stage.field=value``; those of a stage reach the recipes that have it.
-    slots : int or None
-        Runs at the same time; None = one a GPU, or one.
-    cache : Path or None
-        Stage cache; None = ``out/cache``. Shared by several tables it trains their common stages once.
-    truth : Path or None
-        Folder of ground truths that do not lie beside their captures.
-    lpips_weights : Path or None
-    threads : int or None
-        CPU threads of each of several runs; None = what is there, divided among them.
-    train : bool
-        False: only tabulate what is there.
-    """
-
-    table: str
-    data: Path
-    out: Path
-    recipes: tuple[str, ...] = ()
-    scenes: tuple[str, ...] = ()
-    protocol: str = "auto"
-    backend: str = "auto"
-    schedule_scale: float = 1.0
-    downscale: int | None = None
-    seeds: tuple[int, ...] = (0,)
-    overrides: tuple[str, ...] = ()
-    slots: int | None = None
-    cache: Path | None = None
-    truth: Path | None = None
-    lpips_weights: Path | None = None
-    threads: int | None = None
-    train: bool = True
 
 
 @dataclass(frozen=True)
 class Plan:
     """A table's work: its scenes, and the job of every (recipe of a row, scene, seed)."""
 
-    options: PaperOptions
+    options: PaperOptions | SweepOptions
     table: PaperTable
     scenes: tuple[FoundScene, ...]
     cells: Mapping[tuple[str, str, int], Job]
@@ -93,7 +40,7 @@ class Plan:
         return tuple({job.name: job for job in self.cells.values()}.values())
 
 
-def make_plan(options: PaperOptions) -> Plan:
+def make_plan(options: PaperOptions | SweepOptions) -> Plan:
     """Decide everything that can be decided, and can be wrong, before a photograph is read.
 
     Raises
@@ -120,16 +67,14 @@ def make_plan(options: PaperOptions) -> Plan:
     return Plan(options, table, scenes, cells)
 
 
-def _table(options: PaperOptions) -> PaperTable:
+def _table(options: PaperOptions | SweepOptions) -> PaperTable:
     """Return the rows that are asked for."""
-    if options.table == SWEEP:
+    if isinstance(options, SweepOptions):
         if not options.recipes:
             raise RecipeError("`gs2d sweep` needs the name of a recipe or more; `gs2d recipes` lists them")
         for name in options.recipes:
             get_recipe(name)  # a name that is wrong is said before anything is looked for
         return recipe_table(options.recipes)
-    if options.recipes:
-        raise RecipeError(f"recipes must be those of the table {options.table!r}, got {', '.join(options.recipes)}")
     if options.table not in PAPER_TABLES:
         raise RecipeError(f"no table {options.table!r} in the paper; there is {', '.join(PAPER_TABLES)}")
     return PAPER_TABLES[options.table]
@@ -142,7 +87,7 @@ def canonical_recipe(name: str) -> str:
     return next(same, name)
 
 
-def trained_recipe(name: str, options: PaperOptions) -> Recipe:
+def trained_recipe(name: str, options: TableOptions) -> Recipe:
     """Return a named recipe at the schedule and with the changes of the options."""
     recipe = scale_schedule(get_recipe(name), options.schedule_scale)
     return validate(apply_overrides(recipe, fitting_overrides(recipe, options.overrides)))
@@ -162,7 +107,7 @@ def _check_overrides(overrides: Sequence[str], recipes: Sequence[Recipe]) -> Non
             raise RecipeError(f"--set {text} fits no recipe of the table; their stages are {', '.join(stages)}")
 
 
-def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> Job:
+def make_job(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe, seed: int) -> Job:
     """Return the run of a recipe (``trained_recipe`` of the name) on a scene."""
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
@@ -195,7 +140,7 @@ def make_job(options: PaperOptions, scene: FoundScene, name: str, recipe: Recipe
     )
 
 
-def _wanted(scene: FoundScene, options: PaperOptions) -> Iterator[str]:
+def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
     """Yield what is scored: a run that was scored without it is scored again."""
     if scene.scored:
         yield f"surface: {scene.truth.resolve() if scene.truth else 'official'}"
@@ -204,9 +149,9 @@ def _wanted(scene: FoundScene, options: PaperOptions) -> Iterator[str]:
 
 
 # -- the commands that do it -------------------------------------------------------------------------------------------
-def paper_command(options: PaperOptions) -> str:
+def paper_command(options: PaperOptions | SweepOptions) -> str:
     """Return the command that makes a table."""
-    words = ["sweep", *options.recipes] if options.table == SWEEP else ["paper", options.table]
+    words = ["sweep", *options.recipes] if isinstance(options, SweepOptions) else ["paper", options.table]
     return _command(words, options, ("table", "recipes", "slots", "threads", "train"))
 
 

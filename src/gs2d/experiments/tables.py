@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Any
 
 from gs2d.config.presets import TABLES
+from gs2d.experiments.options import SWEEP
 
-SWEEP = "sweep"  # the name of a table of chosen recipes
 TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result
 METRICS: Mapping[str, str] = MappingProxyType(
     {"fscore": "F-score", "chamfer": "Chamfer", "psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from gs2d.errors import RunError
@@ -11,7 +10,7 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.evaluate import evaluate_run
 from gs2d.pipeline.events import OnEvent, Phase, Plan, Step, ignore
 from gs2d.pipeline.job import check_train_options
-from gs2d.pipeline.options import EvaluateOptions, TrainOptions
+from gs2d.pipeline.options import DemoOptions, EvaluateOptions, TrainOptions
 from gs2d.pipeline.plan import DEMO
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.train import check_viewer, train
@@ -22,38 +21,13 @@ from gs2d.synthetic.perturb_poses import TRUTH as TRUE_POSES
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
 TITLE = "gs2d demo: a still life whose true surface is known"
-TRAIN_VIEWS, TEST_VIEWS, SIZE = 40, 8, 256
 SCHEDULE_SCALE = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
-class DemoOptions:
-    """Where and how; see ``TrainOptions``. ``size`` is the width and height of the photographs, px.
-
-    With ``vary_exposure`` the training photographs get random gains (``synthetic.perturb_exposure``), with
-    ``vary_poses`` their cameras are said to be a little off where they were (``synthetic.perturb_poses``).
-    """
-
-    out: Path = Path("runs/demo")
-    backend: str = "auto"
-    seed: int = 0
-    threads: int | None = None
-    resume: bool = False
-    overwrite: bool = False
-    schedule_scale: float | None = None
-    vary_exposure: bool = False
-    exposure: bool = False
-    viewer: bool = False
-    viewer_port: int | None = None
-    vary_poses: bool = False
-    refine_poses: bool = False
-    page: bool = True
-    train_views: int = TRAIN_VIEWS
-    test_views: int = TEST_VIEWS
-    size: int = SIZE
-
-
-def demo(options: DemoOptions = DemoOptions(), on_event: OnEvent = ignore) -> RunFolder:
+def demo(
+    options: DemoOptions = DemoOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+) -> RunFolder:
     """Run the demo. An earlier demo in the same folder is replaced, any other run there is not.
 
     Raises
@@ -122,6 +96,7 @@ def _training(options: DemoOptions, *, overwrite: bool) -> TrainOptions:
         backend=options.backend,
         seed=options.seed,
         exposure=options.exposure,
+        no_exposure=not options.exposure,
         viewer=options.viewer,
         viewer_port=options.viewer_port,
         refine_poses=options.refine_poses,

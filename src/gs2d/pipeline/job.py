@@ -189,7 +189,7 @@ def check_train_options(options: TrainOptions) -> Recipe:
     """
     if options.robust not in ROBUST:
         raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
-    recipe = _recipe_of(options, robust=options.robust != "off", exposure=bool(options.exposure))
+    recipe = _recipe_of(options, robust=options.robust != "off", exposure=bool(options.learns_exposure))
     if options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     if options.checkpoint_every < 1:
@@ -229,8 +229,8 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
     """Return the recipe as this capture needs it, and say what was decided.
 
     Where ``options.robust`` is "auto" it is made robust under a protocol that says so, if the capture tells which
-    sparse points its photographs show; where ``options.exposure`` is None, exposures are learned if those points say
-    that the photographs differ.
+    sparse points its photographs show; where ``options.learns_exposure`` is None, exposures are learned if those
+    points say that the photographs differ.
 
     Raises
     ------
@@ -241,8 +241,8 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
     if lacks is not None:
         robust = False
         on_event(Notice(f"no dense start and no known free space: {lacks}"))
-    exposure = bool(options.exposure)
-    if robust and options.exposure is None and (found := point_gains(scene)) is not None:
+    exposure = bool(options.learns_exposure)
+    if robust and options.learns_exposure is None and (found := point_gains(scene)) is not None:
         exposure = found.spread >= DIFFERS
         least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
         what = "learned for each" if exposure else "taken to be one (--exposure learns them)"

@@ -1,14 +1,26 @@
-"""What the jobs of the pipeline are asked to do. Pure Python; never imports torch."""
+"""What the verbs of gs2d are asked to do: one class for each, in Python and on the command line.
+
+tyro makes the command line of these classes: a field is an option, its docstring the help, its default the default.
+``Positional`` fields have no flag; ``Fixed`` ones are not of the command line. Pure Python: `gs2d --help` is instant.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, UseAppendAction, arg
 
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
+from gs2d.errors import RecipeError
 
+LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
+BoxOption = Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
+Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), UseAppendAction]
+Photos = Annotated[Positional[Path], arg(metavar="PHOTOS")]
 
 
 def paths_of(options: object, *names: str) -> None:
@@ -18,194 +30,283 @@ def paths_of(options: object, *names: str) -> None:
             object.__setattr__(options, name, Path(value))
 
 
+def values(kind: type[Any], options: Any) -> dict[str, Any]:
+    """Return the values that ``options`` has for the fields of a class of options, by name."""
+    return {entry.name: getattr(options, entry.name) for entry in fields(kind)}
+
+
+# -- what several verbs share ------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """One training run.
+class HowItRuns:
+    """How training runs: options of every verb that trains."""
 
-    Attributes
-    ----------
-    scene : Path
-        The capture.
-    out : Path
-        Run folder.
-    recipe : str or Recipe
-        A registered name, or the recipe itself.
-    protocol : str or Protocol
-        A name, "auto" (by the format of the capture), or the protocol itself.
-    backend, format : str
-        Names, or "auto".
-    downscale : int
-    schedule_scale : float
-        Fraction of the full schedule.
-    overrides : tuple of str
-        ``stage.field=value``; applied after the schedule is scaled, so that a number means what it says.
-    seed : int
-    robust : str
-        "on", "off", or "auto": a dense start, free space and opacity decay (``recipes.with_robustness``) where the
-        protocol says so and the capture tells which sparse points its photographs show.
-    exposure : bool or None
-        Learn an exposure and a white balance for each photograph (``recipes.with_exposure``); None: in robust training
-        where its photographs differ.
-    refine_poses : bool
-        Learn where each photograph was taken from, beginning where the capture says (``recipes.with_poses``).
-    depth_prior : str or None
-        Train with known depths (``recipes.with_depth_prior``) of this source: "auto", "sparse", "sensor", "relative".
-    normal_prior : bool
-        Train with known normals (``recipes.with_normal_prior``).
-    resume, overwrite : bool
-        What to do with a run that is already in ``out``.
-    start_from : Path or None
-        Another run, whose stages are taken as far as they are the same.
-    cache : Path or None
-        Folder of finished stages, shared by runs.
-    threads : int or None
-        CPU threads; None = all that this process may use.
-    checkpoint_every, checkpoint_seconds : int, float
-        A checkpoint is written after so many iterations, or so many seconds, whichever comes first.
-    stage2_cache_mb : int
-        MiB for cached views in stages that train only the colours of a row group (cpu backend); 0 = none. A part of
-        the run's definition: which views are cached decides the rounding.
-    title : str or None
-        Heading of the report; None = the name of the capture.
-    shown_views : int
-        Views that are rendered after each stage for the report.
-    allowed : tuple of str
-        Names that may already be in ``out`` (the demo's capture).
-    test_every : int or None
-        Every n-th view is a test view, 0 = none; None: what the protocol says.
-    viewer : bool
-        Show the training in the browser while it runs.
-    viewer_port : int or None
-        Port of that page; None = the first free one from 8080 on.
-    estimate : bool
-        Tell before training how long it will take and what is held out.
-    subject_box : six floats or None
-        The box of the subject, world units (``MeshOptions``); None: it is found.
-    whole_scene : bool
-        Mesh everything, not the subject.
-    page : bool
-        Write ``scene.html`` at the end.
-    """
-
-    scene: Path
-    out: Path
-    recipe: str | Recipe = "2dgs-r"
-    protocol: str | Protocol = "auto"
     backend: str = "auto"
-    format: str = "auto"
-    downscale: int = 1
-    schedule_scale: float = 1.0
-    overrides: tuple[str, ...] = ()
+    """Rasterizer: auto (the fastest that this machine has), cpu, cuda, reference; `gs2d doctor` lists them."""
     seed: int = 0
-    robust: str = "auto"
-    exposure: bool | None = None
-    refine_poses: bool = False
-    depth_prior: str | None = None
-    normal_prior: bool = False
-    resume: bool = False
-    overwrite: bool = False
-    start_from: Path | None = None
-    cache: Path | None = None
+    """Seed of every random choice; the same seed gives the same bytes."""
     threads: int | None = None
-    checkpoint_every: int = 10_000
-    checkpoint_seconds: float = 120.0
-    stage2_cache_mb: int = 1024
-    title: str | None = None
-    shown_views: int = 3
-    allowed: tuple[str, ...] = ()
+    """CPU threads (default: all cores that this process may use)."""
+    resume: bool = False
+    """Continue the run in --out from its last checkpoint (or start, if there is none)."""
+    overwrite: bool = False
+    """Replace the run in --out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """What is trained and how: options of `gs2d train`, and of every command that trains on photographs."""
+
+    recipe: Annotated[str | Recipe, arg(constructor=str)] = "2dgs-r"
+    """What is trained; `gs2d recipes` lists them."""
+    protocol: Annotated[str | Protocol, arg(constructor=str)] = "auto"
+    """What depends on the data set: background, depth, near plane, fusion limits."""
+    robust: Literal["auto", "on", "off"] = "auto"
+    """Keep fog out: a dense start, free space kept free, opacity that decays; auto: for photographs of no data set."""
+    exposure: bool = False
+    """Learn an exposure and a white balance for each photograph (robust training does where photographs differ)."""
+    no_exposure: bool = False
+    """Take all photographs to have one exposure."""
     test_every: int | None = None
-    viewer: bool = False
-    viewer_port: int | None = None
-    estimate: bool = False
-    subject_box: Box | None = None
-    whole_scene: bool = False
+    """Every so many-th view, by name, is a test view; 0: all train (default: what the protocol says, mostly 8)."""
+    refine_poses: bool = False
+    """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
+    depth_prior: Literal["auto", "sparse", "sensor", "relative"] | None = None
+    """Train with known depths: of sparse points, or of maps in depths/, a sensor's or relative; auto: what is there."""
+    normal_prior: bool = False
+    """Train with known normals, of maps in normals/."""
+    start_from: Annotated[Path | None, arg(name="from", metavar="RUN")] = None
+    """Take the stages that this recipe shares with another run from that run."""
+    cache: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Keep finished stages here, and take them from here when scene, settings and stages are the same."""
+    overrides: Overrides = ()
+    """Change the recipe, e.g. --set refine.iterations=2000; may be repeated."""
+    checkpoint_every: int = 10_000
+    """Iterations between checkpoints."""
+    checkpoint_seconds: float = 120.0
+    """Seconds between checkpoints, whichever comes first."""
     page: bool = True
+    """Do not write scene.html, the splats as a page for any browser, at the end."""
+    viewer: bool = False
+    """Show the training in the browser while it runs; the address is printed, and nothing of the result changes."""
+    viewer_port: int | None = None
+    """With --viewer: port of the page (default: the first free one from 8080 on)."""
+    subject_box: BoxOption = None
+    """What the photographs are of, as a box (default: what most cameras look at). The mesh is of it."""
+    whole_scene: Annotated[bool, arg(name="scene")] = False
+    """Mesh everything, not only the subject."""
+    stage2_cache_mb: int = 1024
+    """MiB for cached views in stage 2, about 5 MiB a view of 400x400 (0 = none; results differ by rounding)."""
+
+    @property
+    def learns_exposure(self) -> bool | None:
+        """Whether exposures are learned; None: in robust training where the photographs differ.
+
+        Raises
+        ------
+        RecipeError
+            Both are asked for.
+        """
+        if self.exposure and self.no_exposure:
+            raise RecipeError("--exposure and --no-exposure contradict each other, got both; leave one out")
+        return True if self.exposure else False if self.no_exposure else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """How the cameras of photographs are found: options of `gs2d poses`, and of every command that begins with it."""
+
+    cameras: Literal["auto", "one", "each"] = "auto"
+    """Which photographs share a camera: same folder, size, camera, lens and focal length; all; none."""
+    camera_model: LensModel = "auto"
+    """Lens (auto: with one focal length; the simplest that observations held out do not speak against)."""
+    matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
+    """Pairs to match: all; next ones by name (frames of a video); next and most similar ones. auto: all up to 150."""
+    overlap: int = 10
+    """Next photographs that each is matched with, where not all pairs are."""
+    neighbours: int = 40
+    """Similar photographs that each is matched with, where not all pairs are."""
+    max_size: int | None = None
+    """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
+    feature_size: int = 1600
+    """Longer side on which features are found, px: larger is slower and a little more accurate."""
+    frames: int = 100
+    """Frames to take of a video, each the sharpest of its stretch (needs ffmpeg); photographs are all taken."""
+    link: bool = False
+    """Hard links instead of copies of the photographs: no disk is used."""
+
+
+# -- verbs that make a run ---------------------------------------------------------------------------------------------
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(Training, HowItRuns):
+    """One training run. Overrides are applied after the schedule is scaled: a number means what it says."""
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """Folder of the capture, or a .zip of it: COLMAP, Blender or nerfstudio transforms, DTU, OpenSfM or OpenDroneMap,
+    Metashape, Meshroom."""
+    out: Annotated[Path, arg(metavar="RUN")]
+    """Run folder to make."""
+    format: str = "auto"
+    """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
+    downscale: int = 1
+    """Shrink the photographs by this integer, area-filtered."""
+    schedule_scale: float = 1.0
+    """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
+    title: Annotated[str | None, Fixed, Suppress] = None
+    """Heading of the report; None: the name of the capture."""
+    shown_views: Annotated[int, Fixed, Suppress] = 3
+    """Views that are rendered after each stage for the report."""
+    allowed: Annotated[tuple[str, ...], Fixed, Suppress] = ()
+    """Names that may already be in ``out`` (the demo's capture)."""
+    estimate: Annotated[bool, Fixed, Suppress] = False
+    """Tell before training how long it will take and what is held out."""
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "start_from", "cache")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshOptions:
-    """How the surface is extracted; None is derived from the scene or taken from the run's protocol.
+class PosesOptions(Finding):
+    """One run of structure from motion."""
 
-    Attributes
-    ----------
-    voxel, truncation, depth_limit : float or None
-        World units.
-    bbox : six floats or None
-        Smallest and largest corner of the box that is kept, world units; with ``unbounded`` that of the finest voxels.
-    unbounded : bool
-        Fuse what lies far away too, in voxels that grow with the distance.
-    max_gib : float
-        The volume will not grow beyond this.
-    depth : str or None
-        "mean" or "median".
-    keep_components : int or None
-        The so many largest connected pieces; 0 = all; None = the protocol's.
-    subject_box : six floats or None
-        The box of the subject from now on, world units; None: what the run says, or what is found.
-    whole_scene : bool
-        Everything, not the subject, also where the protocol meshes the subject.
-    """
+    photos: Photos
+    """Folder of photographs, with or without sub-folders, or a video; it is only read."""
+    out: Annotated[Path, arg(metavar="CAPTURE")]
+    """Capture folder to make: images/, sparse/0, poses.json, poses.png. It appears when all is done."""
+    threads: int | None = None
+    """CPU threads (default: all cores that this process may use)."""
+    seed: int = 0
+    """Seed; the same bytes for up to 50 photographs or with --threads 1, else cameras differ by rounding."""
+    overwrite: bool = False
+    """Replace the capture in --out, if this command made it."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "photos", "out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions(HowItRuns):
+    """From photographs to a mesh."""
+
+    photos: Photos
+    """Folder of photographs, with or without sub-folders, or a video; it is only read."""
+    out: Annotated[Path, arg(metavar="RUN")]
+    """Run folder to make; the photographs with their cameras go to its sub-folder `capture`."""
+    quality: Literal["draft", "normal", "full"] = "normal"
+    """How long is trained on how large pictures. On a CPU: 0.03 of the full schedule at 400 px, 0.1 at 800, all at
+    1600; on a GPU 0.1 at 800 px, 0.5 at 1600, all at 1600. The time it will take is told before it begins."""
+    schedule_scale: float | None = None
+    """Fraction of the full schedule (default: by --quality)."""
+    downscale: int | None = None
+    """Shrink the photographs by this integer for training (default: by --quality)."""
+    texture: bool = False
+    """Also write mesh.glb, with a texture from the photographs."""
+    training: Annotated[Training, OmitArgPrefixes] = field(default_factory=Training)
+    """As in `gs2d train`."""
+    finding: Annotated[Finding, OmitArgPrefixes] = field(default_factory=Finding)
+    """As in `gs2d poses`."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "photos", "out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(HowItRuns):
+    """Where and how a synthetic capture is made and trained."""
+
+    out: Path = Path("runs/demo")
+    """Run folder; the capture goes to its sub-folder `capture`. An earlier demo there is replaced."""
+    schedule_scale: float | None = None
+    """Fraction of the full schedule (default: what fits five minutes on two cores)."""
+    vary_exposure: bool = False
+    """Photograph as a camera on automatic does: training pictures differ in exposure and white balance."""
+    exposure: bool = False
+    """Learn an exposure and a white balance for each photograph, as in `gs2d train`."""
+    vary_poses: bool = False
+    """Say wrong places for the cameras: those of training pictures are off by half a degree and half a percent."""
+    refine_poses: bool = False
+    """Learn where each photograph was taken from, as in `gs2d train`."""
+    page: bool = True
+    """Do not write scene.html at the end, as in `gs2d train`."""
+    viewer: bool = False
+    """Show the training in the browser while it runs, as in `gs2d train`."""
+    viewer_port: int | None = None
+    """With --viewer: port of the page (default: the first free one from 8080 on)."""
+    train_views: Annotated[int, Fixed, Suppress] = 40
+    test_views: Annotated[int, Fixed, Suppress] = 8
+    size: Annotated[int, Fixed, Suppress] = 256
+    """Width and height of the photographs, px."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "out")
+
+
+# -- verbs on a run that is there --------------------------------------------------------------------------------------
+@dataclass(frozen=True, kw_only=True)
+class MeshOptions:
+    """How the surface is extracted; what is None is derived from the scene or taken from the run's protocol."""
 
     voxel: float | None = None
+    """Voxel size in world units (default: from the scene)."""
     truncation: float | None = None
+    """Truncation distance in world units (default: from the voxel size)."""
     depth_limit: float | None = None
-    bbox: Box | None = None
+    """Ignore depth beyond this, in world units (default: from the scene)."""
+    bbox: BoxOption = None
+    """Keep only this box, not the subject's. With --unbounded: where the voxels are finest."""
+    subject_box: BoxOption = None
+    """What the photographs are of, from now on (default: what the run says, or what most cameras look at)."""
+    whole_scene: Annotated[bool, arg(name="scene")] = False
+    """Mesh everything, not only the subject."""
     unbounded: bool = False
+    """Mesh what lies far away too, in voxels that grow with the distance."""
     max_gib: float = 4.0
-    depth: str | None = None
+    """Memory for the fused volume; more is an error that names a voxel that fits."""
+    depth: Literal["mean", "median"] | None = None
+    """Depth that is fused (default: the run's protocol)."""
     keep_components: int | None = None
-    subject_box: Box | None = None
-    whole_scene: bool = False
+    """Keep the so many largest connected pieces (default: all that are not small)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TextureOptions:
-    """How the mesh gets its texture.
-
-    Attributes
-    ----------
-    faces : int
-        A larger mesh is simplified to this many triangles.
-    size : int or None
-        Side of the texture, texels; None = two texels for each pixel's length, as a power of two, at most 4096.
-    source : str
-        Where the colours come from: "photographs", or "renders" of the splats from the same cameras.
-    downscale : int or None
-        Of these photographs; None = as in training.
-    """
+    """How the mesh gets its texture."""
 
     faces: int = 50_000
-    size: int | None = None
-    source: str = "photographs"
-    downscale: int | None = None
+    """With --texture: simplify a larger mesh to so many triangles."""
+    texture_size: int | None = None
+    """With --texture: its side in texels (default: two for each pixel's length, at most 4096)."""
+    texture_from: Literal["photographs", "renders"] = "photographs"
+    """With --texture: colours from the photographs, or from the splats as they look from there."""
+    texture_downscale: int | None = None
+    """With --texture: shrink the photographs by this integer (default: as in training; 1 = their full size)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What is measured.
+    """What is measured."""
 
-    Attributes
-    ----------
-    ground_truth : Path or None
-        A PLY or OBJ file of the true surface (a mesh or points), or the folder of the official ground truth of DTU or
-        Tanks and Temples; None: what lies beside the capture, if anything does.
-    thresholds : tuple of float
-        Distances at which precision and recall are taken, world units; empty = 0.25, 0.5 and 1 % of the true diagonal.
-    lpips_weights : Path or None
-    match_exposure : bool
-        Score the test views once more, each half of a rendering matched in colour to the other half of its photograph.
-    match_poses : bool
-        Score the test views once more, each from where the splats look most like its photograph.
-    """
-
-    ground_truth: Path | None = None
-    thresholds: tuple[float, ...] = field(default=())
+    ground_truth: Annotated[Path | None, arg(metavar="MESH_OR_POINTS")] = None
+    """True surface (PLY, OBJ) in the capture's frame (DTU: mm), or the official folder of DTU or Tanks and Temples."""
+    thresholds: tuple[float, ...] = ()
+    """Distances at which precision and recall are taken, world units (default: 0.25, 0.5, 1 % of its size)."""
     lpips_weights: Path | None = None
+    """VGG-16 and LPIPS weights for the LPIPS metric."""
     match_exposure: bool = False
+    """Score test views once more, each half of a rendering matched in colour to the other half of its photograph."""
     match_poses: bool = False
+    """Score test views once more, each camera moved to where the splats look most like its photograph."""
 
     def __post_init__(self) -> None:
         paths_of(self, "ground_truth", "lpips_weights")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """How the page of the viewer is served."""
+
+    port: int | None = None
+    """Port of the page (default: the first free one from 8080 on)."""
+    host: str = "127.0.0.1"
+    """Address that is listened on; 0.0.0.0 lets other machines in, and there is no password."""
+    threads: int | None = None
+    """CPU threads."""

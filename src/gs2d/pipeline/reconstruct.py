@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -19,10 +19,18 @@ from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Plan, ignore
 from gs2d.pipeline.job import check_train_options
-from gs2d.pipeline.options import TrainOptions, paths_of
+from gs2d.pipeline.options import (
+    Finding,
+    HowItRuns,
+    PosesOptions,
+    ReconstructOptions,
+    Training,
+    TrainOptions,
+    values,
+)
 from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
 from gs2d.pipeline.report import report_again
-from gs2d.pipeline.sfm import ASKED_FOR, PosesOptions, check_poses_options, find_poses, placed_line
+from gs2d.pipeline.sfm import ASKED_FOR, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run
 from gs2d.pipeline.train import check_viewer, train
@@ -56,73 +64,31 @@ QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> de
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReconstructOptions:
-    """From photographs to a mesh.
+def poses_options(options: ReconstructOptions) -> PosesOptions:
+    """Return those of ``gs2d poses``, which puts the capture into the run folder."""
+    return PosesOptions(
+        photos=options.photos,
+        out=options.out / CAPTURE,
+        threads=options.threads,
+        seed=options.seed,
+        overwrite=options.overwrite,
+        **values(Finding, options.finding),
+    )
 
-    Attributes
-    ----------
-    photos, out : Path
-        The folder of photographs or the video, which is only read, and the run folder.
-    quality : str
-        A name of ``QUALITIES``: it sets schedule and picture size by the device of the backend.
-    schedule_scale : float or None
-        Fraction of the full schedule; None: what ``quality`` says.
-    downscale : int or None
-        By what the photographs are shrunk for training; None: what ``quality`` says.
-    texture : bool
-        Write ``mesh.glb`` too.
-    threads, seed, resume, overwrite
-        Of both commands; see ``TrainOptions``.
-    finding, training : mapping
-        The other fields of ``PosesOptions`` and of ``TrainOptions``, by their names.
-    """
 
-    photos: Path
-    out: Path
-    quality: str = "normal"
-    schedule_scale: float | None = None
-    downscale: int | None = None
-    texture: bool = False
-    threads: int | None = None
-    seed: int = 0
-    resume: bool = False
-    overwrite: bool = False
-    finding: Mapping[str, Any] = field(default_factory=dict)
-    training: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        paths_of(self, "photos", "out")
-
-    @property
-    def poses_options(self) -> PosesOptions:
-        """Those of ``gs2d poses``, which puts the capture into the run folder."""
-        return PosesOptions(
-            photos=self.photos,
-            out=self.out / CAPTURE,
-            threads=self.threads,
-            seed=self.seed,
-            overwrite=self.overwrite,
-            **self.finding,
-        )
-
-    @property
-    def train_options(self) -> TrainOptions:
-        """Those of ``gs2d train``, but for what ``quality`` decides."""
-        capture = self.out / CAPTURE
-        return TrainOptions(
-            scene=capture,
-            out=self.out,
-            format="colmap",
-            threads=self.threads,
-            seed=self.seed,
-            resume=self.resume,
-            overwrite=self.overwrite,
-            title=_title(self.photos.resolve()),
-            allowed=(CAPTURE, hidden_workspace(capture).name),
-            estimate=True,
-            **self.training,
-        )
+def train_options(options: ReconstructOptions) -> TrainOptions:
+    """Return those of ``gs2d train``, but for what ``quality`` decides."""
+    capture = options.out / CAPTURE
+    return TrainOptions(
+        scene=capture,
+        out=options.out,
+        format="colmap",
+        title=_title(options.photos.resolve()),
+        allowed=(CAPTURE, hidden_workspace(capture).name),
+        estimate=True,
+        **values(Training, options.training),
+        **values(HowItRuns, options),
+    )
 
 
 def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunFolder:
@@ -143,11 +109,11 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
         on_event(Notice(f"the cameras were found before, in {capture}: {placed_line(poses)}"))
     else:
         with _claimed(options.out):
-            poses = find_poses(options.poses_options, on_event)
+            poses = find_poses(poses_options(options), on_event)
             if options.overwrite:  # its checkpoints are of other cameras
                 RunFolder(options.out).clear()
         _tell(poses, capture, on_event)
-    training = replace(options.train_options, overwrite=False)
+    training = replace(train_options(options), overwrite=False)
     run = train(_by_the_images(training, options, quality, on_event), on_event)
     if options.texture and not run.file(TEXTURED).exists():
         with attempted(TEXTURED, again("mesh", run.path, "--texture"), on_event):
@@ -167,7 +133,7 @@ def _title(photos: Path) -> str:
 
 def _check(options: ReconstructOptions) -> Quality:
     """Refuse what can be refused before anything is made; the schedule and the picture size that are meant."""
-    training, out = options.train_options, options.out
+    training, out = train_options(options), options.out
     if options.quality not in QUALITIES:
         raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {options.quality}")
     device = get_backend(training.backend).device
@@ -193,7 +159,7 @@ def _check(options: ReconstructOptions) -> Quality:
             "another --out, or begin anew with --overwrite"
         )
     check_installed()
-    check_poses_options(options.poses_options)
+    check_poses_options(poses_options(options))
     _check_photos(options)
     if (out / CAPTURE).exists() and not options.overwrite:
         raise RunError(
@@ -244,7 +210,7 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
     RunError
         Names the first difference.
     """
-    poses, wanted = read_json(capture / POSES_JSON), options.poses_options
+    poses, wanted = read_json(capture / POSES_JSON), poses_options(options)
     again = "resume with the same, or begin anew with --overwrite"
     try:
         if poses["photos"] != str(options.photos.resolve()):

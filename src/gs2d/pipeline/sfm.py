@@ -10,7 +10,6 @@ import os
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import make_folder, now, remove_made
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Plan, Step, counted, ignore
-from gs2d.pipeline.options import paths_of
+from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, read_facts, solve
 from gs2d.sfm.image_copies import copy_images
@@ -41,55 +40,6 @@ _GROWTH = {"placing cameras": 1.5}  # each is adjusted with those that have a pl
 FRAMES = "frames"  # of a video, in the workplace, until they are in the capture
 SMALLEST_SIDE, MAX_THREADS = 64, 1024
 _DOUBTFUL_FRACTION, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
-
-
-@dataclass(frozen=True, kw_only=True)
-class PosesOptions:
-    """One run of structure from motion.
-
-    Attributes
-    ----------
-    photos, out : Path
-        The folder of photographs or the video, which is only read, and the capture to make.
-    cameras : "auto", "one" or "each"
-        Which photographs share a camera: those of the same folder, size, camera, lens and focal length; all; none.
-    camera_model : str
-        A name of ``CAMERA_MODELS``, or "auto": of those with one focal length, the one that ``sfm.lens`` chooses.
-    matching : str
-        A name of ``MATCHINGS``; "auto" is "exhaustive" up to ``ALL_PAIRS`` photographs, then "similar".
-    overlap, neighbours : int
-        Next photographs and similar photographs that each is matched with ("sequential": only next ones).
-    max_size : int or None
-        Longer side of the photographs in the capture, px; None keeps all pixels.
-    feature_size : int
-        Longer side on which features are found, px.
-    frames : int
-        Frames to take of a video; of a folder of photographs all are taken.
-    link : bool
-        Hard links instead of copies.
-    threads : int or None
-    seed : int
-    overwrite : bool
-        Replace a capture that this command made.
-    """
-
-    photos: Path
-    out: Path
-    cameras: str = "auto"
-    camera_model: str = "auto"
-    matching: str = "auto"
-    overlap: int = 10
-    neighbours: int = 40
-    max_size: int | None = None
-    feature_size: int = 1600
-    frames: int = 100
-    link: bool = False
-    threads: int | None = None
-    seed: int = 0
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        paths_of(self, "photos", "out")
 
 
 def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def texture_run(
         "charts": baked.charts,
         "texels": baked.texels,
         "texels_unseen": baked.unseen,
-        "texture_from": options.source,
+        "texture_from": options.texture_from,
         "bytes": sum(file.stat().st_size for file in files),
     }
 
@@ -119,7 +119,7 @@ def textured_mesh(
         on_event(
             Notice(f"simplified to {len(small.faces):,} triangles, as near as it comes to --faces {options.faces}")
         )
-    size = options.size or texture_size(small, [view.camera for view in views])
+    size = options.texture_size or texture_size(small, [view.camera for view in views])
     images = _images(job, views, splats, options, exposures, on_event)
     return bake(unwrap(small, size), images, size, threads=torch.get_num_threads())
 
@@ -133,10 +133,10 @@ def check_texture_options(options: TextureOptions) -> None:
     """
     if options.faces < 4:
         raise ProtocolError(f"--faces must be a whole number >= 4, got {options.faces}")
-    if options.downscale is not None and options.downscale < 1:
-        raise ProtocolError(f"--texture-downscale must be a whole number >= 1, got {options.downscale}")
-    if options.size is not None and not MIN_SIZE <= options.size <= MAX_SIZE:
-        raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.size}")
+    if options.texture_downscale is not None and options.texture_downscale < 1:
+        raise ProtocolError(f"--texture-downscale must be a whole number >= 1, got {options.texture_downscale}")
+    if options.texture_size is not None and not MIN_SIZE <= options.texture_size <= MAX_SIZE:
+        raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
 
 
 def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder: Path, on_event: OnEvent) -> Mesh:
@@ -151,9 +151,9 @@ def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder
 
 def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
     """Return the training views, in another size if one is asked for, from where those of the job are."""
-    if options.downscale in (None, job.downscale) or job.scene.root is None:
+    if options.texture_downscale in (None, job.downscale) or job.scene.root is None:
         return job.scene.train
-    scene = read_scene(job.scene.root, job.scene.format, options.downscale or 1, job.protocol, on_event)
+    scene = read_scene(job.scene.root, job.scene.format, options.texture_downscale or 1, job.protocol, on_event)
     return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}).train
 
 
@@ -167,7 +167,7 @@ def _images(
 ) -> Iterator[ColorSource]:
     """Yield the views, or what the splats look like from them."""
     for view in counted(views, "colouring the texture", len(views), on_event):
-        if options.source == "renders":
+        if options.texture_from == "renders":
             output = render_view(splats, view, job.settings, job.backend)
             shown = (output.alpha >= OPAQUE).cpu().numpy()
             yield ColorSource(view.camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)

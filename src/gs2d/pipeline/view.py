@@ -26,6 +26,7 @@ from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, load_tensors, ope
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import Job, reload_job
+from gs2d.pipeline.options import ViewOptions
 from gs2d.pipeline.subject import OPAQUE
 from gs2d.pipeline.threads import use_threads
 from gs2d.render.api import rasterize
@@ -40,15 +41,6 @@ from gs2d.viewer.splats import preview
 MAX_CAMERAS = 200
 FINAL = "final"
 _TICK = 0.2  # s between looks at Ctrl-C
-
-
-@dataclass(frozen=True)
-class ViewOptions:
-    """How the page is served."""
-
-    host: str = "127.0.0.1"
-    port: int | None = None
-    threads: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +60,11 @@ class _Content:
         return [view.camera for view in self.views]
 
 
-def open_viewer(path: Path, options: ViewOptions = ViewOptions(), on_event: OnEvent = ignore) -> Viewer:
+def open_viewer(
+    path: Path,
+    options: ViewOptions = ViewOptions(),  # noqa: B008 (frozen)
+    on_event: OnEvent = ignore,
+) -> Viewer:
     """Start to serve a run, or a file of splats; ``close`` the viewer when it was looked at.
 
     Raises

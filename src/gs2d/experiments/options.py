@@ -1,0 +1,108 @@
+"""What `gs2d paper` and `gs2d sweep` are asked to do, as `pipeline/options.py` has it of the other verbs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from gs2d.errors import RecipeError
+from gs2d.pipeline.options import Overrides, paths_of
+
+SWEEP = "sweep"  # the name of a table of chosen recipes
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableOptions:
+    """Options of the commands that train and score many runs, and write a table of them."""
+
+    data: Annotated[Path, arg(metavar="DIR")]
+    """A capture, or a folder of captures."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for runs, table and page. The command can be stopped and started again."""
+    scenes: tuple[str, ...] = ()
+    """Only these captures, by the names of their folders."""
+    protocol: str = "auto"
+    """Protocol of all captures (default: by the format of each)."""
+    downscale: int | None = None
+    """Shrink the photographs by this integer (default: what the protocol says)."""
+    schedule_scale: float = 1.0
+    """Fraction of the full schedule."""
+    seeds: Annotated[tuple[int, ...], arg(constructor=tuple[str, ...])] = (0,)
+    """Seeds, as 0,1,2; or a count: 3 is 0,1,2."""
+    backend: str = "auto"
+    """Rasterizer."""
+    slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
+    """Runs at the same time (default: one a GPU, else one)."""
+    threads: int | None = None
+    """CPU threads of each of several runs (default: the cores divided among them)."""
+    cache: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Stage cache (default: in --out). Tables that share it train their common stages once."""
+    truth: Annotated[Path | None, arg(metavar="DIR")] = None
+    """True surfaces, NAME.ply, for captures that have no mesh_gt.ply beside them."""
+    lpips_weights: Path | None = None
+    """VGG-16 and LPIPS weights for the LPIPS metric."""
+    overrides: Overrides = ()
+    """Change the recipes, as in `gs2d train`; reaches those that have the stage."""
+    train: bool = True
+    """Only write the table of what is there."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "data", "out", "cache", "truth", "lpips_weights")
+        object.__setattr__(self, "scenes", _split(self.scenes))
+        object.__setattr__(self, "seeds", parse_seeds(self.seeds))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperOptions(TableOptions):
+    """Which table of the paper, of which scenes, how."""
+
+    table: Annotated[
+        Positional[Literal["regularisation", "benchmark", "k", "freeze", "modules", "absgs"]], arg(metavar="TABLE")
+    ]
+    """Which table: regularisation, benchmark, k, freeze, modules or absgs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions(TableOptions):
+    """Which recipes, on which scenes, how."""
+
+    recipes: Annotated[Positional[tuple[str, ...]], arg(metavar="RECIPE [RECIPE ...]")]
+    """Names that `gs2d recipes` lists. Recipes that --out has already keep their rows."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "recipes", _split(self.recipes))
+
+    @property
+    def table(self) -> str:
+        """The name of the table."""
+        return SWEEP
+
+
+def _split(words: Iterable[str]) -> tuple[str, ...]:
+    """``a,b c`` and ``a b c`` alike."""
+    return tuple(part for word in words for part in word.split(",") if part)
+
+
+def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
+    """Return seeds: ``0,1,2`` and ``0 1 2`` are seeds; one word n > 0 alone is a count, the seeds 0 to n - 1.
+
+    Raises
+    ------
+    RecipeError
+    """
+    given = tuple(words)
+    if all(isinstance(seed, int) for seed in given):
+        return tuple(map(int, given))
+    parts = _split(map(str, given))
+    if not parts or not all(part.isdecimal() for part in parts):
+        raise RecipeError(
+            f"--seeds must be whole numbers like 0,1,2, or a count like 3, got {' '.join(map(str, given)) or 'nothing'}"
+        )
+    numbers = tuple(int(part) for part in parts)
+    listed = len(numbers) > 1 or "," in str(given[0]) or numbers == (0,)
+    return numbers if listed else tuple(range(numbers[0]))
