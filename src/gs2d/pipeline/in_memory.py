@@ -26,7 +26,7 @@ from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import named
 from gs2d.pipeline.job import choose_backend, choose_protocol, fit_recipe, with_backdrop
 from gs2d.pipeline.mesh import fused
-from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.options import MeshOptions, Robust, TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.scoring import score_views
 from gs2d.pipeline.subject import subject_in, wants_subject
@@ -77,7 +77,7 @@ def train(
     schedule_scale: float = 1.0,
     overrides: tuple[str, ...] = (),
     seed: int = 0,
-    robust: str = "auto",
+    robust: Robust = "auto",
     exposure: bool | None = None,
     on_event: OnAnyEvent = ignore,
 ) -> Trained:
@@ -135,7 +135,8 @@ def train(
         overrides=overrides,
         seed=seed,
         robust=robust,
-        exposure=exposure,
+        exposure=exposure is True,
+        no_exposure=exposure is False,
     )
     chosen = choose_backend(backend, on_event)
     rules = choose_protocol(options, scene.format, on_event)

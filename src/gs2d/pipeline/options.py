@@ -16,6 +16,7 @@ from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
 from gs2d.errors import RecipeError
 
+Robust = Literal["auto", "on", "off"]
 LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
 BoxOption = Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
@@ -60,7 +61,7 @@ class Training:
     """What is trained; `gs2d recipes` lists them."""
     protocol: Annotated[str | Protocol, arg(constructor=str)] = "auto"
     """What depends on the data set: background, depth, near plane, fusion limits."""
-    robust: Literal["auto", "on", "off"] = "auto"
+    robust: Robust = "auto"
     """Keep fog out: a dense start, free space kept free, opacity that decays; auto: for photographs of no data set."""
     exposure: bool = False
     """Learn an exposure and a white balance for each photograph (robust training does where photographs differ)."""
