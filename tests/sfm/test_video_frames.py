@@ -16,6 +16,7 @@ from gs2d.core.json_files import read_json
 from gs2d.errors import DataError
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import PosesOptions, ReconstructOptions
+from gs2d.pipeline.reconstruct import train_options
 from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm.video_frames import Video, choose, is_video, look_into, sharpness_of, take
 from room_photos import write_room
@@ -114,7 +115,7 @@ def test_a_folder_may_be_called_like_a_video(tmp_path: Path) -> None:
     assert not is_video(tmp_path / "a.mp4")
     assert is_video(tmp_path / "b.mp4")
     options = ReconstructOptions(photos=tmp_path / "room.mp4", out=tmp_path / "run")
-    assert options.train_options.title == "room"
+    assert train_options(options).title == "room"
 
 
 @real
