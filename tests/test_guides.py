@@ -16,7 +16,6 @@ from tiny import write_capture
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 ROOT = DOCS.parent
 PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *(ROOT / "benchmarks").rglob("*.md")])
-LONG_LINES = {DOCS / "decisions.md"}  # about to be split
 
 
 def run_blocks(page: Path, least: int) -> dict[str, Any]:
@@ -68,7 +67,7 @@ def test_links_to_files_of_the_repository_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page not in LONG_LINES], ids=lambda path: path.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_no_line_of_a_page_has_more_than_120_characters(page: Path) -> None:
     lines = page.read_text(encoding="utf-8").splitlines()
     assert [f"{page.name}:{number}" for number, line in enumerate(lines, 1) if len(line) > 120] == []
@@ -78,6 +77,17 @@ def test_files_that_the_architecture_names_are_there() -> None:
     named = set(re.findall(r"[\w/]+\.py\b", (DOCS / "architecture.md").read_text(encoding="utf-8")))
     there = [path.as_posix() for folder in ("src", "tests") for path in (ROOT / folder).rglob("*.py")]
     assert {name for name in named if not any(path.endswith("/" + name) for path in there)} == set()
+
+
+def test_citation_and_changelog_are_of_the_version() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    dated = re.search(r"^version: (\S+)\ndate-released: (\S+)$", citation, re.M)
+    assert dated is not None
+    assert dated[1] == gs2d.__version__
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    released = re.findall(r"^## \[(.*)\] - (.*)$", changelog, re.M)
+    assert released[0] == (dated[1], dated[2])
+    assert re.findall(r"^## (.*)$", changelog, re.M)[0] == "[Unreleased]"
 
 
 def test_one_page_names_every_command() -> None:

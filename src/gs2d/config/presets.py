@@ -37,8 +37,8 @@ from gs2d.errors import RecipeError
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
 SH_PATIENCE = 3  # times as many iterations for each SH degree where exposures are learned
 NC_START, DISTORTION_START = 7_000, 3_000  # official: active when iteration > start
-MULTIVIEW_WEIGHT = 0.3  # docs/decisions.md, "Two views"
-DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions.md, "Priors"
+MULTIVIEW_WEIGHT = 0.3  # docs/decisions/multiview.md
+DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
 # reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
@@ -147,7 +147,7 @@ def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
     """Add a colour transform for each training photograph (``NAME-exposure``) to a recipe without one.
 
     Not in the paper. For photographs of a camera on automatic, whose exposure or white balance changes. View-dependent
-    colour comes three times as late: it can feign exposures (docs/decisions.md).
+    colour comes three times as late: it can feign exposures (docs/decisions/exposure.md).
     """
     if recipe.exposure is not None:
         return recipe
@@ -161,7 +161,7 @@ def with_multiview(
     """Add losses of two views to the stages with normal consistency, once nothing is densified any more.
 
     Not in the paper. The photometric weight is the one that PGSR publishes; why the geometric term is off, and why they
-    wait for the end of densification: docs/decisions.md.
+    wait for the end of densification: docs/decisions/poses.md.
     """
 
     def extended(stage: Stage) -> Stage:
@@ -206,7 +206,7 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
     """Return the recipe with what photographs of the street need; what it has of that already stays.
 
     Not in the paper: a dense start, free space that is kept free, opacity that decays, no large
-    splat that is hardly photographed (docs/decisions.md, "Fog"). The capture must say which sparse points its
+    splat that is hardly photographed (docs/decisions/fog.md). The capture must say which sparse points its
     photographs show.
     """
     return replace(

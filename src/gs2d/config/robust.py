@@ -1,6 +1,6 @@
 """What photographs of the street need beside losses: a dense start, free space kept free, opacity that decays.
 
-Why each is there, and what was tried instead: docs/decisions.md, "Fog". Pure Python; never imports torch.
+Why each is there, and what was tried instead: docs/decisions/fog.md. Pure Python; never imports torch.
 """
 
 from __future__ import annotations

@@ -72,15 +72,15 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
     """Yield what the paper leaves open in the recipes of a table, and where gs2d knowingly does otherwise."""
     yield (
         "the rasterizer is gs2d's own and departs from the official one in pixel centres, footprint, and depth where "
-        "the low-pass filter wins: docs/decisions.md, Rasterizer"
+        "the low-pass filter wins: docs/decisions/rasterizer.md"
     )
     if any(scene.protocol.near_plane_policy == "cull" for scene in scenes):
         yield (
             "splats that reach the camera plane are left out of that view, where the official rasterizer draws a part "
-            "of them: docs/decisions.md, Rasterizer"
+            "of them: docs/decisions/rasterizer.md"
         )
     if any(scene.protocol.near_plane_policy != "draw" for scene in scenes):
-        yield "splats that no training view sees are dropped at the end of a stage: docs/decisions.md, Rasterizer"
+        yield "splats that no training view sees are dropped at the end of a stage: docs/decisions/rasterizer.md"
     if any(scene.data_set == DTU for scene in scenes):
         yield (
             "DTU: distortion has no weight but where a row names one, as in the paper's Table 1 (the official DTU "
@@ -90,7 +90,7 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
     if any(len(recipe.stages) > 2 for recipe in recipes.values()):
         yield (
             "the paper does not say which pixels count in E_i, with what opacity clones begin, nor the rates and "
-            "Adam's moments of stages 2 and 3: docs/decisions.md has the readings that were trained"
+            "Adam's moments of stages 2 and 3: docs/decisions/training.md has the readings that were trained"
         )
     if "2dgs-r-absgs-a" in recipes:
         yield (

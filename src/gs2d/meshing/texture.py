@@ -8,7 +8,7 @@ border of the image or of its mask. The ``best`` + 1 highest scores of a texel a
     sum_v w_v c_v / sum_v w_v,    w_v = s_v - (the lowest of them)
 
 so the weights of ``best`` photographs, continuous across the surface: where one photograph takes the place of another
-in the choice, both have weight 0. See docs/math.md and docs/decisions.md.
+in the choice, both have weight 0. See docs/math.md and docs/decisions/meshing.md.
 """
 
 from __future__ import annotations

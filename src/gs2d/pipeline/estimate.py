@@ -14,7 +14,7 @@ from gs2d.training.trainer import Trainer
 
 WARM_UP, FEWEST, MOST = 2, 3, 30  # iterations
 MEASURED_SECONDS = 3.0
-# Seconds of a whole training over iterations x seconds of its first ones: docs/decisions.md has the captures.
+# Seconds of a whole training over iterations x seconds of its first ones: docs/decisions/terminal.md has the captures.
 MIN_GROWTH, MAX_GROWTH = 1.0, 4.0
 
 
