@@ -85,6 +85,30 @@ class Gaussians:
         )]  # fmt: skip
         return Splats(*tensors)
 
+    def flattened(self) -> Splats:
+        """Return flat splats: each Gaussian loses its smallest scale, along whose axis its normal then points.
+
+        The axes are turned in a circle, so that the rotation stays one: with s_0 the smallest (t_u, t_v, n) are
+        columns (1, 2, 0) of the old rotation, with s_1 columns (2, 0, 1).
+        """
+        smallest = self.log_scales.argmin(axis=1)  # [N]
+        # Right factors that turn the third axis to axis 0, 1, 2: a third of a turn about (1, 1, 1) or none.
+        turns = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])[smallest]
+        (w, x, y, z), (a, b, c, d) = unit_quats(self.quats).T, turns.T
+        quats = np.stack(
+            [
+                w * a - x * b - y * c - z * d,
+                w * b + x * a + y * d - z * c,
+                w * c - x * d + y * a + z * b,
+                w * d + x * c - y * b + z * a,
+            ],
+            axis=1,
+        )
+        in_plane = (smallest[:, None] + np.array([1, 2])) % 3
+        scales = np.take_along_axis(self.log_scales, in_plane, axis=1)
+        arrays = (self.means, quats, scales, self.opacity_logits, self.sh0[:, None, :], self.shN)
+        return Splats(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)) for array in arrays))
+
 
 def unit_quats(quats: np.ndarray) -> np.ndarray:
     """Quaternions [N, 4] of length 1, float64; zero becomes no rotation."""

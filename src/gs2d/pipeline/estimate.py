@@ -34,7 +34,7 @@ def estimate(job: Job) -> Estimate | None:
     from other captures only.
     """
     try:
-        trainer = Trainer(job.scene, job.recipe, job.protocol, backend=job.backend, progress_every=1)
+        trainer = Trainer(job.scene, job.recipe, job.protocol, backend=job.backend, init=job.init, progress_every=1)
         trainer.enter(0)
         iteration = _seconds(trainer, job.recipe.stages[0].iterations)
     except Gs2dError:
@@ -73,6 +73,7 @@ def start_text(event: Initialised) -> str:
         "points": "points of the capture",
         "sweep": "places on which neighbouring photographs agree, and points of the capture",
         "depths": "points of the capture and of its known depths",
+        "splats": "given splats",
         "random": "random points in the box the cameras look at",
     }
     source = sources[event.source]

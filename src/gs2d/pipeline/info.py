@@ -69,7 +69,7 @@ def describe_file(path: Path) -> dict[str, Any]:
         return {"points": len(read_points(path).points), "bytes": size}
     file = read_splat_file(path)
     shape = (
-        {} if kind == "2dgs" else {"shape": "flat" if file.to_surfels is not None else "3D, which gs2d does not draw"}
+        {} if kind == "2dgs" else {"shape": "flat" if file.surfels is not None else "3D, which gs2d does not draw"}
     )
     gaussians = file.gaussians
     return {"splats": len(gaussians), "layout": file.kind, **shape, "SH degree": gaussians.sh_degree, "bytes": size}

@@ -25,11 +25,13 @@ from gs2d.config.protocols import BLACK, GENERIC, FusionLimits, MetricConvention
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
+from gs2d.core.splats import Splats
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.data.benchmarks import missing_lines, protocol_of
 from gs2d.data.load import reader_of
 from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
+from gs2d.io.formats.registry import read_surfels
 from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.options import TrainOptions
@@ -66,6 +68,8 @@ class Job:
         Of every decoded photograph, mask and camera, and of the points: the scene as training sees it.
     stage2_cache_bytes : int
         For cached views; see ``Trainer``.
+    init, init_digest : Splats and str, or None
+        What training starts from instead of points, and the hash of its file.
     """
 
     recipe: Recipe
@@ -76,6 +80,8 @@ class Job:
     downscale: int
     images_digest: str
     stage2_cache_bytes: int
+    init: Splats | None = None
+    init_digest: str | None = None
 
     def definition(self) -> dict[str, Any]:
         """Return what ``run.json`` says and a resume compares."""
@@ -97,6 +103,7 @@ class Job:
             "seed": self.recipe.seed,
             "backend": self.backend.facts(),
             "stage2_cache_bytes": self.stage2_cache_bytes,
+            **({} if self.init_digest is None else {"init": self.init_digest}),
         }
 
     def stage_key(self, index: int) -> str:
@@ -112,6 +119,7 @@ class Job:
             "start": [recipe["init_points"], recipe["sh_degree"]],
             "stages": recipe["stages"][: index + 1],
             "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
+            **({} if self.init_digest is None else {"init": self.init_digest}),
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
             **{name: recipe[name] for name in LATER_FIELDS[2:] if recipe[name] is not None},
@@ -190,6 +198,8 @@ def check_train_options(options: TrainOptions) -> Recipe:
     if options.robust not in ROBUST:
         raise RecipeError(f"--robust must be one of {', '.join(ROBUST)}, got {options.robust}")
     recipe = _recipe_of(options, robust=options.robust != "off", exposure=bool(options.learns_exposure))
+    if options.init is not None and options.start_from is not None:
+        raise RecipeError("--init starts from splats, --from takes finished stages of another run, got both; give one")
     if options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     if options.checkpoint_every < 1:
@@ -280,6 +290,7 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     """
     check_train_options(options)
     backend = choose_backend(options.backend, on_event)
+    init = (None, None) if options.init is None else read_init(options.init, on_event)
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
     reader_of(scene_format)  # a wrong name is told before anything is read
     protocol = choose_protocol(options, scene_format, on_event)
@@ -292,7 +303,25 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
         on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
-    return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, options.stage2_cache_mb << 20)
+    cache_bytes = options.stage2_cache_mb << 20
+    return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, cache_bytes, *init)
+
+
+def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
+    """Read the splats that training starts from, and the hash of their file.
+
+    Raises
+    ------
+    DataError
+        No file of splats.
+    """
+    if path.is_dir():
+        inside = path / "splats.ply"
+        hint = f"give {inside}" if inside.exists() else "give a file of splats"
+        raise DataError(f"--init must be a file of splats, got the folder {path}; {hint}")
+    splats, kind = read_surfels(path)
+    on_event(Notice(f"starting from {path.name}: {len(splats):,} {kind}"))
+    return splats, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def choose_protocol(options: TrainOptions, scene_format: str, on_event: OnEvent) -> Protocol:
@@ -453,7 +482,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
     RunError
         Names the first thing that differs.
     """
-    before, after = run.definition(), json.loads(json.dumps(job.definition()))
+    before, after = run.definition(), {"init": None, **json.loads(json.dumps(job.definition()))}
     for name, value in after.items():
         old = before.get(name)
         if name == "protocol" and isinstance(old, dict):
@@ -472,6 +501,8 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]
             name = "scene: its photographs, cameras, points or maps changed"
+        elif name == "init":
+            name = "--init: another file, or none"
         else:
             where = _difference(old, value)
         if old != value:

@@ -152,6 +152,9 @@ class TrainOptions(Training, HowItRuns):
     """Shrink the photographs by this integer, area-filtered."""
     schedule_scale: float = 1.0
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
+    init: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Start from the splats of a file (PLY of 2DGS or 3DGS, .spz, .splat) in the frame of the capture, not from points.
+    3D Gaussians lose their smallest scale, along which the normal then points."""
     title: Annotated[str | None, Fixed, Suppress] = None
     """Heading of the report; None: the name of the capture."""
     shown_views: Annotated[int, Fixed, Suppress] = 3
@@ -162,7 +165,7 @@ class TrainOptions(Training, HowItRuns):
     """Tell before training how long it will take and what is held out."""
 
     def __post_init__(self) -> None:
-        paths_of(self, "scene", "out", "start_from", "cache")
+        paths_of(self, "scene", "out", "init", "start_from", "cache")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -214,6 +214,7 @@ def train_stages(
         on_event=listen,
         between=between,
         state=start.state,
+        init=job.init if start.state is None else None,
         progress_every=recorder.progress_every,
         stage2_cache_bytes=job.stage2_cache_bytes,
     )

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 class Initialised:
     """The start.
 
-    ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths" (known ones too) or
-    "random"; ``dropped``: unusable.
+    ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths" (known ones too),
+    "random", or "splats" (given); ``dropped``: unusable.
     """
 
     splats: int

@@ -86,6 +86,27 @@ def initial_splats(
     return Initial(splats, source, len(points) - len(kept))
 
 
+def splats_as_start(splats: Splats, *, sh_degree: int, dtype: torch.dtype = torch.float32) -> Splats:
+    """Return a copy of splats with the coefficients of a degree: higher ones are left out, or begin at 0.
+
+    Raises
+    ------
+    DataError
+        There are none, or one is not finite.
+    """
+    if len(splats) == 0:
+        raise DataError("a training must start from at least one splat, got none")
+    for name, tensor in splats.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise DataError(f"splats to start from must be finite, got NaN or infinity in their {name}")
+    held, wanted = splats.shN.shape[1], num_coefficients(sh_degree) - 1
+    rest = splats.shN[:, :wanted]
+    if held < wanted:
+        rest = torch.cat([rest, rest.new_zeros(len(splats), wanted - held, 3)], dim=1)
+    parts = dict(splats.items()) | {"shN": rest}
+    return Splats(**{name: tensor.detach().to("cpu", dtype, copy=True).contiguous() for name, tensor in parts.items()})
+
+
 def usable_points(points: np.ndarray, scene: Scene, near: float) -> np.ndarray:
     """Which points are finite, in front of a training camera (depth > near) and not within ``near`` of one.
 

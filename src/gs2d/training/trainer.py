@@ -7,6 +7,7 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -27,7 +28,7 @@ from gs2d.training.adam import adam_step, begin_stage, lr_at
 from gs2d.training.cached_objective import choose_objective
 from gs2d.training.densify.densifier import Surroundings, densifier_of
 from gs2d.training.exposure import apply_exposure
-from gs2d.training.initialize import initial_splats
+from gs2d.training.initialize import initial_splats, splats_as_start
 from gs2d.training.objective import (
     FullRender,
     Objective,
@@ -68,6 +69,8 @@ class Trainer:
         something else that uses the rasterizer. It must leave the state alone.
     state : TrainState, optional
         To go on from; without it training starts anew from ``recipe.seed``.
+    init : Splats, optional
+        To start anew from, instead of points: copied, with the recipe's SH degree.
     progress_every : int
         Iterations between Progress events (the last of a stage always sends one).
     target_bytes : int, optional
@@ -94,6 +97,7 @@ class Trainer:
         on_event: OnEvent = lambda event: None,
         between: Callable[[], None] = lambda: None,
         state: TrainState | None = None,
+        init: Splats | None = None,
         progress_every: int = 10,
         target_bytes: int | None = None,
         stage2_cache_bytes: int = 1 << 30,
@@ -105,8 +109,11 @@ class Trainer:
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
         self._on_event, self._between, self._progress_every = on_event, between, progress_every
         self._pending: list[events.Event] = []
-        self._robust = Robustness(scene, self.recipe, self.settings, self.backend)
-        self.state = self._new_state(dtype) if state is None else self._checked(state)
+        if state is not None and init is not None:
+            raise RunError("training goes on from a state or starts from init, got both; leave one out")
+        begins = self.recipe if init is None else replace(self.recipe, dense_start=None)
+        self._robust = Robustness(scene, begins, self.settings, self.backend)
+        self.state = self._new_state(dtype, init) if state is None else self._checked(state)
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._targets = self._make_targets(target_bytes)
@@ -248,8 +255,12 @@ class Trainer:
             limit_bytes=TARGET_BYTES if limit_bytes is None else limit_bytes,
         )
 
-    def _new_state(self, dtype: torch.dtype) -> TrainState:
+    def _new_state(self, dtype: torch.dtype, init: Splats | None) -> TrainState:
         generator = torch.Generator().manual_seed(self.recipe.seed)
+        if init is not None:
+            splats = splats_as_start(init, sh_degree=self.recipe.sh_degree, dtype=dtype)
+            self._pending.append(events.Initialised(len(splats), "splats", 0))
+            return per_image.start(TrainState(splats, generator), self.recipe, self.scene)
         start = with_known_points(self._robust.scene, self.recipe)
         initial = initial_splats(
             start,

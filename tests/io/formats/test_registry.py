@@ -271,16 +271,16 @@ def test_every_layout_is_read_back_as_flat_splats(tmp_path: Path, layout: str, n
     write_layout(path, a_scene(n, degree=2), layout)
     file = read_splat_file(path)
     assert len(file.gaussians) == n
-    assert file.to_surfels is not None
+    assert file.surfels is not None
     assert file.gaussians.sh_degree == (0 if layout == "splat" else 2)
 
 
 def test_three_dimensional_gaussians_are_told_from_disks(tmp_path: Path, shared: Callable[[str], Path]) -> None:
     file = read_splat_file(shared("gaussians_plush_dog") / "point_cloud_29999_clean.ply")
-    assert (file.kind, file.to_surfels) == ("3dgs (three scales, for viewers)", None)
+    assert (file.kind, file.surfels) == ("3dgs (three scales, for viewers)", None)
     write_spz(tmp_path / "a.spz", file.gaussians)
     file = read_splat_file(tmp_path / "a.spz")
-    assert (file.kind, file.to_surfels) == ("SPZ version 3", None)
+    assert (file.kind, file.surfels) == ("SPZ version 3", None)
     with pytest.raises(DataError, match=r"a\.spz: flat splats were expected, got 3D Gaussians with three scales"):
         file.gaussians.to_surfels(tmp_path / "a.spz")
 

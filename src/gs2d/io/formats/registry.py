@@ -82,11 +82,11 @@ ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """What a file of splats holds: the kind of file in words, and its Gaussians (flat where ``disks`` are there)."""
+    """What a file of splats holds: the kind of file in words, and its Gaussians (flat where ``surfels`` are there)."""
 
     kind: str
     gaussians: Gaussians
-    to_surfels: Splats | None
+    surfels: Splats | None
 
 
 def layout_of(path: Path) -> str | None:
@@ -144,7 +144,26 @@ def read_disks(path: str | os.PathLike[str]) -> Splats:
         Missing, broken, no splats, or 3D Gaussians.
     """
     file = read_splat_file(path)
-    return file.gaussians.to_surfels(path) if file.to_surfels is None else file.to_surfels
+    return file.gaussians.to_surfels(path) if file.surfels is None else file.surfels
+
+
+def read_surfels(path: str | os.PathLike[str]) -> tuple[Splats, str]:
+    """Read the splats of a file to start a training from, and say in words what they were.
+
+    Flat ones are as they are. 3D Gaussians lose their smallest scale, whose axis becomes the normal
+    (:meth:`gs2d.io.gaussians.Gaussians.flattened`).
+
+    Raises
+    ------
+    DataError
+        Missing, broken, or without splats.
+    """
+    file = read_splat_file(path)
+    if len(file.gaussians) == 0:
+        raise DataError(f"{os.fspath(path)} must hold splats to start from, got none")
+    if file.surfels is not None:
+        return file.surfels, "flat splats"
+    return file.gaussians.flattened(), "3D Gaussians without their smallest scales, whose axes are the normals now"
 
 
 def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> SplatFile:

@@ -1,0 +1,48 @@
+"""`gs2d train --init`: what is read, what is written into the run, what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gs2d.errors import DataError, RecipeError, RunError
+from gs2d.io.formats.registry import write_layout
+from gs2d.pipeline.job import check_same_run, prepare_job
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.train import train
+from tiny import write_capture
+from train_toys import random_splats
+
+
+@pytest.fixture(scope="module")
+def options(tmp_path_factory: pytest.TempPathFactory) -> TrainOptions:
+    folder = tmp_path_factory.mktemp("init")
+    write_layout(folder / "start.ply", random_splats(30), "2dgs")
+    capture = write_capture(folder / "ball")
+    return TrainOptions(
+        scene=capture, out=folder / "run", init=folder / "start.ply", schedule_scale=0.0005, page=False, threads=1
+    )
+
+
+def test_a_run_starts_from_the_file_and_resumes_with_it_alone(options: TrainOptions) -> None:
+    told: list[object] = []
+    run = train(options, told.append)
+    assert any("starting from start.ply: 30 flat splats" in str(event) for event in told)
+    assert len(run.definition()["init"]) == 64
+    job = prepare_job(options, lambda event: None)
+    check_same_run(run, job)
+    other = prepare_job(replace(options, init=None), lambda event: None)
+    assert other.stage_key(0) != job.stage_key(0)
+    with pytest.raises(RunError, match="was made with another --init: another file, or none"):
+        check_same_run(run, other)
+
+
+def test_what_cannot_start_a_training_is_one_line(options: TrainOptions, tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="--init starts from splats, --from takes finished stages"):
+        prepare_job(replace(options, start_from=tmp_path), lambda event: None)
+    with pytest.raises(DataError, match="--init must be a file of splats, got the folder"):
+        prepare_job(replace(options, init=tmp_path), lambda event: None)
+    with pytest.raises(DataError, match=r"none.ply"):
+        prepare_job(replace(options, init=tmp_path / "none.ply"), lambda event: None)
