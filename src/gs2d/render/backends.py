@@ -96,6 +96,8 @@ class Backend:
         Whether :meth:`cache_view` is there.
     slow : bool
         Whether one says so to people who did not ask for it by name.
+    about : str
+        What ``gs2d doctor`` says of it where it can run.
     """
 
     name: str = ""
@@ -103,6 +105,7 @@ class Backend:
     lowpass_depths: tuple[str, ...] = ("center",)
     caches_views: bool = False
     slow: bool = False
+    about: str = ""
 
     # -- rendering ---------------------------------------------------------------------------------------------------
     def rasterize(
@@ -195,14 +198,15 @@ class Backend:
         except BackendError as error:
             reason, _, remedy = str(error).partition("; ")
             return BackendStatus(cls.name, False, reason, remedy, "")
-        return BackendStatus(cls.name, True, "", "", made.__doc__.partition("\n")[0] if made.__doc__ else "")
+        return BackendStatus(cls.name, True, "", "", made.about or cls.__module__)
 
 
 @register_backend("reference")
 class ReferenceBackend(Backend):
-    """Plain torch, slow; float32 and float64, any device."""
+    """Plain torch: the judge of the others."""
 
     name = "reference"
+    about = "plain torch, slow; float32 and float64, any device"
     lowpass_depths = ("center", "plane")
     slow = True
 

@@ -1,0 +1,101 @@
+"""A package that adds one of each, installed by pip into a folder of its own, used from the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gs2d.kernels.library import available_variants
+from tiny import write_capture
+
+PLUGIN = Path(__file__).parents[1] / "plugin"
+SOURCE = Path(__file__).parents[2] / "src"
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+pytestmark = pytest.mark.timeout(600)
+
+
+@pytest.fixture(scope="module")
+def gs2d(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The command line in a process that sees the package."""
+    pytest.importorskip("setuptools", minversion="70")
+    if not available_variants():
+        pytest.skip("its backend needs the native library, which is not built")
+    folder = tmp_path_factory.mktemp("site")
+    copy = tmp_path_factory.mktemp("plugin")  # setuptools builds beside what it reads
+    for file in PLUGIN.iterdir():
+        if file.is_file():
+            (copy / file.name).write_text(file.read_text())
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    done = subprocess.run([*pip, "--target", str(folder), str(copy)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+    def run(*words: object, code: int = 0, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{SOURCE}", "OMP_NUM_THREADS": "1"}
+        command = [sys.executable, "-m", "gs2d", *map(str, words)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=cwd)
+        assert done.returncode == code, done.stdout + done.stderr
+        return done
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def trained(gs2d: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on a capture that the package reads, by its recipe, loss and densifier, on its backend."""
+    folder = tmp_path_factory.mktemp("work")
+    capture = write_capture(folder / "ball")
+    (folder / "link").mkdir()
+    (folder / "link" / "capture.txt").write_text(str(capture))
+    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page")
+    chosen = ("--recipe", "example-2dgs", "--backend", "example-checked")
+    gs2d("train", folder / "link", "--out", folder / "run", *chosen, *few)
+    return folder / "run"
+
+
+def test_a_run_uses_all_of_them_and_says_so(trained: Path) -> None:
+    said = json.loads((trained / "run.json").read_text())
+    assert said["backend"]["name"] == "example-checked"
+    assert said["recipe"]["name"] == "example-2dgs"
+    assert said["recipe"]["stages"][0]["densify"] == {"name": "example-prune", "options": {"at": 3, "count": 2}}
+    events = [json.loads(line) for line in (trained / "events.jsonl").read_text().splitlines()]
+    assert any("example-contrast" in event.get("losses", {}) for event in events)
+    pruned = [event for event in events if event["kind"] == "densify"]
+    assert [(event["iteration"], event["splats"]) for event in pruned] == [(3, 58)]
+
+
+def test_the_lists_name_what_the_package_adds(gs2d: Run) -> None:
+    listed = gs2d("recipes").stdout
+    assert "example-2dgs" in listed
+    assert "Like 2dgs, with a loss and a densifier of this package." in listed
+    assert "example-checked: the cpu backend; images are checked" in gs2d("doctor").stdout
+
+
+def test_later_commands_find_the_package_and_export_writes_its_format(gs2d: Run, trained: Path, tmp_path: Path) -> None:
+    said = gs2d("export", trained, "--out", tmp_path / "a.xyz")
+    assert "only the centres were written" in said.stdout + said.stderr
+    assert len((tmp_path / "a.xyz").read_text().splitlines()) == 58
+
+
+def test_a_run_goes_on_with_the_recipe_from_a_file(gs2d: Run, trained: Path) -> None:
+    """What `gs2d recipes show --json` prints, and what trained the run, are one recipe."""
+    file = trained.parent / "mine.json"
+    file.write_text(gs2d("recipes", "show", "example-2dgs", "--json").stdout)
+    few = ("--set", "init_points=60", "--schedule-scale", "0.0003", "--no-page")
+    chosen = ("--recipe", file, "--backend", "example-checked")
+    said = gs2d("train", trained.parent / "link", "--out", trained, *chosen, *few, "--resume")
+    assert "resuming after" in said.stdout + said.stderr
+
+
+def test_a_wrong_option_of_a_guest_is_one_line(gs2d: Run, trained: Path) -> None:
+    wrong = ("--recipe", "example-2dgs", "--set", 'surface.densify.options={"when": 3}')
+    out = trained.parent / "none"
+    said = gs2d("train", trained.parent / "ball", "--out", out, *wrong, "--quiet", code=2).stderr
+    assert "densifier 'example-prune' does not take the options {'when': 3}" in said
+    assert said.count("\n") == 1

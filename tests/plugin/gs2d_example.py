@@ -1,0 +1,85 @@
+"""One of each door of gs2d, from another package; docs/extending.md reads it aloud."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gs2d.config.densify import Densify, register_densifier
+from gs2d.config.losses import register_loss
+from gs2d.config.presets import get_recipe, register_recipe
+from gs2d.config.recipe import LossTerm
+from gs2d.data.load import load_scene
+from gs2d.data.readers.registry import register_reader
+from gs2d.errors import DivergedError
+from gs2d.io.formats.registry import register_format
+from gs2d.render.backends import CpuBackend, register_backend
+from gs2d.training.densify.densifier import Densifier
+from gs2d.training.events import Densified
+from gs2d.training.rows import keep_rows
+
+
+@register_loss("example-contrast")
+def contrast(output, view, gain=1.0):
+    """Compare the spread of colours with that of the photograph."""
+    return gain * (output.color.std() - view.target.std()).square()
+
+
+@register_reader("example-link")
+class LinkReader:
+    """A folder whose capture.txt names the folder where the capture is."""
+
+    def detect(self, path):
+        return (path / "capture.txt").is_file()
+
+    def read(self, path, *, downscale):
+        return load_scene((path / "capture.txt").read_text().strip(), downscale=downscale)
+
+
+@register_densifier("example-prune")
+class PruneFaint(Densifier):
+    """Drop the faintest splats at one iteration."""
+
+    def __init__(self, surroundings, at, count=1):
+        super().__init__(surroundings)
+        self.at, self.count = at, count
+
+    def changes(self, iteration):
+        return iteration == self.at
+
+    def after_backward(self, state, output, iteration):
+        if iteration != self.at:
+            return ()
+        keep = torch.ones(len(state.splats), dtype=torch.bool, device=state.splats.device)
+        keep[state.splats.opacity_logits.argsort()[: self.count]] = False
+        keep_rows(state, keep)
+        return (Densified(self.surroundings.stage, iteration, 0, 0, self.count, 0, len(state.splats)),)
+
+
+@register_recipe("example-2dgs")
+def recipe():
+    """Like 2dgs, with a loss and a densifier of this package."""
+    base = get_recipe("2dgs")
+    losses = (*base.stages[0].losses, LossTerm("example-contrast", 0.1, options={"gain": 2.0}))
+    stage = replace(base.stages[0], losses=losses, densify=Densify("example-prune", {"at": 3, "count": 2}))
+    return replace(base, name="example-2dgs", stages=(stage, *base.stages[1:]))
+
+
+@register_backend("example-checked")
+class CheckedBackend(CpuBackend):
+    """The native kernels, stopping at the first image that is not finite."""
+
+    name, about = "example-checked", "the cpu backend; images are checked"
+
+    def rasterize(self, splats, camera, settings, screen_probe=None, gradient_rows=None):
+        output = super().rasterize(splats, camera, settings, screen_probe, gradient_rows)
+        if not torch.isfinite(output.color).all():
+            raise DivergedError("an image must be finite, got NaN or infinity; lower a rate")
+        return output
+
+
+@register_format("example-xyz", ending=".xyz")
+def write_xyz(path, splats):
+    """Write the centres as text."""
+    np.savetxt(path, splats.means.detach().cpu().numpy(), fmt="%.6g")
+    return ("only the centres were written",)
