@@ -69,7 +69,7 @@ def recipe():
 class CheckedBackend(CpuBackend):
     """The native kernels, stopping at the first image that is not finite."""
 
-    name, about = "example-checked", "the cpu backend; images are checked"
+    name = "example-checked"
 
     def rasterize(self, splats, camera, settings, screen_probe=None, gradient_rows=None):
         output = super().rasterize(splats, camera, settings, screen_probe, gradient_rows)
