@@ -68,8 +68,6 @@ def describe_file(path: Path) -> dict[str, Any]:
     if kind == "points":
         return {"points": len(read_points(path).points), "bytes": size}
     file = read_splat_file(path)
-    shape = (
-        {} if kind == "2dgs" else {"shape": "flat" if file.surfels is not None else "3D, which gs2d does not draw"}
-    )
+    shape = {} if kind == "2dgs" else {"shape": "flat" if file.surfels is not None else "3D, which gs2d does not draw"}
     gaussians = file.gaussians
     return {"splats": len(gaussians), "layout": file.kind, **shape, "SH degree": gaussians.sh_degree, "bytes": size}
