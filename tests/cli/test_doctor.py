@@ -71,4 +71,4 @@ def test_on_a_narrow_terminal_the_doctor_breaks_lines_between_words() -> None:
 
     shown = screen_of(["doctor"], columns=60)
     assert [line for line in shown.splitlines() if len(line) > 60 and " " in line.strip()] == []
-    assert "\n  yes  reference: Plain torch, slow; float32 and float64,\n       any device.\n" in shown
+    assert "\n  yes  reference: plain torch, slow; float32 and float64,\n       any device\n" in shown

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from gs2d import errors
 from gs2d.kernels.library import available_variants
 from tiny import write_capture
 
 PLUGIN = Path(__file__).parents[1] / "plugin"
-SOURCE = Path(__file__).parents[2] / "src"
+SOURCE = Path(errors.__file__).parents[1]  # the source tree, or where the wheel was installed
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 pytestmark = pytest.mark.timeout(600)

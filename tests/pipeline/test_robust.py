@@ -74,7 +74,7 @@ EMPTY = replace(EQUAL, observe=no_points)
         ({}, EMPTY, GENERIC, False, False),
         ({"robust": "off"}, VARIED, GENERIC, False, False),
         ({"robust": "on"}, VARIED, DTU, True, True),
-        ({"exposure": False}, VARIED, GENERIC, True, False),
+        ({"no_exposure": True}, VARIED, GENERIC, True, False),
         ({"exposure": True}, EQUAL, GENERIC, True, True),
         ({"exposure": True, "robust": "off"}, EQUAL, GENERIC, False, True),
     ],
