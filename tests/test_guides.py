@@ -29,6 +29,13 @@ def run_blocks(page: Path, least: int) -> dict[str, Any]:
     return names
 
 
+def test_the_readme_names_the_two_commands_that_set_themselves_up() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    for target in ("demo", "test"):
+        assert any(line.startswith(f"make {target} ") for line in lines), target
+        assert f"\n{target}: " in (ROOT / "Makefile").read_text(encoding="utf-8")
+
+
 def test_the_program_of_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_capture(tmp_path / "capture")
