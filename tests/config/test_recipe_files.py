@@ -78,10 +78,21 @@ def test_a_json_file_is_what_recipes_show_prints(tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text("[]")
     with pytest.raises(RecipeError, match="an object of JSON, got list"):
         get_recipe(str(tmp_path / "bad.json"))
-    with pytest.raises(RecipeError, match="cannot read the recipe .*none.json: No such file"):
+    with pytest.raises(
+        RecipeError,
+        match="none.json must be a recipe in JSON, got: No such file.*; `gs2d recipes show NAME --json` prints one",
+    ):
         get_recipe(str(tmp_path / "none.json"))
+    (tmp_path / "bad.json").write_text('{"name": "x"}')
+    with pytest.raises(RecipeError, match="bad.json: recipe lacks the field 'stages'; `gs2d recipes show"):
+        get_recipe(str(tmp_path / "bad.json"))
+    (tmp_path / "none.py").write_text("x = 1")
+    with pytest.raises(
+        RecipeError, match="none.py must hold a gs2d.Recipe, or a function that returns one, got neither"
+    ):
+        get_recipe(f"{tmp_path / 'none.py'}:x")
     (tmp_path / "bad.py").write_text("1 +")
-    with pytest.raises(RecipeError, match="bad.py cannot be run: SyntaxError"):
+    with pytest.raises(RecipeError, match="bad.py must run as a Python file, got SyntaxError"):
         get_recipe(f"{tmp_path / 'bad.py'}:mine")
 
 

@@ -36,13 +36,21 @@ def read_recipe_file(name: str) -> Recipe:
     file, colon, wanted = name.rpartition(":")
     path = Path(file if colon else name)
     if not path.is_file():
-        raise RecipeError(f"{path} must be a Python file with a recipe, got no such file; --recipe FILE.py:NAME")
+        raise RecipeError(
+            f"{path} must be a Python file with a recipe, got no such file; give FILE.py:NAME, or a name that "
+            "`gs2d recipes` lists"
+        )
     module = _run(path.resolve())
+    own = _recipes_in(module)
+    if not own:
+        raise RecipeError(
+            f"{path} must hold a gs2d.Recipe, or a function that returns one, got neither; docs/extending.md has "
+            "an example"
+        )
     if not colon:
-        raise RecipeError(f"{path} needs the name of a recipe: --recipe {path}:NAME, one of {_recipes_in(module)}")
+        raise RecipeError(f"{path} needs the name of a recipe: --recipe {path}:NAME, one of {', '.join(own)}")
     if not hasattr(module, wanted):
-        names = [key for key in vars(module) if not key.startswith("_")]
-        raise RecipeError(f"{path} has no recipe {wanted!r}{did_you_mean(wanted, names)}; it has {_recipes_in(module)}")
+        raise RecipeError(f"{path} has no recipe {wanted!r}{did_you_mean(wanted, own)}; it has {', '.join(own)}")
     return made_recipe(getattr(module, wanted), name)
 
 
@@ -69,14 +77,20 @@ def _from_json_file(path: Path) -> Recipe:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise RecipeError(f"cannot read the recipe {path}: {error.strerror or error}") from error
+        raise RecipeError(
+            f"{path} must be a recipe in JSON, got: {error.strerror or error}; `gs2d recipes show NAME --json` "
+            "prints one"
+        ) from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise RecipeError(
             f"{path} must hold a recipe in JSON, as `gs2d recipes show NAME --json` prints it, got: {error}"
         ) from error
     if not isinstance(data, dict):
         raise RecipeError(f"{path} must hold a recipe, an object of JSON, got {type(data).__name__}")
-    return from_json(data)
+    try:
+        return from_json(data)
+    except RecipeError as error:
+        raise RecipeError(f"{path}: {error}; `gs2d recipes show NAME --json` prints a whole one") from error
 
 
 @cache  # what a file registers is registered once
@@ -91,18 +105,17 @@ def _run(path: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:  # it may raise anything
         del sys.modules[name]
-        raise RecipeError(f"{path} cannot be run: {_line(error)}") from error
+        raise RecipeError(f"{path} must run as a Python file, got {_line(error)}; mend it and try again") from error
     return module
 
 
-def _recipes_in(module: ModuleType) -> str:
+def _recipes_in(module: ModuleType) -> list[str]:
     """Return the names of a file's recipes, and of the functions that are its own."""
-    own = [
+    return [
         name
         for name, value in vars(module).items()
         if isinstance(value, Recipe) or (callable(value) and getattr(value, "__module__", "") == module.__name__)
     ]
-    return ", ".join(own) or "none"
 
 
 def _line(error: Exception) -> str:

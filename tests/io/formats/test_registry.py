@@ -18,7 +18,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import DataError, DiskError
 from gs2d.io.formats import compressed_ply
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
-from gs2d.io.formats.registry import LAYOUTS, layout_of, read_splat_file, write_layout
+from gs2d.io.formats.registry import LAYOUTS, layout_of, read_splat_file, read_surfels, write_layout
 from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid, unit_quats
@@ -383,3 +383,13 @@ def test_numbers_that_are_no_splats_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.splat").write_bytes(struct.pack("<6f8B", math.nan, 0, 0, 1, 1, 1, *range(8)))
     with pytest.raises(DataError, match="finite positions and positive scales were expected; is it a .splat file"):
         read_splat_file(tmp_path / "a.splat")
+
+
+@pytest.mark.parametrize(("kind", "faces"), [("a mesh", 1), ("a point cloud", 0)])
+def test_what_holds_no_splats_to_start_from_is_named(tmp_path: Path, kind: str, faces: int) -> None:
+    path = tmp_path / "x.ply"
+    header = f"ply\nformat ascii 1.0\nelement vertex 3\n{''.join(f'property float {c}' + chr(10) for c in 'xyz')}"
+    header += f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_text(header + "0 0 0\n1 0 0\n0 1 0\n" + "3 0 1 2\n" * faces)
+    with pytest.raises(DataError, match=f"must hold splats to start from, of 2DGS or 3DGS, got {kind}; give the"):
+        read_surfels(path)

@@ -158,9 +158,15 @@ def read_surfels(path: str | os.PathLike[str]) -> tuple[Splats, str]:
     DataError
         Missing, broken, or without splats.
     """
+    found = {"mesh": "a mesh", "points": "a point cloud"}.get("" if is_splat_file(path) else ply_kind(path))
+    if found is not None:
+        raise DataError(
+            f"{os.fspath(path)} must hold splats to start from, of 2DGS or 3DGS, got {found}; give the splats.ply of a "
+            "run, or what `gs2d export` writes"
+        )
     file = read_splat_file(path)
     if len(file.gaussians) == 0:
-        raise DataError(f"{os.fspath(path)} must hold splats to start from, got none")
+        raise DataError(f"{os.fspath(path)} must hold splats to start from, got none; give a file with some")
     if file.surfels is not None:
         return file.surfels, "flat splats"
     return file.gaussians.flattened(), "3D Gaussians without their smallest scales, whose axes are the normals now"
