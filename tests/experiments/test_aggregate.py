@@ -14,13 +14,13 @@ from gs2d.cli.app import parse
 from gs2d.cli.commands import Train
 from gs2d.config.protocols import MetricConventions
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.experiments.aggregate import Cell, Results, judge_order, read_cell
+from gs2d.experiments.aggregate import Cell, Results, check_claim, read_cell
 from gs2d.experiments.deviations import deviations_of, opacity_resets
 from gs2d.experiments.options import PaperOptions, parse_seeds
 from gs2d.experiments.paper import check_folder, paper
 from gs2d.experiments.plan import commands_of, make_plan, paper_command
 from gs2d.experiments.scenes import find_scenes
-from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Order
+from gs2d.experiments.tables import DTU, NERF_SYNTHETIC, PAPER_TABLES, TNT, Claim
 from gs2d.pipeline.options import TrainOptions, values
 from paper_cells import make_cell, make_row
 from tiny import write_ball_mesh, write_capture
@@ -41,8 +41,8 @@ def test_an_order_is_judged_at_the_seeds_that_have_every_scene() -> None:
     high = [replace(c, figures={**c.figures, "psnr": (c.figures["psnr"] or 0) + 1}) for c in UNEVEN[:2]]
     worse = replace(UNEVEN[2], figures={**UNEVEN[2].figures, "psnr": 0.0})  # seed 1, without scene b
     rows = (make_row("low", *UNEVEN), make_row("high", *high, worse))
-    verdict = judge_order(Order("claim", "psnr", ("low", "high")), rows, TNT)
-    assert (verdict.holds, verdict.steps[0].seeds, verdict.steps[0].difference) == ("yes", 1, 1.0)
+    claim = check_claim(Claim("claim", "psnr", ("low", "high")), rows, TNT)
+    assert (claim.holds, claim.steps[0].seeds, claim.steps[0].difference) == ("yes", 1, 1.0)
 
 
 def test_distances_in_different_units_have_no_common_mean() -> None:
@@ -108,7 +108,7 @@ def test_a_run_whose_surface_could_not_be_scored_keeps_its_pictures_scores(tmp_p
     floats = MetricConventions(from_8bit=False, surface="chamfer")
     other = read_cell(tmp_path, record=record, conventions=floats, **options)
     assert (other.figures["psnr"], other.details["headline"]) == (31.0, "chamfer")  # what its protocol asks for
-    assert judge_order(Order("claim", "surface", ("row", "row")), (make_row("row", other),), TNT).metric == "chamfer"
+    assert check_claim(Claim("claim", "surface", ("row", "row")), (make_row("row", other),), TNT).metric == "chamfer"
     assert read_cell(tmp_path, record={**record, "trained": False}, **options).figures["psnr"] is None
 
 

@@ -1,4 +1,4 @@
-"""`gs2d paper`: scenes found, rows averaged, orders judged, tables written, failures named, nothing done twice."""
+"""`gs2d paper`: scenes found, rows averaged, claims judged, tables written, failures named, nothing done twice."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ import pytest
 from gs2d.cli import run
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.experiments import execute as execute_module
-from gs2d.experiments.aggregate import FIGURES, Results, Row, judge_order, read_cell
+from gs2d.experiments.aggregate import FIGURES, Results, Row, check_claim, read_cell
 from gs2d.experiments.options import PaperOptions, parse_seeds
 from gs2d.experiments.paper import paper
 from gs2d.experiments.plan import canonical_recipe, make_plan
 from gs2d.experiments.render import parts_of, shown, to_csv, to_latex, to_markdown
 from gs2d.experiments.scenes import find_scenes, missing_scenes
-from gs2d.experiments.tables import DTU, PAPER_TABLES, TNT, Order, recipe_table
+from gs2d.experiments.tables import DTU, PAPER_TABLES, TNT, Claim, recipe_table
 from paper_cells import TINY, draw_nothing, make_cell, make_row
 from tiny import write_ball_mesh, write_capture
 
@@ -160,7 +160,7 @@ def test_the_figures_of_a_run_count_shared_stages_and_the_protocols_views(tmp_pa
     assert set(read_cell(tmp_path, test_on="test", **failed).reasons.values()) == {"no photographs"}
 
 
-# -- orders --------------------------------------------------------------------------------------------------------
+# -- claims --------------------------------------------------------------------------------------------------------
 def rows_of(metric: str = "psnr", data_set: str = TNT, **values: list[float]) -> tuple[Row, ...]:
     """A row for each name, with a value for each seed."""
     return tuple(
@@ -174,34 +174,34 @@ def rows_of(metric: str = "psnr", data_set: str = TNT, **values: list[float]) ->
     [([1, 2], [2, 3], "yes"), ([2, 3], [1, 2], "no"), ([1, 3], [2, 2], "open")],
 )
 def test_an_order_holds_if_it_does_at_every_seed(low: list[float], high: list[float], holds: str) -> None:
-    verdict = judge_order(Order("claim", "psnr", ("low", "high")), rows_of(low=low, high=high), TNT)
-    assert verdict.holds == holds
-    (step,) = verdict.steps
+    claim = check_claim(Claim("claim", "psnr", ("low", "high")), rows_of(low=low, high=high), TNT)
+    assert claim.holds == holds
+    (step,) = claim.steps
     assert step.difference == (high[0] - low[0] + high[1] - low[1]) / 2
 
 
 def test_best_flat_and_at_least() -> None:
     rows = rows_of(a=[1.0], b=[3.0], c=[2.95])
-    assert judge_order(Order("best", "psnr", ("a", "c", "b"), "best"), rows, TNT).holds == "yes"
-    assert judge_order(Order("best", "psnr", ("a", "b", "c"), "best"), rows, TNT).holds == "no"
-    assert judge_order(Order("flat", "psnr", ("b", "c"), "flat", 0.1), rows, TNT).holds == "yes"
-    assert judge_order(Order("flat", "psnr", ("a", "b", "c"), "flat", 0.1), rows, TNT).holds == "no"
-    assert judge_order(Order("at least", "psnr", ("b", "c"), "at least"), rows, TNT).holds == "no"
-    assert judge_order(Order("at least", "psnr", ("c", "c"), "at least"), rows, TNT).holds == "yes"
+    assert check_claim(Claim("best", "psnr", ("a", "c", "b"), "best"), rows, TNT).holds == "yes"
+    assert check_claim(Claim("best", "psnr", ("a", "b", "c"), "best"), rows, TNT).holds == "no"
+    assert check_claim(Claim("flat", "psnr", ("b", "c"), "flat", 0.1), rows, TNT).holds == "yes"
+    assert check_claim(Claim("flat", "psnr", ("a", "b", "c"), "flat", 0.1), rows, TNT).holds == "no"
+    assert check_claim(Claim("at least", "psnr", ("b", "c"), "at least"), rows, TNT).holds == "no"
+    assert check_claim(Claim("at least", "psnr", ("c", "c"), "at least"), rows, TNT).holds == "yes"
 
 
 def test_a_surface_is_better_with_a_higher_f_score_and_a_lower_chamfer_distance() -> None:
-    order = Order("surface", "surface", ("worse", "better"))
-    assert judge_order(order, rows_of("fscore", TNT, worse=[0.2], better=[0.3]), TNT).holds == "yes"
-    verdict = judge_order(order, rows_of("chamfer", DTU, worse=[0.8], better=[0.7]), DTU)
-    assert (verdict.holds, verdict.metric) == ("yes", "chamfer")
-    assert verdict.steps[0].difference == pytest.approx(0.1)
+    order = Claim("surface", "surface", ("worse", "better"))
+    assert check_claim(order, rows_of("fscore", TNT, worse=[0.2], better=[0.3]), TNT).holds == "yes"
+    claim = check_claim(order, rows_of("chamfer", DTU, worse=[0.8], better=[0.7]), DTU)
+    assert (claim.holds, claim.metric) == ("yes", "chamfer")
+    assert claim.steps[0].difference == pytest.approx(0.1)
 
 
 def test_what_was_not_measured_cannot_be_judged() -> None:
     rows = (make_row("low", make_cell(psnr=1.0)), make_row("high", make_cell()))
-    verdict = judge_order(Order("claim", "psnr", ("low", "high")), rows, TNT)
-    assert (verdict.holds, verdict.reason) == ("unknown", "no PSNR of high: because")
+    claim = check_claim(Claim("claim", "psnr", ("low", "high")), rows, TNT)
+    assert (claim.holds, claim.reason) == ("unknown", "no PSNR of high: because")
 
 
 # -- files ---------------------------------------------------------------------------------------------------------

@@ -58,12 +58,12 @@ def test_nothing_of_the_paper_stands_in_it(swept: tuple[Path, list[str], int]) -
         text = (out / name).read_text()
         assert "What to know about these figures" in text
         assert "the schedule is 0.0005 of the paper" in text  # what a recipe is defined by
-        phrases = ("orders", "In brackets", "In small print", "differs from", "paper&#39;s figure", "RTX 4090")
+        phrases = ("claims", "In brackets", "In small print", "differs from", "paper&#39;s figure", "RTX 4090")
         for phrase in (*phrases, "gs2d paper"):
             assert phrase not in text
     assert "2DGS with normal consistency 0.05: the paper&#39;s baseline" in (out / "index.html").read_text()
     assert '<p class="lead">2 recipes on 1 scene. Trained at 0.0005 of the schedule' in (out / "index.html").read_text()
-    assert json.loads((out / "about.json").read_text())["orders"] == []
+    assert json.loads((out / "about.json").read_text())["claims"] == []
 
 
 def test_another_recipe_adds_a_row_and_trains_only_what_is_new(swept: tuple[Path, list[str], int]) -> None:

@@ -17,52 +17,52 @@ FLOAT = torch.float32
 
 
 def test_memory_comes_back_when_the_last_view_of_a_tensor_is_gone() -> None:
-    recycler = BufferPool(min_bytes=64)
-    tensor = recycler.empty((10, 3), FLOAT)
+    pool = BufferPool(min_bytes=64)
+    tensor = pool.empty((10, 3), FLOAT)
     first, row = tensor.data_ptr(), tensor[4]
     assert tensor.is_contiguous()
     assert tensor.shape == (10, 3)
     assert first % LINE == 0
     del tensor
-    assert recycler.free_bytes == 0  # the row is still there
-    other = recycler.empty((10, 3), FLOAT)
+    assert pool.free_bytes == 0  # the row is still there
+    other = pool.empty((10, 3), FLOAT)
     assert other.data_ptr() != first
     del row
-    assert recycler.free_bytes > 0
-    assert recycler.empty((9, 3), FLOAT).data_ptr() == first  # 27 of 30 reals
+    assert pool.free_bytes > 0
+    assert pool.empty((9, 3), FLOAT).data_ptr() == first  # 27 of 30 reals
 
 
 def test_tensors_that_the_c_library_keeps_itself_are_its_own() -> None:
-    recycler = BufferPool(min_bytes=64)
-    tensor = recycler.empty((15,), FLOAT)  # 60 bytes
+    pool = BufferPool(min_bytes=64)
+    tensor = pool.empty((15,), FLOAT)  # 60 bytes
     del tensor
-    assert recycler.free_bytes == 0
+    assert pool.free_bytes == 0
 
 
 def test_a_block_that_splats_have_outgrown_is_given_up() -> None:
-    recycler = BufferPool(min_bytes=64)
-    tensor = recycler.empty((1000,), FLOAT)
+    pool = BufferPool(min_bytes=64)
+    tensor = pool.empty((1000,), FLOAT)
     del tensor
-    assert recycler.free_bytes == (4000 + LINE) * 17 // 16
-    larger = recycler.empty((1200,), FLOAT)  # the block holds 1079 reals behind the first cache line
-    assert recycler.free_bytes == 0
+    assert pool.free_bytes == (4000 + LINE) * 17 // 16
+    larger = pool.empty((1200,), FLOAT)  # the block holds 1079 reals behind the first cache line
+    assert pool.free_bytes == 0
     del larger
 
 
 def test_blocks_of_other_sizes_wait_for_their_next_request_but_not_for_ever() -> None:
-    recycler = BufferPool(min_bytes=64)
-    kept, small = recycler.empty((100_000,), FLOAT), (100,)
+    pool = BufferPool(min_bytes=64)
+    kept, small = pool.empty((100_000,), FLOAT), (100,)
     del kept
     for _ in range(64):
-        recycler.empty(small, FLOAT)
-        assert recycler.free_bytes > 400_000
-    recycler.empty(small, FLOAT)
-    assert recycler.free_bytes < 1000
+        pool.empty(small, FLOAT)
+        assert pool.free_bytes > 400_000
+    pool.empty(small, FLOAT)
+    assert pool.free_bytes < 1000
 
 
 def test_images_and_gradients_in_used_memory_have_the_same_bits(native: Library) -> None:
     recycling = copy.copy(native)
-    recycling.recycler = BufferPool(min_bytes=1)
+    recycling.pool = BufferPool(min_bytes=1)
     room = room_workload(300, 40, 33)
 
     def differentiated(library: Library) -> list[torch.Tensor]:
@@ -74,12 +74,12 @@ def test_images_and_gradients_in_used_memory_have_the_same_bits(native: Library)
         return [*(image.detach() for image in images), output.radii, *found]
 
     expected, first = differentiated(native), differentiated(recycling)
-    assert recycling.recycler.free_bytes == 0
+    assert recycling.pool.free_bytes == 0
     held = first[0].data_ptr()
     for tensor in first[1:]:
         tensor.fill_(float("nan"))
     del first[1:], tensor
-    assert recycling.recycler.free_bytes > 0
+    assert recycling.pool.free_bytes > 0
     second = differentiated(recycling)
     assert held not in {t.data_ptr() for t in second}
     for a, b in zip(expected, second, strict=True):

@@ -109,11 +109,11 @@ def test_what_decoding_left_goes_back_however_a_picture_was_asked_for(monkeypatc
 
 
 def test_buffers_that_nobody_holds_are_given_up() -> None:
-    recycler = BufferPool(min_bytes=1024)
-    held = recycler.empty((1024,), torch.float32)
+    pool = BufferPool(min_bytes=1024)
+    held = pool.empty((1024,), torch.float32)
     held[:] = 7
-    recycler.empty((2048,), torch.float32)  # dropped at once
-    assert recycler.free_bytes >= 8192
-    recycler.clear()
-    assert recycler.free_bytes == 0
+    pool.empty((2048,), torch.float32)  # dropped at once
+    assert pool.free_bytes >= 8192
+    pool.clear()
+    assert pool.free_bytes == 0
     assert bool((held == 7).all())

@@ -9,7 +9,7 @@ from gs2d.cli.console import Console
 from gs2d.errors import RunError
 from gs2d.experiments.paper import PaperResult
 from gs2d.experiments.paper import paper as run_paper
-from gs2d.experiments.render import TITLES, parts_of, verdict_text
+from gs2d.experiments.render import TITLES, claim_text, parts_of
 
 
 def show_table(command: Paper | Sweep, console: Console) -> None:
@@ -25,9 +25,9 @@ def show_table(command: Paper | Sweep, console: Console) -> None:
     _tables(result, console)
     if command.json:
         files = {path.name: str(path) for path in result.files}
-        orders = [verdict.to_json() for verdict in result.verdicts]
+        claims = [claim.to_json() for claim in result.checked]
         rows = json.loads(result.files[0].read_text(encoding="utf-8"))
-        console.result({"rows": rows, "orders": orders, "failures": result.failures, "files": files})
+        console.result({"rows": rows, "claims": claims, "failures": result.failures, "files": files})
     if result.failures:
         name, reason = next(iter(result.failures.items()))
         more = (
@@ -47,8 +47,8 @@ def _tables(result: PaperResult, console: Console) -> None:
             heads = ["", *(TITLES[metric] for metric in part.columns)]
             rows = [[row.name, *(figure.measured for figure in row.figures)] for row in part.rows if not row.quoted]
             console.table(f"{result.table.title}: {part.data_set}", heads, rows)
-    for verdict in result.verdicts:
-        console.say(f"{verdict.holds:>7}  {verdict.text} ({verdict.data_set}): {verdict_text(verdict)}")
+    for claim in result.checked:
+        console.say(f"{claim.holds:>7}  {claim.text} ({claim.data_set}): {claim_text(claim)}")
     if result.unfinished:
         console.say(f"{result.unfinished} runs are not trained yet")
     for path in result.files:

@@ -1,4 +1,4 @@
-"""From runs to rows: the figures of each run, means over scenes and seeds, and whether the paper's orders hold."""
+"""From runs to rows: the figures of each run, means over scenes and seeds, and whether the paper's claims hold."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from gs2d.config.protocols import MetricConventions
 from gs2d.errors import Gs2dError
-from gs2d.experiments.tables import DTU, LOWER_IS_BETTER, METRICS, NERF_SYNTHETIC, TNT, Order, PaperTable
+from gs2d.experiments.tables import DTU, LOWER_IS_BETTER, METRICS, NERF_SYNTHETIC, TNT, Claim, PaperTable
 from gs2d.io.run_dir import open_run
 
 FIGURES = (*METRICS, "bytes", "seconds")
@@ -271,10 +271,10 @@ def surface_figures(surface: dict[str, Any] | None, data_set: str) -> dict[str, 
     return {"fscore": surface.get("f_score", middle), "chamfer": surface.get("chamfer")}
 
 
-# -- orders ----------------------------------------------------------------------------------------------------------
+# -- claims ----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Step:
-    """The difference of two neighbouring rows of an order, in the direction in which the paper has it.
+    """The difference of two neighbouring rows of a claim, in the direction in which the paper has it.
 
     Attributes
     ----------
@@ -300,8 +300,8 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Whether one of the paper's orders holds on one data set.
+class ClaimResult:
+    """Whether one of the paper's claims holds on one data set.
 
     ``holds`` is "yes", "no", "open" (the seeds disagree) or "unknown" (something was not measured: ``reason``).
     """
@@ -319,45 +319,45 @@ class Verdict:
         return asdict(self)
 
 
-def judge(table: PaperTable, results: Results) -> tuple[Verdict, ...]:
-    """Every order of a table, on every data set that was trained."""
-    return tuple(judge_order(order, results.rows, d) for d in results.data_sets for order in table.orders)
+def check_claims(table: PaperTable, results: Results) -> tuple[ClaimResult, ...]:
+    """Every claim of a table, on every data set that was trained."""
+    return tuple(check_claim(claim, results.rows, d) for d in results.data_sets for claim in table.claims)
 
 
-def judge_order(order: Order, rows: Sequence[Row], data_set: str) -> Verdict:
-    """One order on one data set."""
-    metric = order.metric
+def check_claim(claim: Claim, rows: Sequence[Row], data_set: str) -> ClaimResult:
+    """One claim on one data set."""
+    metric = claim.metric
     if metric == "surface":
         metric = surface_metric(rows, data_set)
     by_name = {row.name: row for row in rows}
-    facts = (order.text, metric, order.kind, data_set)
-    for name in order.rows:
+    facts = (claim.text, metric, claim.kind, data_set)
+    for name in claim.rows:
         cells = by_name[name].of(data_set)
         if all(cell.figures[metric] is None for cell in cells):
             why = cells[0].reasons.get(metric, "not measured") if cells else "not trained"
-            return Verdict(*facts, "unknown", (), f"no {METRICS[metric]} of {name}: {why}")
-    steps = tuple(_step(by_name[a], by_name[b], metric, data_set, order) for a, b in _pairs(order))
+            return ClaimResult(*facts, "unknown", (), f"no {METRICS[metric]} of {name}: {why}")
+    steps = tuple(_step(by_name[a], by_name[b], metric, data_set, claim) for a, b in _pairs(claim))
     if not all(step.seeds for step in steps):
-        return Verdict(*facts, "unknown", (), "no seed at which both rows have all of their scenes")
+        return ClaimResult(*facts, "unknown", (), "no seed at which both rows have all of their scenes")
     if all(step.seeds_with_sign == step.seeds for step in steps):
         holds = "yes"
     elif any(step.seeds_with_sign == 0 for step in steps):
         holds = "no"
     else:
         holds = "open"
-    return Verdict(*facts, holds, steps)
+    return ClaimResult(*facts, holds, steps)
 
 
-def _pairs(order: Order) -> list[tuple[str, str]]:
-    rows = order.rows
-    if order.kind == "best":
+def _pairs(claim: Claim) -> list[tuple[str, str]]:
+    rows = claim.rows
+    if claim.kind == "best":
         return [(row, rows[-1]) for row in rows[:-1]]
-    if order.kind == "flat":  # the worst and the best decide, but the reader wants to see who they are
+    if claim.kind == "flat":  # the worst and the best decide, but the reader wants to see who they are
         return [(a, b) for i, a in enumerate(rows) for b in rows[i + 1 :]]
     return list(itertools.pairwise(rows))
 
 
-def _step(lower: Row, upper: Row, metric: str, data_set: str, order: Order) -> Step:
+def _step(lower: Row, upper: Row, metric: str, data_set: str, claim: Claim) -> Step:
     sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
     values = {row.name: {(c.scene, c.seed): c.figures[metric] for c in row.of(data_set)} for row in (lower, upper)}
     found: dict[str, dict[int, float]] = {}
@@ -366,10 +366,10 @@ def _step(lower: Row, upper: Row, metric: str, data_set: str, order: Order) -> S
         if high is not None and low is not None:
             found.setdefault(scene, {})[seed] = sign * (high - low)
     differences = by_seed(found)
-    within = order.within or 0.0
-    if order.kind == "flat":
+    within = claim.within or 0.0
+    if claim.kind == "flat":
         right = [abs(d) <= within for d in differences]
-    elif order.kind == "at least":  # not worse by more than the paper rounds away
+    elif claim.kind == "at least":  # not worse by more than the paper rounds away
         right = [d >= -ROUNDING[metric] for d in differences]
     else:
         right = [d > 0 for d in differences]

@@ -13,7 +13,7 @@ from gs2d.config.surface_protocols import DTU_SURFACE, TNT_SURFACE, VISIBLE_SURF
 from gs2d.core.files import atomic_write
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
-from gs2d.experiments.aggregate import FIGURES, Results, Row, Verdict, judge, read_cell
+from gs2d.experiments.aggregate import FIGURES, ClaimResult, Results, Row, check_claims, read_cell
 from gs2d.experiments.deviations import deviations_of
 from gs2d.experiments.execute import execute, failures
 from gs2d.experiments.options import PaperOptions, SweepOptions, TableOptions
@@ -37,7 +37,7 @@ class PaperResult:
     files : tuple of Path
         table.json first.
     results : Results
-    verdicts : tuple of Verdict
+    checked : tuple of ClaimResult
     failures : dict
         Job -> reason, of runs that failed.
     unfinished : int
@@ -47,7 +47,7 @@ class PaperResult:
     table: PaperTable
     files: tuple[Path, ...]
     results: Results
-    verdicts: tuple[Verdict, ...]
+    checked: tuple[ClaimResult, ...]
     failures: dict[str, str]
     unfinished: int
 
@@ -130,15 +130,15 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> 
     """Write table.json, .md, .csv, .tex, about.json and (with ``pictures``) index.html, from the runs as they are."""
     unfinished = sum(job.outcome()["state"] not in ("done", "failed") for job in plan.jobs)
     results = Results(tuple(_row(plan, row) for row in plan.table.rows))
-    verdicts = judge(plan.table, results)
+    checked = check_claims(plan.table, results)
     deviations = deviations_of(plan.options, plan.scenes, plan.table, results)
-    out, facts = plan.options.out, about(plan, results, verdicts)
+    out, facts = plan.options.out, about(plan, results, checked)
     make_folder(out)
     commands = [line for job in plan.jobs for line in commands_of(job)]
     write_json(out / "table.json", [row_json(row, results, deviations) for row in results.rows])
     write_json(out / ABOUT, {**facts, "deviations": deviations})
     texts = {
-        "table.md": to_markdown(plan.table, results, verdicts, deviations, [facts["command"], *commands]),
+        "table.md": to_markdown(plan.table, results, checked, deviations, [facts["command"], *commands]),
         "table.csv": to_csv(results),
         "table.tex": to_latex(plan.table, results),
     }
@@ -147,8 +147,8 @@ def tabulate(plan: Plan, on_event: OnEvent = ignore, *, images: bool = True) -> 
             file.write(text)
     files = [out / name for name in ("table.json", *texts, ABOUT)]
     if images:
-        files.append(write_page(plan.table, results, verdicts, deviations, commands, facts, out, on_event))
-    return PaperResult(plan.table, tuple(files), results, verdicts, failures(plan.jobs), unfinished)
+        files.append(write_page(plan.table, results, checked, deviations, commands, facts, out, on_event))
+    return PaperResult(plan.table, tuple(files), results, checked, failures(plan.jobs), unfinished)
 
 
 def _row(plan: Plan, row: PaperRow) -> Row:
@@ -190,7 +190,7 @@ def row_json(row: Row, results: Results, deviations: Sequence[str]) -> dict[str,
     }
 
 
-def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> dict[str, Any]:
+def about(plan: Plan, results: Results | None, checked: Sequence[ClaimResult]) -> dict[str, Any]:
     """Return what the whole table was made with."""
     options = plan.options
     return {
@@ -203,7 +203,7 @@ def about(plan: Plan, results: Results | None, verdicts: Sequence[Verdict]) -> d
         "protocols": {name: numbers_of(protocol) for name, protocol in _protocols(plan).items()},
         "seeds": list(options.seeds),
         "spread": "standard deviation over seeds of the mean over scenes",
-        "orders": [verdict.to_json() for verdict in verdicts],
+        "claims": [claim.to_json() for claim in checked],
         "failures": failures(plan.jobs) if results is not None else {},
         "command": paper_command(options),
         "versions": versions(),

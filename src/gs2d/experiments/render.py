@@ -22,7 +22,7 @@ from gs2d.core.files import atomic_write
 from gs2d.core.images import read_image
 from gs2d.core.json_files import read_json
 from gs2d.errors import Gs2dError
-from gs2d.experiments.aggregate import FIGURES, Cell, Results, Row, Verdict
+from gs2d.experiments.aggregate import FIGURES, Cell, ClaimResult, Results, Row
 from gs2d.experiments.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.io.run_dir import RENDERS
 from gs2d.pipeline.events import OnEvent, ignore
@@ -167,20 +167,20 @@ def about_row(row: Row) -> str:
     return about if row.name == row.recipe else about.partition(": ")[2] or about
 
 
-def verdict_text(verdict: Verdict) -> str:
-    """Return one line about an order: its steps with differences and spread."""
-    if verdict.holds == "unknown":
-        return verdict.reason
-    steps = verdict.steps
-    if verdict.kind == "flat":
+def claim_text(claim: ClaimResult) -> str:
+    """Return one line about a claim: its steps with differences and spread."""
+    if claim.holds == "unknown":
+        return claim.reason
+    steps = claim.steps
+    if claim.kind == "flat":
         steps = (max(steps, key=lambda step: abs(step.difference)),)
     words = []
     for step in steps:
-        spread = "" if step.spread is None else f" ± {shown(verdict.metric, step.spread)}"
+        spread = "" if step.spread is None else f" ± {shown(claim.metric, step.spread)}"
         seeds = f", {step.seeds_with_sign} of {step.seeds} seeds" if step.seeds > 1 else ""
         sign = "+" if step.difference >= 0 else ""
-        words.append(f"{step.lower} → {step.upper}: {sign}{shown(verdict.metric, step.difference)}{spread}{seeds}")
-    prefix = "largest difference: " if verdict.kind == "flat" else ""
+        words.append(f"{step.lower} → {step.upper}: {sign}{shown(claim.metric, step.difference)}{spread}{seeds}")
+    prefix = "largest difference: " if claim.kind == "flat" else ""
     return prefix + "; ".join(words)
 
 
@@ -200,15 +200,19 @@ def _templates() -> jinja2.Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    env.globals |= {"verdict_text": verdict_text, "deviations_title": deviations_title, "METRICS": METRICS}
+    env.globals |= {"claim_text": claim_text, "deviations_title": deviations_title, "METRICS": METRICS}
     return env
 
 
 def to_markdown(
-    table: PaperTable, results: Results, verdicts: Sequence[Verdict], deviations: Sequence[str], commands: Sequence[str]
+    table: PaperTable,
+    results: Results,
+    checked: Sequence[ClaimResult],
+    deviations: Sequence[str],
+    commands: Sequence[str],
 ) -> str:
     """Return the whole result as Markdown."""
-    values = {"table": table, "verdicts": verdicts, "deviations": deviations, "commands": commands}
+    values = {"table": table, "checked": checked, "deviations": deviations, "commands": commands}
     return _templates().get_template("table.md").render(values, parts=parts_of(table, results))
 
 
@@ -277,7 +281,7 @@ def to_latex(table: PaperTable, results: Results) -> str:
 def write_page(
     table: PaperTable,
     results: Results,
-    verdicts: Sequence[Verdict],
+    checked: Sequence[ClaimResult],
     deviations: Sequence[str],
     commands: Sequence[str],
     about: dict[str, Any],
@@ -294,8 +298,8 @@ def write_page(
     body = template.render(
         table=table,
         parts=parts_of(table, results),
-        verdicts=verdicts,
-        known=[verdict for verdict in verdicts if verdict.holds != "unknown"],
+        checked=checked,
+        known=[claim for claim in checked if claim.holds != "unknown"],
         deviations=deviations,
         scenes=side_by_side(results),
         changes=own_figures(results, out, on_event),

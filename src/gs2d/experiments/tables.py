@@ -1,7 +1,7 @@
 """The tables of the 2DGS-R paper as values, read from ``paper_tables.toml``; and tables of recipes that somebody chose.
 
 Rows without a recipe are quoted: other methods, which this project does not train. What the paper says a table shows
-is here too, as :class:`Order` values that can be checked against any rows. Pure Python; never imports torch.
+is here too, as :class:`Claim` values that can be checked against any rows. Pure Python; never imports torch.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LOWER_IS_BETTER = frozenset({"chamfer", "lpips", "bytes", "seconds"})
 
 
 @dataclass(frozen=True)
-class Order:
+class Claim:
     """Something the paper says a table shows, in a form that rows can be checked against.
 
     Attributes
@@ -67,7 +67,7 @@ class PaperTable:
     label: str
     columns: Mapping[str, tuple[str, ...]]
     rows: tuple[PaperRow, ...]
-    orders: tuple[Order, ...] = ()
+    claims: tuple[Claim, ...] = ()
 
     @property
     def trained(self) -> tuple[PaperRow, ...]:
@@ -102,8 +102,8 @@ def _read(name: str, table: Mapping[str, Any], notes: Mapping[str, str]) -> Pape
             figures = zip(metrics, group.split(), strict=True)
             paper[data_set] = {metric: float(figure) for metric, figure in figures if figure != "-"}
         rows.append(PaperRow(row, TABLES[name].get(row), paper, notes.get(row, "")))
-    orders = tuple(Order(**{**order, "rows": tuple(order["rows"])}) for order in table["orders"])
-    return PaperTable(name, table["title"], table["label"], columns, tuple(rows), orders)
+    claims = tuple(Claim(**{**claim, "rows": tuple(claim["rows"])}) for claim in table["claims"])
+    return PaperTable(name, table["title"], table["label"], columns, tuple(rows), claims)
 
 
 _FILE = tomllib.loads((files("gs2d.experiments") / "paper_tables.toml").read_text(encoding="utf-8"))

@@ -27,7 +27,7 @@ class BufferPool:
     """Hands out tensors and takes their memory back when nobody holds them, or a view of them, any more.
 
     A free block serves tensors of three quarters of its size and more. Where none fits, those of about that size are
-    given up: splats were added or removed. Threads may share a recycler.
+    given up: splats were added or removed. Threads may share a pool.
     """
 
     def __init__(self, min_bytes: int = MIN_BYTES) -> None:

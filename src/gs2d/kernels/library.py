@@ -40,7 +40,7 @@ class Library:
         Of the arrays its functions take.
     lanes : int
         Pixels per vector.
-    recycler : Recycler
+    pool : BufferPool
         Where large results come from.
     """
 
@@ -54,7 +54,7 @@ class Library:
             raise BackendError(f"the CPU kernels {path.name} have version {version}, expected {ABI_VERSION}; {REMEDY}")
         self.path = path
         self.variant = variant
-        self.recycler = BufferPool()
+        self.pool = BufferPool()
         self._functions: dict[tuple[Any, ...], Any] = {}
         self.lanes = int(self._dll.gs2d_lanes())
         self.dtype = torch.float64 if int(self._dll.gs2d_real_bytes()) == 8 else torch.float32

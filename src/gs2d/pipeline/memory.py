@@ -18,5 +18,5 @@ def release(scene: Scene) -> None:
     scene.forget()
     gc.collect()
     if available_variants():
-        load().recycler.clear()
+        load().pool.clear()
     trim()

@@ -142,7 +142,7 @@ def _check_tensors(splats: Splats, settings: RasterSettings, dtype: torch.dtype)
 def _forward(library: Library, view: _View, tensors: Sequence[Tensor]) -> tuple[dict[str, Tensor], Tensor, _Frame]:
     """Images, radii and what the backward pass needs; the tensors are contiguous."""
     H, W = int(view.height), int(view.width)
-    empty, dtype = library.recycler.empty, library.dtype
+    empty, dtype = library.pool.empty, library.dtype
     images = {name: empty((H, W, 3) if name in ("color", "normal") else (H, W), dtype) for name in IMAGES}
     radii = empty((len(tensors[0]),), dtype)
     forward = library.function("gs2d_raster_forward", ctypes.c_int, [ctypes.c_void_p] * 4)
@@ -186,7 +186,7 @@ class _Rasterize(torch.autograd.Function):
         images = _Images(*(_address(t) for t in (color, alpha, normal, depth_mean, None, distortion, None)))
         given = [_plain(g, library.dtype) for g in upstream[: len(IMAGES)]]
         want_probe, want_intrinsics, *want = ctx.needs_input_grad[3:]
-        empty, dtype = library.recycler.empty, library.dtype
+        empty, dtype = library.pool.empty, library.dtype
         grads = [empty(t.shape, dtype) if wanted else None for t, wanted in zip(tensors, want, strict=True)]
         probe = empty(ctx.probe_shape, dtype) if want_probe else None
         columns = 0 if probe is None else int(probe.shape[1])

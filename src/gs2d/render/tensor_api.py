@@ -28,10 +28,7 @@ __all__ = ["Rasterization", "rasterize_2dgs"]
 
 GROUP = 3  # channels that a backend blends at a time
 MIN_SCALE = 1e-18  # world units; the kernels' own floor: a disc without extent is drawn by the low-pass filter alone
-MIN_OPACITY, MAX_OPACITY = (
-    1e-30,
-    1 - 2.0**-20,
-)  # so that the logit is finite; below alpha_min a splat is not drawn anyway
+MIN_OPACITY, MAX_OPACITY = 1e-30, 1 - 2.0**-20  # the logit is finite; below alpha_min a splat is not drawn anyway
 CONSTANTS = ("near", "far", "alpha_min", "alpha_max", "transmittance_min", "error_cutoff", "lowpass_px")
 
 
@@ -363,7 +360,7 @@ _TENSORS = 9  # means to screen_probe
 _ARGUMENTS = (  # written out: what torch reads from annotations differs between its versions
     "Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor colors, Tensor viewmats, Tensor Ks, "
     "Tensor? backgrounds, Tensor? screen_probe, SymInt width, SymInt height, int sh_degree, float[] constants, "
-    "str lowpass_depth, str crossing, bool with_distortion, str backend"
+    "str lowpass_depth, str near_plane_policy, bool with_distortion, str backend"
 )
 _FORWARD = f"({_ARGUMENTS}) -> ({', '.join(['Tensor'] * len(Rasterization._fields))})"
 _BACKWARD = f"(Tensor?[] upstream, bool[] wanted, {_ARGUMENTS}) -> Tensor[]"
