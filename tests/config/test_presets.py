@@ -157,6 +157,26 @@ def test_variants_change_what_they_say() -> None:
     assert get_recipe("2dgs-r-occlusion").stages[1].on_enter == (RankByError(occlusion=True),)
 
 
+def test_controls_change_what_they_say() -> None:
+    def but_for_the_last(name: str, base: str) -> tuple[Stage, Stage]:
+        recipe, plain = get_recipe(name), get_recipe(base)
+        assert recipe.stages[:-1] == plain.stages[:-1]
+        return recipe.stages[-1], plain.stages[-1]
+
+    for name, base in (("2dgs-r-restart", "2dgs-r"), ("2dgs-60k-restart", "2dgs-60k")):
+        last, plain = but_for_the_last(name, base)
+        assert replace(last, lr=plain.lr) == plain
+        # falls once more, and ends with the stage
+        assert last.lr.means_at(0) == pytest.approx(1.6e-4)
+        assert last.lr.means_at(last.iterations - 100) > last.lr.means_at(last.iterations) == pytest.approx(1.6e-6)
+    last, plain = but_for_the_last("2dgs-60k-no-nc-late", "2dgs-60k")
+    assert "normal_consistency" not in weights(last)
+    assert replace(last, losses=plain.losses) == plain
+    last, plain = but_for_the_last("2dgs-r-no-clone", "2dgs-r")
+    assert replace(last, on_enter=plain.on_enter) == plain
+    assert last.on_enter == ()
+
+
 def test_a_weight_of_zero_leaves_the_term_out() -> None:
     assert all(term.weight != 0 for name in RECIPES for s in get_recipe(name).stages for term in s.losses)
     assert LossTerm("normal_consistency", 0.0) not in get_recipe("2dgs-no-nc").stages[0].losses

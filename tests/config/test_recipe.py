@@ -23,7 +23,7 @@ from gs2d.config.recipe import (
     Stage,
     validate,
 )
-from gs2d.config.serialize import to_json
+from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.errors import RecipeError
 
 L1 = (LossTerm("l1", 1.0),)
@@ -68,6 +68,20 @@ def test_official_resets_are_every_3000_before_15000_and_at_500_on_white() -> No
     densify = GradDensify()
     assert [i for i in range(1, 30_001) if densify.resets(i, white=False)] == [3000, 6000, 9000, 12000]
     assert [i for i in range(1, 30_001) if densify.resets(i, white=True)] == [500, 3000, 6000, 9000, 12000]
+
+
+def test_a_reset_on_white_may_stand_alone() -> None:
+    densify = GradDensify(reset_every=0, reset_at_on_white=(500,))
+    assert [i for i in range(1, 30_001) if densify.resets(i, white=True)] == [500]
+    assert [i for i in range(1, 30_001) if densify.resets(i, white=False)] == []
+
+
+def test_large_splats_may_be_pruned_after_densification_as_often_as_in_it() -> None:
+    densify = GradDensify(stop=15_000, prune_until=15_300)
+    assert [i for i in range(1, 30_001) if densify.only_prunes(i)] == [15_000, 15_100, 15_200, 15_300]
+    assert not any(GradDensify().only_prunes(i) for i in range(1, 30_001))
+    alone = GradDensify(start=0, stop=0, reset_every=0, prune_until=300)
+    assert [i for i in range(1, 1001) if alone.only_prunes(i)] == [100, 200, 300]
 
 
 def test_last_reset_ends_resets_and_reset_at_adds_some() -> None:
@@ -122,6 +136,12 @@ def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
         (one(densify=GradDensify(every=0)), "densify.every"),
         (one(densify=GradDensify(reset_opacity=0.0)), "reset_opacity"),
         (one(densify=GradDensify(max_splats=0)), "max_splats"),
+        (
+            one(densify=GradDensify(prune_until=11)),
+            "densify.prune_until must be at most the stage's 10 iterations, got 11",
+        ),
+        (one(densify=GradDensify(scale_cull_start=-1)), "densify.scale_cull_start must be an integer >= 0, got -1"),
+        (one(densify=GradDensify(reset_at_on_white=(0,))), "densify.reset_at_on_white must be an integer >= 1, got 0"),
         (one(densify=GradDensify(), train={"means": "all"}), "resets or caps opacity"),
     ],
 )
@@ -272,6 +292,17 @@ def test_an_unknown_loss_is_refused_with_what_was_meant() -> None:
         validate(one(losses=(*L1, LossTerm("distorsion", 1.0))))
     with pytest.raises(RecipeError, match="loss 'l1' takes no options, got {'power': 2}"):
         validate(one(losses=(LossTerm("l1", 1.0, options={"power": 2}),)))
+
+
+def test_fields_that_came_later_are_written_where_they_say_something_and_can_always_be_set() -> None:
+    plain = to_json(one(densify=GradDensify()))["stages"][0]["densify"]
+    assert list(plain)[-1] == "max_splats"
+    # 0 says something that the default, None, does not
+    recipe = one(densify=GradDensify(scale_cull_start=0))
+    written = to_json(recipe)
+    assert written["stages"][0]["densify"] == plain | {"scale_cull_start": 0}
+    assert from_json(written) == recipe
+    assert apply_overrides(one(densify=GradDensify()), ["s.densify.scale_cull_start=0"]) == recipe
 
 
 def test_a_term_without_options_is_written_as_it_was_before_there_were_any() -> None:

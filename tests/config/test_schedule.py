@@ -62,6 +62,15 @@ def test_the_reset_on_white_is_dropped_where_it_leaves_too_little() -> None:
     assert resets(0.01) == []  # 5 + 200 > 150
 
 
+def test_the_prune_by_size_and_a_reset_on_white_alone_go_with_the_schedule() -> None:
+    recipe = get_recipe("2dgs")
+    given = GradDensify(prune_until=30_000, scale_cull_start=3_000, reset_every=0, reset_at_on_white=(500,))
+    (stage,) = scale_schedule(replace(recipe, stages=(replace(recipe.stages[0], densify=given),)), 0.1).stages
+    assert isinstance(stage.densify, GradDensify)
+    found = stage.densify
+    assert (found.prune_until, found.scale_cull_start, found.reset_at_on_white) == (3_000, 300, (50,))
+
+
 def test_a_longer_schedule_keeps_the_official_resets() -> None:
     densify = scale_schedule(get_recipe("2dgs"), 2.0).stages[0].densify
     assert densify == replace(GradDensify(), start=1000, stop=30_000)

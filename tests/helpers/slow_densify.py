@@ -38,7 +38,8 @@ def densify_step_by_step(
     state: TrainState, densify: GradDensify, *, iteration: int, extent: float, white: bool
 ) -> DensifyCounts:
     """One step after another, each a new copy of everything; parents stay until the end."""
-    to_clone, to_split = _select(state, densify, extent)
+    ends = _prunable(state.splats, densify, iteration=iteration, extent=extent, white=white)
+    to_clone, to_split = _select(state, densify, extent, *ends)
     _append_clones(state, to_clone)
     _append_children(state, to_split, densify)
     parents = torch.zeros(len(state.splats), dtype=torch.bool, device=state.splats.device)
@@ -57,7 +58,9 @@ def densify_step_by_step(
     return DensifyCounts(int(to_clone.sum()), int(to_split.sum()), int(faint.sum()), int(large.sum()))
 
 
-def _select(state: TrainState, densify: GradDensify, extent: float) -> tuple[Tensor, Tensor]:
+def _select(
+    state: TrainState, densify: GradDensify, extent: float, faint: Tensor, large: Tensor
+) -> tuple[Tensor, Tensor]:
     """Rows to clone and rows to split, bool [N] each."""
     statistics = state.statistics
     assert statistics is not None
@@ -71,12 +74,13 @@ def _select(state: TrainState, densify: GradDensify, extent: float) -> tuple[Ten
     to_split = ~small & (for_split >= split_threshold)
     if densify.max_splats is not None:
         urgency = torch.where(small, signed / densify.grad_threshold, for_split / split_threshold)
-        growth = torch.where(to_split, densify.split_count - 1, to_clone.long())  # [N] rows gained
-        order = torch.sort(urgency.where(growth > 0, -torch.ones_like(urgency)), descending=True, stable=True).indices
-        room = densify.max_splats - len(state.splats)
-        allowed = torch.zeros_like(to_clone)
-        allowed[order] = growth[order].cumsum(0) <= room
-        to_clone, to_split = to_clone & allowed, to_split & allowed
+        to_clone, to_split = to_clone & ~faint & ~large, to_split & ~faint
+        room = densify.max_splats - int((~(faint | large)).sum())
+        for row in torch.sort(urgency, descending=True, stable=True).indices.tolist():
+            if to_clone[row] or to_split[row]:
+                room -= 1 if to_clone[row] else densify.split_count - (not large[row])
+            if room < 0:
+                to_clone[row] = to_split[row] = False
     return to_clone, to_split
 
 
@@ -108,6 +112,6 @@ def _prunable(
     if densify.in_prune_grace(iteration, white=white):
         faint = torch.zeros_like(faint)
     large = splats.scales.amax(dim=1) > densify.scale_cull * extent
-    if iteration <= densify.reset_every:
+    if not densify.culls_scale(iteration):
         large = torch.zeros_like(large)
     return faint, large

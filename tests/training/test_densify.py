@@ -171,6 +171,27 @@ def test_max_splats_lets_the_largest_gradients_go_first() -> None:
     assert run(state, GradDensify(max_splats=7)).cloned == 0
 
 
+def test_a_budget_counts_what_is_left_after_pruning() -> None:
+    # five splats, of which the first is too faint: it takes no room, and wins none with its gradient. Four stay, the
+    # budget of six lets two of the other three grow, of which one splits (a parent goes, two children come).
+    sizes = [(0.005, 0.005), (0.005, 0.005), (0.02, 0.02), (0.005, 0.005), (0.005, 0.005)]
+    state = state_of(sizes, [0.01, 0.5, 0.5, 0.5, 0.5], [9e-3, 3e-4, 9e-4, 5e-4, 0.0], [1.0] * 5)
+    assert run(state, GradDensify(max_splats=6)) == DensifyCounts(
+        cloned=1, split=1, pruned_by_opacity=1, pruned_large=0
+    )
+    assert len(state.splats) == 6
+
+
+def test_the_prune_by_size_may_start_apart_from_resets() -> None:
+    def pruned(densify: GradDensify, iteration: int) -> int:
+        return run(
+            state_of([(0.11, 0.01), (0.09, 0.01)], [0.5] * 2, [0.0] * 2, [1.0] * 2), densify, iteration
+        ).pruned_large
+
+    assert [pruned(GradDensify(reset_every=0), i) for i in (100, 3100)] == [1, 1]
+    assert [pruned(GradDensify(reset_every=0, scale_cull_start=600), i) for i in (600, 700)] == [0, 1]
+
+
 def test_more_children_can_be_asked_for() -> None:
     state = state_of([(0.02, 0.02)], [0.5], [1.0], [1.0])
     run(state, GradDensify(split_count=3, split_shrink=2.0))
@@ -238,9 +259,10 @@ def bytes_of(state: TrainState) -> dict[str, bytes]:
         GradDensify(),
         GradDensify(absolute=True, abs_threshold=3e-4, split_count=3),
         GradDensify(max_splats=1100),
+        GradDensify(max_splats=30_000, split_count=3),
         GradDensify(grad_threshold=1.0, opacity_cull=0.0),  # nothing happens before the first reset
     ],
-    ids=["plain", "absolute", "limited", "idle"],
+    ids=["plain", "absolute", "limited", "a-budget", "idle"],
 )
 @pytest.mark.parametrize("iteration", [600, 3050])
 def test_one_pass_leaves_the_bytes_that_one_step_after_another_does(

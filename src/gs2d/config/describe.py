@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from gs2d.config.densify import Densify
-from gs2d.config.recipe import ALL, CloneInPlace, RankByError, Recipe, Stage
+from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, RankByError, Recipe, Stage
 
 
 def describe_recipe(recipe: Recipe) -> Iterator[str]:
@@ -72,11 +72,20 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
         given = ", ".join(f"{name}={value}" for name, value in stage.densify.options.items())
         yield f"densifies by {stage.densify.name}{f' ({given})' if given else ''}"
     elif stage.densify is not None:
-        d = stage.densify
-        signal = "absolute" if d.absolute else "signed"
-        yield (
-            f"densifies every {d.every} iterations from {d.start:,} to {d.stop:,} by {signal} gradients over "
-            f"{d.abs_threshold if d.absolute else d.grad_threshold:g}; opacity reset every {d.reset_every:,}"
-        )
+        yield from _describe_densify(stage.densify)
     else:
         yield "no densification"
+
+
+def _describe_densify(d: GradDensify) -> Iterator[str]:
+    signal = "absolute" if d.absolute else "signed"
+    if d.stop > 0:
+        resets = f"opacity reset every {d.reset_every:,}" if d.reset_every else "no opacity resets"
+        caps = f", capped at {d.opacity_cap:g} every {d.cap_every:,}" if d.cap_every else ""
+        budget = f", up to {d.max_splats:,} splats" if d.max_splats is not None else ""
+        yield (
+            f"densifies every {d.every} iterations from {d.start:,} to {d.stop:,}{budget} by {signal} gradients over "
+            f"{d.abs_threshold if d.absolute else d.grad_threshold:g}; {resets}{caps}"
+        )
+    if d.prune_until > d.stop:
+        yield f"prunes splats larger than {d.scale_cull:g} of the extent until {d.prune_until:,}"

@@ -86,11 +86,13 @@ def refine(
     densify: GradDensify | None = None,
     rows: str = "all",
     rerank: float | None = None,
+    restart: bool = False,
 ) -> Stage:
     """Stage 3: clone the high-error splats in place, then train everything but ``freeze``, NC from the start.
 
     ``clone`` is the opacity of the clones ("copy" or "preserve"), None for no clone (AbsGS densifies instead);
-    ``rerank`` ranks by E_i once more (top percent) before the clone; ``rows`` limits training to a group ("clones").
+    ``rerank`` ranks by E_i once more (top percent) before the clone; ``rows`` limits training to a group ("clones");
+    ``restart``: the means' rate falls once more, from its start.
     """
     rank = () if rerank is None else (RankByError(top_percent=rerank),)
     return Stage(
@@ -98,19 +100,22 @@ def refine(
         20_000,
         train={name: rows for name in ALL if name not in freeze},
         losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
-        lr=_lr_after_surface(),
+        lr=LearningRates(means_decay_steps=20_000) if restart else _lr_after_surface(),
         densify=densify,
         on_enter=rank if clone is None else (*rank, CloneInPlace("high_error", clone)),
     )
 
 
-def continue_training(nc: float = 0.05, iterations: int = 30_000) -> Stage:
-    """More of the same after stage 1: its last rates, its moments, NC on, no densification."""
+def continue_training(nc: float = 0.05, iterations: int = 30_000, *, restart: bool = False) -> Stage:
+    """More of the same after stage 1: its last rates, its moments, NC on, no densification.
+
+    ``restart``: the means' rate falls once more, from its start.
+    """
     return Stage(
         "continue",
         iterations,
         losses=(*PHOTOMETRIC, *_normal_consistency(nc, 0)),
-        lr=_lr_after_surface(),
+        lr=LearningRates(means_decay_steps=iterations) if restart else _lr_after_surface(),
         moments="kept",
     )
 
@@ -120,9 +125,9 @@ def two_dgs(nc: float = 0.05, distortion: float | None = 0.0, *, name: str = "2d
     return Recipe(name, (surface(nc, distortion),))
 
 
-def two_dgs_60k(nc: float = 0.05, *, name: str = "2dgs-60k") -> Recipe:
+def two_dgs_60k(nc: float = 0.05, *, name: str = "2dgs-60k", more: Stage | None = None) -> Recipe:
     """Return the fair control: 2DGS for as many iterations as 2DGS-R in total; its first stage is that of ``2dgs``."""
-    return Recipe(name, (surface(nc), continue_training(nc)))
+    return Recipe(name, (surface(nc), more or continue_training(nc)))
 
 
 def two_dgs_r(*, name: str = "2dgs-r", stage_2: Stage | None = None, stage_3: Stage | None = None) -> Recipe:
@@ -313,6 +318,18 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
     add("2dgs-r-clones-only", "Variant: stage 3 trains the clones alone", clones_only)
     rerank = partial(two_dgs_r, stage_3=refine(rerank=1.0))
     add("2dgs-r-rerank", "Variant: E_i is ranked again after stage 2", rerank)
+    restart = "the means' rate falls once more from 1.6e-4 to 1.6e-6"
+    about = f"Control of 2dgs-r: in stage 3 {restart}"
+    add("2dgs-r-restart", about, partial(two_dgs_r, stage_3=refine(restart=True)))
+    about = f"Control of 2dgs-r-restart: 2dgs-60k, where {restart} in the last 30,000 iterations"
+    add("2dgs-60k-restart", about, partial(two_dgs_60k, more=continue_training(restart=True)))
+    about = "Control of module row III: 2dgs-60k without normal consistency in the last 30,000 iterations"
+    add("2dgs-60k-no-nc-late", about, partial(two_dgs_60k, more=continue_training(nc=0.0)))
+    add(
+        "2dgs-r-no-clone",
+        "Control of 2dgs-r: stage 3 without the clone",
+        partial(two_dgs_r, stage_3=refine(clone=None)),
+    )
     visible = replace(appearance(), on_enter=(RankByError(occlusion=True),))
     add("2dgs-r-occlusion", "Variant: E_i counts visible pixels only", partial(two_dgs_r, stage_2=visible))
     bases: dict[str, Callable[..., Recipe]] = {"2dgs": two_dgs, "2dgs-60k": two_dgs_60k, "2dgs-r": two_dgs_r}

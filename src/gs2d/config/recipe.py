@@ -111,13 +111,21 @@ class GradDensify:
     opacity_cull : float
         Prune below this opacity.
     scale_cull : float
-        Prune when max scale > scale_cull * extent, once iteration > reset_every.
+        Prune when max scale > scale_cull * extent: with every densification after ``scale_cull_start``.
+    scale_cull_start : int or None
+        None = reset_every, as in the official code.
+    prune_until : int
+        The prune by ``scale_cull`` goes on after ``stop``, every so many iterations as densification, up to this one.
+        A stage that only does that has ``start`` and ``stop`` 0.
     reset_every, reset_opacity : int, float
         Every so many iterations (before ``stop``) opacity = min(opacity, reset_opacity); 0 = never.
     reset_at : tuple of int
         Further iterations with a reset.
     reset_at_start_on_white : bool
-        A reset at iteration ``start`` too when the background is white, as in the official code.
+        A reset at iteration ``start`` too when the background is white, as in the official code (and, as there, none
+        where ``reset_every`` is 0).
+    reset_at_on_white : tuple of int
+        Further iterations with a reset when the background is white, whatever ``reset_every`` is.
     last_reset : int or None
         No reset after this iteration; None = any before ``stop``.
     prune_grace : int
@@ -125,7 +133,8 @@ class GradDensify:
     opacity_cap, cap_every : float, int
         AbsGS: every cap_every iterations opacity = min(opacity, opacity_cap); cap_every 0 = never.
     max_splats : int or None
-        Stop growing at this count; the splats with the largest gradient go first.
+        A budget: no densification goes beyond this count. Where more splats ask to be cloned or split, those whose
+        signal is the largest multiple of its threshold win. None = no limit.
     """
 
     grad_threshold: float = 2e-4
@@ -148,6 +157,9 @@ class GradDensify:
     opacity_cap: float = 0.8
     cap_every: int = 0
     max_splats: int | None = None
+    scale_cull_start: int | None = field(default=None, metadata={"omit_empty": True})
+    prune_until: int = field(default=0, metadata={"omit_empty": True})
+    reset_at_on_white: tuple[int, ...] = field(default=(), metadata={"omit_empty": True})
 
     def resets(self, iteration: int, *, white: bool) -> bool:
         """Whether opacity is reset at the end of this iteration."""
@@ -155,11 +167,21 @@ class GradDensify:
             return False
         regular = self.reset_every > 0 and iteration % self.reset_every == 0
         at_start = white and self.reset_at_start_on_white and self.reset_every > 0 and iteration == self.start
-        return regular or at_start or iteration in self.reset_at
+        return regular or at_start or iteration in self.reset_at or (white and iteration in self.reset_at_on_white)
 
     def densifies(self, iteration: int) -> bool:
         """Whether splats are cloned, split and pruned at the end of this iteration."""
         return self.start < iteration < self.stop and iteration % self.every == 0
+
+    def culls_scale(self, iteration: int) -> bool:
+        """Whether a prune at the end of this iteration takes large splats too."""
+        return iteration > (self.reset_every if self.scale_cull_start is None else self.scale_cull_start)
+
+    def only_prunes(self, iteration: int) -> bool:
+        """Whether large splats are pruned at the end of this iteration, after densification."""
+        return (
+            self.stop <= iteration <= self.prune_until and iteration % self.every == 0 and self.culls_scale(iteration)
+        )
 
     def in_prune_grace(self, iteration: int, *, white: bool) -> bool:
         """Whether faint splats are spared because a reset is at most ``prune_grace`` iterations back."""
@@ -366,7 +388,7 @@ def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
 
 
 def _check_densify(where: str, densify: GradDensify, stage: Stage) -> None:
-    for name in ("start", "stop", "reset_every", "prune_grace", "cap_every"):
+    for name in ("start", "stop", "reset_every", "prune_grace", "cap_every", "prune_until"):
         integer(f"{where}.{name}", getattr(densify, name), low=0)
     integer(f"{where}.every", densify.every, low=1)
     integer(f"{where}.split_count", densify.split_count, low=2)
@@ -377,13 +399,18 @@ def _check_densify(where: str, densify: GradDensify, stage: Stage) -> None:
     for name in ("reset_opacity", "opacity_cap"):
         value = number(f"{where}.{name}", getattr(densify, name), low=0.0)
         require(0 < value < 1, f"{where}.{name} must be in (0, 1), got {value}")
-    for value in densify.reset_at:
-        integer(f"{where}.reset_at", value, low=1)
-    if densify.last_reset is not None:
-        integer(f"{where}.last_reset", densify.last_reset, low=0)
-    if densify.max_splats is not None:
-        integer(f"{where}.max_splats", densify.max_splats, low=1)
-    touches_opacity = densify.reset_every > 0 or densify.cap_every > 0 or bool(densify.reset_at)
+    for name in ("reset_at", "reset_at_on_white"):
+        for value in getattr(densify, name):
+            integer(f"{where}.{name}", value, low=1)
+    for name, low in (("last_reset", 0), ("scale_cull_start", 0), ("max_splats", 1)):
+        if getattr(densify, name) is not None:
+            integer(f"{where}.{name}", getattr(densify, name), low=low)
+    require(
+        densify.prune_until <= stage.iterations,
+        f"{where}.prune_until must be at most the stage's {stage.iterations} iterations, got {densify.prune_until}",
+    )
+    resets = bool(densify.reset_at or densify.reset_at_on_white) or densify.reset_every > 0
+    touches_opacity = resets or densify.cap_every > 0
     require(
         not touches_opacity or stage.train.get("opacity_logits") == "all",
         f"{where} resets or caps opacity, which the stage must then train for all rows; "

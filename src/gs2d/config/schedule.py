@@ -1,7 +1,8 @@
 """Short runs that still behave: a recipe scaled by a factor.
 
-Scaled: stage lengths, loss starts, the SH interval, start and stop of densification, the horizons of the rates of
-means, exposures and poses (so that rates end where they should) and of the weights of priors. *Not* scaled: the
+Scaled: stage lengths, loss starts, the SH interval, start and stop of densification and of the prune by size, the
+horizons of the rates of means, exposures and poses (so that rates end where they should) and of the weights of priors,
+resets of white backgrounds alone (``reset_at_on_white``), which go with the start. *Not* scaled: the
 densification interval, as long as ten densifications fit, the first iterations without exposures and poses, and opacity
 resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit by about its rate,
 0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back.
@@ -113,6 +114,13 @@ def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify
     if isinstance(densify, Densify):
         return densify.scaled(factor)
     start, stop = round(densify.start * factor), round(densify.stop * factor)
+    cull = densify.scale_cull_start
+    densify = replace(
+        densify,
+        scale_cull_start=None if cull is None else round(cull * factor),
+        prune_until=round(densify.prune_until * factor),
+        reset_at_on_white=tuple(_scaled(at, factor) for at in densify.reset_at_on_white),
+    )
     wanted = min(MIN_DENSIFICATIONS, count_densifications(densify))
     every = densify.every
     while every > 1 and count_densifications(replace(densify, start=start, stop=stop, every=every)) < wanted:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, Field, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -22,7 +22,11 @@ ACTION_KEY = "action"
 
 
 def to_json(recipe: Recipe) -> dict[str, Any]:
-    """Return a recipe as plain dicts, lists, numbers and strings; every field is written out."""
+    """Return a recipe as plain dicts, lists, numbers and strings.
+
+    Every field is written out but those that came later (``omit_empty``) and have their default: a recipe without them
+    is written as it was before there were any.
+    """
     encoded = _encode(recipe)
     assert isinstance(encoded, dict)
     return encoded
@@ -67,7 +71,7 @@ def apply_overrides(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
     RecipeError
         Unknown field (says which exist), or a value of another type.
     """
-    data = to_json(recipe)
+    data = _encode(recipe, whole=True)  # what is left out of JSON can be set too
     for override in overrides:
         path, equals, text = override.partition("=")
         words = current_path(path.strip().split("."))
@@ -130,17 +134,24 @@ def _entry(entries: list[Any], word: str, override: str) -> Any:
     return entries[tags.index(word)]
 
 
-def _encode(value: Any) -> Any:
+def _encode(value: Any, *, whole: bool = False) -> Any:
+    """Return the JSON form; ``whole``: with every field, also those that are left out at their default."""
     if is_dataclass(value) and not isinstance(value, type):
-        kept = [entry for entry in fields(value) if getattr(value, entry.name) or not entry.metadata.get("omit_empty")]
-        encoded = {entry.name: _encode(getattr(value, entry.name)) for entry in kept}
+        kept = [entry for entry in fields(value) if whole or not _is_left_out(entry, getattr(value, entry.name))]
+        encoded = {entry.name: _encode(getattr(value, entry.name), whole=whole) for entry in kept}
         tags = [name for name, kind in ACTIONS.items() if type(value) is kind]
         return {ACTION_KEY: tags[0], **encoded} if tags else encoded
     if isinstance(value, Mapping):
-        return {str(key): _encode(entry) for key, entry in value.items()}
+        return {str(key): _encode(entry, whole=whole) for key, entry in value.items()}
     if isinstance(value, tuple | list):
-        return [_encode(entry) for entry in value]
+        return [_encode(entry, whole=whole) for entry in value]
     return value
+
+
+def _is_left_out(entry: Field[Any], value: Any) -> bool:
+    """Whether a field came later and has its default."""
+    default = entry.default if entry.default_factory is MISSING else entry.default_factory()
+    return bool(entry.metadata.get("omit_empty")) and value == default
 
 
 def _decode(value: Any, kind: Any, where: str) -> Any:

@@ -21,7 +21,7 @@ from gs2d.errors import DivergedError
 from gs2d.render.backends import PLAIN, Backend
 from gs2d.training import events
 from gs2d.training.densify.densifier import Densifier, Surroundings
-from gs2d.training.rows import append_rows
+from gs2d.training.rows import append_rows, keep_rows
 from gs2d.training.state import Moments, TrainState
 
 if TYPE_CHECKING:
@@ -50,13 +50,13 @@ class GradientDensifier(Densifier):
 
     def begin(self, state: TrainState) -> None:
         """Nothing is gathered yet."""
-        state.statistics = no_statistics(state.splats)
+        state.statistics = no_statistics(state.splats) if self._options.stop > 0 else {}
 
     def changes(self, iteration: int) -> bool:
         """Whether splats come and go, or opacities are limited, at the end of an iteration."""
         options = self._options
         if iteration >= options.stop:
-            return False
+            return options.only_prunes(iteration)
         resets = options.resets(iteration, white=self.surroundings.white)
         return options.densifies(iteration) or resets or self._caps(iteration)
 
@@ -74,7 +74,7 @@ class GradientDensifier(Densifier):
         options, around = self._options, self.surroundings
         happened: list[events.Event] = []
         if iteration >= options.stop:
-            return happened
+            return self._prune_large(state, iteration)
         assert state.statistics is not None
         assert output.signal is not None
         assert output.radii is not None
@@ -93,6 +93,23 @@ class GradientDensifier(Densifier):
             limit_opacity(state, ceiling)
             happened.append(events.OpacityLimited(around.stage, iteration, ceiling, reset))
         return happened
+
+    def _prune_large(self, state: TrainState, iteration: int) -> Sequence[events.Event]:
+        """Prune splats that have grown too large after densification, where that is due."""
+        options, around = self._options, self.surroundings
+        if not options.only_prunes(iteration):
+            return ()
+        large = _largest(state.splats.scales) > options.scale_cull * around.scene.extent
+        count = int(large.sum())
+        if count == 0:
+            return ()
+        if count == len(large):
+            raise DivergedError(
+                f"stage {around.stage!r}: all {count} splats were pruned at iteration {iteration}: none is of size <= "
+                f"{options.scale_cull * around.scene.extent:g}; check the cameras, or scale_cull"
+            )
+        keep_rows(state, ~large)
+        return (events.Densified(around.stage, iteration, 0, 0, 0, count, len(state.splats)),)
 
 
 def no_statistics(splats: Splats) -> dict[str, Tensor]:
@@ -153,8 +170,8 @@ def densify_and_prune(
         If no splat would be left.
     """
     splats, sizes = state.splats, _largest(state.splats.scales)
-    clone, split = _select(state, densify, sizes, extent)
     faint, large = _prunable(splats.opacities, sizes, densify, iteration=iteration, extent=extent, white=white)
+    clone, split = _select(state, densify, sizes, extent, (faint, large))
     parents = split.nonzero().squeeze(1)  # [P]
     children = parents.repeat(densify.split_count)  # [C] all first children, then all second ones
     shrunk = splats.log_scales[children] - math.log(densify.split_shrink)  # [C, 2]
@@ -192,8 +209,10 @@ def limit_opacity(state: TrainState, ceiling: float) -> None:
         )
 
 
-def _select(state: TrainState, densify: GradDensify, sizes: Tensor, extent: float) -> tuple[Tensor, Tensor]:
-    """Rows to clone and rows to split, bool [N] each."""
+def _select(
+    state: TrainState, densify: GradDensify, sizes: Tensor, extent: float, ends: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Rows to clone and rows to split, bool [N] each; ``ends`` are those that are too faint, and too large."""
     statistics = state.statistics
     assert statistics is not None
     count = statistics["count"].clamp(min=1.0)  # never seen: sum 0, mean 0
@@ -206,13 +225,23 @@ def _select(state: TrainState, densify: GradDensify, sizes: Tensor, extent: floa
     to_split = ~small & (for_split >= split_threshold)
     if densify.max_splats is not None:
         urgency = torch.where(small, signed / densify.grad_threshold, for_split / split_threshold)
-        growth = torch.where(to_split, densify.split_count - 1, to_clone.long())  # [N] rows gained
-        order = torch.sort(urgency.where(growth > 0, -torch.ones_like(urgency)), descending=True, stable=True).indices
-        room = densify.max_splats - len(state.splats)
-        allowed = torch.zeros_like(to_clone)
-        allowed[order] = growth[order].cumsum(0) <= room
-        to_clone, to_split = to_clone & allowed, to_split & allowed
+        to_clone, to_split = _within_budget(densify, to_clone, to_split, urgency, ends)
     return to_clone, to_split
+
+
+def _within_budget(
+    densify: GradDensify, to_clone: Tensor, to_split: Tensor, urgency: Tensor, ends: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Of the rows [N] bool to clone and to split the most urgent, so that no more than ``max_splats`` are left."""
+    assert densify.max_splats is not None
+    faint, large = ends
+    stays = ~(faint | large)
+    to_clone, to_split = to_clone & stays, to_split & ~faint  # what would be pruned at once takes no room
+    growth = torch.where(to_split, densify.split_count - stays.long(), to_clone.long())  # [N] rows gained
+    order = torch.sort(urgency.where(growth > 0, -torch.ones_like(urgency)), descending=True, stable=True).indices
+    chosen = torch.zeros_like(to_clone)
+    chosen[order] = growth[order].cumsum(0) <= densify.max_splats - stays.sum()
+    return to_clone & chosen, to_split & chosen
 
 
 def _scattered(state: TrainState, rows: Tensor) -> Tensor:
@@ -239,7 +268,7 @@ def _prunable(
     if densify.in_prune_grace(iteration, white=white):
         faint = torch.zeros_like(faint)
     large = sizes > densify.scale_cull * extent
-    if iteration <= densify.reset_every:
+    if not densify.culls_scale(iteration):
         large = torch.zeros_like(large)
     return faint, large
 
