@@ -14,6 +14,7 @@ from gs2d.config.presets import (
     TABLES,
     get_recipe,
     with_depth_prior,
+    with_edges,
     with_multiview,
     with_normal_prior,
 )
@@ -175,6 +176,15 @@ def test_controls_change_what_they_say() -> None:
     last, plain = but_for_the_last("2dgs-r-no-clone", "2dgs-r")
     assert replace(last, on_enter=plain.on_enter) == plain
     assert last.on_enter == ()
+
+
+@pytest.mark.parametrize("base", ["2dgs", "2dgs-60k"])
+def test_the_other_reading_of_normals_beside_empty_pixels_changes_nothing_else(base: str) -> None:
+    other = get_recipe(f"{base}-edges-camera")
+    edges = [term.edges for stage in other.stages for term in stage.losses if term.kind == "normal_consistency"]
+    assert edges == ["camera"] * len(other.stages)
+    assert with_edges(other, "undefined", name=base) == get_recipe(base)
+    assert "reading" in RECIPES[f"{base}-edges-camera"].about
 
 
 def test_a_weight_of_zero_leaves_the_term_out() -> None:

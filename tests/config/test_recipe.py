@@ -120,6 +120,14 @@ def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
         (one(losses=(LossTerm("l1", None),)), "needs a weight"),
         (one(losses=(*L1, *L1)), "there twice"),
         (one(losses=(*L1, LossTerm("ssim", 1.0, depth="max"))), "depth of loss 'ssim' must be one of mean, median"),
+        (
+            one(losses=(*L1, LossTerm("normal_consistency", 1.0, edges="centre"))),
+            "edges of loss 'normal_consistency' must be one of undefined, camera; got 'centre'",
+        ),
+        (
+            one(losses=(*L1, LossTerm("ssim", 1.0, edges="camera"))),
+            "loss 'ssim' takes no edges; only normal_consistency and normal_consistency_per_splat do",
+        ),
         (one(train={"opacity": "all"}), "stage 's': train must be one of means, quats"),
         (one(train={}), "names no attribute"),
         (one(train={"sh0": "high_error"}), "no earlier action writes the row group 'high_error'; no action"),

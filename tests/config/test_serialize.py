@@ -76,6 +76,14 @@ def test_overrides_reach_every_level() -> None:
     assert refine.lr.sh0 == 1.0
 
 
+def test_a_field_that_came_later_is_written_only_where_it_says_something_and_can_be_set() -> None:
+    plain = to_json(get_recipe("2dgs"))["stages"][0]["losses"][2]
+    assert plain == {"kind": "normal_consistency", "weight": 0.05, "start": 7000, "depth": None}
+    recipe = apply_overrides(get_recipe("2dgs"), ["surface.losses.normal_consistency.edges=camera"])
+    assert recipe.stages == get_recipe("2dgs-edges-camera").stages
+    assert to_json(recipe)["stages"][0]["losses"][2] == plain | {"edges": "camera"}
+
+
 def test_overrides_that_are_not_named_stay_as_they_were() -> None:
     assert changed() == get_recipe("2dgs-r")
     assert changed("refine.iterations=5").stages[:2] == get_recipe("2dgs-r").stages[:2]

@@ -57,14 +57,14 @@ def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor,
     return rendered, target, torch.rand(height, width, generator=g) < 0.8
 
 
-def geometry(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def geometry(height: int, width: int, seed: int = 0, empty: float = 0.05) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rendered normals, depth with holes, alpha and a mask; float64."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=g, dtype=torch.float64)
 
-    depth = torch.where(rand(height, width) < 0.05, 0.0, 2 + rand(height, width))
+    depth = torch.where(rand(height, width) < empty, 0.0, 2 + rand(height, width))
     return rand(height, width, 3) - 0.5, depth, rand(height, width), rand(height, width) < 0.85
 
 
@@ -95,20 +95,23 @@ def test_l1_and_ssim_and_their_gradient_are_those_of_the_reference(
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("per_splat", [False, True])
+@pytest.mark.parametrize(("edges", "weighted"), [("undefined", False), ("undefined", True), ("camera", False)])
 @pytest.mark.parametrize("size", SIZES)
 def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
-    library: Library, size: tuple[int, int], per_splat: bool, masked: bool
+    library: Library, size: tuple[int, int], per_splat: bool, masked: bool, edges: str, weighted: bool
 ) -> None:
-    *images, mask = geometry(*size)
+    *images, mask = geometry(*size, empty=0.3 if edges == "camera" else 0.05)
     camera, valid = make_camera(*size), mask if masked else None
+    weights = torch.rand(size, generator=torch.Generator().manual_seed(1)) if weighted else None
     found_in = [image.float().requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in found_in]
-    value = ops.normal_consistency(*found_in, camera, valid, per_splat=per_splat, library=library)
+    form = {"per_splat": per_splat, "edges": edges, "weights": weights}
+    value = ops.normal_consistency(*found_in, camera, valid, **form, library=library)
     function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
-    exact = function(*exact_in, camera, valid)
+    exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
     if min(size) < 3:
-        assert value.item() == (0 if per_splat else 1)
+        assert weighted or value.item() == (0 if per_splat else 1)
         return
     for cotangent in (0.05, 3.0):  # the first is what the op prepared for
         found = torch.autograd.grad(value, found_in, torch.tensor(cotangent), allow_unused=True, retain_graph=True)
@@ -152,6 +155,20 @@ def test_the_native_formulas_pass_a_float64_gradient_check(double: Library, mask
         lambda n, d: ops.normal_consistency(n, d, alpha.detach(), camera, valid, library=double), inputs[:2]
     )
     assert torch.autograd.gradcheck(lambda x: ops.masked_mean(x, valid, library=double), (inputs[2],))
+    weights, empty = geometry(*size, seed=5)[2], geometry(*size, seed=6, empty=0.3)[1] == 0
+    assert torch.autograd.gradcheck(
+        lambda n, d: ops.normal_consistency(
+            n,
+            torch.where(empty, 0.0, d),
+            alpha.detach(),
+            camera,
+            valid,
+            edges="camera",
+            weights=weights,
+            library=double,
+        ),
+        inputs[:2],
+    )
 
 
 def test_in_float64_native_and_reference_agree_to_rounding(double: Library) -> None:
@@ -176,6 +193,7 @@ def everything(library: Library, height: int = 150, width: int = 41) -> list[Ten
         *ops.photometric(x, y, library=library),
         ops.normal_consistency(n, z, a, make_camera(height, width), mask, library=library),
         ops.normal_consistency(n, z, a, make_camera(height, width), per_splat=True, library=library),
+        ops.normal_consistency(n, z, a, make_camera(height, width), edges="camera", weights=y[..., 0], library=library),
         ops.masked_mean(a, mask, library=library),
     ]
     return [*values, *torch.autograd.grad(sum(values), leaves), ops.blur(y, library=library)]
@@ -240,6 +258,9 @@ def test_nan_at_a_valid_pixel_reaches_the_loss(library: Library) -> None:
         images[bad][7, 8] = float("nan")
         assert ops.normal_consistency(*images, camera, library=library).isnan()
         assert reference.normal_consistency(*images, camera).isnan()
+        images[1][7, 7] = 0  # beside it
+        assert ops.normal_consistency(*images, camera, edges="camera", library=library).isnan()
+        assert reference.normal_consistency(*images, camera, edges="camera").isnan()
 
 
 def test_an_equal_pixel_has_no_l1_gradient(library: Library) -> None:
@@ -301,6 +322,10 @@ def test_a_wrong_argument_is_refused_in_one_line(library: Library) -> None:
         (lambda: ops.blur(image[..., :2], library=library), "image must be"),
         (lambda: ops.masked_mean(image, library=library), "values must be"),
         (lambda: ops.normal_consistency(image, depth[:4], alpha, camera, library=library), "normal must be"),
+        (
+            lambda: ops.normal_consistency(image, depth, alpha, camera, weights=depth[:4], library=library),
+            "weights must be",
+        ),
         (
             lambda: ops.normal_consistency(image, depth, alpha, replace(camera, width=8), library=library),
             "camera is 8x8",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from gs2d.losses import reference
@@ -93,6 +96,89 @@ def test_the_border_and_pixels_beside_the_background_have_no_normal() -> None:
     for row, column in [(1, 3), (3, 3), (2, 2), (2, 4)]:  # the hole's neighbours use it; the hole itself does not
         expected[row, column] = 0
     torch.testing.assert_close(length, expected)
+
+
+def test_with_camera_edges_an_empty_neighbour_lies_at_the_cameras_centre() -> None:
+    camera, generator = make_camera(11, 9), torch.Generator().manual_seed(1)
+    depth = 1 + torch.rand(9, 11, generator=generator, dtype=torch.float64)
+    depth = torch.where(torch.rand(9, 11, generator=generator) < 0.4, 0.0, depth)
+    i, j = np.meshgrid(np.arange(11) + 0.5, np.arange(9) + 0.5)
+    rays = np.stack([(i - camera.cx) / camera.fx, (j - camera.cy) / camera.fy, np.ones_like(i)], axis=-1)
+    points = camera.center + depth.numpy()[..., None] * (rays @ camera.rotation)  # world; the centre where empty
+    down, right = points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2]
+    product = np.cross(down, right)
+    length = np.linalg.norm(product, axis=-1, keepdims=True)
+    expected = np.where(length > 1e-12, product / np.maximum(length, 1e-12), 0.0)
+    found = normals_from_depth(depth, camera, edges="camera")
+    assert ((length == 0).any(), (length > 0).mean() > 0.5) == (True, True)
+    np.testing.assert_allclose(found[1:-1, 1:-1].numpy(), expected, atol=1e-12)
+    beside = normals_from_depth(depth, camera).norm(dim=-1) == 0  # the border too
+    assert (found[beside].norm(dim=-1) > 0.5).sum() > 20
+    torch.testing.assert_close(found[~beside], normals_from_depth(depth, camera)[~beside])
+
+
+def test_with_camera_edges_a_normal_beside_the_background_is_across_the_rays_of_the_rim() -> None:
+    # Half of a plane in front of the camera, the right half empty. At the last hit column but one all is as ever; at
+    # the next two pixels P_right is the centre: N is across P_left, and so are all planes through the centre.
+    camera = make_camera(8, 5)
+    depth = torch.full((5, 8), 2.0, dtype=torch.float64)
+    depth[:, 4:] = 0
+    normals = normals_from_depth(depth, camera, edges="camera")
+    ray = np.array([(2.5 - camera.cx) / camera.fx, (2.5 - camera.cy) / camera.fy, 1.0]) @ camera.rotation
+    assert normals[2, 3].numpy() @ ray == pytest.approx(0, abs=1e-12)  # its left neighbour is column 2
+    assert normals[2, 3].norm().item() == pytest.approx(1)
+    assert normals[2, 2].numpy() @ camera.forward == pytest.approx(-1)
+    assert (normals[:, 5:] == 0).all()  # left and right empty
+    assert (normals[2, 4] == 0).all()  # above and below it empty
+
+
+@pytest.mark.parametrize("mask_one", [(2, 3), (1, 2)])
+def test_with_camera_edges_an_ignored_neighbour_still_leaves_no_normal(mask_one: tuple[int, int]) -> None:
+    camera, depth = make_camera(7, 6), torch.full((6, 7), 2.0)
+    depth[3, 3] = 0
+    mask = torch.ones(6, 7, dtype=torch.bool)
+    mask[mask_one] = False
+    normals = normals_from_depth(depth, camera, mask, edges="camera")
+    row, column = mask_one
+    for away in [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)]:
+        assert (normals[row + away[0], column + away[1]] == 0).all()
+    assert normals[4, 3].norm() > 0.5  # above it is empty, not ignored
+
+
+@pytest.mark.parametrize("loss", [reference.normal_consistency, reference.normal_consistency_per_splat])
+def test_with_camera_edges_gradients_are_those_of_finite_differences_and_0_where_empty(
+    loss: Callable[..., Tensor],
+) -> None:
+    camera, output, g = make_camera(9, 8), make_output(8, 9), torch.Generator().manual_seed(2)
+    empty = torch.rand(8, 9, generator=g) < 0.3
+    weights = torch.rand(8, 9, generator=g, dtype=torch.float64)
+    alpha = output.alpha.detach()
+
+    def value(normal: Tensor, depth: Tensor) -> Tensor:
+        seen = torch.where(empty, 0.0, depth)
+        return loss(normal, seen, alpha, camera, edges="camera", weights=weights)
+
+    assert torch.autograd.gradcheck(value, (output.normal, output.depth_mean))
+    depth = torch.where(empty, 0.0, output.depth_mean.detach()).requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(output.normal, depth, alpha, camera, edges="camera"), depth)
+    assert (gradient[empty] == 0).all()
+    assert gradient.isfinite().all()
+
+
+def test_weights_multiply_the_part_of_each_pixel_and_the_count_stays() -> None:
+    camera, output = make_camera(9, 8), make_output(8, 9)
+    images = (output.normal, output.depth_mean, output.alpha, camera)
+    mask = torch.rand(8, 9, generator=torch.Generator().manual_seed(0)) < 0.9
+    for loss in (reference.normal_consistency, reference.normal_consistency_per_splat):
+        parts = torch.zeros((), dtype=torch.float64)
+        for row in range(2):  # the upper and the lower half, by weights of 0 and 1
+            half = torch.zeros(8, 9, dtype=torch.float64)
+            half[4 * row : 4 * row + 4] = 1
+            parts = parts + (row + 2) * loss(*images, mask, weights=half)
+        whole = torch.full((8, 9), 2.0, dtype=torch.float64)
+        whole[4:] = 3
+        torch.testing.assert_close(loss(*images, mask, weights=whole), parts)
+        torch.testing.assert_close(loss(*images, mask, weights=torch.ones_like(whole)), loss(*images, mask))
 
 
 @given(seed=st.integers(0, 10_000), size=st.tuples(st.integers(3, 9), st.integers(3, 9)))

@@ -181,6 +181,26 @@ def test_a_term_that_names_its_depth_overrides_the_protocol() -> None:
     assert value(LossTerm("normal_consistency", 1.0, depth="median"), "mean") == value(plain, "median")
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("kind", ["normal_consistency", "normal_consistency_per_splat"])
+def test_a_term_says_how_normals_are_taken_beside_empty_pixels(
+    kind: str, backend: str, request: pytest.FixtureRequest
+) -> None:
+    if backend == "cpu":
+        request.getfixturevalue("native")
+    output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.zeros(8, 9, 3)
+    depth = output.depth_mean.detach().clone()
+    depth[2:5, 3:6] = 0
+    output = replace(output, depth_mean=depth)
+    function = getattr(reference, kind)
+    for edges in ("undefined", "camera"):
+        term = LossTerm(kind, 1.0, edges=edges)
+        found = compute_losses(output, target, None, camera, [term], iteration=1, depth_kind="mean", backend=backend)
+        expected = function(output.normal, depth, output.alpha, camera, edges=edges)
+        assert found[kind].item() == pytest.approx(expected.item(), rel=1e-5)
+    assert function(output.normal, depth, output.alpha, camera).item() != pytest.approx(expected.item(), rel=1e-3)
+
+
 def test_terms_of_one_kind_add_up() -> None:
     output, camera, target = make_output(8, 9), make_camera(9, 8), torch.zeros(8, 9, 3, dtype=torch.float64)
     args = (output, target, None, camera)

@@ -18,6 +18,7 @@ from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import (
     ALL,
     ALPHA,
+    NORMAL_KINDS,
     SH,
     CloneInPlace,
     Exposure,
@@ -145,6 +146,16 @@ def with_silhouette(recipe: Recipe, weight: float = 0.1, *, name: str) -> Recipe
         replace(stage, losses=(*stage.losses, LossTerm("silhouette", weight))) if set(stage.train) - set(SH) else stage
         for stage in recipe.stages
     )
+    return replace(recipe, name=name, stages=tuple(stages))
+
+
+def with_edges(recipe: Recipe, edges: str, *, name: str) -> Recipe:
+    """Return the recipe with the other reading of normal consistency beside empty pixels (``LossTerm.edges``)."""
+
+    def changed(term: LossTerm) -> LossTerm:
+        return replace(term, edges=edges) if term.kind in NORMAL_KINDS else term
+
+    stages = (replace(stage, losses=tuple(map(changed, stage.losses))) for stage in recipe.stages)
     return replace(recipe, name=name, stages=tuple(stages))
 
 
@@ -333,6 +344,9 @@ def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> Non
     visible = replace(appearance(), on_enter=(RankByError(occlusion=True),))
     add("2dgs-r-occlusion", "Variant: E_i counts visible pixels only", partial(two_dgs_r, stage_2=visible))
     bases: dict[str, Callable[..., Recipe]] = {"2dgs": two_dgs, "2dgs-60k": two_dgs_60k, "2dgs-r": two_dgs_r}
+    for base in ("2dgs", "2dgs-60k"):
+        about = f"Variant: {base} in the official code's reading of normals beside empty pixels"
+        add(f"{base}-edges-camera", about, partial(with_edges, bases[base](), "camera"))
     for base, build in bases.items():
         add(
             f"{base}-silhouette",

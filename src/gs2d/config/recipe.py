@@ -28,6 +28,8 @@ MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",),
 ALL = MU + SIGMA + ALPHA + SH
 LARGEST_SEED = 2**63 - 1  # torch takes no larger one
 DEPTH_KINDS = ("mean", "median")
+NORMAL_KINDS = ("normal_consistency", "normal_consistency_per_splat")
+EDGES = ("undefined", "camera")
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,9 @@ class LossTerm:
         Depth that surface normals come from; None takes the protocol's.
     options : mapping of str to values of JSON
         Of a registered loss: the keyword arguments that its function, or the constructor of its class, takes.
+    edges : "undefined" or "camera"
+        Of normal consistency, beside empty pixels: depths make no normal there, or one as in the official code, where
+        empty pixels lie at the camera's centre.
     """
 
     kind: str
@@ -57,6 +62,7 @@ class LossTerm:
     start: int = 0
     depth: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict, metadata={"omit_empty": True}, hash=False)
+    edges: str = field(default="undefined", metadata={"omit_empty": True})
 
 
 @dataclass(frozen=True)
@@ -364,6 +370,9 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
         _check_densify(f"{where}: densify", stage.densify, stage)
 
 
+_OF_NORMALS = f"only {' and '.join(NORMAL_KINDS)} do"
+
+
 def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
     kinds = [term.kind for term in stage.losses]
     for term in stage.losses:
@@ -381,6 +390,9 @@ def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
         integer(f"{where}: start of loss {term.kind!r}", term.start, low=0)
         if term.depth is not None:
             one_of(f"{where}: depth of loss {term.kind!r}", term.depth, DEPTH_KINDS)
+        one_of(f"{where}: edges of loss {term.kind!r}", term.edges, EDGES)
+        of_normals = term.kind in NORMAL_KINDS
+        require(of_normals or term.edges == "undefined", f"{where}: loss {term.kind!r} takes no edges; {_OF_NORMALS}")
     if stage.iterations > 0:
         active = [term for term in stage.losses if term.weight != 0 and term.start == 0]
         require(bool(active), f"{where}: no loss is active from the first iteration: got {kinds or 'none'}")

@@ -26,7 +26,7 @@ SIGNATURES: dict[str, list[Any]] = {
     "gs2d_photometric": [POINTER] * 4 + [INT64] * 2 + [DOUBLE] * 2 + [POINTER] * 2,
     "gs2d_blur": [POINTER] + [INT64] * 2 + [POINTER],
     "gs2d_masked_mean": [POINTER] * 2 + [INT64] * 2 + [POINTER],
-    "gs2d_normal_consistency": [POINTER] * 6 + [INT64] * 2 + [INT, DOUBLE] + [POINTER] * 4,
+    "gs2d_normal_consistency": [POINTER] * 7 + [INT64] * 2 + [INT, INT, DOUBLE] + [POINTER] * 4,
 }
 
 
@@ -201,8 +201,10 @@ class _NormalConsistency(torch.autograd.Function):
         depth: Tensor,
         alpha: Tensor,
         mask: Tensor | None,
+        weights: Tensor | None,
         camera: Camera,
         per_splat: bool,
+        edges: str,
         expected: float,
         wanted: bool,
         library: Library,
@@ -213,8 +215,8 @@ class _NormalConsistency(torch.autograd.Function):
         rotation = torch.tensor(camera.rotation, dtype=torch.float64).contiguous()
         value = torch.empty(1, dtype=torch.float64)
         ctx.expected = expected if expected != 0 else 1.0
-        inputs = (normal, depth, alpha, mask, intrinsics, rotation)
-        sizes = (camera.height, camera.width, int(per_splat), ctx.expected)
+        inputs = (normal, depth, alpha, mask, weights, intrinsics, rotation)
+        sizes = (camera.height, camera.width, int(per_splat), int(edges == "camera"), ctx.expected)
         _call(library, "gs2d_normal_consistency", *inputs, *sizes, *gradients, value)
         ctx.save_for_backward(*gradients)
         return value[0].to(normal.dtype)
@@ -225,7 +227,7 @@ class _NormalConsistency(torch.autograd.Function):
         gradients = ctx.saved_tensors
         if not torch.equal(cotangent, torch.tensor(ctx.expected, dtype=torch.float64).to(cotangent.dtype)):
             gradients = tuple(None if g is None else g * (cotangent / ctx.expected) for g in gradients)
-        return (*gradients, None, None, None, None, None, None)
+        return (*gradients, *[None] * 8)
 
 
 def normal_consistency(
@@ -235,6 +237,8 @@ def normal_consistency(
     camera: Camera,
     mask: Tensor | None = None,
     *,
+    weights: Tensor | None = None,
+    edges: str = "undefined",
     per_splat: bool = False,
     expected: float = 0.05,
     library: Library | None = None,
@@ -251,6 +255,10 @@ def normal_consistency(
     camera : Camera
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
+    weights : Tensor [H, W], optional
+        By which each pixel's part is multiplied; a constant.
+    edges : "undefined" or "camera"
+        See ``losses.reference.normals_from_depth``.
     per_splat : bool
         The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
     expected : float
@@ -266,13 +274,17 @@ def normal_consistency(
     shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
     if mask is not None:
         shapes["mask"] = (mask, "H W")
+    if weights is not None:
+        shapes["weights"] = (weights, "H W")
     sizes = check_shapes(shapes)
     if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
         raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
     _arrays(library, normal=normal, depth=depth, alpha=alpha)
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous())
+    if weights is not None:
+        (weights,) = _arrays(library, weights=weights)
     wanted = _wanted(normal, depth, alpha)
-    arguments = (_mask_bytes(mask), camera, per_splat, expected, wanted, library)
+    arguments = (_mask_bytes(mask), weights, camera, per_splat, edges, expected, wanted, library)
     value: Tensor = _NormalConsistency.apply(*images, *arguments)
     return value
 

@@ -111,6 +111,8 @@ class LossView:
         Counted from 1 within the stage.
     depth_kind : "mean" or "median"
         The depth that the term asks for: ``output.depth(view.depth_kind)``.
+    edges : "undefined" or "camera"
+        How the term takes normals of depth beside empty pixels: ``LossTerm.edges``.
     index : int or None
         Of the training view, in the order of ``scene.train``.
     silhouette : Tensor [H, W] or None
@@ -132,6 +134,7 @@ class LossView:
     camera: Camera
     iteration: int = 1
     depth_kind: str = "mean"
+    edges: str = "undefined"
     index: int | None = None
     silhouette: Tensor | None = None
     neighbour: Neighbour | None = None
@@ -224,12 +227,12 @@ def _ssim(output: RenderOutput, view: LossView) -> Tensor:
 
 @register_loss("normal_consistency")
 def _normal_consistency(output: RenderOutput, view: LossView) -> Tensor:
-    return reference.normal_consistency(*_normals(output, view))
+    return reference.normal_consistency(*_normals(output, view), edges=view.edges)
 
 
 @register_loss("normal_consistency_per_splat")
 def _normal_consistency_per_splat(output: RenderOutput, view: LossView) -> Tensor:
-    return reference.normal_consistency_per_splat(*_normals(output, view))
+    return reference.normal_consistency_per_splat(*_normals(output, view), edges=view.edges)
 
 
 @register_loss("distortion")
@@ -272,7 +275,9 @@ def _normal_prior(output: RenderOutput, view: LossView) -> Tensor:
 
 def _fused_normals(output: RenderOutput, view: LossView, operations: LossOperations, kind: str) -> Tensor:
     per_splat, weight = kind == "normal_consistency_per_splat", view.weights.get(kind, 1.0)
-    return operations.normal_consistency(*_normals(output, view), per_splat=per_splat, expected=weight)
+    return operations.normal_consistency(
+        *_normals(output, view), edges=view.edges, per_splat=per_splat, expected=weight
+    )
 
 
 FUSED: Mapping[str, Callable[[RenderOutput, LossView, LossOperations], Tensor]] = MappingProxyType(
@@ -372,18 +377,17 @@ def compute_losses(
         mask,
         camera,
         iteration,
-        depth_kind,
-        index,
-        silhouette,
-        neighbour,
-        prior,
-        None if target_cache is None else target_cache.mean,
-        weights,
-        _operations(backend, output.color.device),
+        index=index,
+        silhouette=silhouette,
+        neighbour=neighbour,
+        prior=prior,
+        target_mean=None if target_cache is None else target_cache.mean,
+        weights=weights,
+        fused=_operations(backend, output.color.device),
     )
     values: dict[str, Tensor] = {}
     for term, weight in active:
-        view.depth_kind = term.depth or depth_kind
+        view.depth_kind, view.edges = term.depth or depth_kind, term.edges
         found = _value(term, output, view, functions or {})
         if found is not None:
             value = weight * found

@@ -75,7 +75,9 @@ def ssim(rendered: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor
     return masked_mean(ssim_map(fill_ignored(rendered, target, mask), target), mask)
 
 
-def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None) -> Tensor:
+def normals_from_depth(
+    depth: Tensor, camera: Camera, mask: Tensor | None = None, *, edges: str = "undefined"
+) -> Tensor:
     """Surface normals of a depth image, by central differences of back-projected points.
 
     N = normalise((P[y+1] - P[y-1]) x (P[x+1] - P[x-1])), with P the world point of each pixel centre. For positive
@@ -88,20 +90,23 @@ def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None
         Depth along the optical axis; 0 where nothing was hit.
     camera : Camera
     mask : Tensor [H, W] bool, optional
-        False = treat the pixel as not hit, and give it no normal.
+        False = ignore the pixel: neither it nor its neighbours have a normal.
+    edges : "undefined" or "camera"
+        What a neighbour that was not hit does: N is undefined, or the neighbour lies at the camera's centre, as in the
+        official 2DGS code. N is then undefined only where both neighbours across, or both above and below, are empty.
 
     Returns
     -------
     Tensor [H, W, 3]
-        Unit normals in the world frame; 0 on the one-pixel border, at ignored pixels, and wherever one of the four
-        neighbours was not hit.
+        Unit normals in the world frame; 0 where undefined, and on the one-pixel border.
         Differentiable in ``depth``; the camera is a constant.
     """
     height, width = depth.shape
     if min(height, width) < 3:
         return torch.zeros_like(depth)[..., None].expand(-1, -1, 3)
-    hit = ~(depth <= 0) if mask is None else ~(depth <= 0) & mask  # NaN counts as a hit: it must reach the loss
-    z = torch.where(hit, depth, torch.ones_like(depth))  # keeps the undefined pixels' gradients finite
+    known = torch.ones_like(depth, dtype=torch.bool) if mask is None else mask
+    hit = ~(depth <= 0) & known  # NaN counts as a hit: it must reach the loss
+    z = torch.where(hit, depth, torch.zeros_like(depth))  # 0 is the camera's centre
     i = torch.arange(width, dtype=depth.dtype, device=depth.device)
     j = torch.arange(height, dtype=depth.dtype, device=depth.device)
     x = ((i + 0.5 - camera.cx) / camera.fx).expand(height, width)
@@ -109,38 +114,63 @@ def normals_from_depth(depth: Tensor, camera: Camera, mask: Tensor | None = None
     points = torch.stack([x * z, y * z, z], dim=-1)  # camera frame; the rotation to the world is applied last
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     right = points[1:-1, 2:] - points[1:-1, :-2]
-    normals = F.normalize(torch.linalg.cross(down, right), dim=-1, eps=0.0)
-    defined = hit[2:, 1:-1] & hit[:-2, 1:-1] & hit[1:-1, 2:] & hit[1:-1, :-2]
-    if mask is not None:
-        defined = defined & mask[1:-1, 1:-1]
-    normals = torch.where(defined[..., None], normals, torch.zeros_like(normals))
+    if edges == "camera":
+        defined = known[2:, 1:-1] & known[:-2, 1:-1] & known[1:-1, 2:] & known[1:-1, :-2]
+        defined = defined & (hit[2:, 1:-1] | hit[:-2, 1:-1]) & (hit[1:-1, 2:] | hit[1:-1, :-2])
+    else:
+        defined = hit[2:, 1:-1] & hit[:-2, 1:-1] & hit[1:-1, 2:] & hit[1:-1, :-2]
+    defined = (defined & known[1:-1, 1:-1])[..., None]
+    product = torch.linalg.cross(down, right)
+    product = torch.where(defined, product, torch.ones_like(product))  # 0 has no direction, and no finite gradient
+    normals = torch.where(defined, F.normalize(product, dim=-1, eps=0.0), torch.zeros_like(product))
     rotation = torch.as_tensor(camera.rotation, dtype=depth.dtype, device=depth.device)
     return F.pad(normals @ rotation, (0, 0, 1, 1, 1, 1))  # rows n^T R = (R^T n)^T
 
 
 def normal_consistency(
-    normal: Tensor, depth: Tensor, alpha: Tensor, camera: Camera, mask: Tensor | None = None
+    normal: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    camera: Camera,
+    mask: Tensor | None = None,
+    *,
+    edges: str = "undefined",
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Mean of 1 - alpha <normal, N>, alpha detached, N from ``depth`` (the form of the official 2DGS code).
 
-    Where N is undefined (border, not hit, ignored neighbour) the pixel contributes the constant 1.
+    Where N is undefined (border, not hit, ignored neighbour) the pixel contributes the constant 1. ``edges`` is that of
+    :func:`normals_from_depth`. With ``weights`` [H, W], constants, each pixel's part is multiplied by its weight; the
+    sum is divided by the count of pixels all the same.
     """
-    surface = normals_from_depth(depth, camera, mask)
+    surface = normals_from_depth(depth, camera, mask, edges=edges)
     normal, alpha = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha))
-    return masked_mean(1 - alpha.detach() * (normal * surface).sum(dim=-1), mask)
+    return masked_mean(_weighted(1 - alpha.detach() * (normal * surface).sum(dim=-1), weights), mask)
+
+
+def _weighted(values: Tensor, weights: Tensor | None) -> Tensor:
+    return values if weights is None else weights.detach() * values
 
 
 def normal_consistency_per_splat(
-    normal: Tensor, depth: Tensor, alpha: Tensor, camera: Camera, mask: Tensor | None = None
+    normal: Tensor,
+    depth: Tensor,
+    alpha: Tensor,
+    camera: Camera,
+    mask: Tensor | None = None,
+    *,
+    edges: str = "undefined",
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Mean of sum_i w_i (1 - <n_i, N>) = alpha - <normal, N>, nothing detached (the paper's Eq. 7).
 
-    Where N is undefined the pixel contributes 0: there is nothing to be consistent with.
+    Where N is undefined the pixel contributes 0: there is nothing to be consistent with. ``edges`` and ``weights`` are
+    those of :func:`normal_consistency`.
     """
-    surface = normals_from_depth(depth, camera, mask)
+    surface = normals_from_depth(depth, camera, mask, edges=edges)
     normal, alpha = (fill_ignored(image, torch.zeros_like(image), mask) for image in (normal, alpha))
     defined = (surface.detach() != 0).any(dim=-1)
-    value = alpha - (normal * surface).sum(dim=-1)
+    value = _weighted(alpha - (normal * surface).sum(dim=-1), weights)
     return masked_mean(torch.where(defined, value, torch.zeros_like(value)), mask)
 
 

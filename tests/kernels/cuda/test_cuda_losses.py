@@ -36,14 +36,14 @@ def photographs(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor,
     return rendered, target, torch.rand(height, width, generator=g) < 0.8
 
 
-def geometry(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def geometry(height: int, width: int, seed: int = 0, empty: float = 0.05) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rendered normals, depth with holes, alpha and a mask; float32."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=g)
 
-    depth = torch.where(rand(height, width) < 0.05, 0.0, 2 + rand(height, width))
+    depth = torch.where(rand(height, width) < empty, 0.0, 2 + rand(height, width))
     return rand(height, width, 3) - 0.5, depth, rand(height, width), rand(height, width) < 0.85
 
 
@@ -133,17 +133,20 @@ def test_without_a_valid_pixel_values_and_gradients_are_0(emulator: emulate.Emul
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("per_splat", [False, True])
+@pytest.mark.parametrize(("edges", "weighted"), [("undefined", False), ("undefined", True), ("camera", False)])
 @pytest.mark.parametrize("size", [*SIZES, (9, 33)])
 def test_normal_consistency_and_its_gradients_are_those_of_the_reference(
-    emulator: emulate.Emulator, size: tuple[int, int], per_splat: bool, masked: bool
+    emulator: emulate.Emulator, size: tuple[int, int], per_splat: bool, masked: bool, edges: str, weighted: bool
 ) -> None:
-    *images, mask = geometry(*size)
+    *images, mask = geometry(*size, empty=0.3 if edges == "camera" else 0.05)
     camera, valid = make_camera(*size), mask if masked else None
+    weights = torch.rand(size, generator=torch.Generator().manual_seed(1)) if weighted else None
     found_in = [image.requires_grad_() for image in images]
     exact_in = [image.detach().double().requires_grad_() for image in images]
-    value = ops.normal_consistency(*found_in, camera, valid, per_splat=per_splat, launcher=emulator)
+    form = {"per_splat": per_splat, "edges": edges, "weights": weights}
+    value = ops.normal_consistency(*found_in, camera, valid, **form, launcher=emulator)
     function = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
-    exact = function(*exact_in, camera, valid)
+    exact = function(*exact_in, camera, valid, edges=edges, weights=weights)
     assert value.item() == pytest.approx(exact.item(), abs=1e-6)
     if min(size) < 3:
         return

@@ -71,7 +71,10 @@ for size in ((37, 44), (1, 1), (12, 43)):
     l1_too, ssim_too = ops.photometric(x, y, launcher=emulator)
     camera = case.camera.resized(size[1], size[0])
     normals = sum(
-        ops.normal_consistency(x, depth, alpha, camera, m, per_splat=form, launcher=emulator) for form in (False, True)
+        ops.normal_consistency(
+            x, depth, alpha, camera, m, per_splat=form, edges=edges, weights=y[..., 0], launcher=emulator
+        )
+        for form, edges in ((False, "undefined"), (True, "camera"))
     )
     (l1 + ssim + l1_too + ssim_too + normals + ops.masked_mean(depth, m, launcher=emulator)).backward()
 

@@ -65,6 +65,19 @@ GS2D_HD DepthNormal<V> depth_normal(V left, V right, V up, V down, V offset_x, V
     return {inverse_length * n, inverse_length, two * inverse_x * inverse_x, two * inverse_y * inverse_y};
 }
 
+// A neighbour of depth 0 was not hit. NaN counts as a hit: it must reach the loss.
+template <class V> GS2D_HD auto was_hit(V depth) { return invert(depth <= V(0.0f)); }
+
+// Whether four neighbours make a normal: all of them were hit; or with `at_camera`, where those that were not hit lie at
+// the camera's centre, one of each pair. Its gx or gy is then 1 or -1, and depth_normal needs no other formula. Ignored
+// pixels, and those outside the image, make none: there they have a negative depth.
+template <class V> GS2D_HD auto makes_normal(V left, V right, V up, V down, bool at_camera) {
+    if (!at_camera) return was_hit(left) & was_hit(right) & was_hit(up) & was_hit(down);
+    const V zero = V(0.0f);
+    const auto absent = (left < zero) | (right < zero) | (up < zero) | (down < zero);
+    return invert(absent) & was_hit(left + right) & was_hit(up + down);
+}
+
 // The pullback of a cotangent of the unit normal to gx and gy, times slope_x and slope_y: the depth of the right
 // neighbour gets x * left, the left one -x * right, the lower one y * up, the upper one -y * down.
 template <class V> struct DepthNormalGrad {

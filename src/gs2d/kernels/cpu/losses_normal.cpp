@@ -2,8 +2,8 @@
 //
 // Two forms: the official one, mean(1 - alpha <n, N>) with alpha detached, and the paper's per-splat one,
 // mean(alpha - <n, N>) with nothing detached. N comes from the depths of the four neighbours, so a depth's gradient is
-// gathered from the four pixels beside it: no atomics. Depths outside the image, of ignored pixels and of the background
-// are 0 in the padded copy, which makes N undefined beside them; such a pixel has no gradient.
+// gathered from the four pixels beside it: no atomics. Depths of the background are 0 in the padded copy; outside the
+// image and at ignored pixels they are `absent`, which makes N undefined beside them. Such a pixel has no gradient.
 #include "core/losses.h"
 #include "cpu/export.h"
 #include "cpu/losses_rows.h"
@@ -13,17 +13,15 @@ namespace {
 
 constexpr int64_t HALO = 2;  // rows of depth that the gradient of a row depends on
 
-// Background has depth 0. NaN counts as a hit: it must reach the loss.
-GS2D_HD M was_hit(V depth) { return ~(depth <= V(real(0))); }
-
 struct Images {
     const real *normal, *depth, *alpha;
     const uint8_t* mask;
+    const real* weights;       // of the pixels, or null
     const double* intrinsics;  // fx, fy, cx, cy
     const double* rotation;    // world to camera, row-major
     int64_t height, width;
     double scale;  // of the gradients: cotangent / valid pixels
-    bool per_splat;
+    bool per_splat, at_camera;  // at_camera: see makes_normal
     real *normal_gradient, *depth_gradient, *alpha_gradient;  // all null, or the first two at least
     double* rows;                                             // the part of each row's sum that is not constant
 };
@@ -39,7 +37,8 @@ class Piece {
           stride(row_stride(im.width)),
           depths(end - begin + 2 * HALO),
           centres(end - begin + 2),
-          scratch(stride * (depths + 2 * centres + 5)),
+          scratch(stride * (depths + 2 * centres + 6)),
+          absent(real(im.at_camera ? -1 : 0)),
           fx(real(im.intrinsics[0])),
           fy(real(im.intrinsics[1])) {
         for (int k = 0; k < 9; ++k) rotation[k] = V(real(im.rotation[k]));
@@ -47,6 +46,7 @@ class Piece {
 
     bool run() {
         if (scratch.failed()) return false;
+        for (int64_t i = 0; im.at_camera && i < stride * depths; ++i) scratch.data[i] = absent;
         for (int64_t y = begin - HALO; y < end + HALO; ++y) read_depth(y);
         const int64_t reach = im.depth_gradient ? 1 : 0;
         for (int64_t y = begin - reach; y < end + reach; ++y) {
@@ -64,13 +64,13 @@ class Piece {
     real* plane(int k) const { return scratch.row(depths + 2 * centres + k, stride); }
 
     void read_depth(int64_t y) {
-        if (y < 0 || y >= im.height) return;  // scratch is 0
+        if (y < 0 || y >= im.height) return;  // it is absent
         const real* from = im.depth + y * im.width;
         real* to = depth_row(y);
         fill_validity(im.mask ? im.mask + y * im.width : nullptr, im.width, 1, to);
         for (int64_t i = 0; i < length; i += LANES) {
             const V z = im.width - i >= LANES ? load(from + i) : load_first(from + i, left_at(i));
-            store(to + i, keep((load(to + i) > V(real(0))) & was_hit(z), z));
+            store(to + i, select(load(to + i) > V(real(0)), keep(was_hit(z), z), V(absent)));
         }
     }
     int left_at(int64_t i) const {
@@ -80,7 +80,7 @@ class Piece {
     // Values, and the gradients that stay at their pixel, of row y; pullbacks for its neighbours.
     void centre_row(int64_t y) {
         const real *z = depth_row(y), *above = depth_row(y - 1), *below = depth_row(y + 1);
-        real *qx = plane(0), *qy = plane(1), *qz = plane(2), *a = plane(3), *validity = plane(4);
+        real *qx = plane(0), *qy = plane(1), *qz = plane(2), *a = plane(3), *validity = plane(4), *w = plane(5);
         const real* q = im.normal + y * 3 * im.width;
         for (int64_t i = 0; i < im.width; ++i) {
             qx[i] = q[3 * i];
@@ -88,14 +88,15 @@ class Piece {
             qz[i] = q[3 * i + 2];
         }
         std::memcpy(a, im.alpha + y * im.width, static_cast<size_t>(im.width) * sizeof(real));
+        if (im.weights) std::memcpy(w, im.weights + y * im.width, static_cast<size_t>(im.width) * sizeof(real));
         fill_validity(im.mask ? im.mask + y * im.width : nullptr, im.width, 1, validity);
         const bool mine = y >= begin && y < end;
-        const V zero = V(real(0)), scale = V(real(im.scale));
+        const V zero = V(real(0)), one = V(real(1));
         const V offset_y = V(real(double(y) + 0.5 - im.intrinsics[3]));
         V total = zero;
         for (int64_t i = 0; i < length; i += LANES) {
             const V l = load(z + i - 1), r = load(z + i + 1), u = load(above + i), d = load(below + i);
-            const M defined = was_hit(l) & was_hit(r) & was_hit(u) & was_hit(d) & (load(validity + i) > zero);
+            const M defined = makes_normal<V>(l, r, u, d, im.at_camera) & (load(validity + i) > zero);
             const V offset_x = iota() + V(real(double(i) + 0.5 - im.intrinsics[2]));
             const DepthNormal<V> f = depth_normal<V>(l, r, u, d, offset_x, offset_y, fx, fy);
             const Vec3<V> world = {load(qx + i), load(qy + i), load(qz + i)};
@@ -103,7 +104,8 @@ class Piece {
                                     dot({rotation[3], rotation[4], rotation[5]}, world),
                                     dot({rotation[6], rotation[7], rotation[8]}, world)};
             const V cosine = dot(camera, f.direction), alpha = load(a + i);
-            total += keep(defined, im.per_splat ? alpha - cosine : alpha * cosine);
+            const V of_pixel = im.weights ? load(w + i) : one, scale = of_pixel * V(real(im.scale));
+            total += keep(defined, of_pixel * (im.per_splat ? alpha - cosine : alpha * cosine));
             if (im.depth_gradient == nullptr) continue;
             const V weight = im.per_splat ? -scale : -(scale * alpha);
             const DepthNormalGrad<V> g = depth_normal_vjp<V>(f, weight * camera, offset_x, offset_y, fx, fy);
@@ -134,14 +136,15 @@ class Piece {
         for (int64_t i = 0; i < im.width; i += LANES) {
             const V from_left = load(gx + i - 1) * load(z + i - 2), from_right = load(gx + i + 1) * load(z + i + 2);
             const V from_above = load(g1 + i) * load(z2 + i), from_below = load(g_1 + i) * load(z_2 + i);
-            store_first(im.depth_gradient + y * im.width + i, (from_left - from_right) + (from_above - from_below),
-                        left_at(i));
+            const V gradient = (from_left - from_right) + (from_above - from_below);
+            store_first(im.depth_gradient + y * im.width + i, keep(was_hit(load(z + i)), gradient), left_at(i));
         }
     }
 
     const Images& im;
     const int64_t begin, end, length, stride, depths, centres;
     const Scratch scratch;
+    const real absent;  // the depth outside the image and at ignored pixels
     const V fx, fy;
     V rotation[9];
 };
@@ -152,12 +155,12 @@ class Piece {
 using namespace gs2d;
 
 // value = mean over valid pixels of 1 - alpha <n, N> (pixels without N count 1), or with per_splat of alpha - <n, N>
-// (pixels without N count 0). Gradients, each times `cotangent`: of normal [H, W, 3] (world frame) and depth [H, W]
+// (pixels without N count 0), each times its weight, if there are `weights` [H, W]; at_camera: see makes_normal. Gradients, each times `cotangent`: of normal [H, W, 3] (world frame) and depth [H, W]
 // (both null, or neither), and of alpha (or null; 0 in the official form, where it must be null).
 // Returns 0, or 1 when there is no memory.
 GS2D_EXPORT int gs2d_normal_consistency(const real* normal, const real* depth, const real* alpha, const uint8_t* mask,
-                                        const double* intrinsics, const double* rotation, int64_t height, int64_t width,
-                                        int per_splat, double cotangent, real* normal_gradient, real* depth_gradient,
+                                        const real* weights, const double* intrinsics, const double* rotation,
+                                        int64_t height, int64_t width, int per_splat, int at_camera, double cotangent, real* normal_gradient, real* depth_gradient,
                                         real* alpha_gradient, double* value) {
     *value = 0;
     auto* rows = static_cast<double*>(std::malloc(static_cast<size_t>(height + 1) * sizeof(double)));
@@ -168,12 +171,14 @@ GS2D_EXPORT int gs2d_normal_consistency(const real* normal, const real* depth, c
                         depth,
                         alpha,
                         mask,
+                        weights,
                         intrinsics,
                         rotation,
                         height,
                         width,
                         cotangent / count,
                         per_splat != 0,
+                        at_camera != 0,
                         normal_gradient,
                         depth_gradient,
                         alpha_gradient,
@@ -184,7 +189,12 @@ GS2D_EXPORT int gs2d_normal_consistency(const real* normal, const real* depth, c
     });
     double total = 0;
     for (int64_t y = 0; !failed && y < height; ++y) total += rows[y];
-    *value = (per_splat ? total : static_cast<double>(valid) - total) / count;
+    double constant = static_cast<double>(valid);
+    if (weights) {
+        constant = 0;
+        for (int64_t i = 0; i < height * width; ++i) constant += mask == nullptr || mask[i] ? double(weights[i]) : 0.0;
+    }
+    *value = (per_splat ? total : constant - total) / count;
     std::free(rows);
     return failed;
 }

@@ -201,8 +201,8 @@ class NormalArguments(ctypes.Structure):
         *_all(ctypes.c_int64, "height", "width"),
         *_all(ctypes.c_float, "fx", "fy", "cx", "cy"),
         ("rotation", ctypes.c_float * 9),
-        ("per_splat", ctypes.c_int32),
-        *_pointers("normal", "depth", "alpha", "mask", "partials", "means", "cotangent"),
+        *_all(ctypes.c_int32, "per_splat", "at_camera"),
+        *_pointers("normal", "depth", "alpha", "mask", "weights", "partials", "means", "cotangent"),
         *_pointers("g_normal", "g_depth", "g_alpha"),
     )
 

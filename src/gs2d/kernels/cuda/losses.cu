@@ -16,10 +16,11 @@ struct NormalArguments {
     int64 height, width;
     float fx, fy, cx, cy;
     float rotation[9];  // world to camera
-    int per_splat;
+    int per_splat, at_camera;             // at_camera: see makes_normal
     const float *normal, *depth, *alpha;  // [H, W, 3] world frame, [H, W], [H, W]
     const uchar* mask;                    // or null
-    float* partials;                      // [2, blocks]: valid pixels; sum of alpha <n, N>, or of alpha - <n, N>
+    const float* weights;                 // of the pixels, or null
+    float* partials;                      // [2, blocks]: valid pixels; sum of alpha <n, N>, of alpha - <n, N>, or of weighted terms
     const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels
     float *g_normal, *g_depth, *g_alpha;  // null where not wanted
 };
@@ -38,14 +39,18 @@ struct FinishArguments {
     float* means;            // [1 + values]: 1 / count, means; a count of 0 is taken as 1
 };
 
-__device__ __forceinline__ bool was_hit(float depth) { return !(depth <= 0.f); }  // NaN too: it must reach the loss
-
-// Depth of a pixel; 0 outside the image, at ignored pixels and in the background.
+// Depth of a pixel; 0 in the background. Outside the image and at ignored pixels it makes no normal: makes_normal.
 __device__ __forceinline__ float depth_at(const NormalArguments& a, int64 x, int64 y) {
-    if (x < 0 || y < 0 || x >= a.width || y >= a.height) return 0.f;
+    const float absent = a.at_camera ? -1.f : 0.f;
+    if (x < 0 || y < 0 || x >= a.width || y >= a.height) return absent;
     const int64 at = y * a.width + x;
+    if (a.mask && !a.mask[at]) return absent;
     const float z = a.depth[at];
-    return (!a.mask || a.mask[at]) && was_hit(z) ? z : 0.f;
+    return keep(was_hit(z), z);
+}
+
+__device__ __forceinline__ float weight_at(const NormalArguments& a, int64 at) {
+    return a.weights ? a.weights[at] : 1.f;
 }
 
 // One pixel: its normal from the depths around it, and the rendered one in the camera frame.
@@ -60,7 +65,7 @@ __device__ __forceinline__ Centre centre_of(const NormalArguments& a, int64 x, i
                                             float up, float down) {
     Centre c;
     const int64 at = y * a.width + x;
-    c.defined = was_hit(left) && was_hit(right) && was_hit(up) && was_hit(down) && (!a.mask || a.mask[at]);
+    c.defined = makes_normal(left, right, up, down, a.at_camera != 0) && (!a.mask || a.mask[at]);
     c.offset_x = float(x) + 0.5f - a.cx, c.offset_y = float(y) + 0.5f - a.cy;
     c.from_depth = depth_normal(left, right, up, down, c.offset_x, c.offset_y, a.fx, a.fy);
     c.rendered = rotate(a.rotation, Vec3<float>{a.normal[3 * at], a.normal[3 * at + 1], a.normal[3 * at + 2]});
@@ -77,7 +82,8 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency(NormalArgum
         const Centre c = centre_of(a, x, y, depth_at(a, x - 1, y), depth_at(a, x + 1, y), depth_at(a, x, y - 1),
                                    depth_at(a, x, y + 1));
         sums[0] = sums[0] + 1.f;
-        sums[1] = sums[1] + keep(c.defined, a.per_splat ? c.alpha - c.cosine : c.alpha * c.cosine);
+        const float part = keep(c.defined, a.per_splat ? c.alpha - c.cosine : c.alpha * c.cosine);
+        sums[1] = sums[1] + (a.weights ? a.weights[at] * (a.per_splat ? part : 1.f - part) : part);
     }
     leave_sums(sums, a.partials);
 }
@@ -87,7 +93,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
     __shared__ float depth[DH][DW], pull_x[CH][CW], pull_y[CH][CW];  // pulls: see depth_normal_vjp
     const int64 across = (a.width + NORMAL_W - 1) / NORMAL_W;
     const int64 left = blockIdx.x % across * NORMAL_W, top = blockIdx.x / across * NORMAL_H;
-    const float scale = *a.cotangent * a.means[0];
+    const float of_all = *a.cotangent * a.means[0];
     for (int i = threadIdx.x; i < DH * DW; i += MEAN_THREADS)
         depth[i / DW][i % DW] = depth_at(a, left + i % DW - HALO, top + i / DW - HALO);
     __syncthreads();
@@ -98,6 +104,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
         if (x >= 0 && y >= 0 && x < a.width && y < a.height) {
             const Centre c =
                 centre_of(a, x, y, depth[cy + 1][cx], depth[cy + 1][cx + 2], depth[cy][cx + 1], depth[cy + 2][cx + 1]);
+            const float scale = of_all * weight_at(a, at);
             const float weight = a.per_splat ? -scale : -(scale * c.alpha);
             if (c.defined)
                 pull = depth_normal_vjp(c.from_depth, weight * c.rendered, c.offset_x, c.offset_y, a.fx, a.fy);
@@ -122,7 +129,8 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
                     from_right = pull_x[dy + 1][dx + 2] * depth[dy + 2][dx + 4];
         const float from_above = pull_y[dy][dx + 1] * depth[dy][dx + 2],
                     from_below = pull_y[dy + 2][dx + 1] * depth[dy + 4][dx + 2];
-        a.g_depth[(top + dy) * a.width + left + dx] = (from_left - from_right) + (from_above - from_below);
+        const float gradient = (from_left - from_right) + (from_above - from_below);
+        a.g_depth[(top + dy) * a.width + left + dx] = keep(was_hit(depth[dy + 2][dx + 2]), gradient);
     }
 }
 

@@ -192,14 +192,16 @@ def photometric(
 
 
 def _normal_arguments(
-    images: Sequence[Tensor | None], camera: Camera, per_splat: bool, **more: Tensor | None
+    images: Sequence[Tensor | None], camera: Camera, per_splat: bool, at_camera: bool, **more: Tensor | None
 ) -> NormalArguments:
-    normal, depth, alpha, mask = images
-    arguments = NormalArguments(height=camera.height, width=camera.width, per_splat=int(per_splat))
+    normal, depth, alpha, mask, weights = images
+    arguments = NormalArguments(
+        height=camera.height, width=camera.width, per_splat=int(per_splat), at_camera=int(at_camera)
+    )
     for name in ("fx", "fy", "cx", "cy"):
         setattr(arguments, name, float(getattr(camera, name)))
     arguments.rotation[:] = np.asarray(camera.rotation).ravel().tolist()
-    fill(arguments, normal=normal, depth=depth, alpha=alpha, mask=mask, **more)
+    fill(arguments, normal=normal, depth=depth, alpha=alpha, mask=mask, weights=weights, **more)
     return arguments
 
 
@@ -211,18 +213,21 @@ class _NormalConsistency(torch.autograd.Function):
         depth: Tensor,
         alpha: Tensor,
         mask: Tensor | None,
+        weights: Tensor | None,
         camera: Camera,
         per_splat: bool,
+        at_camera: bool,
         launcher: Launcher,
     ) -> Tensor:
         blocks = -(-depth.numel() // MEAN_PIXELS)
         partials = depth.new_empty(2, blocks)
         if blocks > 0:
-            arguments = _normal_arguments((normal, depth, alpha, mask), camera, per_splat, partials=partials)
+            images = (normal, depth, alpha, mask, weights)
+            arguments = _normal_arguments(images, camera, per_splat, at_camera, partials=partials)
             launcher.launch("normal_consistency", blocks, THREADS, arguments)
-        means = _finish(launcher, partials, complement=not per_splat)
-        ctx.launcher, ctx.camera, ctx.per_splat = launcher, camera, per_splat
-        ctx.save_for_backward(normal, depth, alpha, mask, means)
+        means = _finish(launcher, partials, complement=not per_splat and weights is None)
+        ctx.launcher, ctx.camera, ctx.per_splat, ctx.at_camera = launcher, camera, per_splat, at_camera
+        ctx.save_for_backward(normal, depth, alpha, mask, weights, means)
         return means[1].clone()
 
     @staticmethod
@@ -236,9 +241,10 @@ class _NormalConsistency(torch.autograd.Function):
             g_normal, g_depth, g_alpha = gradients
             given = _cotangent(cotangent)
             outputs = {"g_normal": g_normal, "g_depth": g_depth, "g_alpha": g_alpha}
-            arguments = _normal_arguments(images, ctx.camera, ctx.per_splat, means=means, cotangent=given, **outputs)
+            form = (ctx.camera, ctx.per_splat, ctx.at_camera)
+            arguments = _normal_arguments(images, *form, means=means, cotangent=given, **outputs)
             ctx.launcher.launch("normal_consistency_vjp", blocks, THREADS, arguments)
-        return (*gradients, None, None, None, None)
+        return (*gradients, *[None] * 6)
 
 
 def normal_consistency(
@@ -248,6 +254,8 @@ def normal_consistency(
     camera: Camera,
     mask: Tensor | None = None,
     *,
+    weights: Tensor | None = None,
+    edges: str = "undefined",
     per_splat: bool = False,
     expected: float = 0.05,
     launcher: Launcher,
@@ -264,6 +272,10 @@ def normal_consistency(
     camera : Camera
     mask : Tensor [H, W] bool, optional
         False = ignore this pixel.
+    weights : Tensor [H, W] float32, optional
+        By which each pixel's part is multiplied; a constant.
+    edges : "undefined" or "camera"
+        See ``losses.reference.normals_from_depth``.
     per_splat : bool
         The paper's form, mean(alpha - <n, N>), instead of the official mean(1 - alpha <n, N>) with alpha detached.
     expected : float
@@ -278,12 +290,15 @@ def normal_consistency(
     """
     del expected
     shapes = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "alpha": (alpha, "H W")}
+    shapes |= {} if weights is None else {"weights": (weights, "H W")}
     sizes = check_shapes(shapes | ({} if mask is None else {"mask": (mask, "H W")}))
     if (camera.height, camera.width) != (sizes["H"], sizes["W"]):
         raise ShapeError(f"camera is {camera.width}x{camera.height}, but depth is {sizes['W']}x{sizes['H']}")
     ready(normal=normal, depth=depth, alpha=alpha)
     images = (normal.contiguous(), depth.contiguous(), alpha.contiguous(), _mask_of(mask, normal.device))
-    value: Tensor = _NormalConsistency.apply(*images, camera, per_splat, launcher)
+    if weights is not None:
+        _, weights = ready(normal=normal, weights=weights)
+    value: Tensor = _NormalConsistency.apply(*images, weights, camera, per_splat, edges == "camera", launcher)
     return value
 
 
