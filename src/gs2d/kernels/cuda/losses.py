@@ -241,8 +241,8 @@ class _NormalConsistency(torch.autograd.Function):
             g_normal, g_depth, g_alpha = gradients
             given = _cotangent(cotangent)
             outputs = {"g_normal": g_normal, "g_depth": g_depth, "g_alpha": g_alpha}
-            form = (ctx.camera, ctx.per_splat, ctx.at_camera)
-            arguments = _normal_arguments(images, *form, means=means, cotangent=given, **outputs)
+            outputs |= {"means": means, "cotangent": given}
+            arguments = _normal_arguments(images, ctx.camera, ctx.per_splat, ctx.at_camera, **outputs)
             ctx.launcher.launch("normal_consistency_vjp", blocks, THREADS, arguments)
         return (*gradients, *[None] * 6)
 
