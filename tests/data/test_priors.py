@@ -167,6 +167,19 @@ def test_downscaled_maps_fit_downscaled_photographs(tmp_path: Path) -> None:
     assert (found == shrink(slope().astype(np.float32), 4)[:7]).all()
 
 
+def test_a_view_that_is_downscaled_later_is_the_one_that_is_downscaled_at_once(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    write_depth(tmp_path / "depths" / "0.png", slope())
+    whole, small = view_of(tmp_path), view_of(tmp_path, downscale=4)
+    later = whole.downscaled(4)
+    assert (later.camera.width, later.camera.height) == (small.camera.width, small.camera.height)
+    assert (later.camera.K == small.camera.K).all()
+    assert (later.image() == small.image()).all()
+    assert later.maps is not None
+    assert (later.maps.depth().values == small.maps.depth().values).all()
+    assert whole.downscaled(1) is whole
+
+
 def test_smaller_maps_are_interpolated_where_neighbours_agree_and_only_there() -> None:
     values = np.array([[100, 102, 200, 0]] * 2, dtype=np.float32)
     x = np.array([1.0, 1.75, 2.25, 3.0])  # centres are at 0.5, 1.5, 2.5, 3.5

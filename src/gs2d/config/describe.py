@@ -56,6 +56,8 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
             yield f"first: the {action.top_percent:g} % of splats with the largest E_i become '{action.writes}'"
         elif isinstance(action, CloneInPlace):
             yield f"first: clone '{action.rows}' in place (opacity: {action.opacity}); the clones are '{action.writes}'"
+    if stage.downscale > 1:
+        yield f"photographs of 1/{stage.downscale} of their size"
     groups: dict[str, list[str]] = {}
     for attribute, rows in stage.train.items():
         groups.setdefault(rows, []).append(attribute)

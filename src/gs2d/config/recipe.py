@@ -242,6 +242,9 @@ class Stage:
         Raise the SH degree every so many iterations from 0; 0 = full degree from the start.
     moments : "fresh" or "kept"
         Adam moments at entry.
+    downscale : int
+        The stage trains on photographs of 1 / ``downscale`` of their size (what ``gs2d train --downscale`` leaves of
+        them), with their masks, silhouettes and maps. Scores and meshes are of the full size.
     """
 
     name: str
@@ -253,6 +256,7 @@ class Stage:
     on_enter: tuple[Action, ...] = ()
     sh_interval: int = 0
     moments: str = "fresh"
+    downscale: int = field(default=1, metadata={"omit_empty": True})
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", MappingProxyType(dict(self.train)))
@@ -341,6 +345,7 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
     integer(f"{where}: iterations", stage.iterations, low=0)
     integer(f"{where}: sh_interval", stage.sh_interval, low=0)
     one_of(f"{where}: moments", stage.moments, ("fresh", "kept"))
+    integer(f"{where}: downscale", stage.downscale, low=1)
     for action in stage.on_enter:
         if isinstance(action, RankByError):
             percent = number(f"{where}: RankByError.top_percent", action.top_percent, low=0.0)

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.camera import Camera
-from gs2d.core.images import area_downscale, image_size, mask_downscale, read_image, read_mask
+from gs2d.core.images import image_size, read_image, read_mask
 from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
@@ -127,14 +127,10 @@ class Decoder:
             mask = None if mask is None else inside & undistort_mask(mask, positions, need=1.0)
             if object_mask is not None:
                 object_mask = inside & undistort_mask(object_mask, positions, need=0.5)
-        if self.downscale > 1:
-            image = area_downscale(image, self.downscale)
-            mask, valid = (
-                None if pixels is None else mask_downscale(pixels, self.downscale, need=1.0) for pixels in (mask, valid)
-            )
-            object_mask = None if object_mask is None else mask_downscale(object_mask, self.downscale, need=0.5)
-        mask, valid = (None if pixels is None or pixels.all() else pixels for pixels in (mask, valid))
-        return DecodedImage(np.ascontiguousarray(image), valid if mask is None else mask, object_mask, valid)
+        small = DecodedImage(image, mask, object_mask, valid).downscaled(self.downscale)
+        mask, valid = (None if pixels is None or pixels.all() else pixels for pixels in (small.mask, small.valid))
+        image = np.ascontiguousarray(small.image)
+        return DecodedImage(image, valid if mask is None else mask, small.object_mask, valid)
 
     def _read_mask(self, path: Path | None, need: float) -> np.ndarray | None:
         """Return a mask at the image's size: True where at least ``need`` of the pixel's area is white."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gs2d.core.images import area_downscale, mask_downscale
 from gs2d.core.memory import trim
 
 TRIM_EVERY = 16  # pictures that are decoded between giving back what decoding left: a few ms each time
@@ -42,6 +43,19 @@ class DecodedImage:
                 frozen = array.view()
                 frozen.setflags(write=False)
                 object.__setattr__(self, field, frozen)
+
+    def downscaled(self, factor: int) -> DecodedImage:
+        """Return it at 1 / ``factor`` of its size, area-filtered; leftover rows and columns are cut.
+
+        A pixel counts where all of its block does, and is the object's where half of its block is.
+        """
+        if factor == 1:
+            return self
+        mask, known = (
+            None if pixels is None else mask_downscale(pixels, factor, need=1.0) for pixels in (self.mask, self.valid)
+        )
+        object_mask = None if self.object_mask is None else mask_downscale(self.object_mask, factor, need=0.5)
+        return DecodedImage(area_downscale(self.image, factor), mask, object_mask, known)
 
     @property
     def nbytes(self) -> int:

@@ -66,6 +66,17 @@ class View:
         camera = replace(self.camera, T_cam_world=T_cam_world)
         return View(self.name, camera, self._image, path=self.path, maps=self.maps)
 
+    def downscaled(self, factor: int) -> View:
+        """Return the same photograph at 1 / ``factor`` of its size, with its camera, masks and maps.
+
+        Its picture is made of that of this view each time it is asked for: nothing is held twice.
+        """
+        if factor == 1:
+            return self
+        camera = self.camera.downscaled(factor)
+        maps = None if self.maps is None else replace(self.maps, camera=camera)
+        return View(self.name, camera, lambda: self._image().downscaled(factor), path=self.path, maps=maps)
+
     def image(self) -> np.ndarray:
         """Return the photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.
 
@@ -212,6 +223,10 @@ class Scene:
         return replace(
             self, train=tuple(view.at(poses[view.name]) if view.name in poses else view for view in self.train)
         )
+
+    def downscaled(self, factor: int) -> Scene:
+        """Return the scene with training photographs of 1 / ``factor`` of their size; test views stay as they are."""
+        return self if factor == 1 else replace(self, train=tuple(view.downscaled(factor) for view in self.train))
 
     @property
     def views(self) -> tuple[View, ...]:

@@ -18,7 +18,7 @@ from gs2d.config.recipe import CloneInPlace, RankByError, Recipe, Stage, validat
 from gs2d.core.memory import trim
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
-from gs2d.errors import DataError, RunError
+from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.losses.api import target_maps
 from gs2d.render.api import splat_errors
 from gs2d.render.backends import Backend, get_backend
@@ -50,6 +50,7 @@ from gs2d.training.targets import TARGET_BYTES, DeviceTargets, Targets, TargetSo
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
 
 OnEvent = Callable[[events.Event], None]
+MIN_SIDE = 11  # px of a photograph in training: the window of SSIM
 
 
 class Trainer:
@@ -116,11 +117,11 @@ class Trainer:
         self.state = self._new_state(dtype, init) if state is None else self._checked(state)
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
-        self._targets = self._make_targets(target_bytes)
         self._learner = self.backend.for_training()
         self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
-        self._whole = FullRender(scene, self.recipe, protocol, self._learner, self._targets)
-        self._stage2_cache_bytes = stage2_cache_bytes
+        self._target_bytes, self._stage2_cache_bytes = target_bytes, stage2_cache_bytes
+        self._check_sizes()
+        self._look_at(self.recipe.stages[min(self.state.stage, len(self.recipe.stages) - 1)].downscale)
         self._objective: Objective | None = None  # of the stage under way, from its first iteration here
 
     @property
@@ -156,6 +157,8 @@ class Trainer:
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
         self._objective = None
+        if stage.downscale != self._downscale:
+            self._look_at(stage.downscale)
         while self._pending:
             self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
@@ -234,9 +237,26 @@ class Trainer:
         """Where the densifier of a stage works."""
         return Surroundings(stage.name, self.scene, self.settings, self.protocol.white, self._learner)
 
-    def _make_targets(self, limit_bytes: int | None) -> TargetSource:
+    def _check_sizes(self) -> None:
+        """Raise RecipeError for a stage whose photographs would be too small to learn from."""
+        least = min(min(view.camera.width, view.camera.height) for view in self.scene.train)
+        for stage in self.recipe.stages:
+            if stage.downscale > 1 and least // stage.downscale < MIN_SIDE:
+                raise RecipeError(
+                    f"stage {stage.name!r}: downscale must leave {MIN_SIDE} px of photographs whose shortest side is "
+                    f"{least} px, got {stage.downscale}; --set {stage.name}.downscale={max(1, least // MIN_SIDE)}"
+                )
+
+    def _look_at(self, downscale: int) -> None:
+        """Train on photographs of 1 / ``downscale`` of their size from now on; those of before are let go."""
+        self._downscale = downscale
+        scene = self.scene.downscaled(downscale)
+        self._targets: TargetSource = self._make_targets(scene, self._target_bytes)
+        self._whole = FullRender(scene, self.recipe, self.protocol, self._learner, self._targets)
+
+    def _make_targets(self, scene: Scene, limit_bytes: int | None) -> TargetSource:
         """Return the photographs, where the splats are."""
-        views, background, splats = self.scene.train, self.protocol.background, self.state.splats
+        views, background, splats = scene.train, self.protocol.background, self.state.splats
         use_masks, dtype, device = self.protocol.use_mask_in_training, splats.dtype, splats.device
         if is_async(device):
             limit = 1 << 31 if limit_bytes is None else limit_bytes
