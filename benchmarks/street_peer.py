@@ -24,7 +24,7 @@ import json
 import math
 import shutil
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -150,8 +150,17 @@ def _inset(whole: Window, by: int) -> Window:
     return Window(whole.x + dx, whole.y + dy, whole.width - 2 * dx, whole.height - 2 * dy)
 
 
-def write_capture(folder: Path, scene: Scene, views: Sequence[View], windows: Sequence[Window]) -> None:
-    """Views in COLMAP's layout: PNG pictures and binary model, a pinhole camera each, and the scene's sparse points."""
+def write_capture(
+    folder: Path,
+    scene: Scene,
+    views: Sequence[View],
+    windows: Sequence[Window],
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> None:
+    """Views in COLMAP's layout: PNG pictures and binary model, a pinhole camera each, and the scene's sparse points.
+
+    The peer knows no alpha: photographs that have it are laid over ``background``.
+    """
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
     cameras, images = [struct.pack("<Q", len(views))], [struct.pack("<Q", len(views))]
@@ -159,7 +168,7 @@ def write_capture(folder: Path, scene: Scene, views: Sequence[View], windows: Se
         name, camera = image_name(number, view), window.camera(view.camera)
         path = folder / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, window.cut(view.image()[:, :, :3]))
+        write_image(path, window.cut(np.rint(view.target(background) * 255).astype(np.uint8)))
         cameras.append(struct.pack("<IiQQ", number, 1, camera.width, camera.height))
         cameras.append(struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy))
         x, y, z, w = Rotation.from_matrix(camera.rotation).as_quat()
@@ -242,7 +251,7 @@ def train_within(binary: Path, capture: Path, folder: Path, budget: float, varia
     iterations, best = PROBE, None
     for attempt in range(TRIES):
         made = folder / f"{attempt}-{SPLATS}"
-        process = _run(train_command(binary, capture, made, iterations, variant), folder, attempt)
+        process = run_peer(train_command(binary, capture, made, iterations, variant), folder, attempt)
         if process.cpu_seconds <= budget and (best is None or iterations > best.iterations):
             best = Trained(iterations, process)
             shutil.move(made, folder / SPLATS)
@@ -256,9 +265,18 @@ def train_within(binary: Path, capture: Path, folder: Path, budget: float, varia
     return best
 
 
-def _run(command: Sequence[str], folder: Path, number: int | str) -> Process:
+def run_peer(
+    command: Sequence[str], folder: Path, number: int | str, environment: Mapping[str, str] | None = None
+) -> Process:
+    """Run the peer to its end, what it says going to ``NUMBER-console.txt`` in a folder.
+
+    Raises
+    ------
+    DataError
+        It failed.
+    """
     console = folder / f"{number}-console.txt"
-    process = watch_process(command, console)
+    process = watch_process(command, console, environment=environment)
     if process.exit_code:
         said = console.read_text(errors="replace").strip().splitlines()[-1:]
         raise DataError(f"the peer ended with exit code {process.exit_code}: {said}")
@@ -278,7 +296,7 @@ def draw_test_views(
         out = folder / "draw"
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
-        _run(draw_command(binary, capture, folder / SPLATS, iterations, name, out), folder, "draw")
+        run_peer(draw_command(binary, capture, folder / SPLATS, iterations, name, out), folder, "draw")
         drawn = sorted(out.glob("[0-9]*.png"))
         if len(drawn) != 1:
             raise DataError(f"the peer drew {len(drawn)} pictures of {view.name}, expected 1")

@@ -70,6 +70,8 @@ class Process:
         Of the processor until the file ``when`` was there; None where it never was.
     peak_rss_bytes : int
         Of the largest process among them.
+    user_seconds : float
+        The part of ``cpu_seconds`` in which it computed itself; 0 in files of before it was kept.
     """
 
     command: list[str]
@@ -78,6 +80,7 @@ class Process:
     cpu_seconds: float
     cpu_seconds_before: float | None
     peak_rss_bytes: int
+    user_seconds: float = 0.0
 
 
 def watch_process(
@@ -120,6 +123,7 @@ def watch_process(
         round(used.ru_utime + used.ru_stime, 2),
         None if before is None else round(before, 2),
         used.ru_maxrss * unit,
+        round(used.ru_utime, 2),
     )
 
 

@@ -164,7 +164,7 @@ def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str |
     longest = max(histories.values(), key=lambda history: max((span.stop for span in history.stages), default=0))
     for axes, panel in zip(figure.subplots(rows, columns, squeeze=False).flat, shown, strict=False):
         for k, (label, history) in enumerate(histories.items()):
-            _draw_stages(axes, history, panel.series, label=label, smooth=panel.smooth, **_style(k))
+            _draw_stages(axes, history, panel.series, label=label, smooth=panel.smooth, **line_style(k))
         _dress(axes, longest, log=panel.log, legend=False)
         axes.set_title(panel.title, fontsize=9, color=INK, pad=16 if len(longest.stages) > 1 else 6)
     handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -180,8 +180,8 @@ def compared(histories: Mapping[str, History], panels: Sequence[Panel]) -> str |
     return svg_text(figure)
 
 
-def _style(k: int) -> dict[str, Any]:
-    """Colour and dashes of line ``k``: no two of 28 lines are alike, and the first is on top where they meet."""
+def line_style(k: int) -> dict[str, Any]:
+    """Return colour and dashes of line ``k``: no two of 28 lines are alike, and the first is on top where they meet."""
     dashes = ("-", "--", ":", "-.")[k // len(_COLORS) % 4]
     return {"color": _COLORS[k % len(_COLORS)], "linestyle": dashes, "order": 3 - 0.01 * k}
 
@@ -216,7 +216,7 @@ def _figure(
     FigureCanvasSVG(figure)
     axes = figure.add_subplot()
     for k, (label, name) in enumerate(lines.items()):
-        _draw_stages(axes, history, name, label=label, smooth=smooth, **_style(k))
+        _draw_stages(axes, history, name, label=label, smooth=smooth, **line_style(k))
     if marks and marks[1]:
         x_marks, y_marks = list(marks[1]), list(marks[1].values())
         axes.plot(x_marks, y_marks, "o", color=_COLORS[1], markersize=5, label=marks[0], clip_on=False)

@@ -1,0 +1,222 @@
+"""One training of the time-to-quality curves, in a process of its own (``benchmarks/time_to_quality.py`` starts it).
+
+Scores are taken while the clocks stand still. At every point of its course the state is saved with the clocks, so that
+a training that was cut off goes on from there: the time since is spent again and counted once, and so are the process's
+start, the reading of the capture and whatever the start of the splats takes (a plane sweep).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gs2d.core.json_files import write_json
+from gs2d.errors import Gs2dError
+from gs2d.pipeline.events import ignore
+from gs2d.pipeline.job import Job, prepare_job
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.threads import use_threads
+from gs2d.training import events
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+
+SPEC, RESULT, STATE = "spec.json", "result.json", "state.pt"
+PROGRESS_EVERY = 10  # iterations: how finely a point of the course can be placed
+
+
+@dataclass(frozen=True)
+class Spent:
+    """Seconds: of the clock, of the processor in this program, and of it in the system."""
+
+    seconds: float = 0.0
+    user_seconds: float = 0.0
+    system_seconds: float = 0.0
+
+    def __add__(self, other: Spent) -> Spent:
+        return Spent(
+            self.seconds + other.seconds,
+            self.user_seconds + other.user_seconds,
+            self.system_seconds + other.system_seconds,
+        )
+
+    def __sub__(self, other: Spent) -> Spent:
+        return self + Spent(-other.seconds, -other.user_seconds, -other.system_seconds)
+
+
+class Clocks:
+    """What a training has spent, without what was done while they stood still.
+
+    Parameters
+    ----------
+    started : float
+        When the process was started (``time.time()``).
+    """
+
+    def __init__(self, started: float) -> None:
+        self._started, self._offset = started, Spent()
+
+    def _now(self) -> Spent:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        return Spent(time.time() - self._started, used.ru_utime, used.ru_stime)
+
+    def spent(self) -> Spent:
+        """Return what was spent until now, to a millisecond."""
+        exact = self._now() - self._offset
+        return Spent(*(round(value, 3) for value in astuple(exact)))
+
+    def set(self, spent: Spent) -> None:
+        """Go on from what an earlier process had spent."""
+        self._offset = self._now() - spent
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Stand still."""
+        before = self._now()
+        yield
+        self._offset = self._offset + (self._now() - before)
+
+
+def train_options(spec: dict[str, Any], folder: Path) -> TrainOptions:
+    """Return the options of a training, as ``gs2d train`` would have them."""
+    return TrainOptions(
+        scene=Path(spec["capture"]),
+        out=folder,  # only its folder is used
+        recipe=spec["recipe"],
+        schedule_scale=spec["scale"],
+        downscale=spec["downscale"],
+        seed=spec["seed"],
+        overrides=tuple(spec["set"]),
+        backend=spec["backend"],
+    )
+
+
+def marks(iterations: int, points: int) -> list[int]:
+    """Return the iterations, evenly spaced, after which the course has a point; the end is not one of them."""
+    return sorted({round(iterations * k / points) for k in range(1, points)} - {0, iterations})
+
+
+def train(spec: dict[str, Any], folder: Path, clocks: Clocks) -> dict[str, Any]:
+    """Train, score on the way and at the end, and return what the results file says of it."""
+    use_threads(spec["threads"])
+    job = prepare_job(train_options(spec, folder), ignore)
+    state, course = _saved(folder / STATE, clocks)
+    waiting = [mark for mark in marks(job.recipe.iterations, spec["points"]) if mark > _done(job, state)]
+
+    def listen(event: events.Event) -> None:
+        if not isinstance(event, events.Progress):
+            return
+        done = sum(stage.iterations for stage in job.recipe.stages[: event.index]) + event.iteration
+        if not waiting or done < waiting[0] or done == job.recipe.iterations:
+            return
+        while waiting and waiting[0] <= done:
+            waiting.pop(0)
+        with clocks.stopped():
+            course.append({"iterations": done, **asdict(clocks.spent()), **score(job, trainer.state)})
+            _save(folder / STATE, trainer.state, clocks.spent(), course)
+
+    every = PROGRESS_EVERY
+    trainer = Trainer(
+        job.scene, job.recipe, job.protocol, backend=job.backend, on_event=listen, state=state, progress_every=every
+    )
+    trainer.run()
+    spent = clocks.spent()
+    result = {"iterations": job.recipe.iterations, **asdict(spent), **score(job, trainer.state)}
+    return {**result, **surface(job, trainer.state, spec, folder), "course": course}
+
+
+def _done(job: Job, state: TrainState | None) -> int:
+    """Return the iterations that a state is after."""
+    if state is None:
+        return 0
+    return sum(stage.iterations for stage in job.recipe.stages[: state.stage]) + state.step
+
+
+def _saved(file: Path, clocks: Clocks) -> tuple[TrainState | None, list[dict[str, Any]]]:
+    """Return the state and the course so far of a training that was cut off, and set the clocks to it."""
+    if not file.exists():
+        return None, []
+    data = torch.load(file, weights_only=True)
+    clocks.set(Spent(**data["spent"]))
+    return TrainState.from_state_dict(data["state"]), list(data["course"])
+
+
+def _save(file: Path, state: TrainState, spent: Spent, course: list[dict[str, Any]]) -> None:
+    temporary = file.with_suffix(".tmp")
+    torch.save({"state": state.state_dict(), "spent": asdict(spent), "course": course}, temporary)
+    os.replace(temporary, file)
+
+
+def score(job: Job, state: TrainState) -> dict[str, Any]:
+    """Return the scores of the test views (of the training views where there are none), and the size of the scene."""
+    # Here, while the clocks stand still: a training does not need them.
+    from benchmarks.street_runs import summary_of
+    from gs2d.pipeline.exposure import named
+    from gs2d.pipeline.predicted_exposure import with_predicted
+    from gs2d.pipeline.scoring import score_views
+
+    exposures = with_predicted(named(job.scene.train, state.exposures), job.scene)
+    views, splats = job.scene.test or job.scene.train, state.splats
+    scores = score_views(
+        splats, views, job.settings, job.backend, name="", on_event=ignore, exposures=exposures, split="test"
+    )
+    summary = dict(summary_of(scores) or {})
+    summary.pop("psnr_by_view", None)
+    size = float(splats.scales.max()) / job.scene.extent
+    return {"images": summary, "splats": len(splats), "longest_splat": round(size, 4)}
+
+
+def surface(job: Job, state: TrainState, spec: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return how good the mesh is and the seconds that making it took, where there is a true surface."""
+    from gs2d.config.surface_protocols import VISIBLE_SURFACE
+    from gs2d.pipeline.in_memory import Trained, extract_mesh
+    from gs2d.pipeline.options import EvaluateOptions
+    from gs2d.pipeline.truth import OfficialTruth, choose_truth, read_truth, score_surface
+    from gs2d.training.per_image import scene_now
+
+    given = None if spec["ground_truth"] is None else Path(spec["ground_truth"])
+    root = job.scene.root or Path(".")
+    truth = read_truth(given) if given is not None and given.is_file() else choose_truth(given, root, ignore)
+    if truth is None or isinstance(truth, OfficialTruth):  # an official one has no F at a fraction of its size
+        return {"surface": None}
+    start = time.process_time()
+    scene = scene_now(state, job.scene)
+    mesh = extract_mesh(Trained(state.splats, scene, job.protocol, job.settings, job.backend, job.recipe))
+    seconds = time.process_time() - start
+    found = score_surface(mesh, truth, job, EvaluateOptions(), ignore, folder=folder / "surface")
+    fractions = map(str, VISIBLE_SURFACE.fractions)
+    return {
+        "surface": {
+            "f_scores": {name: row["f_score"] for name, row in zip(fractions, found["thresholds"], strict=True)},
+            "chamfer": found["chamfer"],
+            "faces": len(mesh.faces),
+            "mesh_cpu_seconds": round(seconds, 2),
+        }
+    }
+
+
+def main(arguments: list[str]) -> int:
+    """Train what a spec says and write ``result.json`` beside it; 2 for what the user can mend."""
+    file, started = Path(arguments[0]), float(arguments[1])
+    folder = file.parent
+    try:
+        result = train(json.loads(file.read_text()), folder, Clocks(started))
+    except Gs2dError as error:
+        print(error)
+        return 2
+    write_json(folder / RESULT, result)
+    (folder / STATE).unlink(missing_ok=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
