@@ -23,7 +23,7 @@ from loss_images import make_camera, make_output
 
 @pytest.fixture(autouse=True)
 def guests() -> Iterator[None]:
-    before = dict(LOSSES._things)
+    before = {name: LOSSES.get(name) for name in LOSSES.builtin}  # modules register once
     yield
     LOSSES._things.clear()
     LOSSES._things.update(before)
@@ -75,6 +75,12 @@ def test_a_class_is_prepared_for_the_scene_and_may_leave_a_view_out() -> None:
     _, recorder = train_toys.train(scene, replace(recipe, stages=(stage,)))
     told = [event.losses for event in recorder.events if isinstance(event, events.Progress)]
     assert sum("mean" in losses for losses in told) == pytest.approx(len(told) / len(scene.train), abs=1)
+
+
+@pytest.mark.parametrize("kind", ["depth_prior", "normal_prior"])
+def test_losses_on_known_maps_are_classes_too_and_ask_for_their_data(kind: str) -> None:
+    with pytest.raises(RecipeError, match=f"loss '{kind}' has data of its own; pass what prepared"):
+        losses_of([LossTerm(kind, 0.1)])
 
 
 def test_options_that_a_loss_does_not_take_stop_before_training() -> None:

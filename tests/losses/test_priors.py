@@ -6,9 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from gs2d.config.recipe import LossTerm
-from gs2d.errors import RecipeError
-from gs2d.losses.api import compute_losses
 from gs2d.losses.priors import (
     MIN_POINTS,
     Depths,
@@ -22,7 +19,7 @@ from gs2d.losses.priors import (
     fit_line,
     normal_prior,
 )
-from loss_images import make_camera, make_output
+from loss_images import make_output
 
 HIT = torch.ones(4, 5, dtype=torch.float64)
 
@@ -180,22 +177,3 @@ def test_where_nothing_was_hit_nothing_breaks() -> None:
         assert loss.item() == 0
         (gradient,) = torch.autograd.grad(loss, [nothing])
         assert (gradient == 0).all()
-
-
-# -- as losses of a recipe ------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", ["depth_prior", "normal_prior"])
-def test_a_loss_without_what_it_compares_with_is_refused(kind: str) -> None:
-    output, camera = make_output(6, 7), make_camera(7, 6)
-    for prior in (None, Prior()):
-        with pytest.raises(RecipeError, match=f"loss '{kind}' needs known .*, got none"):
-            compute_losses(
-                output,
-                torch.rand(6, 7, 3),
-                None,
-                camera,
-                [LossTerm(kind, 0.1)],
-                iteration=1,
-                depth_kind="mean",
-                backend="reference",
-                prior=prior,
-            )

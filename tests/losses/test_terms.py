@@ -16,12 +16,14 @@ from gs2d.config.recipe import LossTerm
 from gs2d.core.camera import Camera
 from gs2d.errors import BackendError, RecipeError, ShapeError
 from gs2d.losses import reference
-from gs2d.losses.api import FUSED, compute_losses, target_maps
+from gs2d.losses.api import FUSED, LossFunction, compute_losses, loss_of, target_maps
 from gs2d.losses.multiview import Neighbour, prepare_image
 from gs2d.losses.priors import MetricDepth, NormalTarget, Prior
 from gs2d.render.types import RenderOutput
+from gs2d.training.prior_losses import DepthPriorLoss, NormalPriorLoss
 from loss_images import make_camera, make_output
 
+KINDS = (*LOSS_KINDS, *PRIOR_KINDS)
 OFFICIAL = (
     LossTerm("l1", 0.8),
     LossTerm("ssim", 0.2),
@@ -52,15 +54,29 @@ def one_loss(
         backend=backend,
         silhouette=target[..., 0],
         neighbour=one_neighbour(target, mask, camera),
-        prior=one_prior(target),
+        index=0,
+        functions=prior_losses(target),
     )
     return losses[kind]
 
 
-def one_prior(target: Tensor) -> Prior:
-    """Depths and normals made of the colours of a target."""
-    valid, directions = torch.ones_like(target[..., 0]), torch.nn.functional.normalize(target, dim=2)
-    return Prior(MetricDepth(0.5 + target[..., 1], valid > 0), NormalTarget(directions, valid), opacity=0.2)
+class OnePrior:
+    """Depths and normals made of the colours of a target, with the face of ``Priors``."""
+
+    def __init__(self, target: Tensor) -> None:
+        valid, directions = torch.ones_like(target[..., 0]), torch.nn.functional.normalize(target, dim=2)
+        self._prior = Prior(MetricDepth(0.5 + target[..., 1], valid > 0), NormalTarget(directions, valid), opacity=0.2)
+
+    def of(self, *_: object) -> Prior:
+        return self._prior
+
+
+def prior_losses(target: Tensor) -> dict[tuple[str, str], LossFunction]:
+    """The losses with data of their own, as training has prepared them."""
+    made = {"depth_prior": DepthPriorLoss(), "normal_prior": NormalPriorLoss()}
+    for loss in made.values():
+        loss._priors = OnePrior(target)  # type: ignore[assignment]
+    return {loss_of(LossTerm(kind, 1.0)): loss for kind, loss in made.items()}
 
 
 def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighbour:
@@ -73,7 +89,7 @@ def one_neighbour(target: Tensor, mask: Tensor | None, camera: Camera) -> Neighb
     return Neighbour(image, image, replace(camera, T_cam_world=aside), depth, draws, settings)
 
 
-@pytest.mark.parametrize("kind", LOSS_KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_what_was_rendered_at_an_ignored_pixel_has_no_influence(
     kind: str, backend: str, request: pytest.FixtureRequest
@@ -107,7 +123,7 @@ def test_what_was_rendered_at_an_ignored_pixel_has_no_influence(
             assert torch.equal(first, other)
 
 
-@pytest.mark.parametrize("kind", LOSS_KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_an_all_true_mask_changes_nothing(kind: str) -> None:
     output, camera, target = make_output(12, 13), make_camera(13, 12), torch.rand(12, 13, 3, dtype=torch.float64)
     plain, masked = (
@@ -117,7 +133,7 @@ def test_an_all_true_mask_changes_nothing(kind: str) -> None:
     torch.testing.assert_close(plain, masked)
 
 
-@pytest.mark.parametrize("kind", LOSS_KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_view_without_valid_pixels_has_loss_zero_except_for_the_constant_of_ssim(kind: str) -> None:
     output, camera = make_output(5, 6), make_camera(6, 5)
     mask, target = torch.zeros(5, 6, dtype=torch.bool), torch.rand(5, 6, 3, dtype=torch.float64)
@@ -125,7 +141,7 @@ def test_a_view_without_valid_pixels_has_loss_zero_except_for_the_constant_of_ss
 
 
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("kind", [kind for kind in LOSS_KINDS if kind not in MULTIVIEW_KINDS])  # test_multiview.py
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in MULTIVIEW_KINDS])  # test_multiview.py
 def test_every_reference_loss_passes_a_float64_gradient_check(kind: str, masked: bool) -> None:
     height, width = 6, 7
     output, camera = make_output(height, width, seed=1), make_camera(width, height)

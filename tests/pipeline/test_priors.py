@@ -60,23 +60,25 @@ def test_a_run_logs_measures_and_shows_what_was_known(run: RunFolder) -> None:
     assert any(losses.get("depth_prior", 0) > 0 for losses in logged)
     assert any(losses.get("normal_prior", 0) > 0 for losses in logged)
     for stage in run.metrics()["stages"]:
-        assert 0 < stage["depth_prior"]["median"] < 1
-        assert 0 < stage["normal_prior"]["median"] < 180
-        assert len(stage["depth_prior"]["by_view"]) == 6
-        assert [view["name"] for view in stage["priors_shown"]] == [f"train/r_{k}.png" for k in (1, 3, 5)]
-    drawn = sorted(path.name for path in (run.path / "renders" / "priors").iterdir())
-    kinds = ("depth", "known-depth", "known-normal", "normal")
+        depth, normal = stage["losses"]["depth_prior"], stage["losses"]["normal_prior"]
+        assert 0 < depth["median"] < 100
+        assert 0 < normal["median"] < 180
+        assert len(depth["by_view"]) == 6
+        for said in (depth, normal):
+            assert [view["name"] for view in said["shown"]] == [f"train/r_{k}.png" for k in (1, 3, 5)]
+    drawn = sorted(path.name for path in (run.path / "renders" / "losses").iterdir())
+    kinds = ("depth_prior.1", "depth_prior.2", "normal_prior.1", "normal_prior.2")
     assert drawn == [f"train__r_{k}.{kind}.png" for k in (1, 3, 5) for kind in kinds]
     report = " ".join(run.file(REPORT).read_text().split())
-    assert "What was known of the photographs" in report
-    assert "rendered and known depth differ by" in report
+    assert "Known depths" in report
+    assert "relative error of depth, %" in report
     assert "rendered normals" in report
 
 
 def test_a_run_without_priors_says_nothing_about_them(undisturbed: RunFolder) -> None:
-    assert not (undisturbed.path / "renders" / "priors").exists()
-    assert "What was known" not in undisturbed.file(REPORT).read_text()
-    assert not any("prior" in key for stage in undisturbed.metrics()["stages"] for key in stage)
+    assert not (undisturbed.path / "renders" / "losses").exists()
+    assert "Known depths" not in undisturbed.file(REPORT).read_text()
+    assert not any("losses" in stage for stage in undisturbed.metrics()["stages"])
 
 
 def test_a_stopped_run_resumes_to_the_same_bytes(run: RunFolder, valid: Path, tmp_path: Path) -> None:
@@ -130,7 +132,7 @@ def test_relative_maps_without_points_are_fitted_to_what_is_rendered(valid: Path
     made = knowing(valid, tmp_path / "run", depth_prior=source, normal_prior=False, recipe="2dgs")
     found = train(made, lambda event: said.append(event.text) if isinstance(event, Notice) else None)
     assert any("scale and shift by what is rendered in 6" in text for text in said)
-    assert found.metrics()["stages"][-1]["depth_prior"]["median"] >= 0
+    assert found.metrics()["stages"][-1]["losses"]["depth_prior"]["median"] >= 0
 
 
 def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(valid: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from gs2d.data.load import load_scene
 from gs2d.data.readers.registry import register_reader
 from gs2d.errors import DivergedError
 from gs2d.io.formats.registry import register_format
+from gs2d.losses.api import LossReport
 from gs2d.render.backends import CpuBackend, register_backend
 from gs2d.training.densify.densifier import Densifier
 from gs2d.training.events import Densified
@@ -23,6 +24,25 @@ from gs2d.training.rows import keep_rows
 def contrast(output, view, gain=1.0):
     """Compare the spread of colours with that of the photograph."""
     return gain * (output.color.std() - view.target.std()).square()
+
+
+@register_loss("example-brightness")
+class Brightness:
+    """Compare the mean brightness with that of the photograph, which is found once."""
+
+    title = "Brightness of the photographs"
+    figure = "error of brightness, levels of 255"
+
+    def prepare(self, scene, recipe, device):
+        self.means = [torch.tensor(view.image()[..., :3].mean() / 255, device=device) for view in scene.train]
+
+    def __call__(self, output, view):
+        return (output.color.mean() - self.means[view.index]).square()
+
+    def report(self, output, view):
+        error = 255 * (output.color.mean() - self.means[view.index]).abs()
+        images = {"photograph": view.target, "rendered": output.color}
+        return LossReport(float(error), {title: image.cpu().numpy() for title, image in images.items()})
 
 
 @register_reader("example-link")
@@ -60,7 +80,8 @@ class PruneFaint(Densifier):
 def recipe():
     """Like 2dgs, with a loss and a densifier of this package."""
     base = get_recipe("2dgs")
-    losses = (*base.stages[0].losses, LossTerm("example-contrast", 0.1, options={"gain": 2.0}))
+    guests = (LossTerm("example-contrast", 0.1, options={"gain": 2.0}), LossTerm("example-brightness", 0.1))
+    losses = (*base.stages[0].losses, *guests)
     stage = replace(base.stages[0], losses=losses, densify=Densify("example-prune", {"at": 3, "count": 2}))
     return replace(base, name="example-2dgs", stages=(stage, *base.stages[1:]))
 

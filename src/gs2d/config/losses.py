@@ -12,10 +12,12 @@ from gs2d.errors import RecipeError
 LOSS_KINDS = (
     *("l1", "ssim", "normal_consistency", "normal_consistency_per_splat", "distortion", "silhouette"),
     *MULTIVIEW_KINDS,
-    *PRIOR_KINDS,
 )
 LOSSES: Registry[Any] = Registry(
-    "loss", "gs2d.losses", builtin=dict.fromkeys(LOSS_KINDS, "gs2d.losses.api"), error=RecipeError
+    "loss",
+    "gs2d.losses",
+    builtin=dict.fromkeys(LOSS_KINDS, "gs2d.losses.api") | dict.fromkeys(PRIOR_KINDS, "gs2d.training.prior_losses"),
+    error=RecipeError,
 )
 """Kinds of loss -> a function of images, or a class with data of its own (``gs2d.losses.api``)."""
 register_loss = LOSSES.register

@@ -42,7 +42,7 @@ from gs2d.io.event_log import EventLog
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
-PRIORS = "priors"  # in RENDERS
+LOSSES = "losses"  # in RENDERS
 SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "report.html", "scene.html"
 EXPOSURE, POSES, SUBJECT, VERDICT = "exposure.json", "poses.json", "subject.json", "verdict.json"
 FORMAT = 1

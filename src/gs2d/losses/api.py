@@ -17,6 +17,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,9 +28,8 @@ from gs2d.core.checks import check_shapes
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError, ShapeError
 from gs2d.kernels.losses import LossOperations
-from gs2d.losses import multiview, priors, reference
+from gs2d.losses import multiview, reference
 from gs2d.losses.multiview import Neighbour, ViewPair
-from gs2d.losses.priors import Prior
 from gs2d.losses.reference import normals_from_depth
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import normals_without_pose_grad
@@ -39,6 +39,7 @@ __all__ = [
     "LOSSES",
     "Loss",
     "LossFunction",
+    "LossReport",
     "LossView",
     "TargetMaps",
     "compute_losses",
@@ -113,14 +114,14 @@ class LossView:
         The depth that the term asks for: ``output.depth(view.depth_kind)``.
     edges : "undefined" or "camera"
         How the term takes normals of depth beside empty pixels: ``LossTerm.edges``.
+    run_iteration : int
+        Counted from 1 over all stages.
     index : int or None
         Of the training view, in the order of ``scene.train``.
     silhouette : Tensor [H, W] or None
         Alpha of the photograph, in [0, 1], if it has one.
     neighbour : Neighbour or None
         The second view of the losses that compare two.
-    prior : Prior or None
-        What is known of the view beforehand.
     target_mean : Tensor [H, W, 3] or None
         Local mean of the target when known (fused SSIM only).
     weights : mapping of kind to float
@@ -135,10 +136,10 @@ class LossView:
     iteration: int = 1
     depth_kind: str = "mean"
     edges: str = "undefined"
+    run_iteration: int = 1
     index: int | None = None
     silhouette: Tensor | None = None
     neighbour: Neighbour | None = None
-    prior: Prior | None = None
     target_mean: Tensor | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
     fused: LossOperations | None = None
@@ -171,10 +172,29 @@ LossFunction = Callable[[RenderOutput, LossView], Tensor | None]
 """(rendered view, what it should look like) -> unweighted scalar; None where it has nothing to say of this view."""
 
 
-class Loss(Protocol):
-    """A loss with data of its own: a class is registered, and made once for each stage and term that names it.
+@dataclass(frozen=True, eq=False)
+class LossReport:
+    """What a loss has to say of a training view after a stage, for ``metrics.json`` and the report.
 
-    Its constructor takes the term's options as keyword arguments.
+    Attributes
+    ----------
+    figure : float or None
+        Compared over the views: the report says their median, and plots it by photograph.
+    images : mapping of title to array
+        Shown for a few views: colours [H, W, 3] in [0, 1], or depths [H, W] in world units, 0 = unknown, which share
+        one scale.
+    """
+
+    figure: float | None = None
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+class Loss(Protocol):
+    """A loss with data of its own: a class is registered, and made once for each kind and options of a recipe.
+
+    Its constructor takes the term's options as keyword arguments. With a method ``report(output, view)`` that returns a
+    :class:`LossReport`, or None, it has a section in the report of the run; ``title`` (str) is its heading, and
+    ``figure`` (str) says what the figure is: "error of depth, %".
     """
 
     def prepare(self, scene: Scene, recipe: Recipe, device: torch.device) -> None:
@@ -259,20 +279,6 @@ def _multiview_geometric(output: RenderOutput, view: LossView) -> Tensor:
     return multiview.geometric(view.two_views(output))
 
 
-@register_loss("depth_prior")
-def _depth_prior(output: RenderOutput, view: LossView) -> Tensor:
-    if view.prior is None or view.prior.depth is None:
-        raise RecipeError("loss 'depth_prior' needs known depths, got none; pass them or take a recipe without it")
-    return priors.depth_prior(view.prior, output.depth(view.depth_kind), output.alpha, view.mask)
-
-
-@register_loss("normal_prior")
-def _normal_prior(output: RenderOutput, view: LossView) -> Tensor:
-    if view.prior is None or view.prior.normal is None:
-        raise RecipeError("loss 'normal_prior' needs known normals, got none; pass them or take a recipe without it")
-    return priors.normal_prior(view.prior, output.normal, output.alpha, view.mask)
-
-
 def _fused_normals(output: RenderOutput, view: LossView, operations: LossOperations, kind: str) -> Tensor:
     per_splat, weight = kind == "normal_consistency_per_splat", view.weights.get(kind, 1.0)
     return operations.normal_consistency(
@@ -305,8 +311,8 @@ def compute_losses(
     target_cache: TargetMaps | None = None,
     silhouette: Tensor | None = None,
     neighbour: Neighbour | None = None,
-    prior: Prior | None = None,
     index: int | None = None,
+    run_iteration: int | None = None,
     functions: Mapping[tuple[str, str], LossFunction] | None = None,
 ) -> dict[str, Tensor]:
     """Weighted values of the active terms; their sum is the loss.
@@ -334,10 +340,10 @@ def compute_losses(
         Alpha of the photograph, for the loss of that name.
     neighbour : Neighbour, optional
         A second view, for the losses that compare two.
-    prior : Prior, optional
-        What is known of the view, for the losses on known depths and normals.
     index : int, optional
-        Of the training view.
+        Of the training view, for losses with data of their own.
+    run_iteration : int, optional
+        ``iteration`` counted over all stages; by default the same.
     functions : mapping, optional
         By :func:`loss_of` the functions of terms with data of their own, which :func:`prepared` makes.
 
@@ -377,10 +383,10 @@ def compute_losses(
         mask,
         camera,
         iteration,
+        run_iteration=iteration if run_iteration is None else run_iteration,
         index=index,
         silhouette=silhouette,
         neighbour=neighbour,
-        prior=prior,
         target_mean=None if target_cache is None else target_cache.mean,
         weights=weights,
         fused=_operations(backend, output.color.device),

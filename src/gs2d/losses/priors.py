@@ -48,7 +48,7 @@ class MetricDepth:
     Attributes
     ----------
     disparity : Tensor [H, W], 1 / world unit
-    known : Tensor [H, W] bool
+    valid : Tensor [H, W] bool
     """
 
     disparity: Tensor
@@ -68,7 +68,7 @@ class RelativeDepths:
     ----------
     values : Tensor [H, W]
         Centred on 0 with deviation 1 (whatever the unit was); 0 where unknown.
-    known : Tensor [H, W] bool
+    valid : Tensor [H, W] bool
     space : "disparity" or "depth"
         What it is linear in.
     """
@@ -91,7 +91,7 @@ class NormalTarget:
     ----------
     directions : Tensor [H, W, 3]
         0 where unknown.
-    known : Tensor [H, W]
+    valid : Tensor [H, W]
         1 where known, else 0.
     """
 

@@ -24,9 +24,9 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, StageDone, Step
 from gs2d.pipeline.exposure import Transforms, named
 from gs2d.pipeline.interruption import HeldSignals
 from gs2d.pipeline.job import Job
+from gs2d.pipeline.loss_reports import report_losses
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
-from gs2d.pipeline.prior_scores import score_priors
 from gs2d.pipeline.render import choose_views, draw_stage
 from gs2d.pipeline.resume import ResumePoint, put_in_cache
 from gs2d.pipeline.scoring import (
@@ -298,7 +298,9 @@ class RunLogger:
         for split, views in self._scored(last=last):
             scores = self._score(split, views, f"scoring {split} views", [keep, *(self._visitors if last else ())])
             entry |= split_metrics(scores, split, of=len(self._views(split)))
-        entry |= score_priors(self._run, self._job, self._now(self._job.scene.train), state.splats)
+        with attempted(f"what the losses say of stage {stage.name}", None, self._on_event):
+            assert self._trainer is not None
+            entry |= report_losses(self._run, self._trainer, self._job.scene.train)
         self._draw(stage.name, outputs)
         stages = [*self._run.metrics()["stages"][:index], entry]
         self._run.write_metrics({"stages": stages, "surface": None})

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,16 @@ from markupsafe import Markup
 
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
-from gs2d.io.run_dir import EXPOSURE, MESH, POSES, PRIORS, RENDERS, REPORT, VERDICT, open_run
+from gs2d.io.run_dir import EXPOSURE, LOSSES, MESH, POSES, RENDERS, REPORT, VERDICT, open_run
 from gs2d.report.guard import Guard, OnFailure
 from gs2d.report.html import macro, missing, page, render
 from gs2d.report.links import links
 from gs2d.report.plots import curves, read_history
 from gs2d.report.sections.capture import capture_section
 from gs2d.report.sections.exposure import exposure_section
+from gs2d.report.sections.losses import loss_section, loss_titles
 from gs2d.report.sections.pictures import hero, mesh_section, view_sections
 from gs2d.report.sections.poses import poses_section
-from gs2d.report.sections.priors import priors_section
 from gs2d.report.sections.subject import subject_section
 from gs2d.report.sections.surface import surface_scores
 from gs2d.report.sections.verdict import grade_of, scaled, verdict_section
@@ -135,7 +136,7 @@ def write_report(run: Path, *, cameras: Sequence[Camera] = (), on_failure: OnFai
 def _parts(record: RunRecord, cameras: Sequence[Camera]) -> dict[str, Callable[[], Markup]]:
     """Return the parts by their names, which failures are told with; ``templates/report.html`` has their order."""
     path, renders, last = record.path, record.path / RENDERS, record.stages[-1] if record.stages else {}
-    stages = [stage["name"] for stage in record.stages]
+    stages, titles = [stage["name"] for stage in record.stages], loss_titles(record.stages)
     return {
         "summary": lambda: verdict(record),
         "verdict": lambda: verdict_section(path / VERDICT),
@@ -152,25 +153,25 @@ def _parts(record: RunRecord, cameras: Sequence[Camera]) -> dict[str, Callable[[
         "photographs": lambda: capture_section(path, record.definition),
         "exposures": lambda: exposure_section(path / EXPOSURE, last),
         "cameras": lambda: poses_section(path / POSES, last),
-        "known depths": lambda: priors_section(renders / PRIORS, record.stages),
         "facts of the run": lambda: macro("macros.html", "facts", definition_facts(record.definition)),
+        **{_of_loss(name): partial(loss_section, renders / LOSSES, record.stages, name) for name in titles},
     }
 
 
 def _of_views(record: RunRecord) -> list[tuple[str, str]]:
-    """Titles and parts about exposures, poses and priors, where the recipe has them."""
+    """Titles and parts about exposures and poses where the recipe has them, and about losses that have a report."""
     recipe = record.definition.get("recipe")
     learned: Mapping[str, Any] = recipe if isinstance(recipe, Mapping) else {}
     wanted = (
         ("Exposure of the photographs", "exposures", learned.get("exposure")),
         ("Where the photographs were taken", "cameras", learned.get("poses")),
-        (
-            "What was known of the photographs",
-            "known depths",
-            learned.get("depth_prior") or learned.get("normal_prior"),
-        ),
     )
-    return [(title, part) for title, part, is_learned in wanted if is_learned]
+    of_losses = [(title, _of_loss(name)) for name, title in loss_titles(record.stages).items()]
+    return [*((title, part) for title, part, is_learned in wanted if is_learned), *of_losses]
+
+
+def _of_loss(name: str) -> str:
+    return f"what loss {name} says"
 
 
 def _title(record: RunRecord) -> str:

@@ -10,9 +10,7 @@ from typing import Protocol as Interface
 import torch
 from torch import Tensor
 
-from gs2d.config.losses import LOSSES
 from gs2d.config.multiview import MULTIVIEW_KINDS
-from gs2d.config.priors import PRIOR_KINDS
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.core.camera import Camera
@@ -20,16 +18,14 @@ from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DivergedError
 from gs2d.kernels.reference import finite
-from gs2d.losses.api import compute_losses, loss_of, prepared
+from gs2d.losses.api import LossFunction, LossReport, LossView, compute_losses, loss_of, prepared
 from gs2d.losses.multiview import Neighbour
-from gs2d.losses.priors import Prior
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.exposure import expose, identity
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.multiview import ImageFiles, draw_turn, find_neighbours, is_compared
 from gs2d.training.poses import pose_rate
-from gs2d.training.priors import Priors, has_priors
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
 
@@ -103,10 +99,8 @@ class FullRender:
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
             self._images = ImageFiles(scene.train, recipe.multiview)
-        guests = [term for stage in recipe.stages for term in stage.losses if term.kind not in LOSSES.builtin]
-        device = torch.device(backend.device)
-        self._functions = {loss_of(term): prepared(term, scene, recipe, device) for term in guests}
-        self._priors = Priors(scene, recipe, device=backend.device) if has_priors(recipe) else None
+        device, terms = torch.device(backend.device), {loss_of(term): term for s in recipe.stages for term in s.losses}
+        self._functions = {known_by: prepared(term, scene, recipe, device) for known_by, term in terms.items()}
 
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
         """Return the rasterizer's constants at an iteration (1-based)."""
@@ -149,6 +143,25 @@ class FullRender:
         here, there = (self._images.of(i, self._targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 
+    @property
+    def reporters(self) -> dict[str, LossFunction]:
+        """The losses with something to say in the report, by name: their kind, with options where one is not enough."""
+        told = {known_by: loss for known_by, loss in self._functions.items() if hasattr(loss, "report")}
+        kinds = [kind for kind, _ in told]
+        return {kind if kinds.count(kind) == 1 else f"{kind} {given}": loss for (kind, given), loss in told.items()}
+
+    @torch.no_grad()
+    def report(
+        self, state: TrainState, index: int, settings: RasterSettings, backend: Backend
+    ) -> dict[str, LossReport]:
+        """Return what the losses say of training view ``index`` as it is now."""
+        camera, target = self.camera(state, index), self._targets[index]
+        output = rasterize(state.splats, camera, settings, backend=backend)
+        view = LossView(target.image, target.mask, camera, depth_kind=self.protocol.depth, index=index)
+        view.silhouette = target.silhouette
+        said = {name: loss.report(output, view) for name, loss in self.reporters.items()}  # type: ignore[attr-defined]
+        return {name: found for name, found in said.items() if found is not None}
+
     def differentiate(
         self,
         state: TrainState,
@@ -172,7 +185,6 @@ class FullRender:
             trainer looks at losses and parameters together, before anything is reported or saved.
         """
         target = self._targets[index]
-        prior = None if self._priors is None else self._priors.of(index, state.stage, iteration, output.color.dtype)
         transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
         if transform is not None:
             clipped, background = clipped_pixels(target), self._background
@@ -183,15 +195,15 @@ class FullRender:
             target.image,
             target.mask,
             camera,
-            [t for t in self.protocol.resolve(stage.losses) if _can_be_asked(t.kind, neighbour, prior)],
+            [t for t in self.protocol.resolve(stage.losses) if neighbour is not None or t.kind not in MULTIVIEW_KINDS],
             iteration=iteration,
             depth_kind=self.protocol.depth,
             backend=self.backend,
             target_cache=target.maps,
             silhouette=target.silhouette,
             neighbour=neighbour,
-            prior=prior,
             index=index,
+            run_iteration=sum(earlier.iterations for earlier in self.recipe.stages[: state.stage]) + iteration,
             functions=self._functions,
         )
         if transform is not None:
@@ -216,13 +228,6 @@ class FullRender:
         if broken is not None:
             raise diverged(stage, iteration, f"the gradient of {broken}")
         return values, gradients
-
-
-def _can_be_asked(kind: str, neighbour: Neighbour | None, prior: Prior | None) -> bool:
-    """Whether a view has what a loss needs."""
-    if kind in PRIOR_KINDS:
-        return prior is not None and (prior.depth if kind == "depth_prior" else prior.normal) is not None
-    return neighbour is not None or kind not in MULTIVIEW_KINDS
 
 
 def clipped_pixels(target: Target) -> Tensor:

@@ -186,18 +186,17 @@ class Priors:
         self.plan = None if recipe.depth_prior is None else plan_depths(scene, recipe.depth_prior)
         self.axes = None if recipe.normal_prior is None else plan_normals(scene, recipe.normal_prior)
 
-    def of(self, index: int, stage: int, iteration: int, dtype: torch.dtype) -> Prior:
-        """Return what is known of view ``index`` in an iteration (from 1) of a stage."""
+    def of(self, index: int, iteration: int, dtype: torch.dtype) -> Prior:
+        """Return what is known of view ``index`` in an iteration (from 1, over all stages)."""
         recipe = self._recipe
         depth, normal = self.at(index, dtype)
-        of_run = sum(earlier.iterations for earlier in recipe.stages[:stage]) + iteration
         return Prior(
             depth,
             normal,
             opacity=0.0 if recipe.depth_prior is None else recipe.depth_prior.opacity,
             noise=1.0 if recipe.depth_prior is None else recipe.depth_prior.noise,
-            depth_weight=0.0 if recipe.depth_prior is None else recipe.depth_prior.weight_at(of_run),
-            normal_weight=0.0 if recipe.normal_prior is None else recipe.normal_prior.weight_at(of_run),
+            depth_weight=0.0 if recipe.depth_prior is None else recipe.depth_prior.weight_at(iteration),
+            normal_weight=0.0 if recipe.normal_prior is None else recipe.normal_prior.weight_at(iteration),
         )
 
     def at(self, index: int, dtype: torch.dtype) -> tuple[Depths | None, NormalTarget | None]:

@@ -19,7 +19,7 @@ from gs2d.core.memory import trim
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.losses.api import target_maps
+from gs2d.losses.api import LossFunction, LossReport, target_maps
 from gs2d.render.api import splat_errors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
@@ -138,6 +138,15 @@ class Trainer:
     def done(self) -> bool:
         """Whether every stage is finished."""
         return self.state.stage >= len(self.recipe.stages)
+
+    @property
+    def loss_reporters(self) -> Mapping[str, LossFunction]:
+        """The losses of the recipe that have something to say in the report, by name."""
+        return self._whole.reporters
+
+    def report_losses(self, index: int) -> dict[str, LossReport]:
+        """Return what those losses say of training view ``index`` as it is now."""
+        return self._whole.report(self.state, index, self.settings, self.backend)
 
     def run(self) -> Splats:
         """Train from where the state is to the end of the last stage."""
