@@ -39,12 +39,15 @@ class LossOperations:
     photometric, normal_consistency, masked_mean : callable
     blur : callable or None
         Where ``photometric`` takes the local mean of the target, which is then worth keeping.
+    compare_views : callable or None
+        ``kernels.multiview.compare_views``; None: the losses of two views are worked out in torch.
     """
 
     photometric: Callable[..., tuple[Tensor, Tensor]]
     normal_consistency: Callable[..., Tensor]
     masked_mean: Callable[..., Tensor]
     blur: Callable[[Tensor], Tensor] | None = None
+    compare_views: Callable[..., tuple[Tensor, Tensor]] | None = None
 
 
 def _call(library: Library, name: str, *arguments: Any) -> None:

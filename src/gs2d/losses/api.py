@@ -29,7 +29,7 @@ from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError, ShapeError
 from gs2d.kernels.losses import LossOperations
 from gs2d.losses import multiview, reference
-from gs2d.losses.multiview import Neighbour, ViewPair
+from gs2d.losses.multiview import CompareViews, Neighbour, ViewPair
 from gs2d.losses.reference import normals_from_depth
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.pose_gradient import normals_without_pose_grad
@@ -144,6 +144,7 @@ class LossView:
     weights: Mapping[str, float] = field(default_factory=dict)
     fused: LossOperations | None = None
     _compared: dict[str, ViewPair] = field(default_factory=dict)
+    _fused_views: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
     _photometric: tuple[Tensor, Tensor] | None = None
 
     def two_views(self, output: RenderOutput) -> ViewPair:
@@ -158,6 +159,12 @@ class LossView:
                 depth, output.normal, hit & reference.textured, self.camera, self.neighbour, self.mask
             )
         return self._compared[kind]
+
+    def compared(self, output: RenderOutput, compare: CompareViews) -> tuple[Tensor, Tensor]:
+        """Return both losses of two views by one operation, shared by the terms of a kind of depth."""
+        if self.depth_kind not in self._fused_views:
+            self._fused_views[self.depth_kind] = self.two_views(output).compared(compare)
+        return self._fused_views[self.depth_kind]
 
     def photometric(self, output: RenderOutput, operations: LossOperations) -> tuple[Tensor, Tensor]:
         """Return (L1, SSIM) by one fused pass, shared by both terms."""
@@ -271,11 +278,15 @@ def _silhouette(output: RenderOutput, view: LossView) -> Tensor:
 
 @register_loss("multiview_photometric")
 def _multiview_photometric(output: RenderOutput, view: LossView) -> Tensor:
+    if view.fused is not None and view.fused.compare_views is not None:
+        return view.compared(output, view.fused.compare_views)[0]
     return multiview.photometric(view.two_views(output))
 
 
 @register_loss("multiview_geometric")
 def _multiview_geometric(output: RenderOutput, view: LossView) -> Tensor:
+    if view.fused is not None and view.fused.compare_views is not None:
+        return view.compared(output, view.fused.compare_views)[1]
     return multiview.geometric(view.two_views(output))
 
 
@@ -295,7 +306,8 @@ FUSED: Mapping[str, Callable[[RenderOutput, LossView, LossOperations], Tensor]] 
         "distortion": lambda output, view, fused: fused.masked_mean(output.distortion, view.mask),
     }
 )
-"""The losses for which a backend may have fused operations; the others are not worth any (docs/performance.md)."""
+"""The losses that every backend with fused operations has; for those of two views it may. The rest is not worth any
+(docs/performance.md)."""
 
 
 def compute_losses(

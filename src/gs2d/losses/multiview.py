@@ -5,7 +5,8 @@ homography. The photometric value is 1 - NCC of the two grey patches, the geomet
 it comes back to through the neighbour's own depth. Formulas and gradients: ``docs/math.md``, "Two views". The idea is
 that of multi-view stereo and of PGSR (Chen et al. 2024), from the papers.
 
-Plain torch for every backend: any dtype and device, and nothing here makes the host wait for the device.
+Plain torch, for any dtype and device; nothing here makes the host wait for the device. A backend may have both losses
+as one operation, with the same formulas (``kernels/core/multiview.h``): :meth:`ViewPair.compared`.
 """
 
 from __future__ import annotations
@@ -23,10 +24,14 @@ from torch.autograd.function import once_differentiable
 
 from gs2d.config.multiview import MultiView
 from gs2d.core.camera import Camera
+from gs2d.kernels.multiview import Compared
 
 MIN_COSINE = 0.1  # between normal and ray: a plane seen more edge-on than this is no plane to warp by
 MIN_SCALE = 0.1  # depth in the neighbour in that here: below, the patch comes too close to the neighbour's camera
 MIN_NORMAL = 1e-4  # length of a rendered normal that has a direction
+
+CompareViews = Callable[[Tensor, Tensor, Tensor, Compared], tuple[Tensor, Tensor]]
+"""``kernels.multiview.compare_views``, or that of another backend."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,9 +236,26 @@ class ViewPair:
     def mean_of(self, values: Tensor, valid: Tensor) -> Tensor:
         """Mean of ``weights * values`` over all pixels, from the P that were asked; 0 where nothing is known."""
         weighted = torch.where(valid & (self.weights > 0), self.weights * values, torch.zeros_like(values))
+        return self.mean_of_sum(weighted.sum())
+
+    def mean_of_sum(self, total: Tensor) -> Tensor:
+        """Mean over all pixels of what sums up to ``total`` [] over the P that were asked."""
         pixels = self.depth.numel() if self.mask is None else self.mask.sum().clamp(min=1)
         fraction = self.candidates.sum() / pixels
-        return weighted.sum() / self._pixels[1].sum().clamp(min=1) * fraction
+        return total / self._pixels[1].sum().clamp(min=1) * fraction
+
+    def compared(self, compare: CompareViews) -> tuple[Tensor, Tensor]:
+        """Return :func:`photometric` and :func:`geometric` by the operation of a backend."""
+        index, chosen = self._pixels
+        reference, source = self.neighbour.reference, self.neighbour.source
+        cameras, settings = (self.camera, self.neighbour.camera), self.neighbour.settings
+        given = Compared(
+            index, chosen, reference.grey, source.grey, source.clear, self.neighbour.depth, *cameras, settings
+        )
+        (rotation, translation), world = self._motion, self._rotation
+        motion = torch.cat([rotation.flatten(), translation, world.flatten()])
+        photometric, geometric = compare(self.depth, self.normal, motion, given)
+        return self.mean_of_sum(photometric), self.mean_of_sum(geometric)
 
     @cached_property
     def similarity(self) -> tuple[Tensor, Tensor]:

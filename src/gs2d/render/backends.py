@@ -18,10 +18,11 @@ from gs2d.config.registry import Registry
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError
-from gs2d.kernels import adam, densify_stats, library, losses, reference
+from gs2d.kernels import adam, densify_stats, library, losses, multiview, reference
 from gs2d.kernels.cuda import adam as cuda_adam
 from gs2d.kernels.cuda import diagnose, launch
 from gs2d.kernels.cuda import losses as cuda_losses
+from gs2d.kernels.cuda import multiview as cuda_multiview
 from gs2d.kernels.losses import LossOperations
 from gs2d.kernels.tsdf import FusionOnDevice, FusionOnHost
 from gs2d.render import cpu, cpu_cached, cuda, reference_errors
@@ -293,7 +294,8 @@ class CpuBackend(Backend):
 
     def loss_operations(self, device: torch.device) -> LossOperations:
         """Fused operations for the losses."""
-        return LossOperations(losses.photometric, losses.normal_consistency, losses.masked_mean, losses.blur)
+        native = (losses.photometric, losses.normal_consistency, losses.masked_mean, losses.blur)
+        return LossOperations(*native, multiview.compare_views if multiview.is_native(library.load()) else None)
 
     def fusion(self) -> FusionOnHost:
         """Return what adds depth maps to volumes."""
@@ -379,6 +381,7 @@ class CudaBackend(Backend):
             partial(cuda_losses.photometric, launcher=launcher),
             partial(cuda_losses.normal_consistency, launcher=launcher),
             partial(cuda_losses.masked_mean, launcher=launcher),
+            compare_views=partial(cuda_multiview.compare_views, launcher=launcher),
         )
 
     def fusion(self) -> FusionOnDevice:

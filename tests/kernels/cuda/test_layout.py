@@ -12,6 +12,7 @@ import re
 import pytest
 
 from gs2d.errors import BackendError
+from gs2d.kernels import multiview
 from gs2d.kernels import tsdf as fusion
 from gs2d.kernels.cuda import arguments, compile
 
@@ -23,7 +24,7 @@ CAMERA = {name: f"camera.{name}" for name in ("R", "t", "center", "fx", "fy", "c
 def structures() -> dict[str, type[ctypes.Structure]]:
     """By name."""
     found = {}
-    for module in (arguments, fusion):
+    for module in (arguments, fusion, multiview):
         for name, value in vars(module).items():
             if isinstance(value, type) and issubclass(value, ctypes.Structure):
                 found[name.lstrip("_")] = value

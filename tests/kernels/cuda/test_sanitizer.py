@@ -38,11 +38,16 @@ emulator.launch("blur_image", 1, 128, arguments)
 """
 
 EVERYTHING = """
+from functools import partial
+
+import two_views
 from kernel_cases import SETTINGS, many_tiles
 from render_scenes import contraction, random_cotangents
 
+from gs2d.config.multiview import MultiView
 from gs2d.kernels.cuda import losses as ops
 from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
+from gs2d.kernels.cuda.multiview import compare_views
 from gs2d.render import cuda
 from gs2d.core.splats import Splats
 
@@ -77,6 +82,10 @@ for size in ((37, 44), (1, 1), (12, 43)):
         for form, edges in ((False, "undefined"), (True, "camera"))
     )
     (l1 + ssim + l1_too + ssim_too + normals + ops.masked_mean(depth, m, launcher=emulator)).backward()
+
+pair = two_views.scenario(settings=MultiView(patches=61, radius=3, texture=0.03, occluded=4.0), masked=True)
+leaves = pair.depth.requires_grad_(), pair.normal.requires_grad_(), torch.zeros(6, requires_grad=True)
+sum(pair.views(*leaves).compared(partial(compare_views, launcher=emulator))).backward()
 
 settings = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "launcher": emulator}
 trained = torch.arange(57) % 2 == 0

@@ -55,6 +55,8 @@ GS2D_HD float min(float a, float b) { return a < b ? a : b; }
 GS2D_HD float max(float a, float b) { return a > b ? a : b; }
 GS2D_HD double min(double a, double b) { return a < b ? a : b; }
 GS2D_HD double max(double a, double b) { return a > b ? a : b; }
+GS2D_HD float whole(float a) { return float(int(a)); }  // floor, of what is not negative and fits 31 bits
+GS2D_HD double whole(double a) { return double(int(a)); }
 
 // What the innermost loops use. On a GPU the instructions behind these err by 1 or 2 units in the last place, the same in
 // the forward and the backward pass; elsewhere they are as exact as the type.

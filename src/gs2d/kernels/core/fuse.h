@@ -38,9 +38,6 @@ struct MarkArguments {
     unsigned char* marks;     // [padded]: of the lower of the two nearest blocks along each axis
 };
 
-GS2D_HD float whole(float a) { return float(int(a)); }  // floor, of what is not negative
-GS2D_HD double whole(double a) { return double(int(a)); }
-
 // The pixel that a voxel is seen through, and the place from its centre, px. Outside of the image it is the border's.
 template <class V> struct FusePixel {
     V column, row, x, y;

@@ -7,12 +7,6 @@
 #include "cpu/threads.h"
 
 namespace gs2d {
-
-GS2D_HD V whole(V a) {
-    const V nearest = round(a);
-    return nearest - keep(nearest > a, V(real(1)));
-}
-
 namespace {
 
 constexpr int64_t GRAIN = 32;  // blocks of a piece

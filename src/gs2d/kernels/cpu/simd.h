@@ -13,6 +13,7 @@
 //   load_first(p, n)          first n lanes, rest 0   store_first(p, v, n)        n in 0..LANES
 //   fma(a,b,c), fnma(a,b,c)   a*b+c, c-a*b            min, max, abs, sqrt, round  min(a,b) is b where a is NaN
 //   exp2, exp, log2           a few ulp               select(m, a, b)             m ? a : b
+//   whole(a)                  floor, |a| < 2^22
 //   keep(m, a)                m ? a : 0               any(m), all(m), bits(m), mask_of(bits), first(n)
 //   iota()                    0, 1, 2, ...            sum(v)                      fixed order
 //   REGISTERS                 how many vectors the processor holds
@@ -21,6 +22,8 @@
 //   columns_of_8(rows, v)     LANES rows of 8 reals to 8 vectors
 //   unzip_planes(p, a, b, c)  the slopes in x and in y and the constants of a splat's planes, repeated
 //   with_bits(i, m, bits)     the LaneInts i, with more bits where m; shifted<N>(i) to the left; store(p, i): LANES of them
+//   ints_of(v)                LaneInts of what is whole and fits 31 bits; row_major(j, width, i): j width + i
+//   gather(p, i)              p[i] of each lane
 //   load_packed<K>(p, v)      LANES rows of K reals to K vectors, and store_packed<K> back
 #pragma once
 
@@ -100,6 +103,10 @@ GS2D_HD V operator-(V a) { return V(real(0)) - a; }
 GS2D_HD V& operator+=(V& a, V b) { return a = a + b; }
 GS2D_HD V& operator-=(V& a, V b) { return a = a - b; }
 GS2D_HD V& operator*=(V& a, V b) { return a = a * b; }
+GS2D_HD V whole(V a) {
+    const V nearest = round(a);
+    return nearest - keep(nearest > a, V(real(1)));
+}
 
 #if !defined(GS2D_OWN_INDICES)
 // Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.

@@ -117,6 +117,11 @@ GS2D_HD LaneInts with_bits(LaneInts i, M m, uint32_t bits) {
 }
 template <int N> GS2D_HD LaneInts shifted(LaneInts i) { return _mm256_slli_epi32(i, N); }
 GS2D_HD void store(uint32_t* p, LaneInts i) { _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), i); }
+GS2D_HD LaneInts ints_of(V a) { return _mm256_cvttps_epi32(a.v); }
+GS2D_HD LaneInts row_major(LaneInts j, int width, LaneInts i) {
+    return _mm256_add_epi32(_mm256_mullo_epi32(j, _mm256_set1_epi32(width)), i);
+}
+GS2D_HD V gather(const float* p, LaneInts i) { return _mm256_i32gather_ps(p, i, 4); }
 
 #define GS2D_OWN_INDICES
 // Writes STRIDE times the indices i < n whose masks[i] has the bit, returns how many; both arrays padded to a multiple of LANES.

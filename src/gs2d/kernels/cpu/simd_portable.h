@@ -176,6 +176,15 @@ template <int N> GS2D_HD LaneInts shifted(LaneInts i) {
 GS2D_HD void store(uint32_t* p, LaneInts n) {
     for (int i = 0; i < LANES; ++i) p[i] = static_cast<uint32_t>(n.of[i / WIDE][i % WIDE]);
 }
+GS2D_HD LaneInts ints_of(V a) {
+    return per_part<M>([&](int k) { return __builtin_convertvector(a.of[k], PartMask); });
+}
+GS2D_HD LaneInts row_major(LaneInts j, int width, LaneInts i) {
+    return per_part<M>([&](int k) { return j.of[k] * lane_int(width) + i.of[k]; });
+}
+GS2D_HD V gather(const real* p, LaneInts n) {
+    return per_lane([&](int i) { return p[n.of[i / WIDE][i % WIDE]]; });
+}
 
 GS2D_HD V load(const real* p) {
     V r;

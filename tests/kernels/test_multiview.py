@@ -1,0 +1,101 @@
+"""The native comparison of two views against the formulas in torch, on every instruction set this machine can run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d.config.multiview import MultiView
+from gs2d.errors import ShapeError
+from gs2d.kernels.library import Library
+from gs2d.kernels.multiview import compare_views
+from two_views import Scenario, in_torch, scenario
+
+DOUBLE = torch.float64
+
+
+def results(case: Scenario, library: Library | None, *, learns: bool = False) -> list[Tensor]:
+    """Both values, and of each the gradients to depth, normal and, where it learns, the camera's motion; float64."""
+    leaves = [case.depth.clone().requires_grad_(), case.normal.clone().requires_grad_()]
+    motion = torch.zeros(6, dtype=DOUBLE, requires_grad=True) if learns else None
+    views = case.views(leaves[0], leaves[1], motion)
+    values = in_torch(views) if library is None else views.compared(partial(compare_views, library=library))
+    if motion is not None:
+        leaves.append(motion)
+    found = list(values)
+    for value in values:
+        gradients = torch.autograd.grad(value, leaves, retain_graph=True, allow_unused=True)
+        found += [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, gradients, strict=True)]
+    return [part.detach().double() for part in found]
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    return float((found - expected).norm() / expected.norm().clamp(min=1e-30))
+
+
+@pytest.mark.parametrize(("masked", "learns"), [(False, False), (True, True)])
+@pytest.mark.parametrize("radius", [1, 3])
+def test_values_and_gradients_are_those_of_the_formulas_in_torch(
+    native: Library, masked: bool, learns: bool, radius: int
+) -> None:
+    settings = MultiView(patches=301, radius=radius, texture=0.03, occluded=4.0)  # not a multiple of the lanes
+    case = scenario(masked=masked, settings=settings)
+    found, expected = results(case, native, learns=learns), results(case.double(), None, learns=learns)
+    assert int((expected[2] != 0).sum()) > 150  # as many patches have a gradient
+    for f, e in zip(found[:2], expected[:2], strict=True):
+        assert relative_error(f, e) < 5e-5  # a round trip is the small difference of two places
+    for f, e in zip(found[2:], expected[2:], strict=True):
+        # A place within a rounding of a pixel's centre may be read on its other side, where the slope is another.
+        off = (f - e).abs() > 2e-4 * e.abs() + 2e-5 * e.abs().max()
+        assert int(off.sum()) <= 0.01 * int((e != 0).sum())
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_in_float64_they_are_the_same_to_rounding(native64: Library, learns: bool) -> None:
+    case = scenario(dtype=DOUBLE, masked=True)
+    for found, expected in zip(results(case, native64, learns=learns), results(case, None, learns=learns), strict=True):
+        assert relative_error(found, expected) < 1e-11
+
+
+def test_pixels_at_every_edge_of_what_counts_are_decided_alike(native64: Library) -> None:
+    """Normals edge-on, turned away and of no length, an image that the patch leaves, and a neighbour far too near."""
+    case = scenario(dtype=DOUBLE, settings=MultiView(patches=2000, radius=2, texture=0.03, occluded=4.0))
+    g = torch.Generator().manual_seed(5)
+    normal = torch.randn(case.normal.shape, generator=g, dtype=DOUBLE)
+    normal = torch.where(torch.rand(normal.shape[:2], generator=g)[..., None] < 0.1, 1e-5 * normal, normal)
+    depth = case.depth * (1 + 0.01 * torch.randn(case.depth.shape, generator=g, dtype=DOUBLE))
+    depth = torch.where(torch.rand(depth.shape, generator=g) < 0.2, 0.3 * depth, depth)
+    wild = replace(case, normal=normal, depth=depth)
+    for found, expected in zip(results(wild, native64), results(wild, None), strict=True):
+        assert relative_error(found, expected) < 1e-10
+
+
+def test_they_have_the_same_bits_for_any_number_of_threads(native: Library) -> None:
+    case = scenario((131, 90), settings=MultiView(patches=3000, occluded=100.0))
+    found = []
+    for threads in (1, 2, 3):
+        native.use_threads(threads)
+        found.append(results(case, native, learns=True))
+    assert all(torch.equal(a, b) for others in found[1:] for a, b in zip(found[0], others, strict=True))
+
+
+def test_a_view_without_a_pixel_to_ask_has_loss_zero_and_no_gradient(native: Library) -> None:
+    case = scenario()
+    unknown = torch.full_like(case.normal, torch.nan)
+    nothing = replace(case, candidates=torch.zeros_like(case.candidates), normal=unknown)
+    assert not any(part.any() for part in results(nothing, native, learns=True))
+
+
+def test_what_the_operation_would_misread_is_refused(native: Library) -> None:
+    case = scenario()
+    with pytest.raises(ShapeError, match="float32"):
+        results(case.double(), native)
+    smaller = replace(case, neighbour=replace(case.neighbour, depth=case.neighbour.depth[1:]))
+    with pytest.raises(ShapeError, match="source_depth"):
+        results(smaller, native)
+    with pytest.raises(ShapeError, match="camera is 60x47"):
+        results(replace(case, camera=replace(case.camera, width=60)), native)
