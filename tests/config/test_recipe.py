@@ -103,6 +103,12 @@ def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
     assert stage.active_sh_degree(4000, 1) == 1
 
 
+def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> None:
+    stage = Stage("s", 10, downscale=12, halve_at=(3, 6))
+    assert [stage.downscale_at(i) for i in range(1, 11)] == [12, 12, 12, 6, 6, 6, 3, 3, 3, 3]
+    assert {Stage("s", 10, downscale=2).downscale_at(i) for i in (1, 10)} == {2}
+
+
 @pytest.mark.parametrize(
     ("recipe", "message"),
     [
@@ -148,6 +154,9 @@ def test_the_sh_degree_rises_every_interval_up_to_the_most() -> None:
             one(densify=GradDensify(prune_until=11)),
             "densify.prune_until must be at most the stage's 10 iterations, got 11",
         ),
+        (one(downscale=0), "stage 's': downscale must be an integer >= 1, got 0"),
+        (one(downscale=4, halve_at=(3, 11)), "stage 's': halve_at must lie in its 10 iterations, got 11"),
+        (one(downscale=2, halve_at=(3, 6)), "downscale must be a multiple of 4 to be halved 2 times, got 2"),
         (one(densify=GradDensify(scale_cull_start=-1)), "densify.scale_cull_start must be an integer >= 0, got -1"),
         (one(densify=GradDensify(reset_at_on_white=(0,))), "densify.reset_at_on_white must be an integer >= 1, got 0"),
         (one(densify=GradDensify(), train={"means": "all"}), "resets or caps opacity"),

@@ -71,6 +71,13 @@ def test_the_prune_by_size_and_a_reset_on_white_alone_go_with_the_schedule() -> 
     assert (found.prune_until, found.scale_cull_start, found.reset_at_on_white) == (3_000, 300, (50,))
 
 
+def test_sizes_of_photographs_go_with_the_schedule() -> None:
+    recipe = get_recipe("2dgs")
+    stage = replace(recipe.stages[0], downscale=4, halve_at=(3_000, 9_000))
+    scaled = scale_schedule(replace(recipe, stages=(stage,)), 0.1).stages[0]
+    assert (scaled.downscale, scaled.halve_at) == (4, (300, 900))
+
+
 def test_a_longer_schedule_keeps_the_official_resets() -> None:
     densify = scale_schedule(get_recipe("2dgs"), 2.0).stages[0].densify
     assert densify == replace(GradDensify(), start=1000, stop=30_000)

@@ -70,8 +70,21 @@ def test_stages_look_at_the_size_that_they_say_and_scores_at_the_full_one(scene:
     assert trainer.scene.train[0].camera.width == 24
 
 
+def test_the_size_may_grow_within_a_stage(scene: Scene, backend: str) -> None:
+    recipe = short()
+    recipe = replace(recipe, stages=(replace(recipe.stages[0], downscale=2, halve_at=(6,)), *recipe.stages[1:]))
+    trainer = Trainer(scene, recipe, GENERIC, backend=backend)
+    trainer.enter(0)
+    widths = []
+    for _ in range(10):
+        trainer.step()
+        widths.append(trainer._targets[0].image.shape[1])
+    assert widths == [12] * 6 + [24] * 4
+
+
 def test_a_run_of_several_sizes_resumes_to_the_same_bytes(scene: Scene, backend: str) -> None:
     recipe, saves = at_half(short(), 0, 2), []
+    recipe = replace(recipe, stages=(replace(recipe.stages[0], halve_at=(5,)), *recipe.stages[1:]))
     trainer = Trainer(
         scene, recipe, GENERIC, backend=backend, progress_every=2, on_event=lambda event: saves.append(saved(trainer))
     )

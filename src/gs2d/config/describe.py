@@ -57,7 +57,8 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
         elif isinstance(action, CloneInPlace):
             yield f"first: clone '{action.rows}' in place (opacity: {action.opacity}); the clones are '{action.writes}'"
     if stage.downscale > 1:
-        yield f"photographs of 1/{stage.downscale} of their size"
+        halved = ", twice that after " + " and ".join(f"{at:,}" for at in stage.halve_at) if stage.halve_at else ""
+        yield f"photographs of 1/{stage.downscale} of their size{halved}"
     groups: dict[str, list[str]] = {}
     for attribute, rows in stage.train.items():
         groups.setdefault(rows, []).append(attribute)

@@ -245,6 +245,9 @@ class Stage:
     downscale : int
         The stage trains on photographs of 1 / ``downscale`` of their size (what ``gs2d train --downscale`` leaves of
         them), with their masks, silhouettes and maps. Scores and meshes are of the full size.
+    halve_at : tuple of int
+        Iterations after which ``downscale`` is half of what it was: 4 with (3000, 9000) is 4 up to iteration 3000, 2 up
+        to 9000, and 1 from then on.
     """
 
     name: str
@@ -257,6 +260,7 @@ class Stage:
     sh_interval: int = 0
     moments: str = "fresh"
     downscale: int = field(default=1, metadata={"omit_empty": True})
+    halve_at: tuple[int, ...] = field(default=(), metadata={"omit_empty": True})
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", MappingProxyType(dict(self.train)))
@@ -265,6 +269,10 @@ class Stage:
     def moves_all(self) -> bool:
         """Whether the means of all splats are trained."""
         return self.train.get("means") == "all"
+
+    def downscale_at(self, iteration: int) -> int:
+        """Return by how much photographs are downscaled at an iteration (1-based)."""
+        return self.downscale >> sum(iteration > at for at in self.halve_at)
 
     def active_sh_degree(self, iteration: int, max_degree: int) -> int:
         """SH degree that is trained at an iteration (1-based): 0, then one more every ``sh_interval`` iterations."""
@@ -346,6 +354,14 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
     integer(f"{where}: sh_interval", stage.sh_interval, low=0)
     one_of(f"{where}: moments", stage.moments, ("fresh", "kept"))
     integer(f"{where}: downscale", stage.downscale, low=1)
+    for at in stage.halve_at:
+        integer(f"{where}: halve_at", at, low=0)
+        require(at <= stage.iterations, f"{where}: halve_at must lie in its {stage.iterations} iterations, got {at}")
+    require(
+        stage.downscale % (1 << len(stage.halve_at)) == 0,
+        f"{where}: downscale must be a multiple of {1 << len(stage.halve_at)} to be halved {len(stage.halve_at)} times, "
+        f"got {stage.downscale}",
+    )
     for action in stage.on_enter:
         if isinstance(action, RankByError):
             percent = number(f"{where}: RankByError.top_percent", action.top_percent, low=0.0)

@@ -1,6 +1,6 @@
 """Short runs that still behave: a recipe scaled by a factor.
 
-Scaled: stage lengths, loss starts, the SH interval, start and stop of densification and of the prune by size, the
+Scaled: stage lengths, loss starts, the SH interval, where ``downscale`` halves, start and stop of densification and of the prune by size, the
 horizons of the rates of means, exposures and poses (so that rates end where they should) and of the weights of priors,
 resets of white backgrounds alone (``reset_at_on_white``), which go with the start. *Not* scaled: the
 densification interval, as long as ten densifications fit, the first iterations without exposures and poses, and opacity
@@ -106,6 +106,7 @@ def _scale_stage(stage: Stage, factor: float) -> Stage:
         losses=tuple(replace(term, start=round(term.start * factor)) for term in stage.losses),
         lr=replace(stage.lr, means_decay_steps=_scaled(stage.lr.means_decay_steps, factor)),
         sh_interval=_scaled(stage.sh_interval, factor),
+        halve_at=tuple(round(at * factor) for at in stage.halve_at),
         densify=None if stage.densify is None else _scale_densify(stage.densify, factor),
     )
 

@@ -34,6 +34,7 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int) 
         and len(groups) == 1
         and "all" not in groups
         and stage.densify is None
+        and not stage.halve_at
         and OF_COLOR.issuperset(term.kind for term in stage.losses)
         and stage.active_sh_degree(1, recipe.sh_degree) == stage.active_sh_degree(stage.iterations, recipe.sh_degree)
         and stage.iterations >= WORTH * views

@@ -120,9 +120,11 @@ class Trainer:
         self._learner = self.backend.for_training()
         self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
         self._target_bytes, self._stage2_cache_bytes = target_bytes, stage2_cache_bytes
-        self._check_sizes()
-        self._look_at(self.recipe.stages[min(self.state.stage, len(self.recipe.stages) - 1)].downscale)
         self._objective: Objective | None = None  # of the stage under way, from its first iteration here
+        self._downscale = 0  # nothing was looked at
+        self._check_sizes()
+        stage = self.recipe.stages[min(self.state.stage, len(self.recipe.stages) - 1)]
+        self._look_at(stage.downscale_at(self.state.step + 1))
 
     @property
     def splats(self) -> Splats:
@@ -166,8 +168,7 @@ class Trainer:
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
         self._objective = None
-        if stage.downscale != self._downscale:
-            self._look_at(stage.downscale)
+        self._look_at(stage.downscale_at(1))
         while self._pending:
             self._on_event(self._pending.pop(0))
         self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
@@ -198,16 +199,18 @@ class Trainer:
         state = self.state
         stage, iteration = self.recipe.stages[state.stage], state.step + 1
         index = state.next_view(len(self.scene.train))
+        self._look_at(stage.downscale_at(iteration))
         if self._objective is None:
             self._objective = choose_objective(self._whole, state, stage, self._stage2_cache_bytes)
         reports = iteration % self._progress_every == 0 or iteration == stage.iterations
         densifier = self._densifiers[state.stage]
         densifies = densifier is not None and densifier.changes(iteration)
         changes_rows = densifies or self._robust.prunes(stage, iteration)
+        sharpens = stage.downscale_at(iteration + 1) != stage.downscale_at(iteration)  # then nothing may be done again
         result, happened = self._learner.iterate(
             partial(self._learn, stage, iteration, index),
             rollback=partial(self._rollback, stage, iteration, index),
-            exact=reports or changes_rows,  # those wait for the device anyway
+            exact=reports or changes_rows or sharpens,
         )
         happened += self._robust.prune(self.state, stage, iteration)
         state.step = iteration
@@ -258,7 +261,9 @@ class Trainer:
 
     def _look_at(self, downscale: int) -> None:
         """Train on photographs of 1 / ``downscale`` of their size from now on; those of before are let go."""
-        self._downscale = downscale
+        if downscale == self._downscale:
+            return
+        self._downscale, self._objective = downscale, None
         scene = self.scene.downscaled(downscale)
         self._targets: TargetSource = self._make_targets(scene, self._target_bytes)
         self._whole = FullRender(scene, self.recipe, self.protocol, self._learner, self._targets)
