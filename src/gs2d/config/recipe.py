@@ -357,10 +357,10 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
     for at in stage.halve_at:
         integer(f"{where}: halve_at", at, low=0)
         require(at <= stage.iterations, f"{where}: halve_at must lie in its {stage.iterations} iterations, got {at}")
+    times = len(stage.halve_at)
     require(
-        stage.downscale % (1 << len(stage.halve_at)) == 0,
-        f"{where}: downscale must be a multiple of {1 << len(stage.halve_at)} to be halved {len(stage.halve_at)} times, "
-        f"got {stage.downscale}",
+        stage.downscale % (1 << times) == 0,
+        f"{where}: downscale must be a multiple of {1 << times} to be halved {times} times, got {stage.downscale}",
     )
     for action in stage.on_enter:
         if isinstance(action, RankByError):

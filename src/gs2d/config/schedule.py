@@ -1,11 +1,11 @@
 """Short runs that still behave: a recipe scaled by a factor.
 
-Scaled: stage lengths, loss starts, the SH interval, where ``downscale`` halves, start and stop of densification and of the prune by size, the
-horizons of the rates of means, exposures and poses (so that rates end where they should) and of the weights of priors,
-resets of white backgrounds alone (``reset_at_on_white``), which go with the start. *Not* scaled: the
-densification interval, as long as ten densifications fit, the first iterations without exposures and poses, and opacity
-resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit by about its rate,
-0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back.
+Scaled: stage lengths, loss starts, the SH interval, where ``downscale`` halves, start and stop of densification and of
+the prune by size, the horizons of the rates of means, exposures and poses (so that rates end where they should) and of
+the weights of priors, and resets of white backgrounds alone (``reset_at_on_white``), which go with the start.
+*Not* scaled: the densification interval, as long as ten densifications fit, the first iterations without exposures and
+poses, and opacity resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit
+by about its rate, 0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back.
 Pure Python; never imports torch.
 """
 
