@@ -14,6 +14,8 @@ import pytest
 from gs2d.cli import run
 from gs2d.cli.app import parse
 from gs2d.cli.commands import Sweep
+from gs2d.config.presets import get_recipe
+from gs2d.config.serialize import to_json
 from gs2d.experiments import execute as execute_module
 from gs2d.experiments.aggregate import Results
 from gs2d.experiments.deviations import deviations_of
@@ -169,3 +171,22 @@ def test_scenes_that_only_the_paper_would_need_are_not_missed(tmp_path: Path) ->
     lines = deviations_of(options, plan.scenes, plan.table, Results(()))
     assert not any("of its 8 scenes are not here" in line or "the paper does not say" in line for line in lines)
     assert "1 seed (0)" in lines
+
+
+def test_recipes_of_files_are_rows_by_their_short_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    draw_nothing(monkeypatch)
+    write_capture(tmp_path / "data" / "ball", train=3, test=1, size=20)
+    stage = replace(get_recipe("2dgs").stages[0], sh_interval=77)
+    (tmp_path / "mine.json").write_text(json.dumps(to_json(replace(get_recipe("2dgs"), name="m", stages=(stage,)))))
+    words = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out"), "--threads", "1", "--quiet", *TINY]
+    assert run(["sweep", str(tmp_path / "mine.json"), "2dgs", *words]) == 0
+    rows = json.loads((tmp_path / "out" / "table.json").read_text())
+    assert [(row["name"], row["recipe"]) for row in rows] == [("mine", str(tmp_path / "mine.json")), ("2dgs", "2dgs")]
+    assert rows[0]["mean"]["psnr"] > 0
+    assert sorted(path.name for path in (tmp_path / "out" / "runs").iterdir()) == ["ball-2dgs-s0", "ball-mine-s0"]
+    (tmp_path / "mine.py").write_text("from gs2d.config.presets import two_dgs\n\nmine = two_dgs()\n")
+    capsys.readouterr()
+    assert run(["sweep", f"{tmp_path}/mine.py:mine", *words]) == 2
+    assert "each recipe of a sweep needs a name of its own, got 'mine' from" in capsys.readouterr().err

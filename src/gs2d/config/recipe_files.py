@@ -15,12 +15,19 @@ from gs2d.config.registry import did_you_mean
 from gs2d.config.serialize import from_json
 from gs2d.errors import Gs2dError, RecipeError
 
-__all__ = ["is_recipe_file", "made_recipe", "read_recipe_file"]
+__all__ = ["is_recipe_file", "made_recipe", "read_recipe_file", "short_name"]
 
 
 def is_recipe_file(name: str) -> bool:
     """Whether a recipe is named by a file that holds it."""
     return name.endswith((".json", ".py")) or ".py:" in name
+
+
+def short_name(name: str) -> str:
+    """Return what a row or a folder calls a recipe: its name, "mine" of ``dir/mine.json`` and of ``file.py:mine``."""
+    if not is_recipe_file(name):
+        return name
+    return Path(name).stem if name.endswith(".json") else name.rpartition(":")[2]
 
 
 def read_recipe_file(name: str) -> Recipe:

@@ -71,7 +71,8 @@ class SweepOptions(TableOptions):
     """Which recipes, on which scenes, how."""
 
     recipes: Annotated[Positional[tuple[str, ...]], arg(metavar="RECIPE [RECIPE ...]")]
-    """Names that `gs2d recipes` lists. Recipes that --out has already keep their rows."""
+    """Names that `gs2d recipes` lists, or files: mine.json, mine.py:name. Recipes that --out has already keep their
+    rows."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

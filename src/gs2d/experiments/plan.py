@@ -14,6 +14,7 @@ from typing import Any
 
 from gs2d.config.presets import RECIPES, get_recipe
 from gs2d.config.recipe import Recipe, validate
+from gs2d.config.recipe_files import short_name
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
 from gs2d.errors import RecipeError
@@ -112,7 +113,7 @@ def make_job(options: TableOptions, scene: FoundScene, name: str, recipe: Recipe
     downscale = options.downscale or scene.downscale
     train = TrainOptions(
         scene=scene.path,
-        out=options.out / "runs" / f"{scene.name}-{name}-s{seed}",
+        out=options.out / "runs" / f"{scene.name}-{short_name(name)}-s{seed}",
         recipe=name,
         protocol=scene.protocol.name if options.protocol == "auto" else options.protocol,
         backend=options.backend,

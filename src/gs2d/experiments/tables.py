@@ -6,6 +6,7 @@ is here too, as :class:`Claim` values that can be checked against any rows. Pure
 
 from __future__ import annotations
 
+import itertools
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from types import MappingProxyType
 from typing import Any
 
 from gs2d.config.presets import TABLES
+from gs2d.config.recipe_files import short_name
+from gs2d.errors import RecipeError
 from gs2d.experiments.options import SWEEP
 
 TNT, NERF_SYNTHETIC, DTU = "TnT", "NeRF-Synthetic", "DTU"  # the data sets, as they are called in every result
@@ -86,8 +89,22 @@ class PaperTable:
 
 
 def recipe_table(recipes: Sequence[str]) -> PaperTable:
-    """Return a table with a row for each recipe, named as it is, and nothing of the paper."""
-    rows = tuple(PaperRow(name, name, {}) for name in dict.fromkeys(recipes))
+    """Return a table with a row for each recipe, by its short name, and nothing of the paper.
+
+    Raises
+    ------
+    RecipeError
+        Two files have recipes of one short name.
+    """
+    names = list(dict.fromkeys(recipes))
+    shown = [short_name(name) for name in names]
+    for first, second in itertools.combinations(range(len(names)), 2):
+        if shown[first] == shown[second]:
+            raise RecipeError(
+                f"each recipe of a sweep needs a name of its own, got {shown[first]!r} from {names[first]} and from "
+                f"{names[second]}; rename one"
+            )
+    rows = tuple(PaperRow(row, name, {}) for row, name in zip(shown, names, strict=True))
     return PaperTable(SWEEP, "Recipes compared", "tab:sweep", {}, rows)
 
 

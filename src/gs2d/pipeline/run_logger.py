@@ -16,7 +16,7 @@ from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import DivergedError, Gs2dError
 from gs2d.evaluation.images import ImageMetrics
-from gs2d.io.run_dir import RunFolder, load_tensors
+from gs2d.io.run_dir import VERDICT, RunFolder, load_tensors
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.changes import Snapshot, mean_changes, take_snapshot
 from gs2d.pipeline.estimate import start_text
@@ -264,8 +264,8 @@ class RunLogger:
         stages = self._run.metrics()["stages"]
         if state.stage > 0 and len(stages) < state.stage:
             self._score_stage(state.stage - 1)
-        elif state.stage > 0 and self._is_last(state.stage - 1) and is_partial(stages[-1]):
-            self._score_stage(state.stage - 1, taken_over=stages[-1])  # the last stage here was none of the last there
+        elif state.stage > 0 and self._is_last(state.stage - 1) and (self._unseen or is_partial(stages[-1])):
+            self._score_stage(state.stage - 1, taken_over=stages[-1])  # the last one here: every view has to be seen
         elif state.stage > 0:
             self._draw(self._stage(state.stage - 1).name)
 
@@ -352,6 +352,11 @@ class RunLogger:
     def _state(self) -> TrainState:
         assert self._trainer is not None
         return self._trainer.state
+
+    @property
+    def _unseen(self) -> bool:
+        """Whether nobody has looked at the views of the finished splats yet."""
+        return bool(self._visitors) and not self._run.file(VERDICT).exists()
 
     def _views(self, split: str) -> Sequence[View]:
         return self._job.scene.train if split == "train" else self._job.scene.test

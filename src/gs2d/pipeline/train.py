@@ -186,7 +186,7 @@ def train_stages(
 ) -> tuple[Splats, Transforms, FoundPoses]:
     """Train from where ``start`` is to the end of the last stage; splats, exposures and poses of the photographs.
 
-    ``visitors`` see every view of the finished splats, unless the last stage was scored before.
+    ``visitors`` see every view of the finished splats.
     """
     from gs2d.training.per_image import scene_now
     from gs2d.training.trainer import Trainer
