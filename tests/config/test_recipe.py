@@ -134,6 +134,18 @@ def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> N
             one(losses=(*L1, LossTerm("ssim", 1.0, edges="camera"))),
             "loss 'ssim' takes no edges; only normal_consistency and normal_consistency_per_splat do",
         ),
+        (one(losses=(*L1, LossTerm("ssim", 1.0, where="object"))), "loss 'ssim' takes no where; only normal_consist"),
+        (one(losses=(*L1, LossTerm("ssim", 1.0, edge_power=1.0))), "loss 'ssim' takes no edge_power; only normal"),
+        (
+            one(losses=(*L1, LossTerm("normal_consistency", 1.0, where="alpha"))),
+            "where of loss 'normal_consistency' must be one of image, object; got 'alpha'",
+        ),
+        (
+            one(losses=(*L1, LossTerm("normal_consistency", 1.0, edge_power=-1.0))),
+            "edge_power of loss 'normal_consistency' must be a finite number >= 0",
+        ),
+        (one(losses=(*L1, LossTerm("ssim", 1.0, every=0))), "every of loss 'ssim' must be an integer >= 1, got 0"),
+        (one(losses=(LossTerm("l1", 1.0, every=2),)), "no loss is active from the first iteration and in every one"),
         (one(train={"opacity": "all"}), "stage 's': train must be one of means, quats"),
         (one(train={}), "names no attribute"),
         (one(train={"sh0": "high_error"}), "no earlier action writes the row group 'high_error'; no action"),

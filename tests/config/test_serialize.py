@@ -82,6 +82,9 @@ def test_a_field_that_came_later_is_written_only_where_it_says_something_and_can
     recipe = apply_overrides(get_recipe("2dgs"), ["surface.losses.normal_consistency.edges=camera"])
     assert recipe.stages == get_recipe("2dgs-edges-camera").stages
     assert to_json(recipe)["stages"][0]["losses"][2] == plain | {"edges": "camera"}
+    said = {"where": "object", "edge_power": 2.0, "every": 2}
+    overrides = [f"surface.losses.normal_consistency.{name}={value}" for name, value in said.items()]
+    assert to_json(apply_overrides(get_recipe("2dgs"), overrides))["stages"][0]["losses"][2] == plain | said
 
 
 def test_overrides_that_are_not_named_stay_as_they_were() -> None:

@@ -181,6 +181,30 @@ def test_weights_multiply_the_part_of_each_pixel_and_the_count_stays() -> None:
         torch.testing.assert_close(loss(*images, mask, weights=torch.ones_like(whole)), loss(*images, mask))
 
 
+def test_an_edge_counts_less_by_its_share_of_the_largest_one() -> None:
+    # Grey columns 0, 0, 0.2, 0.2, 1, 1: central differences 0.2, 0.2, 0.8, 0.8 at columns 1 to 4, of 0.8.
+    image = torch.tensor([0, 0, 0.2, 0.2, 1, 1], dtype=torch.float64)[None, :, None].expand(4, -1, 3)
+    row = reference.edge_weights(image, 2.0)[2].tolist()
+    assert row == pytest.approx([1, 0.75**2, 0.75**2, 0, 0, 1])
+    down = reference.edge_weights(image.transpose(0, 1), 1.0)[:, 2].tolist()
+    assert down == pytest.approx([1, 0.75, 0.75, 0, 0, 1])
+    # With column 5 ignored, column 4 says nothing; column 3 is still the largest.
+    mask = torch.ones(4, 6, dtype=torch.bool)
+    mask[:, 5] = False
+    assert reference.edge_weights(image, 1.0, mask)[2].tolist() == pytest.approx([1, 0.75, 0.75, 0, 1, 1])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 7), (5, 6)])
+def test_a_photograph_without_edges_counts_everywhere_alike(size: tuple[int, int]) -> None:
+    assert (reference.edge_weights(torch.full((*size, 3), 0.7), 2.0) == 1).all()
+
+
+def test_the_object_is_where_alpha_is_more_than_a_half() -> None:
+    rendered, photographed = torch.tensor([[0.4, 0.6]]), torch.tensor([[0.51, 0.5]])
+    assert reference.object_weights(rendered, photographed).tolist() == [[1.0, 0.0]]
+    assert reference.object_weights(rendered).tolist() == [[0.0, 1.0]]
+
+
 @given(seed=st.integers(0, 10_000), size=st.tuples(st.integers(3, 9), st.integers(3, 9)))
 @settings(max_examples=25, deadline=None)
 def test_normals_from_depth_face_the_camera_whatever_the_depth(seed: int, size: tuple[int, int]) -> None:

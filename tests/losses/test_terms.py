@@ -217,6 +217,44 @@ def test_a_term_says_how_normals_are_taken_beside_empty_pixels(
     assert function(output.normal, depth, output.alpha, camera).item() != pytest.approx(expected.item(), rel=1e-3)
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_term_of_the_object_alone_pays_for_no_cover_of_the_empty_background(
+    backend: str, request: pytest.FixtureRequest
+) -> None:
+    if backend == "cpu":
+        request.getfixturevalue("native")
+    output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.zeros(8, 9, 3)
+    alpha = torch.zeros(8, 9)
+    alpha[2:6, 3:7] = 1
+    gradients = {}
+    for where in ("image", "object"):
+        terms = [LossTerm("normal_consistency", 1.0, where=where)]
+        choices = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
+        value = compute_losses(output, target, None, camera, terms, **choices)["normal_consistency"]
+        (gradients[where],) = torch.autograd.grad(value, output.normal)
+    empty = alpha[1:-1, 1:-1] == 0  # of those with a normal
+    inner = {where: gradient[1:-1, 1:-1] for where, gradient in gradients.items()}
+    assert (inner["image"][empty] != 0).all()
+    assert (inner["object"][empty] == 0).all()
+    torch.testing.assert_close(inner["object"][~empty], inner["image"][~empty])
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_term_counts_less_at_edges_of_the_photograph_and_can_be_asked_of_the_object_too(
+    backend: str, request: pytest.FixtureRequest
+) -> None:
+    if backend == "cpu":
+        request.getfixturevalue("native")
+    output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.rand(8, 9, 3)
+    alpha = torch.rand(8, 9)
+    term = LossTerm("normal_consistency", 1.0, where="object", edge_power=2.0)
+    choices = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
+    found = compute_losses(output, target, None, camera, [term], **choices)["normal_consistency"]
+    weights = reference.edge_weights(target, 2.0) * (alpha > 0.5)
+    expected = reference.normal_consistency(output.normal, output.depth_mean, output.alpha, camera, weights=weights)
+    assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+
+
 def test_terms_of_one_kind_add_up() -> None:
     output, camera, target = make_output(8, 9), make_camera(9, 8), torch.zeros(8, 9, 3, dtype=torch.float64)
     args = (output, target, None, camera)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from gs2d.config.densify import Densify
-from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, RankByError, Recipe, Stage
+from gs2d.config.recipe import ALL, CloneInPlace, GradDensify, LossTerm, RankByError, Recipe, Stage
 
 
 def describe_recipe(recipe: Recipe) -> Iterator[str]:
@@ -70,7 +70,7 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
     for term in stage.losses:
         weight = "the protocol's weight" if term.weight is None else f"{term.weight:g}"
         since = f" after iteration {term.start:,}" if term.start else ""
-        yield f"loss {term.kind}: {weight}{since}"
+        yield f"loss {term.kind}: {weight}{since}{_describe_choices(term)}"
     if isinstance(stage.densify, Densify):
         given = ", ".join(f"{name}={value}" for name, value in stage.densify.options.items())
         yield f"densifies by {stage.densify.name}{f' ({given})' if given else ''}"
@@ -78,6 +78,14 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
         yield from _describe_densify(stage.densify)
     else:
         yield "no densification"
+
+
+def _describe_choices(term: LossTerm) -> str:
+    said = [f"every {term.every} iterations"] if term.every > 1 else []
+    said += ["of the object alone"] if term.where == "object" else []
+    said += ["empty pixels at the camera's centre"] if term.edges == "camera" else []
+    said += [f"by (1 - image gradient)^{term.edge_power:g}"] if term.edge_power else []
+    return "".join(f", {words}" for words in said)
 
 
 def _describe_densify(d: GradDensify) -> Iterator[str]:

@@ -30,11 +30,12 @@ LARGEST_SEED = 2**63 - 1  # torch takes no larger one
 DEPTH_KINDS = ("mean", "median")
 NORMAL_KINDS = ("normal_consistency", "normal_consistency_per_splat")
 EDGES = ("undefined", "camera")
+WHERE = ("image", "object")
 
 
 @dataclass(frozen=True)
 class LossTerm:
-    """One term of the loss: ``weight * LOSSES[kind]``, active when iteration > start.
+    """One term of the loss: ``weight * LOSSES[kind]``, in every ``every``-th iteration > start.
 
     Attributes
     ----------
@@ -55,6 +56,16 @@ class LossTerm:
     edges : "undefined" or "camera"
         Of normal consistency, beside empty pixels: depths make no normal there, or one as in the official code, where
         empty pixels lie at the camera's centre.
+    where : "image" or "object"
+        Of normal consistency: asked of all pixels, or of those of the object alone, so that what covers the empty
+        background earns nothing. The object is where the photograph's alpha is above 1/2; of photographs without
+        alpha, where the rendered one is.
+    edge_power : float
+        Of normal consistency: each pixel counts (1 - g) ** edge_power, g in [0, 1] the gradient of the photograph,
+        for depth may jump where colours do. 0: all alike.
+    every : int
+        Iterations of which one has this term (those that it divides); the others cost nothing for it. The weight is as
+        written, not multiplied by ``every``.
     """
 
     kind: str
@@ -63,6 +74,13 @@ class LossTerm:
     depth: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict, metadata={"omit_empty": True}, hash=False)
     edges: str = field(default="undefined", metadata={"omit_empty": True})
+    where: str = field(default="image", metadata={"omit_empty": True})
+    edge_power: float = field(default=0.0, metadata={"omit_empty": True})
+    every: int = field(default=1, metadata={"omit_empty": True})
+
+    def is_active(self, iteration: int) -> bool:
+        """Whether an iteration (from 1) of the stage has this term."""
+        return iteration > self.start and iteration % self.every == 0
 
 
 @dataclass(frozen=True)
@@ -391,9 +409,6 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
         _check_densify(f"{where}: densify", stage.densify, stage)
 
 
-_OF_NORMALS = f"only {' and '.join(NORMAL_KINDS)} do"
-
-
 def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
     kinds = [term.kind for term in stage.losses]
     for term in stage.losses:
@@ -411,12 +426,18 @@ def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
         integer(f"{where}: start of loss {term.kind!r}", term.start, low=0)
         if term.depth is not None:
             one_of(f"{where}: depth of loss {term.kind!r}", term.depth, DEPTH_KINDS)
+        integer(f"{where}: every of loss {term.kind!r}", term.every, low=1)
         one_of(f"{where}: edges of loss {term.kind!r}", term.edges, EDGES)
-        of_normals = term.kind in NORMAL_KINDS
-        require(of_normals or term.edges == "undefined", f"{where}: loss {term.kind!r} takes no edges; {_OF_NORMALS}")
+        one_of(f"{where}: where of loss {term.kind!r}", term.where, WHERE)
+        number(f"{where}: edge_power of loss {term.kind!r}", term.edge_power, low=0.0)
+        for name in ("edges", "where", "edge_power"):
+            plain = getattr(term, name) == getattr(LossTerm, name)
+            message = f"loss {term.kind!r} takes no {name}; only {' and '.join(NORMAL_KINDS)} do"
+            require(plain or term.kind in NORMAL_KINDS, f"{where}: {message}")
     if stage.iterations > 0:
-        active = [term for term in stage.losses if term.weight != 0 and term.start == 0]
-        require(bool(active), f"{where}: no loss is active from the first iteration: got {kinds or 'none'}")
+        active = [term for term in stage.losses if term.weight != 0 and term.start == 0 and term.every == 1]
+        message = "no loss is active from the first iteration and in every one"
+        require(bool(active), f"{where}: {message}: got {kinds or 'none'}")
         require(bool(stage.train), f"{where}: train names no attribute for {stage.iterations} iterations")
 
 

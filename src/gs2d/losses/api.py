@@ -114,6 +114,8 @@ class LossView:
         The depth that the term asks for: ``output.depth(view.depth_kind)``.
     edges : "undefined" or "camera"
         How the term takes normals of depth beside empty pixels: ``LossTerm.edges``.
+    pixel_weights : Tensor [H, W] or None
+        By which the term multiplies the part of each pixel, for ``LossTerm.where`` and ``edge_power``.
     run_iteration : int
         Counted from 1 over all stages.
     index : int or None
@@ -136,6 +138,7 @@ class LossView:
     iteration: int = 1
     depth_kind: str = "mean"
     edges: str = "undefined"
+    pixel_weights: Tensor | None = None
     run_iteration: int = 1
     index: int | None = None
     silhouette: Tensor | None = None
@@ -235,6 +238,15 @@ def loss_of(term: LossTerm) -> tuple[str, str]:
     return term.kind, json.dumps(dict(term.options), sort_keys=True, default=str)
 
 
+def _pixel_weights(term: LossTerm, output: RenderOutput, view: LossView) -> Tensor | None:
+    """Return the weights [H, W] that a term gives to pixels; None where all count alike."""
+    weights = None if term.where == "image" else reference.object_weights(output.alpha, view.silhouette)
+    if term.edge_power > 0:
+        of_edges = reference.edge_weights(view.target, term.edge_power, view.mask)
+        weights = of_edges if weights is None else weights * of_edges
+    return weights
+
+
 def _normals(output: RenderOutput, view: LossView) -> tuple[Tensor, Tensor, Tensor, Camera, Tensor | None]:
     pose, normal = view.camera.pose, output.normal
     if pose is not None and normal.requires_grad:
@@ -254,12 +266,13 @@ def _ssim(output: RenderOutput, view: LossView) -> Tensor:
 
 @register_loss("normal_consistency")
 def _normal_consistency(output: RenderOutput, view: LossView) -> Tensor:
-    return reference.normal_consistency(*_normals(output, view), edges=view.edges)
+    return reference.normal_consistency(*_normals(output, view), edges=view.edges, weights=view.pixel_weights)
 
 
 @register_loss("normal_consistency_per_splat")
 def _normal_consistency_per_splat(output: RenderOutput, view: LossView) -> Tensor:
-    return reference.normal_consistency_per_splat(*_normals(output, view), edges=view.edges)
+    choices = {"edges": view.edges, "weights": view.pixel_weights}
+    return reference.normal_consistency_per_splat(*_normals(output, view), **choices)
 
 
 @register_loss("distortion")
@@ -292,9 +305,8 @@ def _multiview_geometric(output: RenderOutput, view: LossView) -> Tensor:
 
 def _fused_normals(output: RenderOutput, view: LossView, operations: LossOperations, kind: str) -> Tensor:
     per_splat, weight = kind == "normal_consistency_per_splat", view.weights.get(kind, 1.0)
-    return operations.normal_consistency(
-        *_normals(output, view), edges=view.edges, per_splat=per_splat, expected=weight
-    )
+    choices = {"edges": view.edges, "weights": view.pixel_weights}
+    return operations.normal_consistency(*_normals(output, view), **choices, per_splat=per_splat, expected=weight)
 
 
 FUSED: Mapping[str, Callable[[RenderOutput, LossView, LossOperations], Tensor]] = MappingProxyType(
@@ -339,7 +351,7 @@ def compute_losses(
     camera : Camera
         That of the rendering, with its ``pose`` where that learns: the terms then say how they change with it.
     terms : sequence of LossTerm
-        A term is active when ``iteration > term.start``. Terms of one kind add up.
+        Those that are active in the iteration (``LossTerm.is_active``) are evaluated. Terms of one kind add up.
     iteration : int
         Counted from 1 within the stage.
     depth_kind : "mean" or "median"
@@ -349,7 +361,7 @@ def compute_losses(
     target_cache : TargetMaps, optional
         Of this target: spares the native SSIM one blur of four. It never changes the value.
     silhouette : Tensor [H, W], optional
-        Alpha of the photograph, for the loss of that name.
+        Alpha of the photograph, for the loss of that name and for terms that are asked of the object.
     neighbour : Neighbour, optional
         A second view, for the losses that compare two.
     index : int, optional
@@ -387,7 +399,7 @@ def compute_losses(
     for term in terms:
         if term.weight is None:
             raise RecipeError(f"loss {term.kind!r} has no weight; resolve the recipe's losses with a protocol first")
-        if iteration > term.start:
+        if term.is_active(iteration):
             active.append((term, term.weight))
             weights[term.kind] = weights.get(term.kind, 0.0) + term.weight
     view = LossView(
@@ -406,6 +418,7 @@ def compute_losses(
     values: dict[str, Tensor] = {}
     for term, weight in active:
         view.depth_kind, view.edges = term.depth or depth_kind, term.edges
+        view.pixel_weights = _pixel_weights(term, output, view)
         found = _value(term, output, view, functions or {})
         if found is not None:
             value = weight * found

@@ -148,6 +148,34 @@ def normal_consistency(
     return masked_mean(_weighted(1 - alpha.detach() * (normal * surface).sum(dim=-1), weights), mask)
 
 
+def object_weights(alpha: Tensor, silhouette: Tensor | None = None) -> Tensor:
+    """Return the weight [H, W] of each pixel where a loss is asked of the object alone: 1 on it, 0 beside it.
+
+    By the alpha of the photograph (``silhouette``), or where it has none by the rendered ``alpha``, as a constant.
+    """
+    known = alpha.detach() if silhouette is None else silhouette
+    return (known > 0.5).to(alpha.dtype)
+
+
+def edge_weights(image: Tensor, power: float, mask: Tensor | None = None) -> Tensor:
+    """Return the weight (1 - g) ** power [H, W] of each pixel: less where the photograph has an edge.
+
+    g is the larger of the central differences across and down, each the mean over channels, divided by the largest of
+    the photograph [H, W, C]; 0 on the one-pixel border and beside ignored pixels.
+    """
+    height, width = image.shape[:2]
+    if min(height, width) < 3:
+        return image.new_ones(height, width)
+    across = (image[1:-1, 2:] - image[1:-1, :-2]).abs().mean(dim=-1)
+    down = (image[2:, 1:-1] - image[:-2, 1:-1]).abs().mean(dim=-1)
+    if mask is not None:
+        across = torch.where(mask[1:-1, 2:] & mask[1:-1, :-2], across, torch.zeros_like(across))
+        down = torch.where(mask[2:, 1:-1] & mask[:-2, 1:-1], down, torch.zeros_like(down))
+    gradient = torch.maximum(across, down)
+    gradient = gradient / gradient.max().clamp(min=torch.finfo(image.dtype).tiny)
+    return F.pad((1 - gradient) ** power, (1, 1, 1, 1), value=1.0)
+
+
 def _weighted(values: Tensor, weights: Tensor | None) -> Tensor:
     return values if weights is None else weights.detach() * values
 

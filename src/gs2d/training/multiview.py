@@ -24,7 +24,7 @@ SAMPLES = 2000  # points that say how far away is what a camera looks at
 
 def is_compared(stage: Stage, iteration: int) -> bool:
     """Whether a stage compares views at an iteration."""
-    return any(term.kind in MULTIVIEW_KINDS and term.weight and iteration > term.start for term in stage.losses)
+    return any(term.kind in MULTIVIEW_KINDS and term.weight and term.is_active(iteration) for term in stage.losses)
 
 
 def find_neighbours(scene: Scene, settings: MultiView) -> tuple[tuple[int, ...], ...]:

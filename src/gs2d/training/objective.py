@@ -105,7 +105,7 @@ class FullRender:
     def settings(self, stage: Stage, iteration: int) -> RasterSettings:
         """Return the rasterizer's constants at an iteration (1-based)."""
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
-        wanted = any(term.kind == "distortion" for term in stage.losses)
+        wanted = any(term.kind == "distortion" and term.is_active(iteration) for term in stage.losses)
         return replace(raster_settings(self.protocol, self.scene.extent, degree), with_distortion=wanted)
 
     def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:

@@ -283,7 +283,7 @@ class Trainer:
             use_masks=use_masks,
             maps=partial(target_maps, backend=self.backend) if keeps else None,
             with_silhouettes=self.recipe.exposure is not None
-            or any(t.kind == "silhouette" for stage in self.recipe.stages for t in stage.losses),
+            or any(t.kind == "silhouette" or t.where == "object" for s in self.recipe.stages for t in s.losses),
             dtype=dtype,
             device=device,
             limit_bytes=TARGET_BYTES if limit_bytes is None else limit_bytes,

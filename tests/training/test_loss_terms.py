@@ -1,0 +1,119 @@
+"""Which iterations have a term of the loss, what the others save, and where in the image a term is asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import LossTerm, Recipe, Stage
+from gs2d.data.scene import Scene, View
+from gs2d.losses import reference
+from gs2d.render.api import rasterize
+from gs2d.render.types import RasterSettings
+from gs2d.training import objective
+from gs2d.training.trainer import Trainer
+from saved_states import reload, saved
+from train_toys import WIDE, compared, same, short
+
+
+def with_terms(recipe: Recipe, **changes: Any) -> Recipe:
+    """Change fields of the terms of a kind (of all stages): ``normal_consistency={"every": 2}``."""
+
+    def changed(stage: Stage) -> Stage:
+        return replace(stage, losses=tuple(replace(t, **changes.get(t.kind, {})) for t in stage.losses))
+
+    return replace(recipe, stages=tuple(changed(stage) for stage in recipe.stages))
+
+
+def cut_out(scene: Scene) -> Scene:
+    """The same photographs with an alpha channel: empty where they are black."""
+
+    def with_alpha(view: View) -> View:
+        image = view.image()
+        alpha = np.where(image.max(axis=2, keepdims=True) > 8, 255, 0).astype(np.uint8)
+        return View.from_arrays(view.name, view.camera, np.concatenate([image, alpha], axis=2))
+
+    return replace(scene, train=tuple(map(with_alpha, scene.train)))
+
+
+def entered(scene: Scene, recipe: Recipe, backend: str) -> Trainer:
+    trainer = Trainer(scene, recipe, GENERIC, backend=backend)
+    trainer.enter(0)
+    return trainer
+
+
+def test_a_term_is_there_in_the_iterations_that_every_divides() -> None:
+    term = LossTerm("l1", 1.0, start=4, every=3)
+    assert [i for i in range(1, 13) if term.is_active(i)] == [6, 9, 12]
+    assert [i for i in range(1, 7) if LossTerm("l1", 1.0, start=4).is_active(i)] == [5, 6]
+
+
+def test_an_iteration_without_a_term_is_that_of_a_recipe_without_it(scene: Scene, backend: str) -> None:
+    trainer = entered(scene, short(), backend)
+    stage = trainer.recipe.stages[0]
+    rare = with_terms(trainer.recipe, normal_consistency={"every": 3}).stages[0]
+    without = replace(stage, losses=tuple(t for t in stage.losses if t.kind != "normal_consistency"))
+    for iteration, other in ((7, without), (8, without), (9, stage)):
+        found, expected = (trainer._whole.evaluate(trainer.state, s, iteration, 0) for s in (rare, other))
+        assert found.losses == expected.losses  # the weight is as written
+        assert all(torch.equal(found.gradients[name], expected.gradients[name]) for name in expected.gradients)
+    assert set(trainer._whole.evaluate(trainer.state, rare, 9, 0).losses) == {"l1", "ssim", "normal_consistency"}
+
+
+def test_what_a_term_needs_is_not_made_in_an_iteration_without_it(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered: list[RasterSettings] = []
+
+    def counted(splats: Any, camera: Any, settings: RasterSettings, **options: Any) -> Any:
+        rendered.append(settings)
+        return rasterize(splats, camera, settings, **options)
+
+    recipe = compared()
+    first = replace(recipe.stages[0], losses=(*recipe.stages[0].losses, LossTerm("distortion", 1.0)))
+    recipe = replace(recipe, stages=(first, *recipe.stages[1:]), multiview=WIDE)
+    rare = {"every": 2}
+    recipe = with_terms(recipe, multiview_photometric=rare, multiview_geometric=rare, distortion=rare)
+    trainer = entered(scene, recipe, "reference")
+    monkeypatch.setattr(objective, "rasterize", counted)
+    counts = []
+    for iteration in (7, 8):
+        rendered.clear()
+        trainer._whole.evaluate(trainer.state, recipe.stages[0], iteration, 0)
+        counts.append((len(rendered), rendered[0].with_distortion))
+    assert counts == [(1, False), (2, True)]  # the second view, and the map of distortion
+
+
+def test_a_resumed_training_gives_the_same_bytes_whatever_the_terms_say(scene: Scene, backend: str) -> None:
+    said = {"every": 2, "where": "object", "edge_power": 2.0, "edges": "camera"}
+    recipe, made = with_terms(short(), normal_consistency=said), cut_out(scene)
+    end = Trainer(made, recipe, GENERIC, backend=backend).run()
+    assert not same(end, Trainer(made, short(), GENERIC, backend=backend).run())
+    trainer = entered(made, recipe, backend)
+    for _ in range(7):
+        trainer.step()
+    assert same(Trainer(made, recipe, GENERIC, backend=backend, state=reload(saved(trainer))).run(), end)
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_the_object_is_where_the_photograph_s_alpha_says_else_the_rendered_one(
+    scene: Scene, backend: str, has_alpha: bool
+) -> None:
+    made = cut_out(scene) if has_alpha else scene
+    recipe = with_terms(short(), normal_consistency={"start": 0, "where": "object"})
+    trainer = entered(made, recipe, backend)
+    camera = made.train[0].camera
+    with torch.no_grad():
+        seen = rasterize(trainer.splats, camera, trainer._whole.settings(recipe.stages[0], 1), backend=backend)
+    photographed = made.train[0].alpha()
+    alpha = seen.alpha if photographed is None else torch.from_numpy(photographed)
+    weights = (alpha > 0.5).float()
+    assert 0.1 < weights.mean() < 0.9
+    value = reference.normal_consistency(seen.normal, seen.depth(GENERIC.depth), seen.alpha, camera, weights=weights)
+    found = trainer._whole.evaluate(trainer.state, recipe.stages[0], 1, 0).losses["normal_consistency"]
+    assert found == pytest.approx(0.05 * value.item(), rel=1e-4)
