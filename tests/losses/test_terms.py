@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -229,7 +230,7 @@ def test_a_term_of_the_object_alone_pays_for_no_cover_of_the_empty_background(
     gradients = {}
     for where in ("image", "object"):
         terms = [LossTerm("normal_consistency", 1.0, where=where)]
-        choices = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
+        choices: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
         value = compute_losses(output, target, None, camera, terms, **choices)["normal_consistency"]
         (gradients[where],) = torch.autograd.grad(value, output.normal)
     empty = alpha[1:-1, 1:-1] == 0  # of those with a normal
@@ -248,7 +249,7 @@ def test_a_term_counts_less_at_edges_of_the_photograph_and_can_be_asked_of_the_o
     output, camera, target = make_output(8, 9, dtype=torch.float32), make_camera(9, 8), torch.rand(8, 9, 3)
     alpha = torch.rand(8, 9)
     term = LossTerm("normal_consistency", 1.0, where="object", edge_power=2.0)
-    choices = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
+    choices: dict[str, Any] = {"iteration": 1, "depth_kind": "mean", "backend": backend, "silhouette": alpha}
     found = compute_losses(output, target, None, camera, [term], **choices)["normal_consistency"]
     weights = reference.edge_weights(target, 2.0) * (alpha > 0.5)
     expected = reference.normal_consistency(output.normal, output.depth_mean, output.alpha, camera, weights=weights)

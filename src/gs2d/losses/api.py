@@ -271,8 +271,7 @@ def _normal_consistency(output: RenderOutput, view: LossView) -> Tensor:
 
 @register_loss("normal_consistency_per_splat")
 def _normal_consistency_per_splat(output: RenderOutput, view: LossView) -> Tensor:
-    choices = {"edges": view.edges, "weights": view.pixel_weights}
-    return reference.normal_consistency_per_splat(*_normals(output, view), **choices)
+    return reference.normal_consistency_per_splat(*_normals(output, view), edges=view.edges, weights=view.pixel_weights)
 
 
 @register_loss("distortion")
