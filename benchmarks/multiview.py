@@ -27,6 +27,7 @@ from torch import Tensor
 from benchmarks.iteration import bench_trainer
 from benchmarks.timing import machine
 from benchmarks.workload import room_workload
+from gs2d.config.protocols import GENERIC
 from gs2d.kernels.library import ready_library
 from gs2d.kernels.multiview import compare_views
 from gs2d.losses.multiview import ViewPair, geometric, photometric
@@ -75,14 +76,20 @@ def run(count: int, size: int, threads: int, repeats: int) -> dict[str, object]:
     torch.set_num_threads(threads)
     workload = room_workload(count, size, size)
     plain, compared = (bench_trainer(workload, name) for name in ("2dgs", RECIPE))
-    for trainer in (plain, compared):
+    settings = compared.recipe.multiview
+    assert settings is not None
+    recipe = replace(compared.recipe, multiview=replace(settings, depth_downscale=2))
+    coarse = Trainer(compared.scene, recipe, GENERIC, backend="cpu", state=bench_trainer(workload, RECIPE).state)
+    for trainer in (plain, compared, coarse):
         trainer.enter(0)
     pair = make_pair(compared)
     objective, state, stage = compared._whole, compared.state, compared.recipe.stages[0]
     works: dict[str, Callable[[], object]] = {
         "iteration without": plain.step,
         "iteration with": compared.step,
+        "iteration with, depth_downscale 2": coarse.step,
         "render of the neighbour": lambda: objective._neighbour_of(state, stage, 1, 0),
+        "render of the neighbour, depth_downscale 2": lambda: coarse._whole._neighbour_of(state, stage, 1, 0),
         "losses in torch": lambda: losses(pair, native=False),
         "losses, native": lambda: losses(pair, native=True),
     }

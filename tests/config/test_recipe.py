@@ -207,6 +207,8 @@ def test_exposures_are_checked_like_the_stages(field: str, value: float, message
         ("patches", 10**11, "multiview.patches must be at most 1000000, got 100000000000"),
         ("radius", 1.5, "multiview.radius must be an integer >= 1"),
         ("radius", 1000, "multiview.radius must be at most 50"),
+        ("depth_downscale", 0, "multiview.depth_downscale must be an integer >= 1, got 0"),
+        ("depth_downscale", 32, "multiview.depth_downscale must be at most 16, got 32"),
         ("texture", 0.0, "multiview.texture must be positive"),
         ("opacity", 1.0, "multiview.opacity must be below 1"),
         ("occluded", float("inf"), "multiview.occluded must be a finite number"),

@@ -58,9 +58,12 @@ class Scenario:
 
 def scenario(
     size: tuple[int, int] = (61, 47), *, seed: int = 0, dtype: torch.dtype = torch.float32, masked: bool = False,
-    settings: MultiView | None = None,
+    settings: MultiView | None = None, depth_size: tuple[int, int] | None = None,
 ) -> Scenario:  # fmt: skip
-    """Return noisy photographs and depths; some pixels are unclear, some hit nothing, some normals are edge-on."""
+    """Return noisy photographs and depths; some pixels are unclear, some hit nothing, some normals are edge-on.
+
+    ``depth_size`` is that of the neighbour's depth, by default its photograph's.
+    """
     settings = settings or MultiView(patches=300, radius=2, texture=0.03, occluded=4.0)
     g = torch.Generator().manual_seed(seed)
 
@@ -81,6 +84,8 @@ def scenario(
         images.append(prepare_image(grey[..., None].expand(-1, -1, 3).to(dtype), usable, settings))
         depths.append((torch.as_tensor(z) * (1 + 0.004 * noise(*shape))).to(dtype))
     here, there = cameras
+    if depth_size is not None:
+        depths[1] = plane_depth(there.resized(*depth_size)).to(dtype)
     depths[1] = torch.where(torch.rand(depths[1].shape, generator=g) < 0.02, 0, depths[1])
     normal = (torch.as_tensor(NORMAL) * 0.8 + 0.3 * noise(*depths[0].shape, 3)).to(dtype)
     draws = torch.rand(settings.patches, generator=g, dtype=torch.float64)

@@ -54,9 +54,11 @@ def test_values_and_gradients_are_those_of_the_formulas_in_torch(
         assert int(off.sum()) <= 0.01 * int((e != 0).sum())
 
 
-@pytest.mark.parametrize("learns", [False, True])
-def test_in_float64_they_are_the_same_to_rounding(native64: Library, learns: bool) -> None:
-    case = scenario(dtype=DOUBLE, masked=True)
+@pytest.mark.parametrize(("learns", "depth_size"), [(False, None), (True, None), (True, (33, 20))])
+def test_in_float64_they_are_the_same_to_rounding(
+    native64: Library, learns: bool, depth_size: tuple[int, int] | None
+) -> None:
+    case = scenario(dtype=DOUBLE, masked=True, depth_size=depth_size)
     for found, expected in zip(results(case, native64, learns=learns), results(case, None, learns=learns), strict=True):
         assert relative_error(found, expected) < 1e-11
 
@@ -94,8 +96,9 @@ def test_what_the_operation_would_misread_is_refused(native: Library) -> None:
     case = scenario()
     with pytest.raises(ShapeError, match="float32"):
         results(case.double(), native)
-    smaller = replace(case, neighbour=replace(case.neighbour, depth=case.neighbour.depth[1:]))
-    with pytest.raises(ShapeError, match="source_depth"):
+    source = case.neighbour.source
+    smaller = replace(case, neighbour=replace(case.neighbour, source=replace(source, clear=source.clear[1:])))
+    with pytest.raises(ShapeError, match="clear"):
         results(smaller, native)
     with pytest.raises(ShapeError, match="camera is 60x47"):
         results(replace(case, camera=replace(case.camera, width=60)), native)

@@ -130,6 +130,15 @@ def test_both_losses_are_there_once_they_have_started_and_move_depths(scene: Sce
     assert set(after.losses) - set(before.losses) == {"multiview_photometric", "multiview_geometric"}
     assert after.losses["multiview_photometric"] > 0
     assert after.losses["multiview_geometric"] > 0
+    # The neighbour's depth may be a smaller image: nearly the same values, from a quarter of the pixels.
+    assert trainer.recipe.multiview is not None
+    coarse = replace(trainer.recipe, multiview=replace(trainer.recipe.multiview, depth_downscale=2))
+    small = Trainer(scene, coarse, GENERIC, backend=backend, state=trainer.state)._whole
+    neighbour = small._neighbour_of(trainer.state, stage, 7, 0)
+    assert neighbour is not None
+    assert neighbour.depth.shape == tuple(-(-n // 2) for n in neighbour.source.grey.shape)
+    found = small.evaluate(trainer.state, stage, 7, 0).losses["multiview_photometric"]
+    assert float(found) == pytest.approx(float(after.losses["multiview_photometric"]), rel=0.2)
     only = replace(stage, losses=tuple(t for t in stage.losses if not t.kind.startswith("multiview")))
     plain = whole.evaluate(trainer.state, only, 7, 0)
     assert not torch.equal(after.gradients["means"], plain.gradients["means"])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gs2d.config.validate import integer, number, require
 
 MULTIVIEW_KINDS = ("multiview_photometric", "multiview_geometric")
 """Losses that need a second view."""
-LARGEST = {"patches": 1_000_000, "radius": 50}  # more is a slip, and ends out of memory
+LARGEST = {"patches": 1_000_000, "radius": 50, "depth_downscale": 16}  # more is a slip
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,9 @@ class MultiView:
         Degrees. Largest angle between the optical axes of neighbours.
     min_baseline, max_baseline : float
         Distance between the cameras of neighbours, as a share of the distance to what they look at.
+    depth_downscale : int
+        The neighbour's depth is rendered that much smaller. Depth is smooth but at edges, and this render is the
+        larger part of what comparing costs.
     """
 
     patches: int = 2048
@@ -45,6 +48,7 @@ class MultiView:
     max_angle: float = 45.0
     min_baseline: float = 0.05
     max_baseline: float = 1.0
+    depth_downscale: int = field(default=1, metadata={"omit_empty": True})
 
     @property
     def side(self) -> int:
@@ -61,7 +65,7 @@ def check_multiview(where: str, multiview: MultiView | None, kinds: Sequence[str
         )
         return
     require(bool(asked), f"{where} is set, but no loss is {' or '.join(MULTIVIEW_KINDS)}; take a recipe *-multiview")
-    for name in ("patches", "radius", "neighbours"):
+    for name in ("patches", "radius", "neighbours", "depth_downscale"):
         integer(f"{where}.{name}", getattr(multiview, name), low=1)
     for name, largest in LARGEST.items():
         value = getattr(multiview, name)

@@ -176,8 +176,8 @@ def with_multiview(
 ) -> Recipe:
     """Add losses of two views to the stages with normal consistency, once nothing is densified any more.
 
-    Not in the paper. The photometric weight is the one that PGSR publishes; why the geometric term is off, and why they
-    wait for the end of densification: docs/decisions/poses.md.
+    Not in the paper, and not PGSR's weights (0.15 and 0.03 of means over the pixels that count; here means run over all
+    pixels). Why they are these, and why they wait for the end of densification: docs/decisions/multiview.md.
     """
 
     def extended(stage: Stage) -> Stage:

@@ -30,7 +30,8 @@ class CompareArguments(ctypes.Structure):
     """``CompareArguments`` of core/multiview.h."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("count", "width", "height", "source_width", "source_height", "radius")),
+        *((name, ctypes.c_int64) for name in ("count", "width", "height", "source_width", "source_height")),
+        *((name, ctypes.c_int64) for name in ("depth_width", "depth_height", "radius")),
         ("lens", ctypes.c_double * 4),
         ("source_lens", ctypes.c_double * 4),
         ("texture", ctypes.c_double),
@@ -56,8 +57,8 @@ class Compared:
         Grey of the neighbour.
     clear : Tensor [h, w] bool
         Pixels of the neighbour around which a patch may be compared.
-    source_depth : Tensor [h, w] world units
-        0 where nothing is hit.
+    source_depth : Tensor [h', w'] world units
+        Of the whole image of the neighbour, in any size; 0 where nothing is hit.
     camera, source_camera : Camera
     settings : MultiView
     """
@@ -130,6 +131,8 @@ def _arguments(given: Compared) -> CompareArguments:
         height=camera.height,
         source_width=source.width,
         source_height=source.height,
+        depth_width=given.source_depth.shape[1],
+        depth_height=given.source_depth.shape[0],
         radius=settings.radius,
         texture=settings.texture,
         occluded=settings.occluded,
@@ -143,7 +146,11 @@ def compare_on(depth: Tensor, normal: Tensor, motion: Tensor, given: Compared, r
     """Return what :func:`compare_views` does, by the kernel of a backend; shapes are checked here."""
     images = {"depth": (depth, "H W"), "normal": (normal, "H W 3"), "reference": (given.reference, "H W")}
     pixels = {"index": (given.index, "P"), "chosen": (given.chosen, "P"), "motion": (motion, str(MOTION))}
-    there = {name: (getattr(given, name), "h w") for name in ("source", "clear", "source_depth")}
+    there = {
+        "source": (given.source, "h w"),
+        "clear": (given.clear, "h w"),
+        "source_depth": (given.source_depth, "a b"),
+    }
     sizes = check_shapes(images | pixels | there)
     for camera, size in ((given.camera, ("H", "W")), (given.source_camera, ("h", "w"))):
         if (camera.height, camera.width) != tuple(sizes[name] for name in size):

@@ -97,8 +97,9 @@ class Neighbour:
         Of the view that is learned from, and of its neighbour.
     camera : Camera
         The neighbour's.
-    depth : Tensor [h, w] world units
-        As it is rendered for the neighbour; 0 where nothing is hit. Never gets a gradient.
+    depth : Tensor [h', w'] world units
+        As it is rendered for the neighbour, all of its image in this or a smaller size; 0 where nothing is hit. Never
+        gets a gradient.
     draws : Tensor [P]
         Uniform in [0, 1); of P equal shares of the pixels that can be asked, the k-th draw chooses from the k-th.
     settings : MultiView

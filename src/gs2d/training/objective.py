@@ -139,7 +139,8 @@ class FullRender:
             return None
         camera, other = self.camera(state, turn.neighbour), turn.neighbour
         bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False)
-        depth = rasterize(state.splats, camera, bare, backend=self.backend).depth(self.protocol.depth)
+        small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
+        depth = rasterize(state.splats, small, bare, backend=self.backend).depth(self.protocol.depth)
         here, there = (self._images.of(i, self._targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 

@@ -16,7 +16,7 @@ constexpr double ROUND_TRIP_EPS = 1e-12;  // px^2, under the root of a distance:
 
 // P pixels of a view beside one neighbour. R is the type of the arrays.
 template <class R> struct CompareArguments {
-    long long count, width, height, source_width, source_height, radius;
+    long long count, width, height, source_width, source_height, depth_width, depth_height, radius;
     double lens[4], source_lens[4];  // fx, fy, cx, cy, as `Camera` has them
     double texture, occluded;        // of `MultiView`
     const R *depth, *normal;         // [H, W] world units, [H, W, 3] world frame
@@ -25,7 +25,7 @@ template <class R> struct CompareArguments {
     const unsigned char* chosen;     // [P]: there the patch is inside the image, and d > 0
     const R *reference, *source;     // [H, W], [h, w] grey
     const unsigned char* clear;      // [h, w]
-    const R* source_depth;           // [h, w] world units; 0 where nothing is hit
+    const R* source_depth;           // [depth_height, depth_width] of the whole image, world units; 0: nothing is hit
     R* values;                       // [2, P]: weight (1 - NCC), weight error
     R* gradients;                    // [5, P] of the first by depth and normal, of the second by depth; or null
     R* motion_gradients;             // [33, P] of the first by `motion`, of the second by its R and t; or null
@@ -36,8 +36,9 @@ template <class V> using MaskOf = decltype(V(0.f) < V(0.f));
 template <class V> struct Lens {
     V fx, fy, cx, cy;
 };
-template <class V, class R> GS2D_HD Lens<V> lens_of(const double* lens) {
-    return {V(R(lens[0])), V(R(lens[1])), V(R(lens[2] - 0.5)), V(R(lens[3] - 0.5))};
+// Of an image, or of the same one in another size.
+template <class V, class R> GS2D_HD Lens<V> lens_of(const double* lens, double by_x = 1., double by_y = 1.) {
+    return {V(R(lens[0] * by_x)), V(R(lens[1] * by_y)), V(R(lens[2] * by_x - 0.5)), V(R(lens[3] * by_y - 0.5))};
 }
 
 template <class V> struct Rows3 {
@@ -190,7 +191,8 @@ template <class V> struct RoundTrip {
     Vec3<V> by_seen, by_met, by_returned;  // derivatives by R X + t, by `met`, and by R^T met
 };
 
-// `read` samples the neighbour's depth at a place, `is_clear` says whether a patch around it may be compared.
+// `there` is the lens of the neighbour's depths, which `read` samples at a place. `is_clear` says whether a patch around
+// what a ray of the neighbour (z = 1) meets may be compared.
 template <class V, class Read, class Clear>
 GS2D_HD RoundTrip<V> round_trip(V depth, Vec3<V> ray, const Motion<V>& m, const Lens<V>& here, const Lens<V>& there,
                                 V last_x, V last_y, Read read, Clear is_clear) {
@@ -215,7 +217,7 @@ GS2D_HD RoundTrip<V> round_trip(V depth, Vec3<V> ray, const Motion<V>& m, const 
     const V by_u = fma(z.value, by_met.x, by_z * (z.by_x * there.fx));
     const V by_v = fma(z.value, by_met.y, by_z * (z.by_y * there.fy));
     const Vec3<V> by_seen = {inverse * by_u, inverse * by_v, -(inverse * fma(by_u, u, by_v * v))};
-    const MaskOf<V> back = front & inside & (z.value > zero) & before & is_clear(x, y);
+    const MaskOf<V> back = front & inside & (z.value > zero) & before & is_clear(u, v);
     return {error, dot(by_seen, turned), back, met, by_seen, by_met, by_returned};
 }
 

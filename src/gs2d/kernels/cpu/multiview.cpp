@@ -81,9 +81,11 @@ class Comparison {
         : a(a),
           here(lens_of<V, real>(a.lens)),
           there(lens_of<V, real>(a.source_lens)),
+          surface_lens(lens_of<V, real>(a.source_lens, double(a.depth_width) / double(a.source_width),
+                                        double(a.depth_height) / double(a.source_height))),
           motion(motion_of<V>(a.motion)),
           source(a.source, a.source_width, a.source_height),
-          surface(a.source_depth, a.source_width, a.source_height) {}
+          surface(a.source_depth, a.depth_width, a.depth_height) {}
 
     void run(int64_t first, Grey* greys) const {
         Pixels p;
@@ -93,8 +95,8 @@ class Comparison {
             for (int row = 0; a.motion_gradients && row < 33; ++row) leave(a.motion_gradients, row, p, V(real(0)));
             return;
         }
-        const auto clear = [this](V x, V y) { return is_clear(x, y); };
-        const RoundTrip<V> trip = round_trip(p.depth, p.ray, motion, here, there, surface.last_x, surface.last_y, surface, clear);
+        const auto clear = [this](V u, V v) { return is_clear(u, v); };
+        const RoundTrip<V> trip = round_trip(p.depth, p.ray, motion, here, surface_lens, surface.last_x, surface.last_y, surface, clear);
         const M counts = trip.back & p.chosen & (trip.error < V(real(a.occluded)));
         const V weight = keep(counts, exp(-trip.error));
         leave(a.values, 1, p, keep(counts, weight * trip.error));
@@ -109,7 +111,7 @@ class Comparison {
 
   private:
     const CompareArguments<real>& a;
-    const Lens<V> here, there;
+    const Lens<V> here, there, surface_lens;
     const Motion<V> motion;
     const Image source, surface;
 
@@ -117,10 +119,11 @@ class Comparison {
         store_first(rows + row * a.count + p.first, values, p.count);
     }
 
-    M is_clear(V x, V y) const {
+    M is_clear(V u, V v) const {
         alignas(64) real column[LANES], row[LANES];
-        store(column, whole(min(max(x + V(real(0.5)), V(real(0))), surface.last_x)));
-        store(row, whole(min(max(y + V(real(0.5)), V(real(0))), surface.last_y)));
+        const V half = V(real(0.5)), x = fma(there.fx, u, there.cx) + half, y = fma(there.fy, v, there.cy) + half;
+        store(column, whole(min(max(x, V(real(0))), source.last_x)));
+        store(row, whole(min(max(y, V(real(0))), source.last_y)));
         uint32_t found = 0;
         for (int k = 0; k < LANES; ++k)
             found |= uint32_t(a.clear[int64_t(row[k]) * a.source_width + int64_t(column[k])] != 0) << k;

@@ -27,7 +27,9 @@ struct ImageBetween {
 struct ClearAt {
     const uchar* flags;
     int64 width, height;
-    __device__ __forceinline__ bool operator()(float x, float y) const {
+    Lens<float> lens;
+    __device__ __forceinline__ bool operator()(float u, float v) const {
+        const float x = fma(lens.fx, u, lens.cx), y = fma(lens.fy, v, lens.cy);
         const float i = min(max(x + 0.5f, 0.f), float(width - 1)), j = min(max(y + 0.5f, 0.f), float(height - 1));
         return flags[int64(j) * width + int64(i)] != 0;
     }
@@ -98,11 +100,13 @@ extern "C" __global__ void __launch_bounds__(128) compare_views(CompareArguments
     const float x = float(pixel % a.width), y = float(pixel / a.width), depth = a.depth[pixel];
     const Vec3<float> ray = {(x - here.cx) / here.fx, (y - here.cy) / here.fy, 1.f};
     const Vec3<float> q = {a.normal[3 * pixel], a.normal[3 * pixel + 1], a.normal[3 * pixel + 2]};
-    const ImageBetween surface = {a.source_depth, a.source_width, a.source_height};
+    const ImageBetween surface = {a.source_depth, a.depth_width, a.depth_height};
+    const Lens<float> surface_lens = lens_of<float, float>(a.source_lens, double(a.depth_width) / double(a.source_width),
+                                                           double(a.depth_height) / double(a.source_height));
     const ImageBetween source = {a.source, a.source_width, a.source_height};
-    const ClearAt clear = {a.clear, a.source_width, a.source_height};
-    const RoundTrip<float> trip = round_trip(depth, ray, motion, here, there, float(a.source_width - 1),
-                                             float(a.source_height - 1), surface, clear);
+    const ClearAt clear = {a.clear, a.source_width, a.source_height, there};
+    const RoundTrip<float> trip = round_trip(depth, ray, motion, here, surface_lens, float(a.depth_width - 1),
+                                             float(a.depth_height - 1), surface, clear);
     if (!(trip.back && trip.error < float(a.occluded))) return;
     const float weight = exp(-trip.error);
     if (first) {
