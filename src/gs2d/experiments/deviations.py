@@ -80,7 +80,10 @@ def _methods(table: PaperTable, scenes: Sequence[FoundScene]) -> Iterator[str]:
             "of them: docs/decisions/rasterizer.md"
         )
     if any(scene.protocol.near_plane_policy != "draw" for scene in scenes):
-        yield "splats that no training view sees are dropped at the end of a stage: docs/decisions/rasterizer.md"
+        yield (
+            "splats that no training view sees, among them all with an opacity below 1/255, are dropped at the end of "
+            "a stage, so rows with free and with frozen opacity differ in storage: docs/decisions/rasterizer.md"
+        )
     if any(scene.data_set == DTU for scene in scenes):
         yield (
             "DTU: distortion has no weight but where a row names one, as in the paper's Table 1 (the official DTU "
@@ -143,7 +146,10 @@ def _scenes(options: TableOptions, scenes: Sequence[FoundScene], table: PaperTab
             yield f"{scene.name}: photographs shrunk by {factor}, its protocol says {scene.downscale}"
         size = _size(scene)
         if scene.data_set == NERF_SYNTHETIC and size is not None and size != NERF_SYNTHETIC_SIZE:
-            yield f"{scene.name}: photographs of {size[0]}x{size[1]} px, the data set has 800x800"
+            yield (
+                f"{scene.name}: photographs of {size[0]}x{size[1]} px, the data set has 800x800; small ones overstate "
+                "what normal consistency costs: docs/decisions/rasterizer.md"
+            )
         yield from (f"{scene.name}: {line}" for line in scene.missing[:SHOWN_PIECES])
         if len(scene.missing) > SHOWN_PIECES:
             more = len(scene.missing) - SHOWN_PIECES
