@@ -15,6 +15,8 @@ DENSIFIERS: Registry[Any] = Registry(
     builtin={
         "gradient": "gs2d.training.densify.gradient",
         "absolute-gradient": "gs2d.training.densify.absolute",
+        "multi-view-error": "gs2d.training.densify.by_error",
+        "relocation": "gs2d.training.densify.relocation",
     },
     error=RecipeError,
 )

@@ -93,10 +93,11 @@ def _describe_densify(d: GradDensify) -> Iterator[str]:
     if d.stop > 0:
         resets = f"opacity reset every {d.reset_every:,}" if d.reset_every else "no opacity resets"
         caps = f", capped at {d.opacity_cap:g} every {d.cap_every:,}" if d.cap_every else ""
+        errors = f" times the error of {d.error_views} views to the power {d.error_power:g}" if d.error_views else ""
         budget = f", up to {d.max_splats:,} splats" if d.max_splats is not None else ""
         yield (
             f"densifies every {d.every} iterations from {d.start:,} to {d.stop:,}{budget} by {signal} gradients over "
-            f"{d.abs_threshold if d.absolute else d.grad_threshold:g}; {resets}{caps}"
+            f"{d.abs_threshold if d.absolute else d.grad_threshold:g}{errors}; {resets}{caps}"
         )
     if d.prune_until > d.stop:
         yield f"prunes splats larger than {d.scale_cull:g} of the extent until {d.prune_until:,}"

@@ -159,6 +159,11 @@ class GradDensify:
     max_splats : int or None
         A budget: no densification goes beyond this count. Where more splats ask to be cloned or split, those whose
         signal is the largest multiple of its threshold win. None = no limit.
+    error_views : int
+        Training views that are rendered at each densification, to multiply the gradients of a splat by how wrong they
+        are where it is drawn (``training/densify/by_error.py``); 0 = none, gradients alone.
+    error_power : float
+        Of the error in units of its median.
     """
 
     grad_threshold: float = 2e-4
@@ -184,6 +189,8 @@ class GradDensify:
     scale_cull_start: int | None = field(default=None, metadata={"omit_empty": True})
     prune_until: int = field(default=0, metadata={"omit_empty": True})
     reset_at_on_white: tuple[int, ...] = field(default=(), metadata={"omit_empty": True})
+    error_views: int = field(default=0, metadata={"omit_empty": True})
+    error_power: float = field(default=0.5, metadata={"omit_empty": True})
 
     def resets(self, iteration: int, *, white: bool) -> bool:
         """Whether opacity is reset at the end of this iteration."""
@@ -442,11 +449,11 @@ def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
 
 
 def _check_densify(where: str, densify: GradDensify, stage: Stage) -> None:
-    for name in ("start", "stop", "reset_every", "prune_grace", "cap_every", "prune_until"):
+    for name in ("start", "stop", "reset_every", "prune_grace", "cap_every", "prune_until", "error_views"):
         integer(f"{where}.{name}", getattr(densify, name), low=0)
     integer(f"{where}.every", densify.every, low=1)
     integer(f"{where}.split_count", densify.split_count, low=2)
-    for name in ("grad_threshold", "abs_threshold", "percent_dense", "opacity_cull", "scale_cull"):
+    for name in ("grad_threshold", "abs_threshold", "percent_dense", "opacity_cull", "scale_cull", "error_power"):
         number(f"{where}.{name}", getattr(densify, name), low=0.0)
     shrink = number(f"{where}.split_shrink", densify.split_shrink, low=0.0)
     require(shrink > 0, f"{where}.split_shrink must be positive, got {shrink}")

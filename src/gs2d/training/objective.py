@@ -78,6 +78,24 @@ class StepResult:
     rows: Tensor | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class ViewResidual:
+    """How a rendered training view differs from its photograph.
+
+    Attributes
+    ----------
+    error : Tensor [H, W]
+        Mean absolute difference of the channels; 0 where a mask says that the pixel does not count.
+    camera : Camera
+        That it was seen by, and ``settings`` that it was rendered with.
+    settings : RasterSettings
+    """
+
+    error: Tensor
+    camera: Camera
+    settings: RasterSettings
+
+
 class Objective(Interface):
     """How a stage gets the loss and the gradients of a view."""
 
@@ -127,6 +145,18 @@ class FullRender:
         given = (index, camera, output, dict(leaves.items()), neighbour)
         losses, gradients = self.differentiate(state, stage, iteration, *given)
         return StepResult(losses, gradients, None if probe is None else _gradient(probe), output.radii)
+
+    @torch.no_grad()
+    def residual(self, state: TrainState, stage: Stage, iteration: int, index: int) -> ViewResidual:
+        """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph."""
+        camera, target = self.camera(state, index), self._targets[index]
+        settings = replace(self.settings(stage, iteration), with_distortion=False)
+        color = rasterize(state.splats, camera, settings, backend=self.backend).color
+        if state.exposures is not None:
+            clipped, transform = clipped_pixels(target), state.exposures.transform(index)
+            color = expose(color, transform, target.silhouette, self._background, clipped=clipped)
+        error = (color - target.image).abs().mean(dim=2)
+        return ViewResidual(error if target.mask is None else error * target.mask, camera, settings)
 
     @torch.no_grad()
     def _neighbour_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Neighbour | None:

@@ -33,6 +33,7 @@ from gs2d.training.objective import (
     FullRender,
     Objective,
     StepResult,
+    ViewResidual,
     check_losses,
     diverged,
     first_not_finite,
@@ -247,7 +248,11 @@ class Trainer:
 
     def _surroundings(self, stage: Stage) -> Surroundings:
         """Where the densifier of a stage works."""
-        return Surroundings(stage.name, self.scene, self.settings, self.protocol.white, self._learner)
+
+        def compare(state: TrainState, iteration: int, index: int) -> ViewResidual:
+            return self._whole.residual(state, stage, iteration, index)
+
+        return Surroundings(stage.name, self.scene, self.settings, self.protocol.white, self._learner, compare)
 
     def _check_sizes(self) -> None:
         """Raise RecipeError for a stage whose photographs would be too small to learn from."""

@@ -10,5 +10,4 @@ from gs2d.training.densify.gradient import GradientDensifier
 class AbsoluteDensifier(GradientDensifier):
     """Splits are chosen by the absolute gradient, clones still by the signed one."""
 
-    columns = 4
     absolute = True

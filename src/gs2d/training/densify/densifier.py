@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from gs2d.training import events
 from gs2d.training.state import TrainState
 
 if TYPE_CHECKING:
-    from gs2d.training.objective import StepResult
+    from gs2d.training.objective import StepResult, ViewResidual
 
 __all__ = ["Densifier", "Surroundings", "densifier_of"]
 
@@ -39,6 +39,9 @@ class Surroundings:
         Whether the background is white.
     backend : Backend
         That of the training: see ``assign`` and ``accumulate`` there.
+    compare : callable
+        ``compare(state, iteration, index)`` renders training view ``index`` as the stage trains on it now, and returns
+        how it differs from its photograph.
     """
 
     stage: str
@@ -46,6 +49,7 @@ class Surroundings:
     settings: RasterSettings
     white: bool
     backend: Backend
+    compare: Callable[[TrainState, int, int], ViewResidual]
 
 
 class Densifier:
@@ -101,12 +105,11 @@ def densifier_of(densify: GradDensify | Densify | None, surroundings: Surroundin
     if densify is None:
         return None
     if isinstance(densify, GradDensify):
-        found: Densifier = DENSIFIERS.get("absolute-gradient" if densify.absolute else "gradient")(
-            surroundings, densify
-        )
-        return found
+        name = "multi-view-error" if densify.error_views else "absolute-gradient" if densify.absolute else "gradient"
+        made: Densifier = DENSIFIERS.get(name)(surroundings, densify)
+        return made
     try:
-        found = DENSIFIERS.get(densify.name)(surroundings, **densify.options)
+        found: Densifier = DENSIFIERS.get(densify.name)(surroundings, **densify.options)
     except TypeError as error:
         raise RecipeError(
             f"stage {surroundings.stage!r}: densifier {densify.name!r} does not take the options "

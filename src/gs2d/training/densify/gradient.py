@@ -40,13 +40,13 @@ class GradientDensifier(Densifier):
         Fields of GradDensify, instead.
     """
 
-    columns = 2  # of the screen probe
-    absolute = False
+    absolute: bool | None = False  # None: as the options say
 
     def __init__(self, surroundings: Surroundings, densify: GradDensify | None = None, **options: Any) -> None:
         super().__init__(surroundings)
         given = GradDensify() if densify is None else densify
-        self._options = replace(given, **{"absolute": self.absolute, **options})
+        fixed = {} if self.absolute is None else {"absolute": self.absolute}
+        self._options = replace(given, **{**fixed, **options})
 
     def begin(self, state: TrainState) -> None:
         """Nothing is gathered yet."""
@@ -67,7 +67,8 @@ class GradientDensifier(Densifier):
         """Return the screen probe, until densification stops."""
         if iteration >= self._options.stop:
             return None
-        return state.splats.means.new_zeros(len(state.splats), self.columns, requires_grad=True)
+        columns = 4 if self._options.absolute else 2
+        return state.splats.means.new_zeros(len(state.splats), columns, requires_grad=True)
 
     def after_backward(self, state: TrainState, output: StepResult, iteration: int) -> Sequence[events.Event]:
         """Statistics, densification and opacity resets of one iteration."""
@@ -83,7 +84,10 @@ class GradientDensifier(Densifier):
         if options.densifies(iteration):
             extent = around.scene.extent
             try:
-                counts = densify_and_prune(state, options, iteration=iteration, extent=extent, white=white)
+                factor = self.urgency(state, iteration)
+                counts = densify_and_prune(
+                    state, options, iteration=iteration, extent=extent, white=white, factor=factor
+                )
             except DivergedError as error:
                 raise DivergedError(f"stage {around.stage!r}: {error}") from error
             happened.append(events.Densified(around.stage, iteration, **vars(counts), splats=len(state.splats)))
@@ -93,6 +97,10 @@ class GradientDensifier(Densifier):
             limit_opacity(state, ceiling)
             happened.append(events.OpacityLimited(around.stage, iteration, ceiling, reset))
         return happened
+
+    def urgency(self, state: TrainState, iteration: int) -> Tensor | None:
+        """Return by how much the gradients of splats count more [N], at a densification; None: all as they are."""
+        return None
 
     def _prune_large(self, state: TrainState, iteration: int) -> Sequence[events.Event]:
         """Prune splats that have grown too large after densification, where that is due."""
@@ -148,7 +156,13 @@ def accumulate(statistics: Mapping[str, Tensor], signal: Tensor, radii: Tensor, 
 
 @torch.no_grad()
 def densify_and_prune(
-    state: TrainState, densify: GradDensify, *, iteration: int, extent: float, white: bool
+    state: TrainState,
+    densify: GradDensify,
+    *,
+    iteration: int,
+    extent: float,
+    white: bool,
+    factor: Tensor | None = None,
 ) -> DensifyCounts:
     """Clone small splats and split large ones where the mean screen gradient is high, then prune; N changes.
 
@@ -163,6 +177,8 @@ def densify_and_prune(
         Scale of the scene: sizes are compared with it.
     white : bool
         Whether the background is white (there is one more reset then, with its grace).
+    factor : Tensor [N], optional
+        Times which mean gradients count.
 
     Raises
     ------
@@ -171,14 +187,14 @@ def densify_and_prune(
     """
     splats, sizes = state.splats, _largest(state.splats.scales)
     faint, large = _prunable(splats.opacities, sizes, densify, iteration=iteration, extent=extent, white=white)
-    clone, split = _select(state, densify, sizes, extent, (faint, large))
+    clone, split = _select(state, densify, sizes, extent, (faint, large), factor)
     parents = split.nonzero().squeeze(1)  # [P]
     children = parents.repeat(densify.split_count)  # [C] all first children, then all second ones
     shrunk = splats.log_scales[children] - math.log(densify.split_shrink)  # [C, 2]
     ends = _prunable(
         splats.opacities[children], _largest(shrunk.exp()), densify, iteration=iteration, extent=extent, white=white
     )
-    means = _scattered(state, children)  # draws for all children, whether they live or not
+    means = points_in_plane(state, children)  # draws for all children, whether they live or not
     keep, living = ~(split | faint | large), ~(ends[0] | ends[1])
     cloned = (clone & keep).nonzero().squeeze(1)
     counts = _counts(clone, split, (faint, large), ends)
@@ -210,13 +226,20 @@ def limit_opacity(state: TrainState, ceiling: float) -> None:
 
 
 def _select(
-    state: TrainState, densify: GradDensify, sizes: Tensor, extent: float, ends: tuple[Tensor, Tensor]
+    state: TrainState,
+    densify: GradDensify,
+    sizes: Tensor,
+    extent: float,
+    ends: tuple[Tensor, Tensor],
+    factor: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Rows to clone and rows to split, bool [N] each; ``ends`` are those that are too faint, and too large."""
     statistics = state.statistics
     assert statistics is not None
     count = statistics["count"].clamp(min=1.0)  # never seen: sum 0, mean 0
     signed, absolute = statistics["signed"] / count, statistics["absolute"] / count
+    if factor is not None:
+        signed, absolute = signed * factor, absolute * factor
     small = sizes <= densify.percent_dense * extent
     for_split, split_threshold = (
         (absolute, densify.abs_threshold) if densify.absolute else (signed, densify.grad_threshold)
@@ -244,12 +267,16 @@ def _within_budget(
     return to_clone & chosen, to_split & chosen
 
 
-def _scattered(state: TrainState, rows: Tensor) -> Tensor:
-    """Return a point [M, 3] world units drawn from the Gaussian of each of these splats, in its plane."""
+def points_in_plane(state: TrainState, rows: Tensor, reach: Tensor | None = None) -> Tensor:
+    """Return a point [M, 3] world units drawn from the Gaussian of each of these splats, in its plane.
+
+    ``reach`` [M]: standard deviations, of a Gaussian that much as wide.
+    """
     splats = state.splats
     if len(rows) == 0:
         return splats.means[rows]
     draws = torch.randn(len(rows), 2, generator=state.generator, dtype=splats.dtype).to(splats.device)
+    draws = draws if reach is None else draws * reach[:, None]
     in_plane = draws * splats.log_scales[rows].exp()  # [M, 2] world units
     frames = quats_to_matrices(splats.quats[rows])[:, :, :2]  # [M, 3, 2] columns t_u, t_v
     return splats.means[rows] + (frames * in_plane[:, None, :]).sum(dim=2)
