@@ -5,14 +5,43 @@ Why each is there, and what was tried instead: docs/decisions/fog.md. Pure Pytho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gs2d.config.validate import integer, number, require
 
 
 @dataclass(frozen=True)
+class StartFit:
+    """Splats of a dense start that look like the photographs from the first iteration (``training/start_fit.py``).
+
+    Attributes
+    ----------
+    sh_degree : int
+        Colour is fitted by least squares up to this degree (and the recipe's) over the views that see a splat. Degrees
+        above 0 need a stage that trains them from its first iteration (``sh_interval=0``).
+    ridge : float, views
+        Coefficients above degree 0 are drawn to 0 as strongly as by so many views.
+    opacity : float
+        Of every splat.
+    size : float
+        Times the mean distance to the three nearest splats: the standard deviations of a splat.
+    max_size : float, px
+        A splat is not larger than so many pixels of the view that it was found in: what lies apart stays small.
+    """
+
+    sh_degree: int = 0
+    ridge: float = 1.0
+    opacity: float = 0.5
+    size: float = 0.7
+    max_size: float = 6.0
+
+
+@dataclass(frozen=True)
 class DenseStart:
     """Splats to start from where a plane sweep over neighbouring photographs agrees (``training/plane_sweep.py``).
+
+    Where a capture says which sparse points its photographs show, those give the depths to try, else the scene's bounds
+    do (``training/sweep_range.py``): inside the silhouettes of all photographs, where they have an alpha channel.
 
     Attributes
     ----------
@@ -36,6 +65,9 @@ class DenseStart:
         One splat starts in each cell of so many pixels of the shrunk photographs.
     max_views : int
         Photographs that are swept, evenly chosen.
+    fit : StartFit or None
+        How splats are fitted to the photographs; None: grey-opaque beginnings as from sparse points, in the colour of
+        one photograph.
     """
 
     side: int = 200
@@ -49,6 +81,7 @@ class DenseStart:
     votes: int = 2
     cell: float = 3.0
     max_views: int = 120
+    fit: StartFit | None = field(default=None, metadata={"omit_empty": True})
 
 
 @dataclass(frozen=True)
@@ -148,6 +181,8 @@ def check_robust(
             number(f"{at}.{name}", getattr(start, name), low=0.0)
         require(start.cell >= 1, f"{at}.cell must be at least 1 px, got {start.cell}")
         require(start.min_angle < start.max_angle, f"{at}.min_angle must be below max_angle, got {start.min_angle}")
+        if start.fit is not None:
+            _check_fit(f"{at}.fit", start.fit)
     if free is not None:
         at = f"{where}: free_space"
         for name in ("every", "views", "window"):
@@ -169,3 +204,11 @@ def check_robust(
         for name in ("least", "inside", "size"):
             number(f"{at}.{name}", getattr(seen, name), low=0.0)
         require(seen.least < 1, f"{at}.least must be below 1, got {seen.least}: no splat is seen whole")
+
+
+def _check_fit(at: str, fit: StartFit) -> None:
+    require(fit.sh_degree in (0, 1, 2, 3), f"{at}.sh_degree must be 0, 1, 2 or 3, got {fit.sh_degree!r}")
+    for name in ("ridge", "opacity", "size", "max_size"):
+        number(f"{at}.{name}", getattr(fit, name), low=0.0)
+    require(0 < fit.opacity < 1, f"{at}.opacity must be in (0, 1), got {fit.opacity}")
+    require(fit.size > 0 and fit.max_size > 0, f"{at}.size and max_size must be positive, got {fit.size}, {fit.max_size}")

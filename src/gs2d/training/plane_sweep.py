@@ -20,6 +20,8 @@ from gs2d.config.robust import DenseStart
 from gs2d.core.memory import trim
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.errors import DataError
+from gs2d.training.sweep_range import SweepRange, sweep_range
 
 MIN_POINTS = 20  # sparse points of a view, below which its depths are unknown
 NEAREST = 2  # percentile of depth that stands for the nearest: a few sparse points are wrong
@@ -100,7 +102,7 @@ class Sweep:
         places = unproject(view, depth)
         votes = np.zeros(depth.shape, dtype=np.int64)
         for other in self.neighbours[index]:
-            z, column, row, inside = _into(self.views[other], places)
+            z, column, row, inside = project(self.views[other], places)
             there = self.depths[other][row, column]
             votes += inside & (depth > 0) & (there > 0) & (np.abs(there - z) <= fraction * z)
         return votes
@@ -112,15 +114,18 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     Parameters
     ----------
     scene : Scene
-        With ``observe``: which sparse points each photograph shows.
     settings : DenseStart
+
+    Raises
+    ------
+    DataError
+        The capture says nothing of depths: no sparse points that photographs show, no places that two of them see.
     """
-    assert scene.observe is not None
-    observed = scene.observe()
+    known = sweep_range(scene)
     longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
     factor = max(1, round(longest / settings.side))
-    views = tuple(_trimming(_shrunk(view, observed, factor) for view in scene.train))
-    neighbours = _neighbours(scene, views, observed, settings)
+    views = tuple(_trimming(_shrunk(view, known, factor) for view in scene.train))
+    neighbours = _neighbours(scene, views, known.observed, settings)
     found = list(_trimming(_depths(views, index, neighbours[index], settings) for index in range(len(views))))
     return Sweep(views, neighbours, tuple(depth for depth, _ in found), tuple(score for _, score in found))
 
@@ -144,14 +149,35 @@ def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
 
 
 def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud:
-    """Return points to start from: swept ones, and sparse ones where none of those is near."""
+    """Return points to start from: swept ones, and sparse ones where none of those is near.
+
+    Raises
+    ------
+    DataError
+        There are none: no view has a neighbour to be compared with, or no depths agree.
+    """
+    if not any(sweep.neighbours) and not _has_points(scene):
+        raise DataError(
+            f"a plane sweep of {scene.name} needs photographs whose lines of sight are {settings.min_angle:g} to "
+            f"{settings.max_angle:g} degrees apart, got none; set dense_start.min_angle or max_angle, or train with "
+            "--set dense_start=null"
+        )
     found = [_swept(sweep, index, settings) for index in range(len(sweep.views))]
     swept = _thin(_joined(found), settings.cell)
     parts = [(swept.places, swept.colors, swept.normals)]
-    if scene.points is not None and len(scene.points):
+    if scene.points is not None and _has_points(scene):
         parts.append(_apart(scene.points, swept, settings.cell))
+    elif len(swept.places) < 2:
+        raise DataError(
+            f"a plane sweep of {scene.name} found {len(swept.places)} places on which photographs agree, expected at "
+            "least 2; do photographs and cameras belong together? Train with --set dense_start=null"
+        )
     places, colors, normals = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return PointCloud(places, np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8), normals)
+
+
+def _has_points(scene: Scene) -> bool:
+    return scene.points is not None and len(scene.points) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +227,8 @@ def _apart(points: PointCloud, swept: _Found, cell: float) -> tuple[np.ndarray, 
     return places[apart], colors[apart], np.zeros((int(apart.sum()), 3))
 
 
-def _shrunk(view: View, observed: ObservedPoints, factor: int) -> SmallView:
-    camera = view.camera
+def _shrunk(view: View, known: SweepRange, factor: int) -> SmallView:
+    camera, observed = view.camera, known.observed
     image = torch.from_numpy(np.ascontiguousarray(view.target((0.0, 0.0, 0.0)))).permute(2, 0, 1)[None]
     height, width = camera.height // factor * factor, camera.width // factor * factor
     small = F.avg_pool2d(image[:, :, :height, :width], factor)
@@ -216,13 +242,14 @@ def _shrunk(view: View, observed: ObservedPoints, factor: int) -> SmallView:
     K[:2] /= factor
     shown = observed.in_view(view.name, camera)
     enough = len(shown.depth) >= MIN_POINTS
-    near, far = np.percentile(shown.depth, (1, 99)) if enough else (0.0, 0.0)
+    near, far = np.percentile(shown.depth, (1, 99)) * (NEAR_MARGIN, FAR_MARGIN) if enough else (0.0, 0.0)
+    near, far = known.limits.get(view.name, (near, far))
     pixels = np.minimum(shown.pixels / factor, np.array((width // factor, height // factor)) - 0.5)
     grey = (small * torch.tensor(GREY)[:, None, None]).sum(dim=1, keepdim=True)
     T = np.asarray(camera.T_cam_world, dtype=np.float64)
     everywhere = observed.inside(camera).depth  # smooth things have few points, and a photograph finds some of them
     nearest = float(np.percentile(everywhere, NEAREST)) if enough else 0.0
-    return SmallView(small[0], grey, left, K, T, NEAR_MARGIN * near, FAR_MARGIN * far, pixels, shown.depth, nearest)
+    return SmallView(small[0], grey, left, K, T, float(near), float(far), pixels, shown.depth, nearest)
 
 
 def _neighbours(
@@ -308,8 +335,8 @@ def _blurred(image: Tensor, radius: int) -> Tensor:
     return F.avg_pool2d(F.pad(image, (radius,) * 4, mode="reflect"), 2 * radius + 1, 1)
 
 
-def _into(view: SmallView, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Depth, column and row (clipped to the picture) of places [..., 3] in a view, and whether they are inside."""
+def project(view: SmallView, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return depth, column and row (clipped to the picture) of places [..., 3] in a view, and which are inside."""
     seen = places @ view.T[:3, :3].T + view.T[:3, 3]
     z = seen[..., 2]
     front = np.maximum(z, 1e-12)

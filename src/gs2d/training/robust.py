@@ -10,15 +10,17 @@ from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.config.robust import DenseStart
+from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
 from gs2d.training.free_space import FreeSpaceMaps
-from gs2d.training.plane_sweep import start_points, sweep_views
+from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
 from gs2d.training.rows import keep_rows
 from gs2d.training.seen_area import mostly_unseen
+from gs2d.training.start_fit import fit_start
 from gs2d.training.state import TrainState
 
 
@@ -41,25 +43,33 @@ class Robustness:
     Raises
     ------
     DataError
-        From the constructor: the capture does not say which sparse points its photographs show.
+        From the constructor: free space is to be kept, and the capture does not say which sparse points its photographs
+        show; or a plane sweep finds nothing to start from.
     """
 
     def __init__(self, scene: Scene, recipe: Recipe, raster: RasterSettings, backend: Backend) -> None:
         self.scene, self._given, self._recipe = scene, scene, recipe
         self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
+        self._sweep: Sweep | None = None  # until the first splats are fitted
         if recipe.dense_start is None and recipe.free_space is None:
             return
-        if scene.observe is None:
+        if scene.observe is None and recipe.free_space is not None:
             raise DataError(
-                f"{scene.name} must say which sparse points its photographs show (COLMAP does) for a dense start and "
-                "for free space; train with --robust off"
+                f"{scene.name} must say which sparse points its photographs show (COLMAP does) for free space; "
+                "train with --robust off"
             )
         sweep = sweep_views(scene, recipe.dense_start or DenseStart())
         if recipe.dense_start is not None:
             self.scene = replace(scene, points=start_points(scene, sweep, recipe.dense_start))
+            self._sweep = None if recipe.dense_start.fit is None else sweep
         if recipe.free_space is not None:
             self._free = FreeSpaceMaps(sweep, recipe.free_space)
+
+    def fitted(self, splats: Splats) -> Splats:
+        """Return the first splats as the dense start has them fitted; themselves where it fits none. Once."""
+        settings, sweep, self._sweep = self._recipe.dense_start, self._sweep, None
+        return splats if settings is None or sweep is None else fit_start(splats, sweep, settings)
 
     def move_to(self, device: torch.device | str) -> None:
         """Move all tensors to a device."""

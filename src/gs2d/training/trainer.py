@@ -113,7 +113,9 @@ class Trainer:
         self._pending: list[events.Event] = []
         if state is not None and init is not None:
             raise RunError("training goes on from a state or starts from init, got both; leave one out")
-        begins = self.recipe if init is None else replace(self.recipe, dense_start=None)
+        # What goes on has begun; free space is found by the settings of the dense start, so that sweep is made again.
+        goes_on = init is not None or (state is not None and self.recipe.free_space is None)
+        begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe
         self._robust = Robustness(scene, begins, self.settings, self.backend)
         self.state = self._new_state(dtype, init) if state is None else self._checked(state)
         self.state.move_to(self.backend.device)
@@ -312,7 +314,7 @@ class Trainer:
         source = initial.source if start is self._robust.scene else "depths"
         source = "sweep" if source == "points" and self.recipe.dense_start is not None else source
         self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped))
-        return per_image.start(TrainState(initial.splats, generator), self.recipe, self.scene)
+        return per_image.start(TrainState(self._robust.fitted(initial.splats), generator), self.recipe, self.scene)
 
     def _checked(self, state: TrainState) -> TrainState:
         """Return a state from outside, if it is of this recipe."""

@@ -1,0 +1,107 @@
+"""Between which depths a photograph is swept, and what its neighbours share with it.
+
+Sparse points say both where the capture tells which of them each photograph shows. Without, the scene's bounds do: a
+grid of places in that box, those that two photographs see and, where photographs have an alpha channel, those that
+lie in the silhouettes of all (the visual hull).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from gs2d.data.priors import ObservedPoints
+from gs2d.data.scene import Scene, View
+from gs2d.errors import DataError
+
+GRID = 64  # places along each side of the bounds
+MAX_PLACES = 2000  # of those, evenly chosen, by which neighbours are compared
+TRACK = 3  # photographs that a place counts as found in: ObservedPoints leaves out those with fewer
+
+
+@dataclass(frozen=True, eq=False)
+class SweepRange:
+    """What is known of depths before a sweep.
+
+    Attributes
+    ----------
+    observed : ObservedPoints
+        Sparse points, or places of the bounds, and which views show them.
+    limits : mapping of view name to (near, far) world units
+        Empty where the points say it.
+    """
+
+    observed: ObservedPoints
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def sweep_range(scene: Scene) -> SweepRange:
+    """Return where the training views of a scene are swept.
+
+    Raises
+    ------
+    DataError
+        No two training views see a place in the scene's bounds.
+    """
+    return _range_of_bounds(scene) if scene.observe is None else SweepRange(scene.observe())
+
+
+def _range_of_bounds(scene: Scene) -> SweepRange:
+    bounds = np.asarray(scene.bounds, dtype=np.float64)
+    sides = bounds[1] - bounds[0]
+    if not (np.isfinite(bounds).all() and (sides > 0).all()):
+        raise DataError(
+            f"a plane sweep without sparse points needs the box that {scene.name} lies in, got {bounds.tolist()}; "
+            "train with --set dense_start=null"
+        )
+    step = sides / GRID
+    ticks = [bounds[0][k] + (np.arange(GRID) + 0.5) * step[k] for k in range(3)]
+    places = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    half = 0.5 * float(np.linalg.norm(step))
+    inside = np.zeros((len(scene.train), len(places)), dtype=bool)
+    depths = np.zeros((len(scene.train), len(places)), dtype=np.float32)
+    left = np.ones(len(places), dtype=bool)
+    for index, view in enumerate(scene.train):
+        pixels, depths[index] = view.camera.project(places)
+        inside[index], outside = _shows(view, pixels, depths[index], half)
+        left &= ~outside
+    left &= inside.sum(axis=0) >= 2
+    if not left.any():
+        raise DataError(
+            f"a plane sweep of {scene.name} needs places in its bounds that two photographs show (inside the "
+            "silhouettes of all that have an alpha channel), got none; train with --set dense_start=null"
+        )
+    rows = np.flatnonzero(left)
+    limits = {}
+    for index, view in enumerate(scene.train):
+        z = depths[index, rows][inside[index, rows]]
+        if len(z):
+            least = max(float(z.min()) - half, 0.02 * float(z.max()))  # a camera may stand in the box
+            limits[view.name] = (least, float(z.max()) + half)
+    chosen = rows[:: max(1, len(rows) // MAX_PLACES)]
+    seen = {view.name: np.flatnonzero(inside[index, chosen]) for index, view in enumerate(scene.train)}
+    track = np.full(len(chosen), TRACK)
+    return SweepRange(ObservedPoints(places[chosen], np.zeros(len(chosen)), track, seen), limits)
+
+
+def _shows(view: View, pixels: np.ndarray, depth: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return which places lie in a picture (and in its silhouette), and which of them lie outside the silhouette.
+
+    ``half`` is the half diagonal of a cell of the grid: a silhouette is widened by what that is in pixels.
+    """
+    camera = view.camera
+    inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    alpha = view.alpha()
+    if alpha is None or not inside.any():
+        return inside, np.zeros(len(pixels), dtype=bool)
+    reach = int(np.ceil(half * max(camera.fx, camera.fy) / float(np.median(depth[inside]))))
+    solid = torch.from_numpy((alpha >= 0.5).astype(np.float32))[None]
+    for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
+        solid = F.max_pool2d(solid, size, 1, (size[0] // 2, size[1] // 2))
+    column, row = (np.clip(np.where(inside, pixels[:, k], 0), 0, None).astype(np.int64) for k in (0, 1))
+    within = (solid[0].numpy() > 0)[row, column]
+    return inside & within, inside & ~within
