@@ -21,6 +21,7 @@ from gs2d.core.memory import trim
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
+from gs2d.kernels.sweep import BestPlanes, sweep_planes
 from gs2d.training.sweep_range import SweepRange, sweep_range
 
 MIN_POINTS = 20  # sparse points of a view, below which its depths are unknown
@@ -290,28 +291,55 @@ def _depths(
         return np.zeros((height, width)), np.zeros((height, width), dtype=np.float32)
     step = (1 / view.near - 1 / view.far) / (settings.planes - 1)
     z = (1 / (1 / view.far + step * torch.arange(settings.planes, dtype=torch.float64))).float()  # far to near
-    variance = _blurred(view.grey * view.grey, settings.radius) - _blurred(view.grey, settings.radius) ** 2
-    each = [_ncc(view, views[other], z, variance.clamp_min(0), settings.radius) for other in neighbours]
+    best = best_planes(view, [views[other] for other in neighbours], z, settings.radius)
+    bend = best.before - 2 * best.score + best.after
+    shift = torch.where(bend < -1e-6, 0.5 * (best.before - best.after) / bend, torch.zeros_like(bend)).clamp(-0.5, 0.5)
+    depth = 1 / (1 / view.far + step * (best.plane + shift).double())
+    valid = (best.score >= settings.min_ncc) & (best.plane > 0) & (best.plane < settings.planes - 1)
+    valid &= (_variance(view, settings.radius)[0, 0] >= MIN_TEXTURE) & torch.from_numpy(view.usable)
+    return torch.where(valid, depth, torch.zeros_like(depth)).numpy(), best.score.numpy()
+
+
+def best_planes(view: SmallView, others: Sequence[SmallView], z: Tensor, radius: int) -> BestPlanes:
+    """Compare a view with others at depths z [D]; natively where that was built, else in torch: the same to rounding."""
+    pairs = [_homography(view, other) for other in others]
+    turned, moved = (torch.stack([pair[k] for pair in pairs]) for k in (0, 1))
+    grey = [other.grey[0, 0] for other in others]
+    usable = torch.from_numpy(view.usable)
+    found = sweep_planes(view.grey[0, 0], usable, grey, turned, moved, z, radius=radius, noise=NOISE)
+    return found or best_planes_reference(view, others, z, radius)
+
+
+def best_planes_reference(view: SmallView, others: Sequence[SmallView], z: Tensor, radius: int) -> BestPlanes:
+    """Do the same in torch."""
+    variance = _variance(view, radius)
+    each = [_ncc(view, other, z, variance, radius) for other in others]
     score = torch.stack(each).topk(min(2, len(each)), dim=0).values.mean(dim=0)  # [D, H, W]
     best, plane = score.max(dim=0)
-    inner = plane.clamp(1, settings.planes - 2)
-    left, middle, right = (score.gather(0, (inner + offset)[None])[0] for offset in (-1, 0, 1))
-    bend = left - 2 * middle + right
-    shift = torch.where(bend < -1e-6, 0.5 * (left - right) / bend, torch.zeros_like(bend)).clamp(-0.5, 0.5)
-    depth = 1 / (1 / view.far + step * (inner + shift).double())
-    valid = (best >= settings.min_ncc) & (plane > 0) & (plane < settings.planes - 1)
-    valid &= (variance[0, 0] >= MIN_TEXTURE) & torch.from_numpy(view.usable)
-    return torch.where(valid, depth, torch.zeros_like(depth)).numpy(), best.numpy()
+    inner = plane.clamp(1, len(z) - 2)
+    before, after = (score.gather(0, (inner + offset)[None])[0] for offset in (-1, 1))
+    return BestPlanes(best, plane, before, after)
+
+
+def _variance(view: SmallView, radius: int) -> Tensor:
+    """Variance [1, 1, H, W] of the grey values of each patch."""
+    return (_blurred(view.grey * view.grey, radius) - _blurred(view.grey, radius) ** 2).clamp_min(0)
+
+
+def _homography(view: SmallView, other: SmallView) -> tuple[Tensor, Tensor]:
+    """Return M [3, 3] and b [3]: pixel p (x, y, 1) at depth z is at z M p + b, homogeneous, in another view."""
+    motion = other.T @ np.linalg.inv(view.T)
+    turned = other.K @ motion[:3, :3] @ np.linalg.inv(view.K)
+    return torch.from_numpy(turned).float(), torch.from_numpy(other.K @ motion[:3, 3]).float()
 
 
 def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, radius: int) -> Tensor:
     """NCC [D, H, W] of the patches of a view with those of another at depths z [D]; -1 outside the other."""
     (height, width), (rows, columns) = view.size, other.size
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1).double()
-    motion = other.T @ np.linalg.inv(view.T)
-    turned = (torch.from_numpy(other.K @ motion[:3, :3] @ np.linalg.inv(view.K)) @ pixels).float()  # [3, HW]
-    moved = torch.from_numpy(other.K @ motion[:3, 3]).float()
+    pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1)
+    matrix, moved = _homography(view, other)
+    turned = matrix @ pixels  # [3, HW]
     mine = _blurred(view.grey, radius)
 
     def at_depths(some: Tensor) -> Tensor:

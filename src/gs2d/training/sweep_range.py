@@ -18,7 +18,7 @@ from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
 
-GRID = 64  # places along each side of the bounds
+GRID = 48  # places along each side of the bounds
 MAX_PLACES = 2000  # of those, evenly chosen, by which neighbours are compared
 TRACK = 3  # photographs that a place counts as found in: ObservedPoints leaves out those with fewer
 

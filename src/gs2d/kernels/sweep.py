@@ -1,0 +1,95 @@
+"""The plane sweep of one image, natively: ``cpu/sweep.cpp``. ``training/plane_sweep.py``, its only caller, has torch's."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gs2d.kernels.library import library_for
+
+__all__ = ["BestPlanes", "sweep_planes"]
+
+
+@dataclass(frozen=True, eq=False)
+class BestPlanes:
+    """What a sweep keeps of each pixel.
+
+    Attributes
+    ----------
+    score : Tensor [H, W]
+        Of the best plane: mean of the NCC with the two images that agree best.
+    plane : Tensor [H, W] int64
+    before, after : Tensor [H, W]
+        Scores of the planes beside it; anything where it is the first or the last.
+    """
+
+    score: Tensor
+    plane: Tensor
+    before: Tensor
+    after: Tensor
+
+
+class _Arguments(ctypes.Structure):
+    """``SweepArguments`` of cpu/sweep.cpp, with float32 arrays."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("height", "width", "planes", "neighbours", "radius")),
+        *((name, ctypes.c_void_p) for name in ("image", "wanted", "others", "sizes", "turned", "moved", "depths")),
+        ("noise", ctypes.c_float),
+        *((name, ctypes.c_void_p) for name in ("best", "plane", "before", "after")),
+    )
+
+
+def sweep_planes(
+    image: Tensor,
+    wanted: Tensor,
+    others: Sequence[Tensor],
+    turned: Tensor,
+    moved: Tensor,
+    depths: Tensor,
+    *,
+    radius: int,
+    noise: float,
+) -> BestPlanes | None:
+    """Return the best plane of each pixel of a grey image; None where the library is not there or does not have it.
+
+    Parameters
+    ----------
+    image : Tensor [H, W] float32
+    wanted : Tensor [H, W] bool
+        Of other pixels the score is -1.
+    others : sequence of n Tensor [h, w] float32
+        Each has its own size.
+    turned, moved : Tensor [n, 3, 3], [n, 3] float32
+        A pixel (x, y, 1) at depth z is shown by an other at ``z turned (x, y, 1) + moved``, homogeneous.
+    depths : Tensor [D] float32, world units
+    radius : int
+        Patches are of 2 radius + 1 pixels a side; images are mirrored at their edges.
+    noise : float
+        Variance that is no texture: added to both sides of the NCC.
+
+    Raises
+    ------
+    MemoryError
+    """
+    library = library_for(image)
+    if library is None or library.dtype != torch.float32 or not library.has("gs2d_sweep"):
+        return None
+    height, width = image.shape
+    images = [tensor.contiguous() for tensor in others]
+    inputs = [tensor.contiguous() for tensor in (image, wanted.to(torch.uint8), turned, moved, depths)]
+    sizes = torch.tensor([list(tensor.shape) for tensor in images], dtype=torch.int64)
+    addresses = torch.tensor([tensor.data_ptr() for tensor in images], dtype=torch.int64)
+    best, before, after = (torch.full((height, width), -1.0) for _ in range(3))
+    plane = torch.zeros(height, width, dtype=torch.int32)
+    at = dict(zip(("image", "wanted", "turned", "moved", "depths"), (t.data_ptr() for t in inputs), strict=True))
+    at |= {"best": best.data_ptr(), "plane": plane.data_ptr(), "before": before.data_ptr(), "after": after.data_ptr()}
+    counts = {"height": height, "width": width, "planes": len(depths), "neighbours": len(images), "radius": radius}
+    arguments = _Arguments(**counts, **at, others=addresses.data_ptr(), sizes=sizes.data_ptr(), noise=noise)
+    if not library.function("gs2d_sweep", ctypes.c_int, [ctypes.c_void_p])(ctypes.byref(arguments)):
+        raise MemoryError("no memory for a plane sweep")
+    return BestPlanes(best, plane.long(), before, after)
