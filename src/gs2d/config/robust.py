@@ -211,4 +211,6 @@ def _check_fit(at: str, fit: StartFit) -> None:
     for name in ("ridge", "opacity", "size", "max_size"):
         number(f"{at}.{name}", getattr(fit, name), low=0.0)
     require(0 < fit.opacity < 1, f"{at}.opacity must be in (0, 1), got {fit.opacity}")
-    require(fit.size > 0 and fit.max_size > 0, f"{at}.size and max_size must be positive, got {fit.size}, {fit.max_size}")
+    require(
+        fit.size > 0 and fit.max_size > 0, f"{at}.size and max_size must be positive, got {fit.size}, {fit.max_size}"
+    )

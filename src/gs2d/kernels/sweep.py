@@ -1,4 +1,4 @@
-"""The plane sweep of one image, natively: ``cpu/sweep.cpp``. ``training/plane_sweep.py``, its only caller, has torch's."""
+"""The plane sweep of one image, natively (``cpu/sweep.cpp``); ``training/plane_sweep.py`` has the same in torch."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def sweep_planes(
     ----------
     image : Tensor [H, W] float32
     wanted : Tensor [H, W] bool
-        Of other pixels the score is -1.
+        Nothing is asked of other pixels: their score is -1, or what it would be.
     others : sequence of n Tensor [h, w] float32
         Each has its own size.
     turned, moved : Tensor [n, 3, 3], [n, 3] float32

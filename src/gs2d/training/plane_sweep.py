@@ -301,9 +301,9 @@ def _depths(
 
 
 def best_planes(view: SmallView, others: Sequence[SmallView], z: Tensor, radius: int) -> BestPlanes:
-    """Compare a view with others at depths z [D]; natively where that was built, else in torch: the same to rounding."""
+    """Compare a view with others at depths z [D]: natively where that was built, else in torch; alike to rounding."""
     pairs = [_homography(view, other) for other in others]
-    turned, moved = (torch.stack([pair[k] for pair in pairs]) for k in (0, 1))
+    turned, moved = (torch.stack([pair[k] for pair in pairs]).float() for k in (0, 1))
     grey = [other.grey[0, 0] for other in others]
     usable = torch.from_numpy(view.usable)
     found = sweep_planes(view.grey[0, 0], usable, grey, turned, moved, z, radius=radius, noise=NOISE)
@@ -327,19 +327,19 @@ def _variance(view: SmallView, radius: int) -> Tensor:
 
 
 def _homography(view: SmallView, other: SmallView) -> tuple[Tensor, Tensor]:
-    """Return M [3, 3] and b [3]: pixel p (x, y, 1) at depth z is at z M p + b, homogeneous, in another view."""
+    """Return float64 M [3, 3], b [3]: pixel p (x, y, 1) at depth z is at z M p + b, homogeneous, in another view."""
     motion = other.T @ np.linalg.inv(view.T)
     turned = other.K @ motion[:3, :3] @ np.linalg.inv(view.K)
-    return torch.from_numpy(turned).float(), torch.from_numpy(other.K @ motion[:3, 3]).float()
+    return torch.from_numpy(turned), torch.from_numpy(other.K @ motion[:3, 3])
 
 
 def _ncc(view: SmallView, other: SmallView, z: Tensor, variance: Tensor, radius: int) -> Tensor:
     """NCC [D, H, W] of the patches of a view with those of another at depths z [D]; -1 outside the other."""
     (height, width), (rows, columns) = view.size, other.size
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1)
-    matrix, moved = _homography(view, other)
-    turned = matrix @ pixels  # [3, HW]
+    pixels = torch.stack([x, y, torch.ones_like(x)]).reshape(3, -1).double()
+    matrix, shift = _homography(view, other)
+    turned, moved = (matrix @ pixels).float(), shift.float()  # [3, HW], [3]
     mine = _blurred(view.grey, radius)
 
     def at_depths(some: Tensor) -> Tensor:

@@ -1,0 +1,97 @@
+"""The native plane sweep against the one in torch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.config.robust import DenseStart
+from gs2d.kernels import sweep as native
+from gs2d.kernels.library import load
+from gs2d.training import plane_sweep
+from gs2d.training.plane_sweep import SmallView, best_planes, best_planes_reference, sweep_views
+from wall_scene import WALL, wall
+
+Z = 1 / torch.linspace(1 / 7.0, 1 / 2.5, 23)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[SmallView]:
+    return list(sweep_views(wall(), DenseStart(side=48, planes=8, min_angle=1.0)).views)
+
+
+@pytest.fixture(autouse=True)
+def built() -> None:
+    if not load().has("gs2d_sweep"):
+        pytest.skip("the kernels were built before there was a plane sweep; run `make kernels`")
+
+
+def assert_like(score: torch.Tensor, true: torch.Tensor, view: SmallView) -> None:
+    """Scores of float32: a bare patch has a variance of 1e-4 (the noise), of which rounding is a thousandth."""
+    torch.testing.assert_close(score, true, atol=3e-3, rtol=0)
+    textured = plane_sweep._variance(view, 1)[0, 0] > 1e-3
+    assert textured.float().mean() > 0.3
+    torch.testing.assert_close(score[textured], true[textured], atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize(("others", "radius"), [((1,), 3), ((1, 3), 2), ((0, 1, 3, 4), 1), ((1, 3, 4), 7)])
+def test_it_finds_the_planes_and_scores_that_torch_finds(
+    views: list[SmallView], others: tuple[int, ...], radius: int
+) -> None:
+    beside = [views[k] for k in others]
+    found, true = best_planes(views[2], beside, Z, radius), best_planes_reference(views[2], beside, Z, radius)
+    assert_like(found.score, true.score, views[2])
+    same, textured = found.plane == true.plane, plane_sweep._variance(views[2], radius)[0, 0] > 1e-3
+    assert same[textured].float().mean() > 0.99
+    inner = same & (true.plane > 0) & (true.plane < len(Z) - 1)
+    assert inner.float().mean() > 0.4
+    for name in ("before", "after"):
+        torch.testing.assert_close(getattr(found, name)[inner], getattr(true, name)[inner], atol=2e-3, rtol=0)
+    depth = Z[found.plane][(found.score > 0.9) & textured]
+    assert float((depth / WALL - 1).abs().median()) < 0.05
+
+
+def test_images_of_other_sizes_are_compared_and_what_they_do_not_show_is_unknown(views: list[SmallView]) -> None:
+    cut = replace(views[3], grey=views[3].grey[:, :, :20, :31].contiguous())
+    found, true = best_planes(views[2], [cut], Z, 2), best_planes_reference(views[2], [cut], Z, 2)
+    assert_like(found.score, true.score, views[2])
+    assert (found.score == -1).float().mean() > 0.1
+    turned = views[3].T.copy()
+    turned[:3] = np.diag([-1.0, 1.0, -1.0]) @ turned[:3]  # it looks the other way
+    away = replace(views[3], T=turned)
+    assert (best_planes(views[2], [away], Z, 2).score == -1).all()
+
+
+def test_nothing_is_asked_of_pixels_that_are_left_out(views: list[SmallView]) -> None:
+    usable = np.zeros(views[2].size, dtype=bool)
+    usable[5:20, 25:40] = True
+    some = best_planes(replace(views[2], usable=usable), views[3:], Z, 3)
+    all_ = best_planes(views[2], views[3:], Z, 3)
+    assert (some.score[:, :25] == -1).all()
+    assert torch.equal(some.score[torch.from_numpy(usable)], all_.score[torch.from_numpy(usable)])
+    nothing = best_planes(replace(views[2], usable=usable & False), views[3:], Z, 3)
+    assert (nothing.score == -1).all()
+
+
+def test_the_result_is_the_same_for_any_number_of_threads(views: list[SmallView]) -> None:
+    tall = [replace(v, grey=v.grey.repeat(1, 1, 4, 1), usable=np.tile(v.usable, (4, 1))) for v in views]
+    results = []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            results.append(best_planes(tall[2], tall[3:], Z, 3))
+    finally:
+        torch.set_num_threads(1)
+    assert torch.equal(results[0].score, results[1].score)
+    assert torch.equal(results[0].plane, results[1].plane)
+
+
+def test_without_the_library_torch_does_it(views: list[SmallView], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "library_for", lambda tensor: None)
+    used = []
+    monkeypatch.setattr(plane_sweep, "best_planes_reference", lambda *a: used.append(1) or best_planes_reference(*a))
+    best_planes(views[2], views[3:], Z, 2)
+    assert used

@@ -1,0 +1,225 @@
+"""A dense start of photographs without sparse points: where is swept, what is found, how splats are fitted to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from gs2d.config.presets import two_dgs
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.robust import DenseStart, FreeSpace, StartFit
+from gs2d.config.schedule import scale_schedule
+from gs2d.config.serialize import from_json, to_json
+from gs2d.core.camera import look_at
+from gs2d.core.sh import sh_to_rgb
+from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.errors import DataError, RecipeError
+from gs2d.evaluation.images import psnr_float
+from gs2d.render.api import rasterize
+from gs2d.training import start_fit
+from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
+from gs2d.training.start_fit import fit_start
+from gs2d.training.sweep_range import sweep_range
+from gs2d.training.trainer import Trainer
+from tiny import RADIUS, ball_image
+from wall_scene import WALL, wall
+
+BALL = DenseStart(side=64, planes=40, neighbours=3, cell=2.0, radius=2, agree=0.02)
+PIXEL = 3.0 / 80  # world units at the middle of the ball
+BOUNDS = np.array([[-1.2, -1.2, -1.2], [1.3, 1.2, 1.2]])
+
+
+@cache
+def ball() -> Scene:
+    """A mottled ball with an alpha channel, photographed from a ring of cameras 12 degrees apart; no points."""
+    views = []
+    for i, turn in enumerate(np.radians(np.arange(0, 360, 12))):
+        eye = 3.0 * np.array([np.cos(turn), np.sin(turn), 0.1])
+        camera = look_at(eye, np.zeros(3), np.array([0.0, 0, 1]), width=64, height=64, fx=80.0)
+        views.append(View.from_arrays(f"{i:02d}.png", camera, ball_image(camera)))
+    return Scene("ball", "blender", tuple(views), (), None, 3.3, BOUNDS)
+
+
+@cache
+def swept_ball() -> Sweep:
+    return sweep_views(ball(), BALL)
+
+
+def pointless_wall() -> Scene:
+    return replace(wall(), observe=None, points=None, bounds=np.array([[-1.5, -1.2, 3.0], [1.5, 1.2, 5.0]]))
+
+
+# -- where is swept -------------------------------------------------------------------------------------------------
+def test_a_view_is_swept_between_the_nearest_and_the_farthest_place_in_the_silhouettes_of_all() -> None:
+    found = sweep_range(ball())
+    cell = float(np.linalg.norm(BOUNDS[1] - BOUNDS[0])) / 48
+    for view in ball().train:
+        distance = float(np.linalg.norm(view.camera.center))
+        near, far = found.limits[view.name]
+        assert distance - RADIUS - 4 * cell < near < distance - RADIUS
+        assert distance + RADIUS < far < distance + 1.25 * RADIUS + 4 * cell  # the hull of a ring has poles
+    assert np.linalg.norm(found.observed.points, axis=1).max() < 1.3 * RADIUS + 2 * cell
+    assert len(found.observed.points) <= 2 * 2000
+
+
+def test_without_silhouettes_it_is_the_part_of_the_bounds_that_two_photographs_show() -> None:
+    found = sweep_range(pointless_wall())
+    for near, far in found.limits.values():
+        assert 2.8 < near < 3.2
+        assert 4.9 < far < 5.4
+
+
+def test_sparse_points_say_it_where_there_are_some() -> None:
+    assert not sweep_range(wall()).limits
+    assert len(sweep_range(wall()).observed.points) == 300
+
+
+def test_a_wall_without_points_is_found_as_with_them() -> None:
+    sweep = sweep_views(pointless_wall(), DenseStart(side=48, planes=32, min_angle=1.0))
+    depth = sweep.depths[2][:, 20:]
+    assert (depth > 0).mean() > 0.8
+    assert np.median(np.abs(depth[depth > 0] / WALL - 1)) < 0.02
+
+
+# -- what is found --------------------------------------------------------------------------------------------------
+def test_places_lie_on_the_ball_and_in_no_background() -> None:
+    cloud = start_points(ball(), swept_ball(), BALL)
+    off = np.abs(np.linalg.norm(cloud.points, axis=1) - RADIUS)
+    assert len(cloud) > 300
+    assert np.median(off) < PIXEL
+    assert np.percentile(off, 95) < 3 * PIXEL
+    assert cloud.normals is not None
+    outward = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
+    assert np.median(np.abs((cloud.normals * outward).sum(axis=1))) > 0.85
+    for depth, view in zip(swept_ball().depths, ball().train, strict=True):
+        alpha = view.alpha()
+        assert alpha is not None
+        assert not (depth > 0)[alpha < 0.5].any()
+
+
+@pytest.mark.parametrize(
+    ("scene", "settings", "said"),
+    [
+        (ball(), replace(BALL, min_angle=1.0, max_angle=1.1), "ball needs photographs .* 1 to 1.1 degrees apart"),
+        (replace(ball(), bounds=BOUNDS * 0), BALL, "needs the box that ball lies in"),
+        (replace(ball(), bounds=BOUNDS + 50), BALL, "places in its bounds that two photographs show"),
+        (ball(), replace(BALL, min_ncc=1.1), "found 0 places on which photographs agree"),
+    ],
+)
+def test_a_sweep_that_has_nothing_to_go_by_says_so_in_one_line(scene: Scene, settings: DenseStart, said: str) -> None:
+    with pytest.raises(DataError, match=said) as raised:
+        Trainer(scene, recipe(settings), GENERIC, backend="reference")
+    assert "dense_start=null" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_sparse_points_are_a_start_where_no_photographs_can_be_compared() -> None:
+    points = PointCloud(np.random.default_rng(0).normal(size=(30, 3)) * 0.3)
+    alone = replace(BALL, min_angle=1.0, max_angle=1.1)
+    scene = replace(ball(), points=points)
+    assert len(start_points(scene, sweep_views(scene, alone), alone)) == 30
+
+
+def test_free_space_still_needs_sparse_points() -> None:
+    with pytest.raises(DataError, match="must say which sparse points .* for free space"):
+        Trainer(ball(), replace(recipe(BALL), free_space=FreeSpace()), GENERIC, backend="reference")
+
+
+# -- how splats are fitted ------------------------------------------------------------------------------------------
+def recipe(settings: DenseStart, iterations: int = 6) -> Recipe:
+    made = scale_schedule(two_dgs(), iterations / 30_000)
+    stage = replace(made.stages[0], densify=None, sh_interval=0)
+    return replace(made, stages=(stage,), sh_degree=2, dense_start=settings)
+
+
+def test_colours_are_those_of_least_squares_over_the_views_that_see_a_splat() -> None:
+    rng = torch.Generator().manual_seed(0)
+    true = 0.2 * torch.randn(1, 9, 3, generator=rng, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(30, 3, generator=rng, dtype=torch.float64), dim=1)
+    basis = start_fit.sh_basis(directions, 2)
+    colors = basis @ true[0]  # minus 1/2
+    gram, right = (basis.T @ basis)[None], (basis.T @ colors)[None]
+    exact = start_fit._solved(gram, right, StartFit(sh_degree=2, ridge=0.0))
+    torch.testing.assert_close(exact, true, atol=1e-7, rtol=0)
+    damped = start_fit._solved(gram, right, StartFit(sh_degree=2, ridge=1e9))
+    assert damped[0, 1:].abs().max() < 1e-6
+    mean = (basis[:, :1] * colors).sum(dim=0) / (basis[:, 0] ** 2).sum()
+    torch.testing.assert_close(damped[0, 0], mean, atol=1e-6, rtol=0)
+
+
+def test_a_fitted_start_looks_more_like_the_photographs_than_an_unfitted_one() -> None:
+    def likeness(settings: DenseStart) -> float:
+        trainer = Trainer(ball(), recipe(settings), GENERIC, backend="auto")
+        values = []
+        for view in ball().train[::6]:
+            image = rasterize(trainer.splats, view.camera, trainer.settings, backend=trainer.backend).color.detach()
+            values.append(psnr_float(image, torch.from_numpy(view.target(trainer.settings.background).copy())))
+        return float(np.mean(values))
+
+    plain, fitted = likeness(BALL), likeness(replace(BALL, fit=StartFit(opacity=0.9, size=1.0)))
+    assert fitted > plain + 1
+
+
+def test_a_splat_has_the_colour_that_the_views_show_its_opacity_and_a_bounded_size() -> None:
+    fit = StartFit(sh_degree=1, opacity=0.7, size=0.5, max_size=1.5)
+    plain = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
+    fitted = fit_start(plain, swept_ball(), replace(BALL, fit=fit))
+    assert torch.equal(fitted.means, plain.means)
+    assert torch.equal(fitted.quats, plain.quats)
+    torch.testing.assert_close(fitted.opacities, torch.full_like(fitted.opacities, 0.7))
+    assert (fitted.scales <= 1.5 * 1.1 * PIXEL).all()
+    small = plain.scales * 0.5 < 1.5 * 0.6 * PIXEL  # the nearest camera is 1 - 1.1 x 0.8 / 3 of the distance away
+    assert small.float().mean() > 0.5
+    torch.testing.assert_close(fitted.scales[small], 0.5 * plain.scales[small])
+    shown = sh_to_rgb(fitted.sh0, fitted.shN, torch.nn.functional.normalize(-fitted.means, dim=1), 1)  # from outside
+    true = 0.5 + 0.4 * fitted.means / RADIUS + 0.1 * torch.sin(9 * fitted.means)
+    assert (shown - true).abs().median() < 0.03
+    assert (fitted.shN[:, 3:] == 0).all()
+
+
+def test_a_splat_that_no_view_sees_keeps_its_colour() -> None:
+    plain = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
+    hidden = plain.rows(torch.arange(len(plain)) < 3)
+    hidden = replace(hidden, means=torch.zeros(3, 3))  # in the middle of the ball
+    fitted = fit_start(hidden, swept_ball(), replace(BALL, fit=StartFit(sh_degree=1)))
+    assert torch.equal(fitted.sh0, hidden.sh0)
+    assert torch.equal(fitted.shN, hidden.shN)
+
+
+# -- in training ----------------------------------------------------------------------------------------------------
+def test_a_resumed_training_sweeps_nothing_again_and_ends_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = recipe(replace(BALL, fit=StartFit()))
+    whole = Trainer(ball(), made, GENERIC, backend="auto").run()
+    first = Trainer(ball(), made, GENERIC, backend="auto")
+    first.enter(0)
+    for _ in range(4):
+        first.step()
+    state = type(first.state).from_state_dict(first.state.state_dict())
+    monkeypatch.setattr("gs2d.training.robust.sweep_views", None)
+    again = Trainer(ball(), made, GENERIC, backend="auto", state=state).run()
+    assert all(torch.equal(a, b) for (_, a), (_, b) in zip(whole.items(), again.items(), strict=True))
+
+
+def test_a_fit_is_written_only_where_there_is_one_and_read_again() -> None:
+    assert "fit" not in to_json(recipe(BALL))["dense_start"]
+    made = recipe(replace(BALL, fit=StartFit(sh_degree=2)))
+    assert from_json(to_json(made)) == made
+
+
+@pytest.mark.parametrize(
+    ("fit", "said"),
+    [
+        (StartFit(sh_degree=4), "dense_start.fit.sh_degree must be 0, 1, 2 or 3, got 4"),
+        (StartFit(opacity=1.0), r"dense_start.fit.opacity must be in \(0, 1\), got 1.0"),
+        (StartFit(size=0.0), "dense_start.fit.size and max_size must be positive"),
+        (StartFit(ridge=-1.0), "dense_start.fit.ridge"),
+    ],
+)
+def test_a_fit_that_cannot_be_made_is_refused(fit: StartFit, said: str) -> None:
+    with pytest.raises(RecipeError, match=said):
+        validate(recipe(replace(BALL, fit=fit)))
