@@ -149,6 +149,26 @@ def test_the_colmap_capture_of_these_tests_is_good_when_nothing_is_broken(
     assert json.loads(capsys.readouterr().out)["points"] == 20
 
 
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        ('{"min_angle": 1.0, "max_angle": 1.1}', "needs photographs whose lines of sight are 1 to 1.1 degrees apart"),
+        ('{"min_ncc": 2.0, "max_angle": 170.0}', "found 0 places on which photographs agree"),
+        ('{"planes": 1}', "dense_start.planes"),
+        ('{"fit": {"opacity": 1.5}}', "dense_start.fit.opacity must be in (0, 1), got 1.5"),
+    ],
+)
+def test_a_plane_sweep_that_finds_nothing_is_told_in_one_line_and_leaves_no_run(
+    start: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_capture(tmp_path / "capture")
+    out = tmp_path / "run"
+    words = ["train", str(tmp_path / "capture"), "--out", str(out), "--quiet", *TINY, "--set", f"dense_start={start}"]
+    assert run(words) == 2
+    assert said in one_line(capsys.readouterr().err)
+    assert not out.exists()
+
+
 def masked_colmap(folder: Path, black: tuple[int, ...]) -> None:
     """The ball in COLMAP's layout with masks, of which some are black; view 0 is the test view."""
     from PIL import Image
