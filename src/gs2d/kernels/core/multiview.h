@@ -1,8 +1,8 @@
-// Two views of one surface: a patch warped by the plane of its pixel, and the way of a pixel to the other view and back.
+// Two views of one surface: a patch warped by its pixel's plane, and the way of a pixel to the other view and back.
 // Formulas and gradients: docs/math.md, "Two views"; losses/multiview.py has the same in torch.
 //
-// A pixel of a view, with depth d along its ray (z = 1) and a rendered normal q, is a plane. Its point X = d ray lies at
-// R X + t for the neighbour. Places are px from the centre of an image's first pixel, so cx and cy of a `Lens` are too.
+// A pixel of a view, with depth d along its ray (z = 1) and a rendered normal q, is a plane. Its point X = d ray lies
+// at R X + t for the neighbour. Places are px from the centre of an image's first pixel; so are cx and cy of a `Lens`.
 #pragma once
 
 #include "core/base.h"
@@ -13,6 +13,11 @@ constexpr double MIN_COSINE = 0.1;        // between normal and ray: a plane see
 constexpr double MIN_SCALE = 0.1;         // depth in the neighbour in that here: below, a patch comes too close to it
 constexpr double MIN_NORMAL = 1e-4;       // length of a rendered normal that has a direction
 constexpr double ROUND_TRIP_EPS = 1e-12;  // px^2, under the root of a distance: no gradient is infinite
+
+// Rows of CompareArguments. Those of `motion_gradients`: of the similarity by R, t and the world's rotation, then of
+// the round trip by R and t.
+constexpr int VALUE_ROWS = 2, GRADIENT_ROWS = 5, MOTION_ROWS = 33;
+constexpr int TURN_ROW = 0, SHIFT_ROW = 9, WORLD_ROW = 12, TRIP_TURN_ROW = 21, TRIP_SHIFT_ROW = 30;
 
 // P pixels of a view beside one neighbour. R is the type of the arrays.
 template <class R> struct CompareArguments {
@@ -44,7 +49,9 @@ template <class V, class R> GS2D_HD Lens<V> lens_of(const double* lens, double b
 template <class V> struct Rows3 {
     Vec3<V> x, y, z;
 };
-template <class V> GS2D_HD Vec3<V> times(const Rows3<V>& m, Vec3<V> v) { return {dot(m.x, v), dot(m.y, v), dot(m.z, v)}; }
+template <class V> GS2D_HD Vec3<V> times(const Rows3<V>& m, Vec3<V> v) {
+    return {dot(m.x, v), dot(m.y, v), dot(m.z, v)};
+}
 template <class V> GS2D_HD Vec3<V> transposed_times(const Rows3<V>& m, Vec3<V> v) {
     return axpy(v.x, m.x, axpy(v.y, m.y, v.z * m.z));
 }
@@ -126,8 +133,8 @@ template <class V> struct PatchPlaneGrad {
 };
 
 template <class V>
-GS2D_HD PatchPlaneGrad<V> patch_plane_vjp(const PatchPlane<V>& p, Vec3<V> g_right, Vec3<V> g_down, Vec3<V> g_middle, V depth,
-                                          Vec3<V> ray, const Motion<V>& m, const Lens<V>& lens) {
+GS2D_HD PatchPlaneGrad<V> patch_plane_vjp(const PatchPlane<V>& p, Vec3<V> g_right, Vec3<V> g_down, Vec3<V> g_middle,
+                                          V depth, Vec3<V> ray, const Motion<V>& m, const Lens<V>& lens) {
     const Vec3<V> right = (V(1.f) / lens.fx) * g_right, down = (V(1.f) / lens.fy) * g_down;
     const V g_x = dot(right, m.shift), g_y = dot(down, m.shift);
     const V g_offset = -(p.inverse * fma(g_x, p.slope_x, g_y * p.slope_y));  // of q . X
@@ -191,8 +198,8 @@ template <class V> struct RoundTrip {
     Vec3<V> by_seen, by_met, by_returned;  // derivatives by R X + t, by `met`, and by R^T met
 };
 
-// `there` is the lens of the neighbour's depths, which `read` samples at a place. `is_clear` says whether a patch around
-// what a ray of the neighbour (z = 1) meets may be compared.
+// `there` is the lens of the neighbour's depths, which `read` samples at a place. `is_clear` says whether a patch
+// around what a ray of the neighbour (z = 1) meets may be compared.
 template <class V, class Read, class Clear>
 GS2D_HD RoundTrip<V> round_trip(V depth, Vec3<V> ray, const Motion<V>& m, const Lens<V>& here, const Lens<V>& there,
                                 V last_x, V last_y, Read read, Clear is_clear) {

@@ -69,13 +69,18 @@ struct Pixels {
     }
 };
 
-// Of a pixel of the patches: its greys here and there, less those of the middle, and what pulls that there to the plane.
+// A pixel of the patches: its greys here and there, less those of the middle, and what pulls that there to the plane.
 struct Grey {
     V a, b;
     Vec3<V> pull;
 };
 
 class Comparison {
+    // Leaves the k-th number of each lane that counts in row + k of the motion's gradients.
+    auto rows_from(int row, const Pixels& p, M counts) const {
+        return [this, row, &p, counts](int k, V v) { leave(a.motion_gradients, row + k, p, keep(counts, v)); };
+    }
+
   public:
     explicit Comparison(const CompareArguments<real>& a)
         : a(a),
@@ -90,21 +95,20 @@ class Comparison {
     void run(int64_t first, Grey* greys) const {
         Pixels p;
         if (!p.set(a, here, first)) {
-            for (int row = 0; row < 2; ++row) leave(a.values, row, p, V(real(0)));
-            for (int row = 0; a.gradients && row < 5; ++row) leave(a.gradients, row, p, V(real(0)));
-            for (int row = 0; a.motion_gradients && row < 33; ++row) leave(a.motion_gradients, row, p, V(real(0)));
-            return;
+            leave_nothing(a.values, VALUE_ROWS, p), leave_nothing(a.gradients, GRADIENT_ROWS, p);
+            return leave_nothing(a.motion_gradients, MOTION_ROWS, p);
         }
         const auto clear = [this](V u, V v) { return is_clear(u, v); };
-        const RoundTrip<V> trip = round_trip(p.depth, p.ray, motion, here, surface_lens, surface.last_x, surface.last_y, surface, clear);
+        const RoundTrip<V> trip = round_trip(p.depth, p.ray, motion, here, surface_lens, surface.last_x, surface.last_y,
+                                             surface, clear);
         const M counts = trip.back & p.chosen & (trip.error < V(real(a.occluded)));
         const V weight = keep(counts, exp(-trip.error));
         leave(a.values, 1, p, keep(counts, weight * trip.error));
         if (a.gradients) leave(a.gradients, 4, p, keep(counts, weight * trip.by_depth));
         if (a.motion_gradients) {
             const MotionGrad<V> g = motion_grad(trip, p.depth, p.ray);
-            each_of(g.turn, weight, [&](int k, V v) { leave(a.motion_gradients, 21 + k, p, keep(counts, v)); });
-            each_of(g.shift, weight, [&](int k, V v) { leave(a.motion_gradients, 30 + k, p, keep(counts, v)); });
+            each_of(g.turn, weight, rows_from(TRIP_TURN_ROW, p, counts));
+            each_of(g.shift, weight, rows_from(TRIP_SHIFT_ROW, p, counts));
         }
         compare(p, weight, greys);
     }
@@ -117,6 +121,10 @@ class Comparison {
 
     void leave(real* rows, int row, const Pixels& p, V values) const {
         store_first(rows + row * a.count + p.first, values, p.count);
+    }
+
+    void leave_nothing(real* rows, int count, const Pixels& p) const {
+        for (int row = 0; rows != nullptr && row < count; ++row) leave(rows, row, p, V(real(0)));
     }
 
     M is_clear(V u, V v) const {
@@ -156,11 +164,9 @@ class Comparison {
         each_of(normal, by_ncc, [&](int k, V v) { leave(a.gradients, 1 + k, p, keep(valid, v)); });
         if (a.motion_gradients == nullptr) return;
         const MotionGrad<V> m = motion_grad(plane, g, middle, p.ray);
-        const auto from = [&](int row) {
-            return [this, row, &p, valid](int k, V v) { leave(a.motion_gradients, row + k, p, keep(valid, v)); };
-        };
-        each_of(m.turn, by_ncc, from(0)), each_of(m.shift, by_ncc, from(9));
-        each_of(outer(g.normal, p.q), by_ncc, from(12));
+        each_of(m.turn, by_ncc, rows_from(TURN_ROW, p, valid));
+        each_of(m.shift, by_ncc, rows_from(SHIFT_ROW, p, valid));
+        each_of(outer(g.normal, p.q), by_ncc, rows_from(WORLD_ROW, p, valid));
     }
 
     // A square stays convex: all of the patch is where its corners are.
@@ -204,17 +210,17 @@ class Comparison {
 
 using namespace gs2d;
 
-// Fills `values`, `gradients` and `motion_gradients` of the arguments, and the sums [2] and [33] of the first and the last.
-// Returns 0, or 1 when there is no memory.
+// Fills `values`, `gradients` and `motion_gradients` of the arguments, and the sums [2] and [33] of the first and the
+// last. Returns 0, or 1 when there is no memory.
 GS2D_EXPORT int gs2d_compare_views(const CompareArguments<real>* arguments, double* sums) {
     const CompareArguments<real>& a = *arguments;
     const Comparison comparison(a);
-    const size_t side = static_cast<size_t>(2 * a.radius + 1);
+    const size_t side = static_cast<size_t>(2 * a.radius + 1), line = alignof(Grey);
     int failed = 0;
     parallel_ranges((a.count + LANES - 1) / LANES, GROUPS, [&](int64_t begin, int64_t end) {
-        void* const block = std::malloc(side * side * sizeof(Grey) + alignof(Grey));
+        void* const block = std::malloc(side * side * sizeof(Grey) + line);
         if (block == nullptr) return __atomic_store_n(&failed, 1, __ATOMIC_RELAXED);
-        const uintptr_t aligned = (reinterpret_cast<uintptr_t>(block) + alignof(Grey) - 1) / alignof(Grey) * alignof(Grey);
+        const uintptr_t aligned = (reinterpret_cast<uintptr_t>(block) + line - 1) / line * line;
         for (int64_t i = begin; i < end; ++i) comparison.run(i * LANES, reinterpret_cast<Grey*>(aligned));
         std::free(block);
     });
@@ -224,7 +230,7 @@ GS2D_EXPORT int gs2d_compare_views(const CompareArguments<real>* arguments, doub
             for (int64_t k = 0; k < a.count; ++k) to[row] += double(rows[k]);
         }
     };
-    sum_rows(a.values, 2, sums);
-    if (a.motion_gradients != nullptr) sum_rows(a.motion_gradients, 33, sums + 2);
+    sum_rows(a.values, VALUE_ROWS, sums);
+    if (a.motion_gradients != nullptr) sum_rows(a.motion_gradients, MOTION_ROWS, sums + VALUE_ROWS);
     return failed;
 }

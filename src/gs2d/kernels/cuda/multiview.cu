@@ -1,6 +1,6 @@
-// Patches of a view beside those of a neighbour: a warp for each pixel, its lanes the pixels of the patch. All lanes work
-// out the plane and the way there and back, which is a hundredth of the work; the patch is sampled twice, for the sums
-// and for the gradient. A pixel's numbers are its own: nothing is added up across pixels here.
+// Patches of a view beside those of a neighbour: a warp for each pixel, its lanes the pixels of the patch. All lanes
+// work out the plane and the way there and back, which is a small part of the work; the patch is sampled twice, for the
+// sums and for the gradient. A pixel's numbers are its own: nothing is added up across pixels here.
 #include "core/multiview.h"
 #include "cuda/common.h"
 
@@ -14,7 +14,8 @@ struct ImageBetween {
     int64 width, height;
     __device__ __forceinline__ Sampled<float> operator()(float x, float y) const {
         x = min(max(x, 0.f), float(width - 1)), y = min(max(y, 0.f), float(height - 1));
-        const float i = min(whole(x), float(width > 1 ? width - 2 : 0)), j = min(whole(y), float(height > 1 ? height - 2 : 0));
+        const float i = min(whole(x), float(width > 1 ? width - 2 : 0));
+        const float j = min(whole(y), float(height > 1 ? height - 2 : 0));
         const int64 right = width > 1, below = height > 1 ? width : 0;
         const float* at = pixels + int64(j) * width + int64(i);
         return between(at[0], at[right], at[below], at[below + right], x - i, y - j);
@@ -74,7 +75,8 @@ __device__ __forceinline__ bool patch_is_inside(const ImageBetween& source, cons
         const float i = float(corner & 1 ? radius : -radius), j = float(corner & 2 ? radius : -radius);
         const Vec3<float> h = axpy(i, plane.right, axpy(j, plane.down, plane.middle));
         const PatchPlace<float> at = patch_place(h);
-        inside = inside && h.z > float(MIN_SCALE) && source.contains(fma(there.fx, at.x, there.cx), fma(there.fy, at.y, there.cy));
+        inside = inside && h.z > float(MIN_SCALE) &&
+                 source.contains(fma(there.fx, at.x, there.cx), fma(there.fy, at.y, there.cy));
     }
     return inside;
 }
@@ -83,15 +85,13 @@ extern "C" __global__ void __launch_bounds__(128) compare_views(CompareArguments
     const int lane = threadIdx.x & 31;
     const int64 patch = int64(blockIdx.x) * PATCHES + (threadIdx.x >> 5);
     if (patch >= a.count) return;  // whole warps
-    const LeaveRows values = {a.values, patch, a.count, 0}, gradients = {a.gradients, patch, a.count, 0};
-    const LeaveRows moves = {a.motion_gradients, patch, a.count, 0}, trip_moves = {a.motion_gradients, patch, a.count, 21};
-    const LeaveRows normals = {a.gradients, patch, a.count, 1}, shifts = {a.motion_gradients, patch, a.count, 9};
-    const LeaveRows turns = {a.motion_gradients, patch, a.count, 12}, trip_shifts = {a.motion_gradients, patch, a.count, 30};
+    const auto rows = [&](float* all, int row) { return LeaveRows{all, patch, a.count, row}; };
+    const LeaveRows values = rows(a.values, 0), gradients = rows(a.gradients, 0), moves = rows(a.motion_gradients, 0);
     const bool first = lane == 0;
     if (first) {
-        for (int k = 0; k < 2; ++k) values(k, 0.f);
-        for (int k = 0; a.gradients && k < 5; ++k) gradients(k, 0.f);
-        for (int k = 0; a.motion_gradients && k < 33; ++k) moves(k, 0.f);
+        for (int k = 0; k < VALUE_ROWS; ++k) values(k, 0.f);
+        for (int k = 0; a.gradients && k < GRADIENT_ROWS; ++k) gradients(k, 0.f);
+        for (int k = 0; a.motion_gradients && k < MOTION_ROWS; ++k) moves(k, 0.f);
     }
     if (!a.chosen[patch]) return;
     const int64 pixel = a.index[patch];
@@ -101,8 +101,9 @@ extern "C" __global__ void __launch_bounds__(128) compare_views(CompareArguments
     const Vec3<float> ray = {(x - here.cx) / here.fx, (y - here.cy) / here.fy, 1.f};
     const Vec3<float> q = {a.normal[3 * pixel], a.normal[3 * pixel + 1], a.normal[3 * pixel + 2]};
     const ImageBetween surface = {a.source_depth, a.depth_width, a.depth_height};
-    const Lens<float> surface_lens = lens_of<float, float>(a.source_lens, double(a.depth_width) / double(a.source_width),
-                                                           double(a.depth_height) / double(a.source_height));
+    const double by_x = double(a.depth_width) / double(a.source_width);
+    const double by_y = double(a.depth_height) / double(a.source_height);
+    const Lens<float> surface_lens = lens_of<float, float>(a.source_lens, by_x, by_y);
     const ImageBetween source = {a.source, a.source_width, a.source_height};
     const ClearAt clear = {a.clear, a.source_width, a.source_height, there};
     const RoundTrip<float> trip = round_trip(depth, ray, motion, here, surface_lens, float(a.depth_width - 1),
@@ -114,7 +115,8 @@ extern "C" __global__ void __launch_bounds__(128) compare_views(CompareArguments
         if (a.gradients) gradients(4, weight * trip.by_depth);
         if (a.motion_gradients) {
             const MotionGrad<float> g = motion_grad(trip, depth, ray);
-            each_of(g.turn, weight, trip_moves), each_of(g.shift, weight, trip_shifts);
+            each_of(g.turn, weight, rows(a.motion_gradients, TRIP_TURN_ROW));
+            each_of(g.shift, weight, rows(a.motion_gradients, TRIP_SHIFT_ROW));
         }
     }
     const int radius = int(a.radius), side = 2 * radius + 1;
@@ -147,12 +149,15 @@ extern "C" __global__ void __launch_bounds__(128) compare_views(CompareArguments
     sum_lanes(g);
     if (!first) return;
     const Vec3<float> by_middle = {g[6], g[7], g[8]};
-    const PatchPlaneGrad<float> back = patch_plane_vjp(plane, {g[0], g[1], g[2]}, {g[3], g[4], g[5]}, by_middle, depth, ray, motion, here);
+    const PatchPlaneGrad<float> back =
+        patch_plane_vjp(plane, {g[0], g[1], g[2]}, {g[3], g[4], g[5]}, by_middle, depth, ray, motion, here);
     gradients(0, -weight * back.depth);
-    each_of(transposed_times(motion.world, back.normal), -weight, normals);
+    each_of(transposed_times(motion.world, back.normal), -weight, rows(a.gradients, 1));
     if (!a.motion_gradients) return;
     const MotionGrad<float> m = motion_grad(plane, back, by_middle, ray);
-    each_of(m.turn, -weight, moves), each_of(m.shift, -weight, shifts), each_of(outer(back.normal, q), -weight, turns);
+    each_of(m.turn, -weight, rows(a.motion_gradients, TURN_ROW));
+    each_of(m.shift, -weight, rows(a.motion_gradients, SHIFT_ROW));
+    each_of(outer(back.normal, q), -weight, rows(a.motion_gradients, WORLD_ROW));
 }
 
 }  // namespace gs2d
