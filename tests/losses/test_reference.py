@@ -199,10 +199,11 @@ def test_a_photograph_without_edges_counts_everywhere_alike(size: tuple[int, int
     assert (reference.edge_weights(torch.full((*size, 3), 0.7), 2.0) == 1).all()
 
 
-def test_the_object_is_where_alpha_is_more_than_a_half() -> None:
-    rendered, photographed = torch.tensor([[0.4, 0.6]]), torch.tensor([[0.51, 0.5]])
+def test_the_object_is_where_the_photograph_s_alpha_is_more_than_a_half_else_as_much_as_is_rendered() -> None:
+    rendered, photographed = torch.tensor([[0.25, 0.75]], requires_grad=True), torch.tensor([[0.51, 0.5]])
     assert reference.object_weights(rendered, photographed).tolist() == [[1.0, 0.0]]
-    assert reference.object_weights(rendered).tolist() == [[0.0, 1.0]]
+    assert reference.object_weights(rendered).tolist() == [[0.25, 0.75]]
+    assert not reference.object_weights(rendered).requires_grad
 
 
 @given(seed=st.integers(0, 10_000), size=st.tuples(st.integers(3, 9), st.integers(3, 9)))

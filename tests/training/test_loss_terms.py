@@ -111,8 +111,7 @@ def test_the_object_is_where_the_photograph_s_alpha_says_else_the_rendered_one(
     with torch.no_grad():
         seen = rasterize(trainer.splats, camera, trainer._whole.settings(recipe.stages[0], 1), backend=backend)
     photographed = made.train[0].alpha()
-    alpha = seen.alpha if photographed is None else torch.from_numpy(photographed)
-    weights = (alpha > 0.5).float()
+    weights = seen.alpha if photographed is None else torch.from_numpy(photographed > 0.5).float()
     assert 0.1 < weights.mean() < 0.9
     value = reference.normal_consistency(seen.normal, seen.depth(GENERIC.depth), seen.alpha, camera, weights=weights)
     found = trainer._whole.evaluate(trainer.state, recipe.stages[0], 1, 0).losses["normal_consistency"]

@@ -59,7 +59,7 @@ class LossTerm:
     where : "image" or "object"
         Of normal consistency: asked of all pixels, or of those of the object alone, so that what covers the empty
         background earns nothing. The object is where the photograph's alpha is above 1/2; of photographs without
-        alpha, where the rendered one is.
+        alpha each pixel counts by the rendered one, which sheets of white can still grow by.
     edge_power : float
         Of normal consistency: each pixel counts (1 - g) ** edge_power, g in [0, 1] the gradient of the photograph,
         for depth may jump where colours do. 0: all alike.

@@ -151,10 +151,9 @@ def normal_consistency(
 def object_weights(alpha: Tensor, silhouette: Tensor | None = None) -> Tensor:
     """Return the weight [H, W] of each pixel where a loss is asked of the object alone: 1 on it, 0 beside it.
 
-    By the alpha of the photograph (``silhouette``), or where it has none by the rendered ``alpha``, as a constant.
+    By the alpha of the photograph (``silhouette``); where it has none the weight is the rendered ``alpha``, a constant.
     """
-    known = alpha.detach() if silhouette is None else silhouette
-    return (known > 0.5).to(alpha.dtype)
+    return alpha.detach() if silhouette is None else (silhouette > 0.5).to(alpha.dtype)
 
 
 def edge_weights(image: Tensor, power: float, mask: Tensor | None = None) -> Tensor:
