@@ -158,6 +158,16 @@ def test_variants_change_what_they_say() -> None:
     assert get_recipe("2dgs-r-occlusion").stages[1].on_enter == (RankByError(occlusion=True),)
 
 
+def test_a_dense_start_is_fitted_and_not_reset() -> None:
+    plain, dense, still = (get_recipe(name) for name in ("2dgs", "2dgs-dense", "2dgs-dense-still"))
+    assert dense.dense_start is not None
+    assert dense.dense_start.fit is not None
+    assert dense.dense_start == still.dense_start
+    assert isinstance(plain.stages[0].densify, GradDensify)
+    assert dense.stages[0] == replace(plain.stages[0], densify=replace(plain.stages[0].densify, reset_every=0))
+    assert still.stages[0] == replace(plain.stages[0], densify=None)
+
+
 def test_controls_change_what_they_say() -> None:
     def but_for_the_last(name: str, base: str) -> tuple[Stage, Stage]:
         recipe, plain = get_recipe(name), get_recipe(base)

@@ -22,7 +22,7 @@ from gs2d.errors import DataError, RecipeError
 from gs2d.evaluation.images import psnr_float
 from gs2d.render.api import rasterize
 from gs2d.training import start_fit
-from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
+from gs2d.training.plane_sweep import Sweep, _unique_rows, start_points, sweep_views
 from gs2d.training.start_fit import fit_start
 from gs2d.training.sweep_range import sweep_range
 from gs2d.training.trainer import Trainer
@@ -223,3 +223,11 @@ def test_a_fit_is_written_only_where_there_is_one_and_read_again() -> None:
 def test_a_fit_that_cannot_be_made_is_refused(fit: StartFit, said: str) -> None:
     with pytest.raises(RecipeError, match=said):
         validate(recipe(replace(BALL, fit=fit)))
+
+
+@pytest.mark.parametrize("spread", [(30.0, 30.0, 2.0), (1e9, 1e9, 1e9)])
+def test_one_of_each_cell_is_found_as_numpy_finds_it(spread: tuple[float, ...]) -> None:
+    keys = np.floor(np.random.default_rng(0).normal(size=(5000, 3)) * spread)
+    for found, true in zip(_unique_rows(keys), np.unique(keys, axis=0, return_index=True), strict=True):
+        np.testing.assert_array_equal(found, true)
+    assert len(_unique_rows(keys[:0])[1]) == 0

@@ -32,7 +32,7 @@ from gs2d.config.recipe import (
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
 from gs2d.config.registry import Registry
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, StartFit
 from gs2d.errors import RecipeError
 
 PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))  # official: lambda_dssim = 0.2
@@ -235,6 +235,18 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
     )
 
 
+def with_dense_start(recipe: Recipe, *, still: bool = False, name: str | None = None) -> Recipe:
+    """Return the recipe from a dense start, fitted to the photographs (``NAME-dense``); ``still`` never densifies.
+
+    Not in the paper. There are no opacity resets in its first stage: they take away what the fit has found.
+    """
+    first, *rest = recipe.stages
+    if isinstance(first.densify, GradDensify):
+        first = replace(first, densify=None if still else replace(first.densify, reset_every=0))
+    start = DenseStart(side=256, neighbours=3, fit=StartFit())
+    return replace(recipe, name=name or f"{recipe.name}-dense", stages=(first, *rest), dense_start=start)
+
+
 def _in_stages(recipe: Recipe, term: LossTerm) -> Recipe:
     """Add a loss to the stages that train the means of all splats; a start is that of the first stage."""
 
@@ -318,6 +330,9 @@ def _registry() -> dict[str, NamedRecipe]:
 def _add_variants(add: Callable[[str, str, Callable[..., Recipe]], None]) -> None:
     """Add the other readings of what the paper leaves open."""
     preserve = partial(two_dgs_r, stage_3=refine(clone="preserve"))
+    about = "2DGS from a plane sweep of the photographs, splats fitted to them; "
+    add("2dgs-dense", about + "no opacity resets", partial(with_dense_start, two_dgs()))
+    add("2dgs-dense-still", about + "never densified", partial(with_dense_start, two_dgs(), still=True))
     add(
         "2dgs-r-clone-preserve",
         "Variant: a splat and its clone share the opacity, so the image hardly changes",

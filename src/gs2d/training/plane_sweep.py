@@ -199,9 +199,22 @@ def _thin(found: _Found, cell: float) -> _Found:
     level = np.rint(np.log2(found.pixel * cell))
     keys = np.concatenate([np.floor(found.places / np.exp2(level)[:, None]), level[:, None]], axis=1)
     order = np.argsort(-found.score, kind="stable")
-    _, first = np.unique(keys[order], axis=0, return_index=True)
+    _, first = _unique_rows(keys[order])
     rows = order[first]
     return _Found(*(getattr(found, name)[rows] for name in _Found.__dataclass_fields__))
+
+
+def _unique_rows(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``np.unique(keys, axis=0, return_index=True)`` of whole numbers [M, C], each as one number."""
+    if not len(keys):
+        return keys, np.zeros(0, dtype=np.int64)
+    low = keys.min(axis=0)
+    sizes = (keys.max(axis=0) - low + 1).astype(np.float64)
+    if sizes.prod() >= 2.0**62:
+        return np.unique(keys, axis=0, return_index=True)
+    flat = np.ravel_multi_index(tuple((keys - low).astype(np.int64).T), tuple(sizes.astype(np.int64)))
+    first = np.unique(flat, return_index=True)[1]
+    return keys[first], first
 
 
 def _swept(sweep: Sweep, index: int, settings: DenseStart) -> _Found:
