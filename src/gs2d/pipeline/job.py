@@ -99,7 +99,7 @@ class Job:
                 "skipped": list(self.scene.skipped),
                 "digest": self.images_digest,
             },
-            "raster": asdict(self.settings),
+            "raster": self.settings.facts(),
             "seed": self.recipe.seed,
             "backend": self.backend.facts(),
             "stage2_cache_bytes": self.stage2_cache_bytes,
@@ -112,7 +112,7 @@ class Job:
         facts = {
             "scene": self.images_digest,
             "protocol": _training_facts(asdict(self.protocol)),
-            "raster": asdict(self.settings),
+            "raster": self.settings.facts(),
             "seed": self.recipe.seed,
             "backend": self.backend.facts(),
             "versions": {name: versions()[name] for name in ("2dgs-r", "torch")},

@@ -59,7 +59,7 @@ class _Images(ctypes.Structure):
 
 
 class _ImageGradients(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in IMAGES)
+    _fields_ = tuple((name, ctypes.c_void_p) for name in (*IMAGES, "depth_transmittance"))
 
 
 class _ParameterGradients(ctypes.Structure):
@@ -139,7 +139,9 @@ def _check_tensors(splats: Splats, settings: RasterSettings, dtype: torch.dtype)
         raise BackendError(f"the cpu backend takes fewer than 2^31 splats, got {len(splats)}")
 
 
-def _forward(library: Library, view: _View, tensors: Sequence[Tensor]) -> tuple[dict[str, Tensor], Tensor, _Frame]:
+def _forward(
+    library: Library, view: _View, depth_width: float | None, tensors: Sequence[Tensor]
+) -> tuple[dict[str, Tensor], Tensor, _Frame]:
     """Images, radii and what the backward pass needs; the tensors are contiguous."""
     H, W = int(view.height), int(view.width)
     empty, dtype = library.pool.empty, library.dtype
@@ -150,24 +152,33 @@ def _forward(library: Library, view: _View, tensors: Sequence[Tensor]) -> tuple[
     native_images = _Images(*(_address(t) for t in images.values()), _address(radii))
     native_splats = _parameters(tensors)
     _check(forward(*(ctypes.byref(x) for x in (view, native_splats, native_images, pointer))))
-    return images, radii, _Frame(library, pointer)
+    frame = _Frame(library, pointer)
+    if depth_width is not None:
+        images["depth_transmittance"] = empty((H, W), dtype)
+        find = library.function(
+            "gs2d_transmittance_depth", ctypes.c_int, [ctypes.c_void_p] * 2 + [ctypes.c_double, ctypes.c_void_p]
+        )
+        found = _address(images["depth_transmittance"])
+        _check(find(pointer, ctypes.byref(native_images), depth_width, found))
+    return images, radii, frame
 
 
 class _Rasterize(torch.autograd.Function):
-    """Images and radii from the six parameter tensors; ``rows`` are those whose gradients are wanted, None for all."""
+    """Radii and images from the six parameter tensors; ``rows`` are those whose gradients are wanted, None for all."""
 
     @staticmethod
     def forward(
         ctx: Any,
         library: Library,
         view: _View,
+        depth_width: float | None,
         rows: Tensor | None,
         probe: Tensor | None,
         intrinsics: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
-        images, radii, frame = _forward(library, view, tensors)
+        images, radii, frame = _forward(library, view, depth_width, tensors)
         if any(ctx.needs_input_grad):
             ctx.library, ctx.frame, ctx.rows = library, frame, rows
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
@@ -176,7 +187,7 @@ class _Rasterize(torch.autograd.Function):
             ctx.save_for_backward(*saved, *tensors)
             ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
-        return (*images.values(), radii)
+        return (radii, *images.values())
 
     @staticmethod
     @once_differentiable
@@ -184,8 +195,8 @@ class _Rasterize(torch.autograd.Function):
         library: Library = ctx.library
         color, alpha, normal, depth_mean, distortion, *tensors = ctx.saved_tensors
         images = _Images(*(_address(t) for t in (color, alpha, normal, depth_mean, None, distortion, None)))
-        given = [_plain(g, library.dtype) for g in upstream[: len(IMAGES)]]
-        want_probe, want_intrinsics, *want = ctx.needs_input_grad[3:]
+        given = [_plain(g, library.dtype) for g in upstream[1:]]
+        want_probe, want_intrinsics, *want = ctx.needs_input_grad[4:]
         empty, dtype = library.pool.empty, library.dtype
         grads = [empty(t.shape, dtype) if wanted else None for t, wanted in zip(tensors, want, strict=True)]
         probe = empty(ctx.probe_shape, dtype) if want_probe else None
@@ -198,12 +209,12 @@ class _Rasterize(torch.autograd.Function):
         if to_intrinsics is None:
             backward = library.function("gs2d_raster_backward", ctypes.c_int, [ctypes.c_void_p] * 5)
             _check(backward(*pointers))
-            return None, None, None, probe, None, *grads
+            return None, None, None, None, probe, None, *grads
         backward = library.function("gs2d_raster_backward_intrinsics", ctypes.c_int, [ctypes.c_void_p] * 6)
         _check(backward(*pointers, _address(to_intrinsics)))
         # numpy adds one row after the other: the same bits for any number of threads
         total = torch.from_numpy(to_intrinsics.numpy().sum(axis=0, dtype=np.float64))
-        return None, None, None, probe, total.to(ctx.of_intrinsics), *grads
+        return None, None, None, None, probe, total.to(ctx.of_intrinsics), *grads
 
 
 def rasterize_with(
@@ -230,10 +241,14 @@ def rasterize_with(
     news = settings.sh_degree == PLAIN_COLORS or camera.intrinsics is not None
     if news and not library.has("gs2d_raster_backward_intrinsics"):
         raise BackendError(f"the CPU kernels are older than plain colours and gradients of intrinsics; {REMEDY}")
+    depth_width = settings.depth_width(camera) if settings.with_transmittance_depth else None
+    if depth_width is not None and not library.has("gs2d_transmittance_depth"):
+        raise BackendError(f"the CPU kernels are older than the depth by transmittance; {REMEDY}")
     view = _view(camera, settings, exact_masks)
-    given = (library, view, gradient_rows, screen_probe, camera.intrinsics)
-    *images, radii = _Rasterize.apply(*given, *(t for _, t in splats.items()))
-    return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
+    given = (library, view, depth_width, gradient_rows, screen_probe, camera.intrinsics)
+    radii, *images = _Rasterize.apply(*given, *(t for _, t in splats.items()))
+    names = (*IMAGES, "depth_transmittance")[: len(images)]
+    return RenderOutput(**dict(zip(names, images, strict=True)), radii=radii)
 
 
 def rasterize(

@@ -24,11 +24,12 @@ from gs2d.render.reference_projection import (
     screen_boxes,
     visible_rows,
 )
+from gs2d.render.reference_transmittance import depth_at_half
 from gs2d.render.types import RasterSettings, RenderOutput
 
 __all__ = ["Pairs", "blend_weights", "evaluate_pairs", "rasterize"]
 
-CHANNELS = 10  # color 3, normal 3, alpha, depth_mean, depth_median, distortion
+CHANNELS = 11  # color 3, normal 3, alpha, depth_mean, depth_median, distortion, depth_transmittance
 
 
 def rasterize(
@@ -66,6 +67,7 @@ def rasterize(
         depth_median=images[..., 8],
         distortion=images[..., 9],
         radii=radii,
+        depth_transmittance=images[..., 10] if settings.with_transmittance_depth else None,
     )
 
 
@@ -155,7 +157,8 @@ def _blend_block(
     screen = screen.rows(block.splats)
     shift = None if probe is None else _probe_shift(probe[block.splats], screen.Tw[:, 2], len(block.pixels), camera)
     pairs = evaluate_pairs(screen, block.points, settings, shift)
-    w, T = blend_weights(pair_alpha(screen.opacity, pairs, settings), settings)  # [n, P]
+    alphas = pair_alpha(screen.opacity, pairs, settings)
+    w, T = blend_weights(alphas, settings)  # [n, P]
 
     background = torch.tensor(settings.background, dtype=w.dtype, device=w.device)
     alpha = w.sum(dim=0)  # [P] = 1 - T_final
@@ -172,7 +175,11 @@ def _blend_block(
     m = -(settings.far * settings.near / (settings.far - settings.near)) / pairs.depth
     before = [(w * power).cumsum(dim=0) - w * power for power in (torch.ones_like(m), m, m * m)]  # A, M1, M2 so far
     distortion = (w * (m * m * before[0] - 2 * m * before[1] + before[2])).sum(dim=0)  # rule 10
-    channels = torch.stack([alpha, depth_mean, depth_median, distortion], dim=1)
+    depth_transmittance = torch.zeros_like(alpha)
+    if settings.with_transmittance_depth:
+        blended = torch.where(w > 0, alphas, 0.0)
+        depth_transmittance = depth_at_half(blended, 1 / pairs.depth, alpha, settings.depth_width(camera))
+    channels = torch.stack([alpha, depth_mean, depth_median, distortion, depth_transmittance], dim=1)
     return torch.cat([color, normal, channels], dim=1)
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from torch import Tensor
 
+from gs2d.core.camera import Camera
+
+TRANSMITTANCE = "transmittance"  # the kind of depth that is rendered only where it is asked for
 PLAIN_COLORS = -1  # of RasterSettings.sh_degree
 NEAR_PLANE_POLICIES = (
     "draw",
@@ -46,6 +50,11 @@ class RasterSettings:
         "cull", or "box": only in the tiles of the official rasterizer's box, which has no meaning for them (rule 19).
     with_distortion : bool
         False = nobody looks at that image: a backend may leave it out (NaN) where that saves work.
+    with_transmittance_depth : bool
+        True = ``depth_transmittance`` is wanted too: one search along the ray of each pixel (rule 22).
+    depth_width_px : float
+        px. Half of the depth over which a splat's opacity is spread for it, as seen from the camera: so many times the
+        width of a pixel there.
     """
 
     near: float = 0.2
@@ -60,6 +69,21 @@ class RasterSettings:
     lowpass_depth: str = "center"
     near_plane_policy: str = "draw"
     with_distortion: bool = True
+    with_transmittance_depth: bool = field(default=False, metadata={"omit_default": True})
+    depth_width_px: float = field(default=2.0, metadata={"omit_default": True})
+
+    def for_depths(self, *kinds: str | None) -> RasterSettings:
+        """Return the settings that render these kinds of depth; None: no particular one."""
+        return replace(self, with_transmittance_depth=self.with_transmittance_depth or TRANSMITTANCE in kinds)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the constants by name, as they are written down: without those that older runs do not name."""
+        kept = (f for f in fields(self) if not f.metadata.get("omit_default") or getattr(self, f.name) != f.default)
+        return {f.name: getattr(self, f.name) for f in kept}
+
+    def depth_width(self, camera: Camera) -> float:
+        """Return kappa of rule 22: the half width as a fraction of the depth."""
+        return self.depth_width_px / math.sqrt(camera.fx * camera.fy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +106,9 @@ class RenderOutput:
         Sum over pairs i > j of w_i w_j (m_i - m_j)^2, m the mapped depth.
     radii : Tensor [N] px
         Half the longer side of each splat's screen box; 0 for splats that touch no pixel.
+    depth_transmittance : Tensor [H, W] world units, or None
+        Depth before which half of alpha lies, each splat's opacity spread over a little depth; 0 where nothing was hit.
+        None without ``RasterSettings.with_transmittance_depth``.
     normal_without_pose_grad : Tensor [H, W, 3] or None
         Where a camera learns: ``normal`` as if the world turned with the camera. For losses that compare normals.
     """
@@ -93,12 +120,17 @@ class RenderOutput:
     depth_median: Tensor
     distortion: Tensor
     radii: Tensor
+    depth_transmittance: Tensor | None = None
     normal_without_pose_grad: Tensor | None = None
 
     def depth(self, kind: str) -> Tensor:
-        """``depth_mean`` or ``depth_median`` by the name a recipe or protocol uses."""
+        """Return the depth image by the name a recipe or protocol uses: "mean", "median" or "transmittance"."""
         if kind == "mean":
             return self.depth_mean
         if kind == "median":
             return self.depth_median
-        raise ValueError(f"depth must be 'mean' or 'median', got {kind!r}")
+        if kind != TRANSMITTANCE:
+            raise ValueError(f"depth must be 'mean', 'median' or 'transmittance', got {kind!r}")
+        if self.depth_transmittance is None:
+            raise ValueError("no transmittance depth was rendered; rasterize with settings.for_depths('transmittance')")
+        return self.depth_transmittance

@@ -3,6 +3,7 @@
 
 #include "core/base.h"
 #include "core/project.h"
+#include "core/transmittance.h"
 
 namespace gs2d {
 
@@ -12,6 +13,7 @@ template <class V> struct BlendLimits {
     V near;
     V log2_alpha_min;
     V alpha_max, transmittance_min;
+    V inv_depth_width = V(0);  // of rule 22, where that depth has a gradient
 };
 
 // A splat's plane at a pixel: u / z, v / z and 1 / z, affine in the pixel.
@@ -155,12 +157,20 @@ template <class V> struct PixelGradient {
     // The distortion's part of s: g (q^2 sum w - 2 q M1 + M2) with g its gradient. The last term is folded into alpha.
     V distortion2, distortion1;  // g sum w, -2 g M1
     V inverse_depth0;
+    V transmittance, z;  // of the depth by transmittance: the factor of depth_pair_vjp, the depth
 };
 
 // What the distortion adds to the gradient of a pixel: total = sum w.
 template <class V> GS2D_HD void add_distortion(V g, V total, V M1, V M2, PixelGradient<V>& p) {
     p.distortion2 = g * total, p.distortion1 = V(-2) * g * M1;
     p.alpha = fma(g, M2, p.alpha);
+}
+
+// What the depth by transmittance adds to it, `slope` from slope_of; 0 where nothing was hit.
+template <class V> GS2D_HD void add_transmittance(V g, V z, V slope, V total, PixelGradient<V>& p) {
+    const V upstream = keep(total > V(0), g / slope), half = V(0.5f);
+    p.transmittance = upstream * fnma(half, total, V(1)), p.z = z;
+    p.alpha = fma(half, upstream, p.alpha);
 }
 
 // What one splat gathers over its pixels; `finish` turns it into a RecordGradient.
@@ -179,8 +189,8 @@ template <class V> struct PairGradient {
 };
 
 // One splat at one pixel, front to back. T is 0 where the pixel has stopped (or does not exist).
-// Geo: normal or depth images have gradients. Dist: the distortion has.
-template <bool Geo, bool Dist, class V>
+// Geo: normal or depth images have gradients. Dist: the distortion has. Trans: the depth by transmittance has.
+template <bool Geo, bool Dist, bool Trans, class V>
 GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, V raw_alpha, const BlendLimits<V>& k,
                                   const PixelGradient<V>& g, V& T, V& S) {
     const V alpha = min(raw_alpha, k.alpha_max);
@@ -202,8 +212,13 @@ GS2D_HD PairGradient<V> weigh_vjp(const Record<V>& s, V depth, V inverse_depth, 
         gI = fma(w, fma(q, g.distortion2, slope), gI);
     }
     S = fnma(w, along, S);
+    V of_alpha = fnma(S, reciprocal(V(1) - alpha), T * along);
+    if constexpr (Trans) {
+        const DepthPairGradient<V> d = depth_pair_vjp(alpha, inverse_depth, g.z, k.inv_depth_width, g.transmittance);
+        of_alpha = of_alpha + d.alpha, gI = gI + keep(goes_on, d.inverse_depth);
+    }
     // d alpha / d ln(alpha) = the unclamped alpha: the ceiling passes gradients
-    const V gl = keep(goes_on, fnma(S, reciprocal(V(1) - alpha), T * along) * raw_alpha);
+    const V gl = keep(goes_on, of_alpha * raw_alpha);
     T = keep(goes_on, after);
     return {w, gl, gI};
 }
@@ -248,10 +263,10 @@ GS2D_HD void add_geometry(const Record<V>& s, V dx, V dy, V t, V tu, V tv, V rho
 }
 
 // All of it.
-template <bool Geo, bool Dist, bool Abs, bool Filtered, bool Column, class V>
+template <bool Geo, bool Dist, bool Abs, bool Trans, bool Filtered, bool Column, class V>
 GS2D_HD void composite_vjp(const Record<V>& s, V dx, V dy, const Hit<V>& h, const BlendLimits<V>& k,
                            const PixelGradient<V>& g, V& T, V& S, PairSums<V>& sums) {
-    const PairGradient<V> p = weigh_vjp<Geo, Dist>(s, h.depth, h.inverse_depth, h.alpha, k, g, T, S);
+    const PairGradient<V> p = weigh_vjp<Geo, Dist, Trans>(s, h.depth, h.inverse_depth, h.alpha, k, g, T, S);
     add_colors<Geo>(g, p, sums);
     const V t = p.ln_alpha * h.depth;
     add_geometry<Geo, Abs, Filtered, Column>(s, dx, dy, t, t * h.u, t * h.v, h.rho, h.inverse_depth, h.ray, p, sums);

@@ -15,7 +15,7 @@ constexpr int KEEP = 2;  // frames whose memory is kept for the next view
 
 template <class F> void for_each_buffer(Frame& f, F&& visit) {
     visit(f.records), visit(f.tile_begin), visit(f.entries), visit(f.tile_count), visit(f.taken), visit(f.saved),
-        visit(f.scratch);
+        visit(f.depth_slope), visit(f.scratch);
     visit(f.histogram), visit(f.slot_begin), visit(f.chunks), visit(f.own_sums);
     visit(f.target), visit(f.splat_begin), visit(f.splat_slots);
 }
@@ -89,6 +89,11 @@ GS2D_EXPORT int gs2d_raster_forward(const View* view, const Parameters* splats, 
     give_back(*frame);
     *frame = nullptr;
     return NO_MEMORY;
+}
+
+// Depth by transmittance [H, W] of the view that was just rendered; `images` are its outputs.
+GS2D_EXPORT int gs2d_transmittance_depth(Frame* frame, const Images* images, double width, real* depth) {
+    return find_transmittance_depth(*frame, images->alpha, images->depth_median, width, depth) ? OK : NO_MEMORY;
 }
 
 // Gradients of the parameters of the same call's splats; `images` are that call's outputs. `intrinsics` [N, 4], or null: what each

@@ -10,13 +10,15 @@ namespace gs2d {
 namespace {
 
 // Per pixel of the tile, in block order: state, then what PixelGradient<V> holds.
-enum Plane { T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST2, DIST1, DEPTH0, PLANES };
+enum Plane {
+    T, S, RED, GREEN, BLUE, ALPHA, NX, NY, NZ, DEPTH, MEDIAN, MEDIAN_BELOW, DIST2, DIST1, DEPTH0, TRANSMITTANCE, Z, PLANES
+};
 using Planes = real (*)[PIXELS];
 
 inline PixelGradient<V> load_gradient(const Planes s, int b) {
     const auto at = [&](Plane p) { return load(&s[p][b * LANES]); };
     return {at(RED),   at(GREEN),  at(BLUE),         at(ALPHA), at(NX),    at(NY),    at(NZ),
-            at(DEPTH), at(MEDIAN), at(MEDIAN_BELOW), at(DIST2), at(DIST1), at(DEPTH0)};
+            at(DEPTH), at(MEDIAN), at(MEDIAN_BELOW), at(DIST2), at(DIST1), at(DEPTH0), at(TRANSMITTANCE), at(Z)};
 }
 
 // Upstream gradients as PixelGradient wants them, and S = the sum over all splats of w s, from the image's totals.
@@ -42,6 +44,12 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
         read_planes<1>(&f.saved[2 * pixels], W, a, dist[3]);
         read_planes<1>(&f.saved[3 * pixels], W, a, s[DEPTH0]);
     }
+    alignas(64) real found[3][PIXELS];  // depth by transmittance: upstream, image, slope
+    if (g.depth_transmittance) {
+        read_planes<1>(g.depth_transmittance, W, a, found[0]);
+        read_planes<1>(&f.depth_slope[0], W, a, found[1]);
+        read_planes<1>(&f.depth_slope[pixels], W, a, found[2]);
+    }
     const V bg[3] = {V(real(v.background[0])), V(real(v.background[1])), V(real(v.background[2]))};
     const double lever = v.far * v.near / (v.far - v.near);
     for (int b = 0; b < BLOCKS; ++b) {
@@ -54,6 +62,13 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
             ga = fnma(gc, bg[c], ga);
             sum = fma(gc, fnma(final_T, bg[c], at(total[c])), sum);
             sum = fma(at(s[NX + c]), at(total[3 + c]), sum);
+        }
+        if (g.depth_transmittance) {
+            PixelGradient<V> p;
+            p.alpha = ga;
+            add_transmittance(at(found[0]), at(found[1]), at(found[2]), alpha, p);
+            ga = p.alpha;
+            put(s[TRANSMITTANCE], p.transmittance), put(s[Z], p.z);
         }
         // depth_mean = D / alpha: dD = g / alpha, dalpha = -g mean / alpha
         const V gd = at(s[DEPTH]) / select(alpha > V(0), alpha, V(1));
@@ -83,6 +98,10 @@ RowLines images_read(const Frame& f, const Images& images, const ImageGradients&
     lines.add(g.color, 3), lines.add(g.normal, 3), lines.add(images.color, 3),
         lines.add(g.normal ? images.normal : nullptr, 3);
     lines.add(g.alpha, 1), lines.add(g.depth_mean, 1), lines.add(g.depth_median, 1), lines.add(g.distortion, 1);
+    if (g.depth_transmittance) {
+        lines.add(g.depth_transmittance, 1);
+        for (int k = 0; k < 2; ++k) lines.add(&f.depth_slope[k * pixels], 1);
+    }
     lines.add(images.alpha, 1), lines.add(g.depth_mean ? images.depth_mean : nullptr, 1), lines.add(&f.saved[0], 1);
     if (!g.distortion) return lines;
     lines.add(images.distortion, 1);
@@ -123,7 +142,7 @@ __attribute__((noinline)) void pass_by(const real* record, bool plain, uint32_t 
         const int b = __builtin_ctz(blocks);
         const Hit<V> h = hit_at(splat, zc, planes.at(b), plain, centres, b, limits);
         V pixel_T = load(&s[T][b * LANES]), pixel_S = load(&s[S][b * LANES]);
-        weigh_vjp<Geo, Dist>(splat, h.depth, h.inverse_depth, h.alpha, limits, load_gradient(s, b), pixel_T, pixel_S);
+        weigh_vjp<Geo, Dist, false>(splat, h.depth, h.inverse_depth, h.alpha, limits, load_gradient(s, b), pixel_T, pixel_S);
         store(&s[T][b * LANES], pixel_T);
         store(&s[S][b * LANES], pixel_S);
     }
@@ -196,14 +215,14 @@ template <bool WithInverse> inline void find_hits(Batch& w, const Centres& centr
 }
 
 // One pair: T and S move on; what its sums need is left in the batch.
-template <bool Geo, bool Dist>
+template <bool Geo, bool Dist, bool Trans>
 inline PairGradient<V> weigh_pair(Batch& w, int i, const Record<V>& splat, const PixelGradient<V>& g, Planes s,
                                   const BlendLimits<V>& limits) {
     const int at = w.block[i] * LANES;
     V pixel_T = load(&s[T][at]), pixel_S = load(&s[S][at]);
-    const V inverse_depth = Dist ? load(w.inverse_depth[i]) : V(0);
+    const V inverse_depth = Dist || Trans ? load(w.inverse_depth[i]) : V(0);
     const PairGradient<V> p =
-        weigh_vjp<Geo, Dist>(splat, load(w.depth[i]), inverse_depth, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
+        weigh_vjp<Geo, Dist, Trans>(splat, load(w.depth[i]), inverse_depth, load(w.alpha[i]), limits, g, pixel_T, pixel_S);
     store(&s[T][at], pixel_T), store(&s[S][at], pixel_S);
     store(w.alpha[i], p.ln_alpha);
     if constexpr (Geo) store(w.I[i], p.I);
@@ -249,14 +268,14 @@ inline void write_slot(const Record<V>& splat, const PairSums<V>& sums, bool fil
 }
 
 // Empties the batch; returns where the next splat's slot is.
-template <bool Geo, bool Dist, bool Abs>
+template <bool Geo, bool Dist, bool Abs, bool Trans>
 __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const Centres& centres,
                                              const BlendLimits<V>& limits) {
-    find_hits<Dist || Abs>(w, centres, limits);
+    find_hits<Dist || Abs || Trans>(w, centres, limits);
     if constexpr (!COLORS_FIT)
         for (int i = 0; i < w.pairs; ++i) {
             const PixelGradient<V> g = load_gradient(s, w.block[i]);
-            store(w.w[i], weigh_pair<Geo, Dist>(w, i, broadcast(w.record[w.splat[i]]), g, s, limits).w);
+            store(w.w[i], weigh_pair<Geo, Dist, Trans>(w, i, broadcast(w.record[w.splat[i]]), g, s, limits).w);
         }
     for (int j = 0, first = 0; j < w.splats; first = w.end[j++], to = to.from(1)) {
         const V zero = V(0);
@@ -267,7 +286,7 @@ __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const
             int i = first;
             do {
                 const PixelGradient<V> g = load_gradient(s, w.block[i]);
-                add_colors<Geo>(g, weigh_pair<Geo, Dist>(w, i, splat, g, s, limits), sums);
+                add_colors<Geo>(g, weigh_pair<Geo, Dist, Trans>(w, i, splat, g, s, limits), sums);
             } while (++i < w.end[j]);
         }
         if (w.filtered[j])
@@ -280,7 +299,7 @@ __attribute__((noinline)) Slots finish_batch(Batch& w, Slots to, Planes s, const
     return to;
 }
 
-template <bool Geo, bool Dist, bool Abs>
+template <bool Geo, bool Dist, bool Abs, bool Trans = false>
 void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Planes s, const TileArea& area,
               const BlendLimits<V>& limits, RowsAhead next) {
     const Centres centres(area);
@@ -294,7 +313,7 @@ void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Plane
         const real* record = &f.records[size_t(entry->splat()) * RECORD];
         const bool learns = !rows || rows[entry->splat()];
         if (batch.splats && !(learns && batch.has_room(entry->blocks)))
-            to = finish_batch<Geo, Dist, Abs>(batch, to, s, centres, limits);
+            to = finish_batch<Geo, Dist, Abs, Trans>(batch, to, s, centres, limits);
         if (!learns) {
             pass_by<Geo, Dist>(record, entry->plain(), entry->blocks & interest.blocks, s, centres, limits);
             continue;
@@ -302,7 +321,7 @@ void tile_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows, Plane
         if (rows) interest.passed(*entry, at);
         batch.add(record, entry->plain(), entry->blocks, centres);
     }
-    if (batch.splats) finish_batch<Geo, Dist, Abs>(batch, to, s, centres, limits);
+    if (batch.splats) finish_batch<Geo, Dist, Abs, Trans>(batch, to, s, centres, limits);
 }
 
 // Only the colours' gradients: no geometry, no opacity.
@@ -343,8 +362,10 @@ void tile_color_vjp(const Frame& f, int64_t tile, Slots to, const uint8_t* rows,
 using TileVjp = void (*)(const Frame&, int64_t, Slots, const uint8_t*, Planes, const TileArea&, const BlendLimits<V>&,
                          RowsAhead);
 
-TileVjp variant(bool geo, bool dist, bool abs, bool color_only) {
+TileVjp variant(bool geo, bool dist, bool abs, bool trans, bool color_only) {
     if (color_only) return tile_color_vjp;
+    if (trans && dist) return abs ? tile_vjp<true, true, true, true> : tile_vjp<true, true, false, true>;
+    if (trans) return abs ? tile_vjp<true, false, true, true> : tile_vjp<true, false, false, true>;
     if (dist) return abs ? tile_vjp<true, true, true> : tile_vjp<true, true, false>;
     if (geo) return abs ? tile_vjp<true, false, true> : tile_vjp<true, false, false>;
     return abs ? tile_vjp<false, false, true> : tile_vjp<false, false, false>;
@@ -360,8 +381,9 @@ bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, in
     clock.done(INDEX_SLOTS);
     const bool dist = g.distortion != nullptr;
     const bool geo = dist || g.normal || g.depth_mean || g.depth_median;
-    const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, !geometry);
-    const BlendLimits<V> limits = limits_of(f.view);
+    const TileVjp vjp = variant(geo, dist, out.probe && out.probe_columns == 4, g.depth_transmittance, !geometry);
+    BlendLimits<V> limits = limits_of(f.view);
+    limits.inv_depth_width = V(f.inv_depth_width);
     const RowLines read = images_read(f, images, g);
     sums.for_each_tile([&](int64_t tile, int64_t next, Slots to) {
         alignas(64) real planes[PLANES][PIXELS];

@@ -69,6 +69,7 @@ struct Images {
 
 struct ImageGradients {  // null where there is no gradient
     const real *color, *alpha, *normal, *depth_mean, *depth_median, *distortion;
+    const real* depth_transmittance;  // after find_transmittance_depth
 };
 
 struct ParameterGradients {  // null where not wanted
@@ -152,6 +153,8 @@ struct Frame {
     Buffer<std::atomic<uint8_t>> taken;  // [groups]: whether somebody blends these tiles (share_out)
     Buffer<int32_t> tile_count;  // entries that survive the forward pass; they are moved to the front of their tile
     Buffer<real> saved;          // [4, H W]: T_final, M1, M2, inverse_depth0
+    Buffer<real> depth_slope;    // [2, H W]: depth by transmittance, -dT/dz there
+    real inv_depth_width = 0;
     int64_t visible = 0;
     int64_t groups() const { return (tiles + GROUP - 1) / GROUP; }
 
@@ -222,6 +225,8 @@ bool bin_splats(Frame& frame);
 bool blend_tiles(Frame& frame, const Images& images);
 bool blend_tiles_vjp(Frame& frame, const Images& images, const ImageGradients& gradients, int64_t sh_rest,
                      const ParameterGradients& out, bool geometry);
+// Rule 22, after blend_tiles: `alpha` and `median` are its images, `width` the half width as a fraction of the depth.
+bool find_transmittance_depth(Frame& frame, const real* alpha, const real* median, double width, real* depth);
 bool splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 bool occluded_splat_errors(Frame& frame, const real* image, const uint8_t* mask, real* errors);
 void project_splats_vjp(Frame& frame, const Parameters& splats, const ParameterGradients& out, real* intrinsics);
