@@ -31,7 +31,7 @@ class FusionLimits:
     clusters : int
         How many of the largest connected components are kept; 0 keeps all.
     depth : str or None
-        "mean" or "median": the depth that is fused; None is the one that the losses use.
+        "mean", "median" or "transmittance": the depth that is fused; None is the one that the losses use.
     subject : bool
         Mesh what most cameras look at (``data.subject``), cleaned and simplified by evidence; False: all that is
         inside the limits, as the scripts of the data sets do.
@@ -72,7 +72,7 @@ class Protocol:
     ----------
     name : str
     depth : str
-        "mean" or "median": depth of surface normals and of fusion, where a loss names none.
+        "mean", "median" or "transmittance": depth of surface normals and of fusion, where a loss names none.
     distortion_weight : float
         Weight of a distortion loss that names none (Table 1 of the 2DGS-R paper).
     background : tuple of 3 floats
@@ -121,7 +121,7 @@ class Protocol:
 
     @property
     def fused_depth(self) -> str:
-        """Depth that becomes the mesh, "mean" or "median"."""
+        """Depth that becomes the mesh, "mean", "median" or "transmittance"."""
         return self.depth if self.fusion.depth is None else self.fusion.depth
 
     def resolve(self, terms: Sequence[LossTerm]) -> tuple[LossTerm, ...]:

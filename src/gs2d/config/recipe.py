@@ -27,7 +27,7 @@ from gs2d.config.views import check_exposure, check_poses
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
 LARGEST_SEED = 2**63 - 1  # torch takes no larger one
-DEPTH_KINDS = ("mean", "median")
+DEPTH_KINDS = ("mean", "median", "transmittance")
 NORMAL_KINDS = ("normal_consistency", "normal_consistency_per_splat")
 EDGES = ("undefined", "camera")
 WHERE = ("image", "object")
@@ -49,7 +49,7 @@ class LossTerm:
         None, for "distortion" only: the protocol's weight (Table 1 of the paper writes it 100/10).
     start : int
         Iterations of the stage without this term.
-    depth : "mean", "median" or None
+    depth : "mean", "median", "transmittance" or None
         Depth that surface normals come from; None takes the protocol's.
     options : mapping of str to values of JSON
         Of a registered loss: the keyword arguments that its function, or the constructor of its class, takes.

@@ -110,7 +110,7 @@ class LossView:
     camera : Camera
     iteration : int
         Counted from 1 within the stage.
-    depth_kind : "mean" or "median"
+    depth_kind : "mean", "median" or "transmittance"
         The depth that the term asks for: ``output.depth(view.depth_kind)``.
     edges : "undefined" or "camera"
         How the term takes normals of depth beside empty pixels: ``LossTerm.edges``.
@@ -151,7 +151,7 @@ class LossView:
     _photometric: tuple[Tensor, Tensor] | None = None
 
     def two_views(self, output: RenderOutput) -> ViewPair:
-        """Return the view beside its neighbour, by mean or median depth; shared by the losses that ask."""
+        """Return the view beside its neighbour, by one kind of depth; shared by the losses that ask."""
         if self.neighbour is None:
             raise RecipeError("losses of two views need a neighbour, got none; pass one or take a recipe without them")
         kind = self.depth_kind
@@ -353,7 +353,7 @@ def compute_losses(
         Those that are active in the iteration (``LossTerm.is_active``) are evaluated. Terms of one kind add up.
     iteration : int
         Counted from 1 within the stage.
-    depth_kind : "mean" or "median"
+    depth_kind : "mean", "median" or "transmittance"
         The protocol's depth, for terms that name none.
     backend : str or Backend
         That rendered ``output``: its fused operations are taken, where it has any.

@@ -247,7 +247,7 @@ def _extract(
 
 
 def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:
-    views, settings = job.scene.train, replace(job.settings, with_distortion=False)
+    views, settings = job.scene.train, replace(job.settings, with_distortion=False).for_depths(depth)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
             output = rasterize(splats, view.camera, settings, backend=job.backend)
@@ -257,7 +257,7 @@ def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -
 
 
 def fusion_frame(job: RenderedScene, view: View, output: RenderOutput, depth: str) -> RenderedView:
-    """Return what fusion takes of a view: depth ("mean" or "median") and colour where it is covered well enough."""
+    """Return what fusion takes of a view: depth of a kind and colour where it is covered well enough."""
     valid = (output.alpha >= OPAQUE).cpu().numpy()
     mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
     for pixels in (mask, view.valid()):  # beyond the photograph nothing has said how far the surface is

@@ -265,7 +265,7 @@ class MeshOptions:
     """Mesh what lies far away too, in voxels that grow with the distance."""
     max_gib: float = 4.0
     """Memory for the fused volume; more is an error that names a voxel that fits."""
-    depth: Literal["mean", "median"] | None = None
+    depth: Literal["mean", "median", "transmittance"] | None = None
     """Depth that is fused (default: the run's protocol)."""
     keep_components: int | None = None
     """Keep the so many largest connected pieces (default: all that are not small)."""

@@ -41,7 +41,7 @@ def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> Raster
         background=protocol.background,
         sh_degree=sh_degree,
         near_plane_policy=protocol.near_plane_policy,
-    )
+    ).for_depths(protocol.depth, protocol.fused_depth)
 
 
 @torch.no_grad()
@@ -124,7 +124,13 @@ class FullRender:
         """Return the rasterizer's constants at an iteration (1-based)."""
         degree = stage.active_sh_degree(iteration, self.recipe.sh_degree)
         wanted = any(term.kind == "distortion" and term.is_active(iteration) for term in stage.losses)
-        return replace(raster_settings(self.protocol, self.scene.extent, degree), with_distortion=wanted)
+        settings = replace(
+            raster_settings(self.protocol, self.scene.extent, degree),
+            with_distortion=wanted,
+            with_transmittance_depth=False,
+        )
+        asked = (term.depth or self.protocol.depth for term in stage.losses if term.is_active(iteration))
+        return settings.for_depths(*asked)
 
     def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
         """Return the camera of training view ``index`` where it is now; with ``learns`` its pose gets a gradient."""
@@ -168,9 +174,11 @@ class FullRender:
         if turn is None:
             return None
         camera, other = self.camera(state, turn.neighbour), turn.neighbour
-        bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False)
+        kind = next((term.depth for term in stage.losses if term.kind in MULTIVIEW_KINDS and term.depth), None)
+        kind = kind or self.protocol.depth
+        bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False).for_depths(kind)
         small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
-        depth = rasterize(state.splats, small, bare, backend=self.backend).depth(self.protocol.depth)
+        depth = rasterize(state.splats, small, bare, backend=self.backend).depth(kind)
         here, there = (self._images.of(i, self._targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 
