@@ -19,7 +19,7 @@ from gs2d.errors import ShapeError
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda.arguments import View
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.cuda_passes import IMAGES, PARAMETERS, ForwardState, Wanted, backward, errors, forward
+from gs2d.render.cuda_passes import DEPTH, IMAGES, PARAMETERS, ForwardState, Wanted, backward, errors, forward
 from gs2d.render.cuda_passes import view_of as _view
 from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
@@ -49,9 +49,14 @@ class _Options:
     view: View
     exact_masks: bool
     distortion: bool
+    transmittance: bool
     deterministic: bool
     learns: Tensor | None
     budget: PairBudget | None
+
+
+def _image_names(transmittance: bool) -> tuple[str, ...]:
+    return (*IMAGES, "depth_transmittance") if transmittance else IMAGES
 
 
 SAVED = tuple(field.name for field in fields(ForwardState) if field.name not in ("view", "images"))
@@ -66,7 +71,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         launcher, view = options.launcher, options.view
-        choices = {"exact": options.exact_masks, "distortion": options.distortion}
+        choices = {"exact": options.exact_masks, "distortion": options.distortion, "transmittance": options.transmittance}
         frame = forward(launcher, view, tensors, **choices, budget=options.budget)
         if any(ctx.needs_input_grad):
             # The images returned to the user may be changed in place: save_for_backward would notice, a plain
@@ -77,7 +82,8 @@ class _Rasterize(torch.autograd.Function):
             ctx.save_for_backward(*(getattr(frame, name) for name in SAVED), *frame.images.values(), *tensors)
             ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(frame.radii)
-        return (*(frame.images[name] for name in IMAGES), frame.radii)
+        names = _image_names(options.transmittance)
+        return (frame.radii, *(frame.images[name] for name in names))
 
     @staticmethod
     @once_differentiable
@@ -85,10 +91,10 @@ class _Rasterize(torch.autograd.Function):
         options: _Options = ctx.options
         saved = ctx.saved_tensors
         tensors = saved[-len(PARAMETERS) :]
-        images = dict(zip((*IMAGES, "final_T", "moments"), saved[len(SAVED) : -len(PARAMETERS)], strict=True))
+        images = dict(zip((*IMAGES, "final_T", "moments", *DEPTH), saved[len(SAVED) : -len(PARAMETERS)], strict=True))
         hidden = dict(zip(SAVED, saved[: len(SAVED)], strict=True))
         frame = ForwardState(view=options.view, images=images, **hidden)
-        given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[: len(IMAGES)]]
+        given = [None if g is None else g.detach().to(torch.float32).contiguous() for g in upstream[1:]]
         if not options.distortion:
             given[IMAGES.index("distortion")] = None  # a constant
         want_probe, want_intrinsics, *want = ctx.needs_input_grad[1:]
@@ -99,7 +105,8 @@ class _Rasterize(torch.autograd.Function):
         probe = torch.empty(ctx.probe_shape, dtype=torch.float32, device=device) if want_probe else None
         each = torch.zeros(len(tensors[0]), 4, dtype=torch.float32, device=device) if want_intrinsics else None
         wanted = Wanted({**gradients, "probe": probe, "intrinsics": each}, options.learns, options.deterministic)
-        backward(options.launcher, frame, tensors, dict(zip(IMAGES, given, strict=True)), wanted)
+        by_name = {"depth_transmittance": None} | dict(zip(_image_names(options.transmittance), given, strict=True))
+        backward(options.launcher, frame, tensors, by_name, wanted)
         total = None if each is None else each.sum(dim=0, dtype=torch.float64).to(ctx.of_intrinsics)
         return None, probe, total, *gradients.values()
 
@@ -159,9 +166,11 @@ def rasterize_with(
         gradient_rows = gradient_rows.clone()  # whatever happens to it before the backward pass
     if deterministic is None:
         deterministic = torch.are_deterministic_algorithms_enabled()
-    options = _Options(launcher, _view(camera, settings), exact_masks, distortion, deterministic, gradient_rows, budget)
-    *images, radii = _Rasterize.apply(options, screen_probe, camera.intrinsics, *(t for _, t in splats.items()))
-    return RenderOutput(**dict(zip(IMAGES, images, strict=True)), radii=radii)
+    transmittance = settings.with_transmittance_depth
+    choices = (exact_masks, distortion, transmittance, deterministic)
+    options = _Options(launcher, _view(camera, settings), *choices, gradient_rows, budget)
+    radii, *images = _Rasterize.apply(options, screen_probe, camera.intrinsics, *(t for _, t in splats.items()))
+    return RenderOutput(**dict(zip(_image_names(transmittance), images, strict=True)), radii=radii)
 
 
 def rasterize(

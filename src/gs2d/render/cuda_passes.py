@@ -21,6 +21,7 @@ from gs2d.kernels.cuda.arguments import (
     BlendArguments,
     BlendColorsArguments,
     BlendVjpArguments,
+    DepthArguments,
     EmitArguments,
     ErrorArguments,
     OccludedArguments,
@@ -35,7 +36,7 @@ from gs2d.kernels.cuda.launch import Launcher
 from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, room_for
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 
-__all__ = ["IMAGES", "PARAMETERS", "ForwardState", "Wanted", "backward", "errors", "forward", "view_of"]
+__all__ = ["DEPTH", "IMAGES", "PARAMETERS", "ForwardState", "Wanted", "backward", "errors", "forward", "view_of"]
 
 TILE = 16
 THREADS = 128
@@ -44,6 +45,7 @@ MAX_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MAX_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
+DEPTH = ("depth_transmittance", "slope")  # without pixels where that depth was not asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ class ForwardState:
     seen : Tensor [words, 8] int32
         Who was seen by a live pixel, one bit per entry and sub-block.
     images : dict of Tensor
-        The outputs, ``final_T`` [H, W] and ``moments`` [H, W, 3].
+        The outputs, ``final_T`` [H, W], ``moments`` [H, W, 3], ``depth_transmittance`` and its ``slope`` [H, W].
     radii : Tensor [N] float32
     order : Tensor [N] int64
         Splats by depth.
@@ -129,6 +131,7 @@ def view_of(camera: Camera, settings: RasterSettings) -> View:
         settings.error_cutoff**2,
         NEAR_PLANE_POLICIES.index(settings.near_plane_policy),
     )
+    view.inv_depth_width = 1 / settings.depth_width(camera)
     view.distortion_scale = (settings.far * settings.near / (settings.far - settings.near)) ** 2
     view.tiles_x, view.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     return view
@@ -188,12 +191,14 @@ def forward(
     *,
     exact: bool = True,
     distortion: bool = True,
+    transmittance: bool = False,
     budget: PairBudget | None = None,
 ) -> ForwardState:
     """Render one view; ``exact=False`` turns off culling inside tiles, and all of what has no ellipse (tests).
 
     The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device. Without
-    ``distortion`` that image is NaN: it is a tenth of the blending, and few recipes want it.
+    ``distortion`` that image is NaN: it is a tenth of the blending, and few recipes want it. ``transmittance``: with the
+    depth of that kind; it has no pixels otherwise.
     """
     device = parameters[0].device
 
@@ -213,6 +218,13 @@ def forward(
     _fill(blend, {"records": projected.records, "seen": seen, **images})
     _fill(blend, {name: getattr(lists, name) for name in ("entries", "ranges", "tiles")})
     launcher.launch(f"blend_forward{'_distortion' if distortion else ''}", len(lists.tiles), THREADS, blend)
+    images |= {name: floats(H, W) if transmittance else floats(0) for name in DEPTH}
+    if transmittance:
+        find = DepthArguments(view=view)
+        _fill(find, {"records": projected.records, "seen": seen, "alpha": images["alpha"]})
+        _fill(find, {"median": images["depth_median"], "depth": images["depth_transmittance"]})
+        _fill(find, {"slope": images["slope"], **{name: getattr(lists, name) for name in ("entries", "ranges", "tiles")}})
+        launcher.launch("transmittance_depth", len(lists.tiles), THREADS, find)
     return ForwardState(
         view=view,
         records=projected.records,
@@ -309,11 +321,13 @@ def backward(
         kind = "geometry"
     if upstream["distortion"] is not None:
         kind = "distortion"
+    if upstream["depth_transmittance"] is not None:
+        kind = "distortion_transmittance" if kind == "distortion" else "transmittance"
     sums = _Sums(frame, wanted.deterministic, columns=16)
     blend = BlendVjpArguments(view=frame.view)
     _fill(blend, {name: getattr(frame, name) for name in ("records", "entries", "ranges", "tiles", "seen")})
     _fill(blend, {name: image for name, image in frame.images.items() if name != "depth_median"})
-    _fill(blend, {f"g_{name}": upstream[name] for name in IMAGES})
+    _fill(blend, {f"g_{name}": upstream[name] for name in (*IMAGES, "depth_transmittance")})
     _fill(blend, {"gradients": sums.gradients, "extras": sums.extras, "slots": sums.slots, "learns": wanted.learns})
     launcher.launch(f"blend_vjp_{kind}{'_abs' if absolute else ''}", len(frame.tiles), THREADS, blend)
     gradients, extras = sums.of_splats(launcher)

@@ -13,6 +13,7 @@ __all__ = [
     "BlendColorsArguments",
     "BlendVjpArguments",
     "BlurArguments",
+    "DepthArguments",
     "EmitArguments",
     "ErrorArguments",
     "FinishArguments",
@@ -58,7 +59,7 @@ class View(ctypes.Structure):
         ("center", ctypes.c_float * 3),
         *_all(ctypes.c_float, "fx", "fy", "cx", "cy"),
         *_all(ctypes.c_float, "near", "lowpass_px", "inv_lowpass2", "log2_alpha_min", "alpha_max", "transmittance_min"),
-        *_all(ctypes.c_float, "error_k2", "distortion_scale"),
+        *_all(ctypes.c_float, "error_k2", "distortion_scale", "inv_depth_width"),
         ("background", ctypes.c_float * 3),
         *_all(ctypes.c_int32, "width", "height", "tiles_x", "tiles_y", "sh_degree", "near_plane_policy"),
     )
@@ -110,6 +111,16 @@ class BlendVjpArguments(ctypes.Structure):
         *_pointers("records", "entries", "ranges", "tiles", "seen"),
         *_pointers("color", "alpha", "normal", "depth_mean", "distortion", "final_T", "moments"),
         *_pointers(*(f"g_{name}" for name in IMAGES), "learns", "slots", "gradients", "extras"),
+        *_pointers("depth_transmittance", "slope", "g_depth_transmittance"),
+    )
+
+
+class DepthArguments(ctypes.Structure):
+    """Of transmittance.cu."""
+
+    _fields_ = (
+        ("view", View),
+        *_pointers("records", "entries", "ranges", "tiles", "seen", "alpha", "median", "depth", "slope"),
     )
 
 

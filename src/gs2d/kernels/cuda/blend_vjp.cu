@@ -21,13 +21,14 @@ struct BlendVjpArguments {
     const int64* slots;   // [entries]: the candidate that each was, or null
     float* gradients;     // [N, 16], zeros on entry; with slots [4 * candidates, 16]
     float* extras;        // the same rows of 4: low-pass centre, absolute densification signal
+    const float *depth_transmittance, *slope, *g_depth_transmittance;  // of transmittance.cu; TRANS only
 };
 
 // One value of a plane that may be absent.
 __device__ __forceinline__ float at_or_zero(const float* plane, int64 i) { return plane ? plane[i] : 0.f; }
 
 // The upstream gradient as composite_vjp wants it, and S = the sum over all splats of w s, from the image's totals.
-template <bool GEO, bool DIST>
+template <bool GEO, bool DIST, bool TRANS>
 __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArguments& a, int64 i, float& S) {
     const float* bg = a.view.background;
     const float T = a.final_T[i], alpha = a.alpha[i];
@@ -48,6 +49,8 @@ __device__ __forceinline__ PixelGradient<float> upstream_of(const BlendVjpArgume
         S = fma(g.depth, a.depth_mean[i] * alpha, S);
         g.median = at_or_zero(a.g_depth_median, i), g.median_below = max(T, 0.5f);
     }
+    if constexpr (TRANS)
+        add_transmittance(a.g_depth_transmittance[i], a.depth_transmittance[i], a.slope[i], alpha, g);
     S = fma(g.alpha, alpha, S);
     if constexpr (DIST) {
         S = fma(2.f * a.g_distortion[i], a.distortion[i], S);  // each pair counts for both of its splats
@@ -78,15 +81,17 @@ __device__ __forceinline__ void add_gradient(const BlendVjpArguments& a, int64 r
 }
 
 // What the inner loop needs of a pixel's upstream gradient, in shared memory: each thread reads what it wrote itself.
-template <bool GEO> struct Upstream {
+template <bool GEO, bool TRANS = false> struct Upstream {
     float4 color[HALVES][128];             // red, green, blue, alpha
     float4 normal[HALVES][GEO ? 128 : 1];  // and depth
     float2 median[HALVES][GEO ? 128 : 1];  // and the transmittance behind the median pair
+    float2 depth[HALVES][TRANS ? 128 : 1];  // by transmittance: factor and depth
     __device__ __forceinline__ void put(int h, const PixelGradient<float>& g) {
         color[h][threadIdx.x] = {g.red, g.green, g.blue, g.alpha};
         if constexpr (!GEO) return;
         const int i = GEO ? threadIdx.x : 0;
         normal[h][i] = {g.nx, g.ny, g.nz, g.depth}, median[h][i] = {g.median, g.median_below};
+        if constexpr (TRANS) depth[h][threadIdx.x] = {g.transmittance, g.z};
     }
     __device__ __forceinline__ void get(int h, PixelGradient<float>& g) const {
         const float4 c = color[h][threadIdx.x];
@@ -96,6 +101,7 @@ template <bool GEO> struct Upstream {
         const float4 n = normal[h][i];
         const float2 m = median[h][i];
         g.nx = n.x, g.ny = n.y, g.nz = n.z, g.depth = n.w, g.median = m.x, g.median_below = m.y;
+        if constexpr (TRANS) g.transmittance = depth[h][threadIdx.x].x, g.z = depth[h][threadIdx.x].y;
     }
 };
 
@@ -104,8 +110,8 @@ struct Staged {  // of a warp: 32 splats
     uint rows[32];
 };
 
-template <bool GEO, bool DIST, bool ABS>
-__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream<GEO>& upstream) {
+template <bool GEO, bool DIST, bool ABS, bool TRANS = false>
+__device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& staged, Upstream<GEO, TRANS>& upstream) {
     const Place at = place_of(a.view, a.tiles);
     const BlendLimits<float> limits = limits_of(a.view);
     PixelGradient<float> g[HALVES];  // in registers only what is not in `upstream`
@@ -115,7 +121,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
         g[h] = {}, T[h] = 0.f, S[h] = 0.f;
         if (at.inside[h]) {
             T[h] = 1.f;
-            g[h] = upstream_of<GEO, DIST>(a, int64(at.y + 4 * h) * a.view.width + at.x, S[h]);
+            g[h] = upstream_of<GEO, DIST, TRANS>(a, int64(at.y + 4 * h) * a.view.width + at.x, S[h]);
         }
         upstream.put(h, g[h]);
     }
@@ -154,7 +160,7 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
                 const float dy = first_dy + float(4 * h);
                 const Hit<float> hit = hit_of<PLAIN>(s, planes[h], dx, dy, limits);
                 upstream.get(h, g[h]);
-                composite_vjp<GEO, DIST, ABS, !PLAIN, true>(s, dx, dy, hit, limits, g[h], T[h], S[h], sums);
+                composite_vjp<GEO, DIST, ABS, TRANS, !PLAIN, true>(s, dx, dy, hit, limits, g[h], T[h], S[h], sums);
             }
             if (!(learning & bit)) return;  // the same for all lanes
             finish_column(dx, sums);
@@ -164,7 +170,8 @@ __device__ __forceinline__ void blend_vjp(const BlendVjpArguments& a, Staged& st
     }
 }
 
-// GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is wanted.
+// GEO: normal or depth images have gradients (or the distortion has: DIST). ABS: the AbsGS signal is wanted. TRANS: the
+// depth by transmittance has.
 extern "C" __global__ void __launch_bounds__(128, 7) blend_vjp_color(BlendVjpArguments a) {
     __shared__ Staged staged[4];
     __shared__ Upstream<false> upstream;
@@ -199,6 +206,30 @@ extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion_abs(Bl
     __shared__ Staged staged[4];
     __shared__ Upstream<true> upstream;
     blend_vjp<true, true, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_transmittance(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true, true> upstream;
+    blend_vjp<true, false, false, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_transmittance_abs(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true, true> upstream;
+    blend_vjp<true, false, true, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion_transmittance(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true, true> upstream;
+    blend_vjp<true, true, false, true>(a, staged[threadIdx.x >> 5], upstream);
+}
+
+extern "C" __global__ void __launch_bounds__(128, 5) blend_vjp_distortion_transmittance_abs(BlendVjpArguments a) {
+    __shared__ Staged staged[4];
+    __shared__ Upstream<true, true> upstream;
+    blend_vjp<true, true, true, true>(a, staged[threadIdx.x >> 5], upstream);
 }
 
 }  // namespace gs2d

@@ -22,13 +22,15 @@ struct View {
     float near, lowpass_px, inv_lowpass2, log2_alpha_min, alpha_max, transmittance_min;
     float error_k2;          // error_cutoff^2
     float distortion_scale;  // (far near / (far - near))^2
+    float inv_depth_width;   // of rule 22
     float background[3];
     int width, height, tiles_x, tiles_y;
     int sh_degree, near_plane_policy;
 };
 
 __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
-    return {v.inv_lowpass2, v.near, v.log2_alpha_min, v.alpha_max, v.transmittance_min};
+    return {v.inv_lowpass2, v.near, v.log2_alpha_min, v.alpha_max, v.transmittance_min,
+            v.inv_depth_width};
 }
 
 __device__ __forceinline__ bool is_finite(float a) { return abs(a) <= 3.402823466e38f; }  // false for NaN

@@ -1,0 +1,100 @@
+// Depth by continuous transmittance, after the blending and only where it is asked for. With the layout of blend.cu: a thread
+// searches for its two pixels at once, and each step of the search is a walk over the pairs of the warp, which the words
+// of the forward pass tell. A warp goes on while one of its pixels does; the warps of a block never wait for each other.
+#include "cuda/pixels.h"
+
+namespace gs2d {
+
+struct DepthArguments {
+    View view;
+    const float* records;
+    const uint* entries;
+    const int64* ranges;
+    const int* tiles;
+    const uint* seen;
+    const float *alpha, *median;  // [H, W] of the blending; the median is the first guess
+    float *depth, *slope;         // [H, W]: where half of alpha lies; -dT/dz there
+};
+
+constexpr float TOLERANCE = 2e-7f;
+
+// Calls pair(half, alpha, inverse depth) for the pairs that the pixels of this thread have blended.
+template <class F>
+__device__ __forceinline__ void walk(const DepthArguments& a, const Place& at, const BlendLimits<float>& limits,
+                                     float4 (*records)[32], F&& pair) {
+    const float x = float(at.x) + 0.5f, y = float(at.y) + 0.5f;
+    const int64 begin = a.ranges[2 * int64(at.tile)];
+    const int count = int(a.ranges[2 * int64(at.tile) + 1] - begin);
+    float T[HALVES] = {at.inside[0] ? 1.f : 0.f, at.inside[1] ? 1.f : 0.f};
+    for (int chunk = 0; 32 * chunk < count; ++chunk) {
+        const uint* words = a.seen + word_of(begin, at.tile, chunk);
+        const uint hits[HALVES] = {uniform(words[at.sub_block[0]], at.lane), uniform(words[at.sub_block[1]], at.lane)};
+        const uint wanted = hits[0] | hits[1];
+        if (wanted == 0u) continue;  // the same for all lanes
+        bool mine_is_plain = false;
+        if (wanted >> at.lane & 1u) {
+            fetch_record(a.records, a.entries[begin + 32 * chunk + at.lane] >> 8, records, at.lane);
+            mine_is_plain = plain_for_warp(a.view, at, records);
+        }
+        const uint plain = __ballot_sync(FULL_MASK, mine_is_plain);
+        __syncwarp();
+        for_each_splat(wanted, plain, [&](auto is_plain, int j, uint bit) {
+            const Record<float> s = record_of(records[0][j], records[1][j], records[2][j], records[3][j]);
+            const float dx = x - s.cx, dy = y - s.cy;
+            PlaneAt<float> planes[HALVES];
+            planes_of(s, dx, dy, planes);
+#pragma unroll
+            for (int h = 0; h < HALVES; ++h) {
+                if (!(hits[h] & bit)) continue;  // the same for all lanes
+                const Hit<float> hit = hit_of<decltype(is_plain)::value>(s, planes[h], dx, dy + float(4 * h), limits);
+                const float alpha = min(hit.alpha, limits.alpha_max), after = fnma(alpha, T[h], T[h]);
+                const bool goes_on = after >= limits.transmittance_min;
+                T[h] = keep(goes_on, after);
+                pair(h, keep(goes_on, alpha), hit.inverse_depth);
+            }
+        });
+        __syncwarp();  // before the records are overwritten
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(128, 7) transmittance_depth(DepthArguments a) {
+    __shared__ float4 staged[4][4][32];
+    const Place at = place_of(a.view, a.tiles);
+    float4(*records)[32] = staged[at.warp];
+    const BlendLimits<float> limits = limits_of(a.view);
+    const float inv_width = a.view.inv_depth_width;
+    float least[HALVES] = {1e30f, 1e30f}, most[HALVES] = {0.f, 0.f};
+    walk(a, at, limits, records, [&](int h, float alpha, float inverse_depth) {
+        least[h] = alpha > 0.f ? min(least[h], inverse_depth) : least[h];
+        most[h] = alpha > 0.f ? max(most[h], inverse_depth) : most[h];
+    });
+    DepthSearch<float> search[HALVES];
+    float level[HALVES];
+    Transmittance<float> t[HALVES];
+#pragma unroll
+    for (int h = 0; h < HALVES; ++h) {
+        const int64 i = int64(at.y + 4 * h) * a.view.width + at.x;
+        const bool hit = at.inside[h] && most[h] > 0.f;
+        level[h] = hit ? fnma(0.5f, a.alpha[i], 1.f) : 1.f, t[h] = {1.f, 0.f};
+        begin_search(hit ? a.median[i] : 1.f, reciprocal(hit ? most[h] : 1.f), reciprocal(hit ? least[h] : 1.f),
+                     inv_width, hit, search[h]);
+    }
+    for (int step = 0; step < MAX_SEARCH_STEPS && __any_sync(FULL_MASK, search[0].open || search[1].open); ++step) {
+        t[0] = {1.f, 0.f}, t[1] = {1.f, 0.f};
+        walk(a, at, limits, records, [&](int h, float alpha, float inverse_depth) {
+            pass_pair(alpha, inverse_depth, search[h].z, inv_width, t[h]);
+        });
+#pragma unroll
+        for (int h = 0; h < HALVES; ++h) advance(t[h], level[h], inv_width, TOLERANCE, search[h]);
+    }
+#pragma unroll
+    for (int h = 0; h < HALVES; ++h) {
+        if (!at.inside[h]) continue;
+        const int64 i = int64(at.y + 4 * h) * a.view.width + at.x;
+        const bool hit = most[h] > 0.f;
+        a.depth[i] = hit ? search[h].z : 0.f;
+        a.slope[i] = hit ? slope_of(t[h].fall, a.alpha[i], search[h].z, inv_width) : 1.f;
+    }
+}
+
+}  // namespace gs2d
