@@ -146,6 +146,11 @@ def rasterize_2dgs(
     >>> out.colors.shape, out.alphas.shape, out.radii.shape
     (torch.Size([1, 48, 64, 8]), torch.Size([1, 48, 64, 1]), torch.Size([1, 50]))
     """
+    if settings.with_transmittance_depth:
+        raise ShapeError(
+            "rasterize_2dgs has no depth by transmittance, got settings with it: render with gs2d.rasterize, or leave "
+            "with_transmittance_depth False"
+        )
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
     if torch.compiler.is_compiling() or not _is_plain(means):
         if not isinstance(backend, str):
