@@ -31,20 +31,25 @@ template <class V> GS2D_HD void pass_pair(V alpha, V inverse_depth, V z, V inv_w
 template <class V> struct DepthSearch {
     V z, near, far;  // near < depth <= far
     V step;          // the last one's length
+    V fall;          // of T where it began
     mask_t<V> open;  // still moving
 };
 
 constexpr int MAX_SEARCH_STEPS = 64;  // twice what bisection needs in float
+// Of a width: the search ends with a step that is shorter, after which Newton's method is off by its square, and T falls as
+// it did before.
+template <class real> constexpr real SEARCH_TOLERANCE = real(sizeof(real) == sizeof(double) ? 1e-8 : 1e-4);
 
-// `first` is a guess; nearest, farthest: depths of the pixel's pairs.
+// At the depth of one of the pixel's pairs; least, most: 1 / z of its pairs.
 template <class V>
-GS2D_HD void begin_search(V first, V nearest, V farthest, V inv_width, mask_t<V> hit, DepthSearch<V>& s) {
+GS2D_HD DepthSearch<V> begin_search(V z, V least, V most, V inv_width, mask_t<V> hit) {
     const V width = reciprocal(inv_width);
-    s.near = nearest * (V(1) - width), s.far = farthest * (V(1) + width);
-    s.z = min(max(first, s.near), s.far), s.step = s.far - s.near, s.open = hit;
+    const V near = (V(1) - width) * reciprocal(select(hit, most, V(1)));
+    const V far = (V(1) + width) * reciprocal(select(hit, least, V(1)));
+    return {z, near, far, far - near, V(0), hit};
 }
 
-// One step, given T at z. Where it has become smaller than `tolerance` z the pixel stays where T was evaluated.
+// One step, given T at z.
 template <class V>
 GS2D_HD void advance(const Transmittance<V>& t, V level, V inv_width, V tolerance, DepthSearch<V>& s) {
     const V excess = t.T - level;
@@ -54,8 +59,9 @@ GS2D_HD void advance(const Transmittance<V>& t, V level, V inv_width, V toleranc
     // false for NaN and infinities: bisection
     const auto good = (next > s.near) & (next < s.far) & (abs(newton) <= V(0.5f) * s.step);
     const V z = select(good, next, s.near + half), step = select(good, abs(newton), half);
-    s.open = s.open & (step > tolerance * s.z);
-    s.z = select(s.open, z, s.z), s.step = step;
+    const auto moves = s.open;
+    s.open = moves & (step * inv_width > tolerance * s.z);
+    s.z = select(moves, z, s.z), s.fall = select(moves, t.fall, s.fall), s.step = step;
 }
 
 // -dT/dz as the gradient takes it: a pixel between two surfaces has nearly none, and would have any gradient.

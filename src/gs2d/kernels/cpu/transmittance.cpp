@@ -7,8 +7,6 @@
 namespace gs2d {
 namespace {
 
-constexpr real TOLERANCE = sizeof(real) == 8 ? real(1e-14) : real(2e-7);
-
 // alpha and 1 / z of the pairs of a tile, a block's one after the other; alpha is 0 where a pixel did not blend the splat.
 struct Pairs {
     Buffer<real> values;  // [pairs, 2, LANES]
@@ -55,24 +53,23 @@ bool gather(const Frame& f, int64_t tile, const TileArea& area, const BlendLimit
 void search(Pairs& pairs, int b, V alpha, V inv_width, real* depth, real* slope) {
     const int64_t begin = pairs.begin[b], end = pairs.begin[b + 1];
     const M hit = alpha > V(0);
+    const V level = fnma(V(real(0.5)), alpha, V(1)), first = load(depth);
     V least = V(real(1e30)), most = V(0);
-    for (int64_t i = begin; i < end; ++i) {
-        const V inverse = load(pairs.at(i) + LANES);
-        const M blended = load(pairs.at(i)) > V(0);
-        least = min(least, select(blended, inverse, least)), most = max(most, keep(blended, inverse));
-    }
-    const V level = fnma(V(real(0.5)), alpha, V(1));
-    DepthSearch<V> s;
-    begin_search(load(depth), reciprocal(select(hit, most, V(1))), reciprocal(select(hit, least, V(1))), inv_width, hit,
-                 s);
     Transmittance<V> t = {V(1), V(0)};
-    for (int step = 0; step < MAX_SEARCH_STEPS && any(s.open); ++step) {
+    for (int64_t i = begin; i < end; ++i) {
+        const V weight = load(pairs.at(i)), inverse = load(pairs.at(i) + LANES);
+        const M blended = weight > V(0);
+        least = min(least, select(blended, inverse, least)), most = max(most, keep(blended, inverse));
+        pass_pair(weight, inverse, first, inv_width, t);
+    }
+    DepthSearch<V> s = begin_search(first, least, most, inv_width, hit);
+    for (int step = 1; advance(t, level, inv_width, V(SEARCH_TOLERANCE<real>), s), any(s.open); ++step) {
+        if (step == MAX_SEARCH_STEPS) break;
         t = {V(1), V(0)};
         for (int64_t i = begin; i < end; ++i) pass_pair(load(pairs.at(i)), load(pairs.at(i) + LANES), s.z, inv_width, t);
-        advance(t, level, inv_width, V(TOLERANCE), s);
     }
     store(depth, keep(hit, s.z));
-    store(slope, select(hit, slope_of(t.fall, alpha, s.z, inv_width), V(1)));
+    store(slope, select(hit, slope_of(s.fall, alpha, s.z, inv_width), V(1)));
 }
 
 }  // namespace

@@ -16,8 +16,6 @@ struct DepthArguments {
     float *depth, *slope;         // [H, W]: where half of alpha lies; -dT/dz there
 };
 
-constexpr float TOLERANCE = 2e-7f;
-
 // Calls pair(half, alpha, inverse depth) for the pairs that the pixels of this thread have blended.
 template <class F>
 __device__ __forceinline__ void walk(const DepthArguments& a, const Place& at, const BlendLimits<float>& limits,
@@ -63,37 +61,40 @@ extern "C" __global__ void __launch_bounds__(128, 7) transmittance_depth(DepthAr
     float4(*records)[32] = staged[at.warp];
     const BlendLimits<float> limits = limits_of(a.view);
     const float inv_width = a.view.inv_depth_width;
-    float least[HALVES] = {1e30f, 1e30f}, most[HALVES] = {0.f, 0.f};
-    walk(a, at, limits, records, [&](int h, float alpha, float inverse_depth) {
-        least[h] = alpha > 0.f ? min(least[h], inverse_depth) : least[h];
-        most[h] = alpha > 0.f ? max(most[h], inverse_depth) : most[h];
-    });
-    DepthSearch<float> search[HALVES];
-    float level[HALVES];
+    float least[HALVES], most[HALVES], level[HALVES], first[HALVES];
     Transmittance<float> t[HALVES];
 #pragma unroll
     for (int h = 0; h < HALVES; ++h) {
         const int64 i = int64(at.y + 4 * h) * a.view.width + at.x;
-        const bool hit = at.inside[h] && most[h] > 0.f;
-        level[h] = hit ? fnma(0.5f, a.alpha[i], 1.f) : 1.f, t[h] = {1.f, 0.f};
-        begin_search(hit ? a.median[i] : 1.f, reciprocal(hit ? most[h] : 1.f), reciprocal(hit ? least[h] : 1.f),
-                     inv_width, hit, search[h]);
+        level[h] = at.inside[h] ? fnma(0.5f, a.alpha[i], 1.f) : 1.f, first[h] = at.inside[h] ? a.median[i] : 0.f;
+        least[h] = 1e30f, most[h] = 0.f, t[h] = {1.f, 0.f};
     }
-    for (int step = 0; step < MAX_SEARCH_STEPS && __any_sync(FULL_MASK, search[0].open || search[1].open); ++step) {
+    walk(a, at, limits, records, [&](int h, float alpha, float inverse_depth) {
+        least[h] = alpha > 0.f ? min(least[h], inverse_depth) : least[h];
+        most[h] = alpha > 0.f ? max(most[h], inverse_depth) : most[h];
+        pass_pair(alpha, inverse_depth, first[h], inv_width, t[h]);
+    });
+    DepthSearch<float> search[HALVES];
+#pragma unroll
+    for (int h = 0; h < HALVES; ++h) {
+        search[h] = begin_search(first[h], least[h], most[h], inv_width, level[h] < 1.f);
+        advance(t[h], level[h], inv_width, SEARCH_TOLERANCE<float>, search[h]);
+    }
+    for (int step = 1; step < MAX_SEARCH_STEPS && __any_sync(FULL_MASK, search[0].open || search[1].open); ++step) {
         t[0] = {1.f, 0.f}, t[1] = {1.f, 0.f};
         walk(a, at, limits, records, [&](int h, float alpha, float inverse_depth) {
             pass_pair(alpha, inverse_depth, search[h].z, inv_width, t[h]);
         });
 #pragma unroll
-        for (int h = 0; h < HALVES; ++h) advance(t[h], level[h], inv_width, TOLERANCE, search[h]);
+        for (int h = 0; h < HALVES; ++h) advance(t[h], level[h], inv_width, SEARCH_TOLERANCE<float>, search[h]);
     }
 #pragma unroll
     for (int h = 0; h < HALVES; ++h) {
         if (!at.inside[h]) continue;
         const int64 i = int64(at.y + 4 * h) * a.view.width + at.x;
-        const bool hit = most[h] > 0.f;
+        const bool hit = level[h] < 1.f;
         a.depth[i] = hit ? search[h].z : 0.f;
-        a.slope[i] = hit ? slope_of(t[h].fall, a.alpha[i], search[h].z, inv_width) : 1.f;
+        a.slope[i] = hit ? slope_of(search[h].fall, a.alpha[i], search[h].z, inv_width) : 1.f;
     }
 }
 
