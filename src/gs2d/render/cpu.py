@@ -140,7 +140,7 @@ def _check_tensors(splats: Splats, settings: RasterSettings, dtype: torch.dtype)
 
 
 def _forward(
-    library: Library, view: _View, depth_width: float | None, tensors: Sequence[Tensor]
+    library: Library, view: _View, tensors: Sequence[Tensor], depth_width: float | None = None
 ) -> tuple[dict[str, Tensor], Tensor, _Frame]:
     """Images, radii and what the backward pass needs; the tensors are contiguous."""
     H, W = int(view.height), int(view.width)
@@ -178,7 +178,7 @@ class _Rasterize(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
-        images, radii, frame = _forward(library, view, depth_width, tensors)
+        images, radii, frame = _forward(library, view, tensors, depth_width)
         if any(ctx.needs_input_grad):
             ctx.library, ctx.frame, ctx.rows = library, frame, rows
             ctx.probe_shape = None if probe is None else tuple(probe.shape)
