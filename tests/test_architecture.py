@@ -65,7 +65,7 @@ INSIDE = {
         "cpu_cached pose_gradient exposure": 4,
         "cpu cuda reference_errors": 3,
         "cuda_passes reference": 2,
-        "pair_budget reference_projection pose_gradient_native exposure_native": 1,
+        "pair_budget reference_projection reference_transmittance pose_gradient_native exposure_native": 1,
         "types": 0,
     },
 }

@@ -249,7 +249,8 @@ def test_22_bare_tensors_refuse_it() -> None:
 
 
 def test_22_constants_that_older_runs_do_not_name_are_written_only_where_they_differ() -> None:
-    facts = RasterSettings().facts()
-    assert "with_transmittance_depth" not in facts
+    facts = RasterSettings(with_transmittance_depth=True).facts()
     assert "depth_width_px" not in facts
-    assert RasterSettings(**replace(SETTINGS, near=0.5).facts()) == replace(SETTINGS, near=0.5)
+    assert "with_transmittance_depth" not in facts  # what is asked for is no constant
+    written = replace(SETTINGS, near=0.5, depth_width_px=3.0).facts()
+    assert RasterSettings(**written).for_depths("transmittance") == replace(SETTINGS, near=0.5, depth_width_px=3.0)

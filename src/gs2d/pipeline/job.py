@@ -440,6 +440,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
     try:
         recipe, protocol = from_json(data["recipe"], to_train=False), protocol_from_json(data["protocol"])
         settings = RasterSettings(**{**data["raster"], "background": tuple(data["raster"]["background"])})
+        settings = settings.for_depths(protocol.depth, protocol.fused_depth)
         named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
         cache_bytes = int(data.get("stage2_cache_bytes", 0))  # runs of before there were cached views had none
     except (KeyError, TypeError) as error:

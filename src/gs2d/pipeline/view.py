@@ -199,7 +199,9 @@ def drawn(
 ) -> Drawn:
     """Return the exact picture of a kind ("exact", "normals", "depth") for the viewer."""
     with torch.no_grad():
-        output = rasterize(splats, camera, replace(settings, with_distortion=False).for_depths(depth_kind), backend=backend)
+        output = rasterize(
+            splats, camera, replace(settings, with_distortion=False).for_depths(depth_kind), backend=backend
+        )
     alpha, depth = output.alpha.cpu().numpy(), output.depth(depth_kind).cpu().numpy()
     if kind == "normals":
         image = normal_image(output.normal.cpu().numpy(), alpha)

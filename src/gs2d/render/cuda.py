@@ -71,7 +71,11 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         tensors = [p.detach().contiguous() for p in parameters]
         launcher, view = options.launcher, options.view
-        choices = {"exact": options.exact_masks, "distortion": options.distortion, "transmittance": options.transmittance}
+        choices = {
+            "exact": options.exact_masks,
+            "distortion": options.distortion,
+            "transmittance": options.transmittance,
+        }
         frame = forward(launcher, view, tensors, **choices, budget=options.budget)
         if any(ctx.needs_input_grad):
             # The images returned to the user may be changed in place: save_for_backward would notice, a plain

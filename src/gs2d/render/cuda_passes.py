@@ -223,7 +223,9 @@ def forward(
         find = DepthArguments(view=view)
         _fill(find, {"records": projected.records, "seen": seen, "alpha": images["alpha"]})
         _fill(find, {"median": images["depth_median"], "depth": images["depth_transmittance"]})
-        _fill(find, {"slope": images["slope"], **{name: getattr(lists, name) for name in ("entries", "ranges", "tiles")}})
+        _fill(
+            find, {"slope": images["slope"], **{name: getattr(lists, name) for name in ("entries", "ranges", "tiles")}}
+        )
         launcher.launch("transmittance_depth", len(lists.tiles), THREADS, find)
     return ForwardState(
         view=view,

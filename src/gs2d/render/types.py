@@ -69,7 +69,7 @@ class RasterSettings:
     lowpass_depth: str = "center"
     near_plane_policy: str = "draw"
     with_distortion: bool = True
-    with_transmittance_depth: bool = field(default=False, metadata={"omit_default": True})
+    with_transmittance_depth: bool = field(default=False, metadata={"derived": True})
     depth_width_px: float = field(default=2.0, metadata={"omit_default": True})
 
     def for_depths(self, *kinds: str | None) -> RasterSettings:
@@ -77,9 +77,13 @@ class RasterSettings:
         return replace(self, with_transmittance_depth=self.with_transmittance_depth or TRANSMITTANCE in kinds)
 
     def facts(self) -> dict[str, Any]:
-        """Return the constants by name, as they are written down: without those that older runs do not name."""
-        kept = (f for f in fields(self) if not f.metadata.get("omit_default") or getattr(self, f.name) != f.default)
-        return {f.name: getattr(self, f.name) for f in kept}
+        """Return the constants by name, as they are written down.
+
+        Without which depths are rendered, which protocol and losses say, and without defaults that older runs do not name.
+        """
+        named = {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("derived")}
+        later = {f.name: f.default for f in fields(self) if f.metadata.get("omit_default")}
+        return {name: value for name, value in named.items() if name not in later or value != later[name]}
 
     def depth_width(self, camera: Camera) -> float:
         """Return kappa of rule 22: the half width as a fraction of the depth."""

@@ -57,7 +57,7 @@ GS2D_HD void advance(const Transmittance<V>& t, V level, V inv_width, V toleranc
     s.near = select(before, s.z, s.near), s.far = select(before, s.far, s.z);
     const V newton = quotient(excess, t.fall * inv_width), half = V(0.5f) * (s.far - s.near), next = s.z + newton;
     // false for NaN and infinities: bisection
-    const auto good = (next > s.near) & (next < s.far) & (abs(newton) <= V(0.5f) * s.step);
+    const auto good = (next >= s.near) & (next <= s.far) & (abs(newton) <= V(0.5f) * s.step);
     const V z = select(good, next, s.near + half), step = select(good, abs(newton), half);
     const auto moves = s.open;
     s.open = moves & (step * inv_width > tolerance * s.z);
