@@ -1,7 +1,7 @@
 """The numbered contract of ``gs2d.render.api``: rule 22, depth by continuous transmittance, on every backend.
 
-Camera at the origin along +z, 9 x 9 px, focal length 10 px; with ``depth_width_px`` = 1, kappa = 0.1. Pixel (4, 4) looks
-along the axis, through the middles of splats at (0, 0, z) that face it. Where F(x) = (2 + 3x - x^3) / 4 is wanted,
+Camera at the origin along +z, 9 x 9 px, focal length 10 px; with ``depth_width_px`` = 1, kappa = 0.1. Pixel (4, 4)
+looks along the axis, through the middles of splats at (0, 0, z) that face it. Where F(x) = (2 + 3x - x^3) / 4 is wanted,
 x = (4F - 2 + x^3) / 3 is iterated by hand.
 """
 
@@ -76,7 +76,7 @@ def test_22_the_width_is_a_setting_and_goes_with_the_focal_length(backend: Backe
 
 
 def test_22_the_order_of_blending_does_not_matter(backend: Backend) -> None:
-    # Two slanted splats that cross: at column 0 the second is in front of the first, by 0.3, although its centre is behind.
+    # Two slanted splats that cross: beside the middle the second to be blended is in front of the first.
     first = splat((0, 0, 2.0), scales=(2, 2), axis=Y_AXIS, degrees=40, opacity=0.6)
     second = splat((0, 0, 2.0), scales=(2, 2), axis=Y_AXIS, degrees=-40, opacity=0.7)
     either = [stack(first, second), stack(second, first)]  # equal centres: the row decides the order (rule 2)
@@ -87,8 +87,8 @@ def test_22_the_order_of_blending_does_not_matter(backend: Backend) -> None:
 
 
 def test_22_splats_behind_the_stop_do_not_count(backend: Backend) -> None:
-    # Opacity 0.98 twice leaves T = 0.0004, the third stops the pixel (rule 7): alpha = 0.9996, 0.98 F = 0.4998, F = 0.51,
-    # x = 0.013334, z = 2 (1 + 0.0013334).
+    # Opacity 0.98 twice leaves T = 0.0004, the third stops the pixel (rule 7): alpha = 0.9996, 0.98 F = 0.4998,
+    # F = 0.51, x = 0.013334, z = 2 (1 + 0.0013334).
     layers = [facing(2 + i, 0.98) for i in range(3)]
     found = depth_of(stack(*layers, facing(6, 0.1)), backend)
     equal(found[4, 4], 2.0026668)

@@ -134,8 +134,8 @@ def rasterize(
     settings = _checked(splats, settings, chosen)
     if settings.with_transmittance_depth and not settings.depth_width(camera) < 0.5:
         raise ShapeError(
-            f"RasterSettings.depth_width_px must be less than half the focal length ({camera.fx:g} x {camera.fy:g} px), "
-            f"got {settings.depth_width_px!r}"
+            "RasterSettings.depth_width_px must be less than half the focal length "
+            f"({camera.fx:g} x {camera.fy:g} px), got {settings.depth_width_px!r}"
         )
     if screen_probe is not None:
         columns = screen_probe.shape[1] if screen_probe.dim() == 2 else 0

@@ -197,8 +197,8 @@ def forward(
     """Render one view; ``exact=False`` turns off culling inside tiles, and all of what has no ellipse (tests).
 
     The parameters are contiguous float32 tensors in the order of ``Splats``, all on the launcher's device. Without
-    ``distortion`` that image is NaN: it is a tenth of the blending, and few recipes want it. ``transmittance``: with the
-    depth of that kind; it has no pixels otherwise.
+    ``distortion`` that image is NaN: it is a tenth of the blending, and few recipes want it. The depth by
+    ``transmittance`` has no pixels without it.
     """
     device = parameters[0].device
 

@@ -79,7 +79,8 @@ class RasterSettings:
     def facts(self) -> dict[str, Any]:
         """Return the constants by name, as they are written down.
 
-        Without which depths are rendered, which protocol and losses say, and without defaults that older runs do not name.
+        Without which depths are rendered, which protocol and losses say, and without defaults that older runs do not
+        name.
         """
         named = {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("derived")}
         later = {f.name: f.default for f in fields(self) if f.metadata.get("omit_default")}
