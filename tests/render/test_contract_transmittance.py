@@ -1,8 +1,8 @@
 """The numbered contract of ``gs2d.render.api``: rule 22, depth by continuous transmittance, on every backend.
 
 Camera at the origin along +z, 9 x 9 px, focal length 10 px; with ``depth_width_px`` = 1, kappa = 0.1. Pixel (4, 4)
-looks along the axis, through the middles of splats at (0, 0, z) that face it. Where F(x) = (2 + 3x - x^3) / 4 is wanted,
-x = (4F - 2 + x^3) / 3 is iterated by hand.
+looks along the axis, through the middles of splats at (0, 0, z) that face it. Where F(x) = (2 + 3x - x^3) / 4 is
+wanted, x = (4F - 2 + x^3) / 3 is iterated by hand.
 """
 
 from __future__ import annotations
