@@ -12,11 +12,12 @@ import pytest
 import torch
 
 from ball_runs import Stop, comparable, options
+from gs2d.config.presets import get_recipe
 from gs2d.errors import DiskError, DivergedError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.demo import demo
-from gs2d.pipeline.estimate import duration
+from gs2d.pipeline.estimate import duration, full_iterations
 from gs2d.pipeline.events import Event, Notice, Step, ignore
 from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.options import DemoOptions
@@ -195,6 +196,14 @@ def test_the_user_is_told_where_training_starts_and_what_was_skipped(capture: Pa
     assert "... and 1 more views skipped; `gs2d info` lists them" in texts
     assert any(text.startswith("near plane at") for text in texts)
     assert not (tmp_path / "run").exists()  # nothing was saved yet
+
+
+def test_iterations_on_smaller_photographs_count_for_less_in_an_estimate() -> None:
+    recipe = get_recipe("2dgs-60k")
+    first, more = recipe.stages
+    assert full_iterations(recipe) == 60_000
+    smaller = replace(recipe, stages=(replace(first, downscale=4, halve_at=(8_000, 20_000)), more))
+    assert full_iterations(smaller) == 8_000 / 16 + 12_000 / 4 + 10_000 + 30_000
 
 
 def test_an_estimate_is_told_before_training_and_changes_no_byte(

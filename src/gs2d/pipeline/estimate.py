@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from gs2d.config.recipe import Recipe
 from gs2d.errors import Gs2dError
 from gs2d.pipeline.events import duration
 from gs2d.pipeline.job import Job
@@ -31,18 +32,26 @@ def estimate(job: Job) -> Estimate | None:
     """Measure the first iterations of a job and forget them; None where they fail, of which training itself will tell.
 
     Iterations get slower while splats are added, so that the first ones tell a lower bound; how much slower is known
-    from other captures only.
+    from other captures only. They are measured on photographs of the full size; of smaller ones an iteration takes at
+    least as much less as they have fewer pixels.
     """
+    first, *rest = job.recipe.stages
+    full = replace(job.recipe, stages=(replace(first, downscale=1, halve_at=()), *rest))
     try:
-        trainer = Trainer(job.scene, job.recipe, job.protocol, backend=job.backend, init=job.init, progress_every=1)
+        trainer = Trainer(job.scene, full, job.protocol, backend=job.backend, init=job.init, progress_every=1)
         trainer.enter(0)
-        iteration = _seconds(trainer, job.recipe.stages[0].iterations)
+        iteration = _seconds(trainer, first.iterations)
     except Gs2dError:
         return None
     if iteration is None:
         return None
-    whole = iteration * job.recipe.iterations
-    return Estimate(iteration, MIN_GROWTH * whole, MAX_GROWTH * whole)
+    most = MAX_GROWTH * iteration * job.recipe.iterations
+    return Estimate(iteration, MIN_GROWTH * iteration * full_iterations(job.recipe), most)
+
+
+def full_iterations(recipe: Recipe) -> float:
+    """Return the iterations of a recipe, each counted as the fraction of pixels that its photographs have."""
+    return sum(1 / stage.downscale_at(i) ** 2 for stage in recipe.stages for i in range(1, stage.iterations + 1))
 
 
 def _seconds(trainer: Trainer, iterations: int) -> float | None:

@@ -21,8 +21,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import train_toys
 from emulate import Emulator
 from fake_backends import altered, cuda_on_host
+from gs2d.config.densify import Densify
 from gs2d.config.protocols import GENERIC
-from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
+from gs2d.config.recipe import Exposure, GradDensify, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
@@ -59,11 +60,24 @@ def cpu_backend() -> Backend:
         pytest.skip(str(error))
 
 
+GROWS = GradDensify(every=3, start=1, stop=10, reset_every=0, opacity_cull=0.005, max_splats=75, absolute=True)
+
+
+def in_first_stage(**fields: Any) -> Recipe:
+    recipe = train_toys.short()
+    return replace(recipe, stages=(replace(recipe.stages[0], **fields), *recipe.stages[1:]))
+
+
 VARIANTS = {
     "plain": train_toys.short(),
     "exposure": replace(train_toys.short(), exposure=Exposure(start=2, decay_steps=10)),
     "poses": replace(train_toys.short(), poses=PoseRefinement(start=2, decay_steps=10)),
     "multiview": train_toys.compared(),
+    "sizes": in_first_stage(downscale=2, halve_at=(5,)),
+    "errors": in_first_stage(densify=replace(GROWS, error_views=2)),
+    "relocation": in_first_stage(
+        densify=Densify("relocation", {"max_splats": 70, "start": 0, "stop": 10, "rounds": 3, "noise_every": 4})
+    ),
 }
 
 

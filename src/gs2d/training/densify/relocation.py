@@ -144,7 +144,7 @@ class RelocationDensifier(Densifier):
     @torch.no_grad()
     def _wander(self, state: TrainState, iteration: int) -> None:
         options, splats = self._options, state.splats
-        gate = torch.sigmoid(SHARPNESS * (FAINT - splats.opacities)) / torch.sigmoid(torch.tensor(SHARPNESS * FAINT))
+        gate = torch.sigmoid(SHARPNESS * (FAINT - splats.opacities)) * (1 + math.exp(-SHARPNESS * FAINT))
         reach = options.noise * (1 - iteration / options.stop) * gate
         rows = torch.arange(len(splats), device=splats.device)
         moved = points_in_plane(state, rows, reach)
