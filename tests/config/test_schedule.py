@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from gs2d.config.presets import RECIPES, get_recipe
-from gs2d.config.recipe import ALL, GradDensify
+from gs2d.config.recipe import ALL, GradDensify, LearningRates
 from gs2d.config.schedule import count_densifications, longer_steps, scale_schedule
 from gs2d.errors import RecipeError
 
@@ -69,6 +69,19 @@ def test_the_prune_by_size_and_a_reset_on_white_alone_go_with_the_schedule() -> 
     assert isinstance(stage.densify, GradDensify)
     found = stage.densify
     assert (found.prune_until, found.scale_cull_start, found.reset_at_on_white) == (3_000, 300, (50,))
+
+
+def test_rates_are_stretched_in_shorter_schedules_where_a_stage_says_so() -> None:
+    recipe = get_recipe("2dgs")
+    stage = replace(recipe.stages[0], lr=LearningRates(stretch=0.25))
+    stretched = replace(recipe, stages=(stage,))
+    (short,) = scale_schedule(stretched, 1 / 16).stages
+    (plain,) = scale_schedule(recipe, 1 / 16).stages
+    for name in (*ALL, "means_final"):
+        assert getattr(short.lr, name) == pytest.approx(2 * getattr(plain.lr, name))
+    assert (short.lr.means_decay_steps, short.lr.beta1) == (plain.lr.means_decay_steps, plain.lr.beta1)
+    (longer,) = scale_schedule(stretched, 2.0).stages
+    assert longer.lr == replace(stage.lr, means_decay_steps=60_000)
 
 
 def test_sizes_of_photographs_go_with_the_schedule() -> None:

@@ -12,7 +12,7 @@ Pure Python; never imports torch.
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TypeVar
 
 from gs2d.config.densify import Densify
@@ -70,16 +70,8 @@ def longer_steps(recipe: Recipe, factor: float) -> Recipe:
     """
     if factor >= 1:
         return recipe
-    names = [
-        entry.name
-        for entry in fields(LearningRates)
-        if entry.name not in ("means_decay_steps", "beta1", "beta2", "eps")
-    ]
-
-    def longer(lr: LearningRates) -> LearningRates:
-        return replace(lr, **{name: getattr(lr, name) * factor**-LONGER for name in names})
-
-    return replace(recipe, stages=tuple(replace(stage, lr=longer(stage.lr)) for stage in recipe.stages))
+    times = factor**-LONGER
+    return replace(recipe, stages=tuple(replace(stage, lr=stage.lr.times(times)) for stage in recipe.stages))
 
 
 def _scale_prior(prior: Prior, factor: float) -> Prior:
@@ -104,11 +96,16 @@ def _scale_stage(stage: Stage, factor: float) -> Stage:
         stage,
         iterations=_scaled(stage.iterations, factor),
         losses=tuple(replace(term, start=round(term.start * factor)) for term in stage.losses),
-        lr=replace(stage.lr, means_decay_steps=_scaled(stage.lr.means_decay_steps, factor)),
+        lr=_scale_lr(stage.lr, factor),
         sh_interval=_scaled(stage.sh_interval, factor),
         halve_at=tuple(round(at * factor) for at in stage.halve_at),
         densify=None if stage.densify is None else _scale_densify(stage.densify, factor),
     )
+
+
+def _scale_lr(lr: LearningRates, factor: float) -> LearningRates:
+    times = factor**-lr.stretch if factor < 1 else 1.0
+    return replace(lr.times(times) if times != 1 else lr, means_decay_steps=_scaled(lr.means_decay_steps, factor))
 
 
 def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify | Densify:
