@@ -229,6 +229,11 @@ def test_views_are_compared_by_the_recipes_that_say_so_with_normal_consistency_a
             expected |= {"multiview_photometric": (MULTIVIEW_WEIGHT, starts[before.name])}
         assert weights(after) == expected
         assert replace(after, losses=before.losses) == before
+    settings = MultiView(depth_downscale=2)
+    late = with_multiview(plain, 0.6, 0.02, every=2, last=0.2, multiview=settings)
+    assert late.multiview == settings
+    found = [term for term in late.stages[0].losses if term.kind == "multiview_geometric"]
+    assert found == [LossTerm("multiview_geometric", 0.02, round(0.8 * plain.stages[0].iterations), every=2)]
     assert [name for name in RECIPES if get_recipe(name).multiview] == [
         f"{x}-multiview" for x in ("2dgs", "2dgs-60k", "2dgs-r")
     ]

@@ -172,9 +172,18 @@ def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
 
 
 def with_multiview(
-    recipe: Recipe, photometric: float = MULTIVIEW_WEIGHT, geometric: float = 0.0, *, name: str | None = None
+    recipe: Recipe,
+    photometric: float = MULTIVIEW_WEIGHT,
+    geometric: float = 0.0,
+    *,
+    every: int = 1,
+    last: float = 1.0,
+    multiview: MultiView = MultiView(),  # noqa: B008 (frozen)
+    name: str | None = None,
 ) -> Recipe:
     """Add losses of two views to the stages with normal consistency, once nothing is densified any more.
+
+    In the ``last`` part of a stage's iterations, of which one in ``every`` compares.
 
     Not in the paper, and not PGSR's weights (0.15 and 0.03 of means over the pixels that count; here means run over all
     pixels). Why they are these, and why they wait for the end of densification: docs/decisions/multiview.md.
@@ -182,13 +191,14 @@ def with_multiview(
 
     def extended(stage: Stage) -> Stage:
         starts = [term.start for term in stage.losses if term.kind == "normal_consistency" and term.weight]
-        start = max([*starts, 0 if stage.densify is None else stage.densify.stop])
+        densified = 0 if stage.densify is None else stage.densify.stop
+        start = max([*starts, densified, round((1 - last) * stage.iterations)])
         weights = {"multiview_photometric": photometric, "multiview_geometric": geometric} if starts else {}
-        terms = (LossTerm(kind, weight, start) for kind, weight in weights.items() if weight > 0)
+        terms = (LossTerm(kind, weight, start, every=every) for kind, weight in weights.items() if weight > 0)
         return replace(stage, losses=(*stage.losses, *terms))
 
     stages = tuple(extended(stage) for stage in recipe.stages)
-    return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=MultiView())
+    return replace(recipe, name=name or f"{recipe.name}-multiview", stages=stages, multiview=multiview)
 
 
 def with_depth_prior(
