@@ -72,6 +72,7 @@ def test_the_blend_kernels_leave_room_for_the_warps_that_hide_their_latencies(
         "blend_forward_distortion": 7,
         "blend_vjp": 7,
         "blend_vjp_distortion": 5,
+        "blend_vjp_transmittance": 5,
         "splat_errors": 8,
     }
     for kernel, figures in measured.items():

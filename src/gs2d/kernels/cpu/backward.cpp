@@ -44,12 +44,6 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
         read_planes<1>(&f.saved[2 * pixels], W, a, dist[3]);
         read_planes<1>(&f.saved[3 * pixels], W, a, s[DEPTH0]);
     }
-    alignas(64) real found[3][PIXELS];  // depth by transmittance: upstream, image, slope
-    if (g.depth_transmittance) {
-        read_planes<1>(g.depth_transmittance, W, a, found[0]);
-        read_planes<1>(&f.depth_slope[0], W, a, found[1]);
-        read_planes<1>(&f.depth_slope[pixels], W, a, found[2]);
-    }
     const V bg[3] = {V(real(v.background[0])), V(real(v.background[1])), V(real(v.background[2]))};
     const double lever = v.far * v.near / (v.far - v.near);
     for (int b = 0; b < BLOCKS; ++b) {
@@ -62,13 +56,6 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
             ga = fnma(gc, bg[c], ga);
             sum = fma(gc, fnma(final_T, bg[c], at(total[c])), sum);
             sum = fma(at(s[NX + c]), at(total[3 + c]), sum);
-        }
-        if (g.depth_transmittance) {
-            PixelGradient<V> p;
-            p.alpha = ga;
-            add_transmittance(at(found[0]), at(found[1]), at(found[2]), alpha, p);
-            ga = p.alpha;
-            put(s[TRANSMITTANCE], p.transmittance), put(s[Z], p.z);
         }
         // depth_mean = D / alpha: dD = g / alpha, dalpha = -g mean / alpha
         const V gd = at(s[DEPTH]) / select(alpha > V(0), alpha, V(1));
@@ -89,6 +76,26 @@ void start(const Frame& f, const Images& images, const ImageGradients& g, const 
         put(s[MEDIAN_BELOW], max(final_T, V(real(0.5))));
         const M inside = lanes_inside(block_x(b), block_y(b), a.width, a.height);
         put(s[T], keep(inside, V(1)));
+    }
+}
+
+// The part of the depth by transmittance, after `start`, which is as short as without it.
+__attribute__((noinline)) void start_transmittance(const Frame& f, const real* upstream, const real* alpha,
+                                                   const TileArea& a, Planes s) {
+    const int W = f.view.width;
+    const int64_t pixels = int64_t(W) * f.view.height;
+    alignas(64) real read[4][PIXELS];
+    read_planes<1>(upstream, W, a, read[0]);
+    read_planes<1>(&f.depth_slope[0], W, a, read[1]);
+    read_planes<1>(&f.depth_slope[pixels], W, a, read[2]);
+    read_planes<1>(alpha, W, a, read[3]);
+    for (int i = 0; i < PIXELS; i += LANES) {
+        PixelGradient<V> p;
+        p.alpha = V(0);
+        add_transmittance(load(&read[0][i]), load(&read[1][i]), load(&read[2][i]), load(&read[3][i]), p);
+        store(&s[ALPHA][i], load(&s[ALPHA][i]) + p.alpha);
+        store(&s[S][i], fma(p.alpha, load(&read[3][i]), load(&s[S][i])));
+        store(&s[TRANSMITTANCE][i], p.transmittance), store(&s[Z][i], p.z);
     }
 }
 
@@ -389,6 +396,7 @@ bool blend_tiles_vjp(Frame& f, const Images& images, const ImageGradients& g, in
         alignas(64) real planes[PLANES][PIXELS];
         const TileArea area = tile_area(f, tile);
         start(f, images, g, area, planes);
+        if (g.depth_transmittance) start_transmittance(f, g.depth_transmittance, images.alpha, area, planes);
         vjp(f, tile, to, out.rows, planes, area, limits, RowsAhead(f, read, next, f.tile_count[tile]));
     });
     clock.done(BLEND_BACKWARD);
