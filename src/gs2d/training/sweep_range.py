@@ -58,46 +58,44 @@ def _range_of_bounds(scene: Scene) -> SweepRange:
             f"a plane sweep without sparse points needs the box that {scene.name} lies in, got {bounds.tolist()}; "
             "train with --set dense_start=null"
         )
-    step = sides / GRID
-    ticks = [bounds[0][k] + (np.arange(GRID) + 0.5) * step[k] for k in range(3)]
+    cell = sides / GRID
+    ticks = [bounds[0][k] + (np.arange(GRID) + 0.5) * cell[k] for k in range(3)]
     places = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    half = 0.5 * float(np.linalg.norm(step))
-    inside = np.zeros((len(scene.train), len(places)), dtype=bool)
-    depths = np.zeros((len(scene.train), len(places)), dtype=np.float32)
-    left = np.ones(len(places), dtype=bool)
-    for index, view in enumerate(scene.train):
-        pixels, depths[index] = view.camera.project(places)
-        inside[index], outside = _shows(view, pixels, depths[index], half)
-        left &= ~outside
-    left &= inside.sum(axis=0) >= 2
+    half = 0.5 * float(np.linalg.norm(cell))
+    for view in scene.train:  # each carves what the ones before have left
+        places = places[~_shows(view, places, half)[1]]
+    inside = np.stack([_shows(view, places, half)[0] for view in scene.train])
+    left = inside.sum(axis=0) >= 2
     if not left.any():
         raise DataError(
             f"a plane sweep of {scene.name} needs places in its bounds that two photographs show (inside the "
             "silhouettes of all that have an alpha channel), got none; train with --set dense_start=null"
         )
-    rows = np.flatnonzero(left)
+    places, inside = places[left], inside[:, left]
     limits = {}
     for index, view in enumerate(scene.train):
-        z = depths[index, rows][inside[index, rows]]
+        z = view.camera.project(places[inside[index]])[1]
         if len(z):
             least = max(float(z.min()) - half, 0.02 * float(z.max()))  # a camera may stand in the box
             limits[view.name] = (least, float(z.max()) + half)
-    chosen = rows[:: max(1, len(rows) // MAX_PLACES)]
-    seen = {view.name: np.flatnonzero(inside[index, chosen]) for index, view in enumerate(scene.train)}
+    step = max(1, len(places) // MAX_PLACES)
+    chosen, inside = places[::step], inside[:, ::step]
+    seen = {view.name: np.flatnonzero(inside[index]) for index, view in enumerate(scene.train)}
     track = np.full(len(chosen), TRACK)
-    return SweepRange(ObservedPoints(places[chosen], np.zeros(len(chosen)), track, seen), limits)
+    return SweepRange(ObservedPoints(chosen, np.zeros(len(chosen)), track, seen), limits)
 
 
-def _shows(view: View, pixels: np.ndarray, depth: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
+def _shows(view: View, places: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
     """Return which places lie in a picture (and in its silhouette), and which of them lie outside the silhouette.
 
     ``half`` is the half diagonal of a cell of the grid: a silhouette is widened by what that is in pixels.
     """
     camera = view.camera
+    pixels, depth = camera.project(places)
     inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
     alpha = view.alpha()
     if alpha is None or not inside.any():
-        return inside, np.zeros(len(pixels), dtype=bool)
+        return inside, np.zeros(len(places), dtype=bool)
     reach = int(np.ceil(half * max(camera.fx, camera.fy) / float(np.median(depth[inside]))))
     solid = torch.from_numpy((alpha >= 0.5).astype(np.float32))[None]
     for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
