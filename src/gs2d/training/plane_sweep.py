@@ -272,7 +272,7 @@ def _neighbours(
     """Return the views that each is compared with: many shared points, and lines of sight some ten degrees apart."""
     count = len(views)
     centers = np.stack([view.camera.center for view in scene.train])
-    rows = [observed.seen.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train]
+    shared_points = _shared([observed.seen.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train])
     swept = set(np.unique(np.linspace(0, count - 1, min(count, settings.max_views)).round().astype(int)).tolist())
     found: list[tuple[int, ...]] = []
     for index, view in enumerate(scene.train):
@@ -283,7 +283,7 @@ def _neighbours(
         mine, theirs = view.camera.center - target, centers - target
         lengths = np.maximum(np.linalg.norm(theirs, axis=1) * np.linalg.norm(mine), 1e-12)
         angle = np.degrees(np.arccos(np.clip(theirs @ mine / lengths, -1, 1)))
-        shared = np.array([np.isin(rows[index], other, assume_unique=True).sum() for other in rows])
+        shared = shared_points[index]
         fits = (angle >= settings.min_angle) & (angle <= settings.max_angle) & (shared >= MIN_SHARED)
         fits[index] = False
         width = np.where(angle < BEST_ANGLE, NARROW, WIDE)
@@ -291,6 +291,18 @@ def _neighbours(
         order = np.argsort(-worth, kind="stable")[: settings.neighbours]
         found.append(tuple(int(i) for i in order if worth[i] > 0))
     return tuple(found)
+
+
+def _shared(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """How many points each two views share, [V, V]; ``rows`` are the points of each view, each once."""
+    from scipy.sparse import csr_matrix
+
+    ends = np.cumsum([0, *(len(found) for found in rows)])
+    points = np.concatenate(rows)
+    shows = csr_matrix(
+        (np.ones(len(points), dtype=np.int64), points, ends), shape=(len(rows), points.max(initial=0) + 1)
+    )
+    return np.asarray((shows @ shows.T).toarray())
 
 
 @torch.no_grad()
