@@ -75,6 +75,8 @@ def draw(document: dict[str, Any], time: str) -> Any:
 
 
 def _panel(axes: Any, capture: dict[str, Any], names: Sequence[str], time: str, value: Value, title: str) -> None:
+    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+
     for curve in capture["curves"]:
         look = line_style(names.index(curve["name"]))
         look["zorder"] = look.pop("order")
@@ -88,6 +90,9 @@ def _panel(axes: Any, capture: dict[str, Any], names: Sequence[str], time: str, 
             axes.plot(xs, ys, marker="o", markersize=4.5, linewidth=1.6, label=curve["name"], **look)
     axes.set_title(title, fontsize=9, color=INK)
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel(TIMES[time], fontsize=8, color=INK)
     axes.tick_params(colors=INK, labelsize=8, which="both", length=3)
     axes.grid(True, which="both", color=INK, alpha=0.16, linewidth=0.6)
