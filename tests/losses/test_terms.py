@@ -108,7 +108,7 @@ def test_what_was_rendered_at_an_ignored_pixel_has_no_influence(
                 mask if image.dim() == 2 else mask[..., None], image.detach(), torch.full_like(image.detach(), junk)
             ).requires_grad_()
             for name, image in vars(clean).items()
-            if name not in ("radii", "normal_without_pose_grad")
+            if image is not None and name not in ("radii", "normal_without_pose_grad")
         }
         output = RenderOutput(**leaves, radii=clean.radii)
         loss = one_loss(kind, output, target, mask, camera, backend=backend)

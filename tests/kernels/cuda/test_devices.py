@@ -119,8 +119,8 @@ with FakeTensorMode():
     splats = (rand(9, 3), rand(9, 4), rand(9, 2), rand(9), rand(9, 1, 3), rand(9, 15, 3))
     view = cuda_passes.view_of(camera, RasterSettings())
     rows = torch.ones(9, dtype=torch.bool, device="cuda:0")
-    for sure in (False, True):
-        options = cuda._Options(launcher, view, True, True, sure, rows, budget)
+    for sure, transmittance in ((False, False), (True, False), (False, True), (True, True)):
+        options = cuda._Options(launcher, view, True, True, transmittance, sure, rows, budget)
         for columns in (2, 4):
             intrinsics = torch.rand(4)  # in the host's memory, where cameras are
             there_and_back(cuda._Rasterize, (False, *[True] * 8), options, rand(9, columns), intrinsics, *splats)
@@ -128,8 +128,9 @@ with FakeTensorMode():
     image, plane, mask = rand(24, 40, 3), rand(24, 40), torch.ones(24, 40, dtype=torch.bool, device="cuda:0")
     mean = ops.blur(image, launcher=launcher)
     there_and_back(ops._Photometric, (True,), image, rand(24, 40, 3), mask, mean, True, launcher)
-    for form in (False, True):
-        there_and_back(ops._NormalConsistency, (True, True, True), image, plane, plane, mask, camera, form, launcher)
+    for form, weights in ((False, None), (True, plane)):
+        given = (image, plane, plane, mask, weights, camera, form, form, launcher)
+        there_and_back(ops._NormalConsistency, (True, True, True), *given)
     there_and_back(ops._MaskedMean, (True,), plane, mask, launcher)
     cuda_passes.errors(launcher, view, splats, image, mask)
     print(sorted(launched), pointers[0])
@@ -158,7 +159,14 @@ def test_an_iteration_of_each_stage_stays_on_the_device(said: list[str]) -> None
 
 
 def test_gradients_and_splat_errors_stay_on_the_device(said: list[str]) -> None:
-    for kernel in ("blend_vjp_distortion_abs", "blend_vjp_learning", "sum_slots", "photometric_vjp", "splat_errors"):
+    for kernel in (
+        "blend_vjp_distortion_abs",
+        "blend_vjp_distortion_transmittance_abs",
+        "blend_vjp_learning",
+        "sum_slots",
+        "photometric_vjp",
+        "splat_errors",
+    ):
         assert f"'{kernel}'" in said[1]
 
 

@@ -228,7 +228,7 @@ def test_tiles_beyond_32767_are_blended_as_any_other(emulator: Emulator) -> None
     found: list[tuple[Tensor, Tensor]] = []
     for cam in (camera, near):
         frame = cuda_passes.forward(FewBlocks(emulator), cuda_passes.view_of(cam, settings), parameters)
-        upstream: dict[str, Tensor | None] = dict.fromkeys(cuda_passes.IMAGES)
+        upstream: dict[str, Tensor | None] = dict.fromkeys((*cuda_passes.IMAGES, "depth_transmittance"))
         upstream["color"] = torch.zeros(cam.height, cam.width, 3)
         upstream["color"][-16:, -16:] = g_color
         means = torch.empty_like(scene.means)
@@ -262,7 +262,7 @@ def test_the_highest_splat_ids_are_read_and_written_where_they_are(emulator: Emu
                     setattr(arguments, field, getattr(arguments, field) - row_bytes * base)
             emulator.launch(name, blocks, threads, arguments, shared_bytes)
 
-    upstream: dict[str, Tensor | None] = dict.fromkeys(cuda_passes.IMAGES)
+    upstream: dict[str, Tensor | None] = dict.fromkeys((*cuda_passes.IMAGES, "depth_transmittance"))
     upstream["color"] = color_cotangent(case)["color"].float()
     results = []
     for launcher in (emulator, Moved()):
