@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from gs2d.config.multiview import MultiView
+from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import (
     ALPHA,
@@ -27,6 +27,7 @@ from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.errors import RecipeError
 
 L1 = (LossTerm("l1", 1.0),)
+PAIR = MULTIVIEW_KINDS
 
 
 def one(**fields: object) -> Recipe:
@@ -146,6 +147,14 @@ def test_photographs_are_twice_as_large_after_each_iteration_that_says_so() -> N
         ),
         (one(losses=(*L1, LossTerm("ssim", 1.0, every=0))), "every of loss 'ssim' must be an integer >= 1, got 0"),
         (one(losses=(LossTerm("l1", 1.0, every=2),)), "no loss is active from the first iteration and in every one"),
+        (
+            replace(
+                one(losses=(*L1, LossTerm(PAIR[0], 1.0, depth="median"), LossTerm(PAIR[1], 1.0))),
+                multiview=MultiView(),
+            ),
+            "stage 's': the losses between views are of one rendering of the neighbour, so of one depth; "
+            "got median and the protocol's",
+        ),
         (one(train={"opacity": "all"}), "stage 's': train must be one of means, quats"),
         (one(train={}), "names no attribute"),
         (one(train={"sh0": "high_error"}), "no earlier action writes the row group 'high_error'; no action"),

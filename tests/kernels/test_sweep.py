@@ -10,23 +10,17 @@ import torch
 
 from gs2d.config.robust import DenseStart
 from gs2d.kernels import sweep as native
-from gs2d.kernels.library import load
 from gs2d.training import plane_sweep
 from gs2d.training.plane_sweep import SmallView, best_planes, best_planes_reference, sweep_views
 from wall_scene import WALL, wall
 
+pytestmark = pytest.mark.usefixtures("native")
 Z = 1 / torch.linspace(1 / 7.0, 1 / 2.5, 23)
 
 
 @pytest.fixture(scope="module")
 def views() -> list[SmallView]:
     return list(sweep_views(wall(), DenseStart(side=48, planes=8, min_angle=1.0)).views)
-
-
-@pytest.fixture(autouse=True)
-def built() -> None:
-    if not load().has("gs2d_sweep"):
-        pytest.skip("the kernels were built before there was a plane sweep; run `make kernels`")
 
 
 def assert_like(score: torch.Tensor, true: torch.Tensor, view: SmallView) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 from gs2d.config.densify import DENSIFIERS, Densify
 from gs2d.config.losses import LOSSES
-from gs2d.config.multiview import MultiView, check_multiview
+from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
 from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
 from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
@@ -450,6 +450,12 @@ def _check_losses(where: str, stage: Stage, to_train: bool) -> None:
             plain = getattr(term, name) == getattr(LossTerm, name)
             message = f"loss {term.kind!r} takes no {name}; only {' and '.join(NORMAL_KINDS)} do"
             require(plain or term.kind in NORMAL_KINDS, f"{where}: {message}")
+    compared = {term.depth or "the protocol's" for term in stage.losses if term.kind in MULTIVIEW_KINDS}
+    require(
+        len(compared) <= 1,
+        f"{where}: the losses between views are of one rendering of the neighbour, so of one depth; "
+        f"got {' and '.join(sorted(compared))}",
+    )
     if stage.iterations > 0:
         active = [term for term in stage.losses if term.weight != 0 and term.start == 0 and term.every == 1]
         message = "no loss is active from the first iteration and in every one"

@@ -19,7 +19,7 @@ import torch
 from gs2d.errors import BackendError
 from gs2d.kernels.buffer_pool import BufferPool
 
-ABI_VERSION = 7
+ABI_VERSION = 8
 VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
 LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "portable", "f64": "portable, float64"}
 FOLDER = Path(__file__).parent / "lib"
@@ -68,10 +68,6 @@ class Library:
             function.restype, function.argtypes = restype, list(argtypes)
             self._functions[key] = function
         return function
-
-    def has(self, name: str) -> bool:
-        """Whether it exports a function: one that was built before has the same version without what came since."""
-        return hasattr(self._dll, name)
 
     def use_threads(self, n: int) -> None:
         """Let the following calls use ``n`` threads. Results do not depend on it."""

@@ -21,7 +21,7 @@ from gs2d.core.checks import check_shapes
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, ready_library
 
-__all__ = ["CompareArguments", "Compared", "compare_on", "compare_views", "is_native"]
+__all__ = ["CompareArguments", "Compared", "compare_on", "compare_views"]
 
 VALUES, GRADIENTS, MOTION, TURN_SHIFT = 2, 5, 21, 12  # rows; those of motion_gradients are the last two, in turn
 
@@ -163,11 +163,6 @@ def compare_on(depth: Tensor, normal: Tensor, motion: Tensor, given: Compared, r
         depth.contiguous(), normal.contiguous(), motion.contiguous(), given, wanted, moves, run
     )
     return photometric, geometric
-
-
-def is_native(library: Library) -> bool:
-    """Whether a library has the operation: one that was built before it has the same version."""
-    return library.has("gs2d_compare_views")
 
 
 def compare_views(

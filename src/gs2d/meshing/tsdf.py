@@ -589,8 +589,6 @@ def block_finder(backend: str | Backend, threads: int | None) -> Library | None:
     if not available_variants():
         return None
     library = load()
-    if not library.has("gs2d_mark_blocks"):
-        return None
     library.use_threads(threads or os.cpu_count() or 1)
     return library
 

@@ -294,8 +294,9 @@ class CpuBackend(Backend):
 
     def loss_operations(self, device: torch.device) -> LossOperations:
         """Fused operations for the losses."""
-        native = (losses.photometric, losses.normal_consistency, losses.masked_mean, losses.blur)
-        return LossOperations(*native, multiview.compare_views if multiview.is_native(library.load()) else None)
+        return LossOperations(
+            losses.photometric, losses.normal_consistency, losses.masked_mean, losses.blur, multiview.compare_views
+        )
 
     def fusion(self) -> FusionOnHost:
         """Return what adds depth maps to volumes."""

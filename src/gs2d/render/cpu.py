@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from gs2d.core.camera import Camera
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import BackendError, ShapeError
-from gs2d.kernels.library import REMEDY, Library, ready_library
+from gs2d.kernels.library import Library, ready_library
 from gs2d.render.types import NEAR_PLANE_POLICIES, PLAIN_COLORS, RasterSettings, RenderOutput
 
 __all__ = ["rasterize", "rasterize_with", "splat_errors", "splat_errors_with"]
@@ -238,12 +238,7 @@ def rasterize_with(
                 f"gradient_rows must be bool [{len(splats)}], got {gradient_rows.dtype} {list(gradient_rows.shape)}"
             )
         gradient_rows = gradient_rows.to("cpu", copy=True).contiguous()  # it may change before the backward pass
-    news = settings.sh_degree == PLAIN_COLORS or camera.intrinsics is not None
-    if news and not library.has("gs2d_raster_backward_intrinsics"):
-        raise BackendError(f"the CPU kernels are older than plain colours and gradients of intrinsics; {REMEDY}")
     depth_width = settings.depth_width(camera) if settings.with_transmittance_depth else None
-    if depth_width is not None and not library.has("gs2d_transmittance_depth"):
-        raise BackendError(f"the CPU kernels are older than the depth by transmittance; {REMEDY}")
     view = _view(camera, settings, exact_masks)
     given = (library, view, depth_width, gradient_rows, screen_probe, camera.intrinsics)
     radii, *images = _Rasterize.apply(*given, *(t for _, t in splats.items()))
