@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from gs2d.core.files import sweep
 from gs2d.core.json_files import atomic_write, read_json, write_json
 from gs2d.errors import DataError, DiskError
 
@@ -128,19 +129,64 @@ def test_a_disk_that_fills_up_is_one_line_and_leaves_nothing_behind(tmp_path: Pa
     assert names(tmp_path) == ["out"]
 
 
-def test_a_kill_in_the_middle_leaves_the_old_file(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("old")
+def kill_while_writing(path: Path) -> None:
+    """Let a process die half-way through an atomic write."""
     code = (
         "import os, sys, signal\nfrom gs2d.core.json_files import atomic_write\n"
         "with atomic_write(sys.argv[1]) as f:\n    f.write(b'new'); f.flush(); os.kill(os.getpid(), signal.SIGKILL)"
     )
     source = Path(__file__).resolve().parents[2] / "src"
     done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "out")],
+        [sys.executable, "-c", code, str(path)],
         env={**os.environ, "PYTHONPATH": str(source)}, check=False, timeout=120,
     )  # fmt: skip
     assert done.returncode == -signal.SIGKILL
+
+
+def test_a_kill_in_the_middle_leaves_the_old_file_and_the_next_write_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("old")
+    kill_while_writing(tmp_path / "out")
     assert (tmp_path / "out").read_text() == "old"
+    assert len(names(tmp_path)) == 2  # nobody can remove it who is dead
+    with atomic_write(tmp_path / "out") as file:
+        file.write(b"newer")
+    assert (tmp_path / "out").read_text() == "newer"
+    assert names(tmp_path) == ["out"]
+
+
+def test_sweeping_takes_what_the_killed_left_and_nothing_of_those_who_write_or_of_others(tmp_path: Path) -> None:
+    for name in ("a", "b" * 250, "ü" * 120, "c\nd"):
+        kill_while_writing(tmp_path / name)
+    (tmp_path / ".old.pt.999999999.0123abcd.tmp").write_text("of a gs2d that knew no locks")
+    others = [".mine.tmp", "x.gs2d.tmp", f".old.pt.{os.getpid()}.0123abcd.tmp"]
+    for name in others:
+        (tmp_path / name).write_text("")
+    (tmp_path / ".folder.gs2d.tmp").mkdir()
+    with atomic_write(tmp_path / "out") as file:
+        assert sweep(tmp_path) == 5
+        file.write(b"whole")
+    assert (tmp_path / "out").read_text() == "whole"
+    assert names(tmp_path) == sorted([*others, ".folder.gs2d.tmp", "out"])
+    assert sweep(tmp_path / "nowhere") == 0
+
+
+def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / ".out.gs2d.tmp").symlink_to(tmp_path / "mine")
+    with atomic_write(tmp_path / "out") as file:
+        file.write(b"new")
+    assert sweep(tmp_path) == 0
+    assert ((tmp_path / "mine").read_text(), (tmp_path / "out").read_text()) == ("mine", "new")
+
+
+def test_two_who_write_the_same_file_at_once_both_write_it_whole(tmp_path: Path) -> None:
+    with atomic_write(tmp_path / "out") as first:
+        first.write(b"1" * 5)
+        with atomic_write(tmp_path / "out") as second:
+            second.write(b"2" * 3)
+        assert (tmp_path / "out").read_bytes() == b"222"
+    assert (tmp_path / "out").read_bytes() == b"11111"
+    assert names(tmp_path) == ["out"]
 
 
 def test_json_round_trip_keeps_order_and_letters(tmp_path: Path) -> None:

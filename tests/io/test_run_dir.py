@@ -73,6 +73,19 @@ def test_a_run_whose_process_was_killed_while_it_wrote_run_json_is_started_again
     assert claim_run(tmp_path, resume=True, overwrite=False).checkpoints() == []
 
 
+def test_whoever_locks_a_run_removes_what_a_killed_process_left_in_it(tmp_path: Path) -> None:
+    run = new_run(tmp_path)
+    kill = "import os, sys\nfrom gs2d.core.files import atomic_write\n"
+    kill += "with atomic_write(sys.argv[1]): os.kill(os.getpid(), 9)"
+    left = ("events.jsonl", "checkpoints/0-surface-0000010.pt", "renders/surface/test__a.png", "surface/precision.ply")
+    for name in left:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        subprocess.run([sys.executable, "-c", kill, str(tmp_path / name)], check=False)
+    assert len(list(tmp_path.rglob("*.tmp"))) == len(left)
+    with run.locked():
+        assert not list(tmp_path.rglob("*.tmp"))
+
+
 def test_a_file_is_not_a_run_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match="must be a folder"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from gs2d.pipeline.events import Event, StageDone, Step
 from gs2d.pipeline.export import export_run
 from gs2d.pipeline.mesh import mesh_run
 from gs2d.pipeline.options import EvaluateOptions, MeshOptions, TrainOptions
+from gs2d.pipeline.page import page_run
 from gs2d.pipeline.paths import orbit_cameras
 from gs2d.pipeline.render import file_name, file_names, render_run
 from gs2d.pipeline.report import report_run
@@ -162,6 +163,17 @@ def test_exporting_writes_the_layout_that_viewers_open(undisturbed: RunFolder, t
     head = (tmp_path / "out.ply").read_bytes()[:2000].decode("latin1")
     assert "property float scale_2" in head
     assert result["splats"] == len(read_splats(undisturbed.file("splats.ply")))
+
+
+@pytest.mark.parametrize("command", [export_run, mesh_run, page_run, report_run])
+def test_a_command_removes_what_a_killed_one_left_in_the_run(
+    undisturbed: RunFolder, tmp_path: Path, command: Callable[..., Any]
+) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    for name in (".scene.html.gs2d.tmp", "checkpoints/.2-refine-end.pt.gs2d.tmp", ".mesh.ply.999999999.01234567.tmp"):
+        run.file(name).write_bytes(b"half")
+    command(run.path, *([tmp_path / "out.spz"] if command is export_run else []))
+    assert not list(run.path.rglob("*.tmp"))
 
 
 def test_strings_are_paths_too(undisturbed: RunFolder, tmp_path: Path) -> None:

@@ -1,4 +1,9 @@
-"""Atomic file writes: a file is either the old one or the complete new one, never a part."""
+"""Atomic file writes: a file is either the old one or the complete new one, never a part.
+
+What a killed write leaves is a file ``.NAME.gs2d.tmp`` beside NAME. Its writer held a lock on it, which died with the
+process: the next write of NAME removes it, and so does :func:`sweep`. The temporary file of a process that lives is
+never touched.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +11,22 @@ import contextlib
 import errno
 import io
 import os
+import re
 import secrets
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+from gs2d.core.locks import try_lock
 from gs2d.errors import DiskError
 
+_TEMPORARY = re.compile(r"\..+\.gs2d\.tmp", re.DOTALL)
+_BEFORE_LOCKS = re.compile(r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp", re.DOTALL)  # as gs2d 0.2 called them: with the process
+_LONGEST = 200  # bytes of a file's name that are in the temporary one
+_ATTEMPTS = 100  # at a temporary name
 _ESCAPED = "backslashreplace"  # a file name that is not UTF-8 is written as \udcff, which JSON reads back
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another folder",
@@ -59,7 +71,7 @@ class _RecordingFile(io.FileIO):
 def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
     r"""Open a file for writing that appears under its name only when it is complete.
 
-    The bytes go to a temporary name in the same folder (hidden, ending in ``.tmp``), reach the disk (fsync) and
+    The bytes go to a temporary name in the same folder (hidden, ending in ``.gs2d.tmp``), reach the disk (fsync) and
     are renamed. When the body or the disk fails, the temporary file is removed and an older file stays as it was.
 
     Parameters
@@ -77,36 +89,147 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
     if mode not in ("wb", "w"):
         raise ValueError(f"mode must be 'wb' or 'w', got {mode!r}")
     target = Path(path)
-    temporary = target.with_name(f".{target.name[:100]}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    with temporary_beside(target) as (temporary, descriptor):
+        raw = _RecordingFile(os.dup(descriptor), "wb")
+        try:
+            buffer = io.BufferedWriter(raw, 1 << 20)
+            file: IO[Any] = io.TextIOWrapper(buffer, "utf-8", _ESCAPED, newline="\n") if mode == "w" else buffer
+            try:
+                yield file
+                file.flush()
+            finally:
+                with contextlib.suppress(OSError):  # a failed flush is already on its way up
+                    file.close()
+                raw.close()
+        except BaseException as error:
+            failure = raw.failure
+            if failure is None and isinstance(error, OSError) and error.errno in _REMEDIES:
+                # Only errors of this very write: an OSError about another file (an input) passes unchanged.
+                named = error.filename
+                failure = error if named is None or Path(os.fsdecode(named)) in (temporary, target) else None
+            if failure is not None:
+                raise disk_error(target, failure) from error
+            raise
+
+
+@contextlib.contextmanager
+def temporary_beside(target: Path) -> Iterator[tuple[Path, int]]:
+    """Hold an empty file in the folder of ``target``, which takes its name at the end; it goes where the body fails.
+
+    Yields its path, which other programs may write to as long as they do not replace it, and a descriptor that is open
+    for writing. At the end the bytes reach the disk (fsync) before the file is renamed.
+
+    Raises
+    ------
+    DiskError
+    """
     try:
-        # 0o666: the user's umask decides, as for any other file (mkstemp would make it private).
-        raw = _RecordingFile(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666), "wb")
+        temporary, descriptor = _claimed(target)
     except OSError as error:
         raise disk_error(target, error) from error
     try:
-        buffer = io.BufferedWriter(raw, 1 << 20)
-        file: IO[Any] = io.TextIOWrapper(buffer, "utf-8", _ESCAPED, newline="\n") if mode == "w" else buffer
+        yield temporary, descriptor
         try:
-            yield file
-            file.flush()
-            os.fsync(raw.fileno())
-        finally:
-            with contextlib.suppress(OSError):  # a failed flush is already on its way up
-                file.close()
-            raw.close()
-        os.replace(temporary, target)
-    except BaseException as error:
-        with contextlib.suppress(FileNotFoundError):
+            os.fsync(descriptor)
+            if sys.platform == "win32":  # which renames no open file
+                os.close(descriptor)
+                descriptor = -1
+            os.replace(temporary, target)
+        except OSError as error:
+            raise disk_error(target, error) from error
+    except BaseException:
+        with contextlib.suppress(OSError):
             os.unlink(temporary)
-        failure = raw.failure
-        if failure is None and isinstance(error, OSError) and error.errno in _REMEDIES:
-            # Only errors of this very write: an OSError about another file (an input) passes unchanged.
-            named = error.filename
-            failure = error if named is None or Path(os.fsdecode(named)) in (temporary, target) else None
-        if failure is not None:
-            raise disk_error(target, failure) from error
         raise
+    finally:  # the lock is held until there is nothing left to sweep
+        if descriptor >= 0:
+            os.close(descriptor)
     _sync_folder(target.parent)
+
+
+def _claimed(target: Path) -> tuple[Path, int]:
+    """Make and lock a temporary file; one of this name that a killed process left goes first."""
+    name = target.name
+    while len(os.fsencode(name)) > _LONGEST:
+        name = name[:-1]
+    temporary = target.with_name(f".{name}.gs2d.tmp")
+    for _ in range(_ATTEMPTS):
+        try:
+            # 0o666: the user's umask decides, as for any other file (mkstemp would make it private).
+            flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
+            descriptor = os.open(temporary, flags, 0o666)
+        except FileExistsError:
+            if not _removed(temporary):  # another process writes the same file: the last one wins
+                temporary = target.with_name(f".{name}.{secrets.token_hex(4)}.gs2d.tmp")
+            continue
+        if _is_ours(temporary, descriptor):
+            return temporary, descriptor
+        os.close(descriptor)  # swept between the two lines above
+    raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(temporary))
+
+
+def _is_ours(temporary: Path, descriptor: int) -> bool:
+    """Lock a new file; False where another process took it for what a killed one left."""
+    if sys.platform == "win32":  # which deletes no open file
+        return True
+    try:
+        if not try_lock(descriptor):
+            return False
+        return os.path.samestat(os.stat(temporary), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+    except OSError:  # a file system without locks, where nothing can be swept either
+        return True
+
+
+def _removed(temporary: Path) -> bool:
+    """Remove a temporary file, if nobody writes it any more."""
+    try:
+        if sys.platform == "win32":
+            os.unlink(temporary)
+            return True
+        descriptor = os.open(temporary, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            if not try_lock(descriptor):
+                return False
+            os.unlink(temporary)
+        finally:
+            os.close(descriptor)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    return True
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file has the name of one that is being written, or was when its process was killed."""
+    return bool(_TEMPORARY.fullmatch(name) or _BEFORE_LOCKS.fullmatch(name))
+
+
+def sweep(folder: Path) -> int:
+    """Remove the temporary files in a folder that killed processes left; returns how many. Never raises OSError."""
+    swept = 0
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in list(entries):
+            older = _BEFORE_LOCKS.fullmatch(entry.name)
+            abandoned = _TEMPORARY.fullmatch(entry.name) or (older and not _runs(int(older[1])))
+            if abandoned and entry.is_file(follow_symlinks=False):
+                swept += _removed(Path(entry.path))
+    return swept
+
+
+def _runs(process: int) -> bool:
+    """Whether there is such a process on this machine (True where that cannot be told)."""
+    if sys.platform == "win32":  # where os.kill ends it
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

@@ -25,7 +25,6 @@ import os
 import platform
 import re
 import shutil
-import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -35,8 +34,9 @@ from typing import Any
 
 from gs2d import __version__
 from gs2d.config.renamed import current_names
-from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.files import atomic_write, disk_error, is_temporary, sweep
 from gs2d.core.json_files import read_json, write_json
+from gs2d.core.locks import try_lock
 from gs2d.errors import RunError
 from gs2d.io.event_log import EventLog
 
@@ -49,7 +49,6 @@ FORMAT = 1
 KEPT_CHECKPOINTS = 2
 _UNREADABLE = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 _CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
-_UNFINISHED = re.compile(r"\.run\.json\.\d+\.[0-9a-f]+\.tmp")  # left by a process that was killed while it made a run
 
 
 _SCENE = {"name", "path", "format", "train", "test"}  # of run.json, at least
@@ -167,7 +166,7 @@ class RunFolder:
     # -- ownership -----------------------------------------------------------------------------------------------------
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the run against other processes.
+        """Hold the run against other processes; what killed ones left half written goes.
 
         Raises
         ------
@@ -179,11 +178,18 @@ class RunFolder:
         except OSError as error:
             raise disk_error(self.file(LOCK), error) from error
         try:
-            if not _try_lock(file.fileno()):
+            if not try_lock(file.fileno()):
                 raise RunError(f"{self.path} is being trained by another process; wait for it or choose another --out")
+            self.sweep()
             yield
         finally:
             file.close()
+
+    def sweep(self) -> None:
+        """Remove the temporary files that killed processes left in the run's own folders."""
+        drawn = (Path(folder) for folder, _, _ in os.walk(self.file(RENDERS)))
+        for folder in (self.path, self.file(CHECKPOINTS), self.file(SURFACE), *drawn):
+            sweep(folder)
 
     def clear(self) -> None:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""
@@ -213,6 +219,11 @@ def _object(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise RunError(f"{path} must hold a JSON object, got {type(data).__name__}; it was damaged: restore it")
     return data
+
+
+def _is_unfinished(name: str) -> bool:
+    """Whether a file was left by a process that was killed while it made a run."""
+    return name.startswith(f".{RUN_JSON}.") and is_temporary(name)
 
 
 def is_run(path: Path) -> bool:
@@ -259,7 +270,7 @@ def check_claim(path: str | Path, *, resume: bool, overwrite: bool, allowed: tup
             raise RunError(f"{path} already holds a run; continue it with --resume, replace it with --overwrite")
         return
     names = (entry.name for entry in path.iterdir())
-    others = sorted(name for name in names if name not in (LOCK, *allowed) and not _UNFINISHED.fullmatch(name))
+    others = sorted(name for name in names if name not in (LOCK, *allowed) and not _is_unfinished(name))
     if others:
         raise RunError(
             f"--out must be new, empty or a run; {path} holds other files ({others[0]}); choose another folder"
@@ -378,24 +389,3 @@ def machine() -> dict[str, Any]:
 def now() -> str:
     """UTC time, to the second."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _try_lock(descriptor: int) -> bool:
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
-
-else:
-    import fcntl
-
-    def _try_lock(descriptor: int) -> bool:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        return True

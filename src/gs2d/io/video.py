@@ -16,7 +16,7 @@ from pathlib import Path
 from PIL import Image
 
 from gs2d.core.extras import FFMPEG
-from gs2d.core.files import atomic_write, disk_error
+from gs2d.core.files import atomic_write, disk_error, temporary_beside
 from gs2d.errors import BackendError, DataError
 
 SUFFIXES = (".mp4", ".webp")
@@ -108,10 +108,9 @@ def _write_mp4(path: Path, frames: Sequence[Path], fps: float, threads: int, on_
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-framerate", f"{fps:g}", "-i", "-", "-vf", _FILTERS]
     coded = ["-c:v", "libx264", "-crf", str(QUALITY), *_TAGS, "-threads", str(threads), "-movflags", "+faststart"]
     try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".video-") as folder:
-            whole = Path(folder) / "video.mp4"
-            _run(["ffmpeg", "-v", "error", *given, *coded, f"file:{whole}"], _decoded(frames, on_frame), path)
-            os.replace(whole, path)
+        with temporary_beside(path) as (temporary, _):
+            whole = ["-f", "mp4", "-y", f"file:{temporary}"]
+            _run(["ffmpeg", "-v", "error", *given, *coded, *whole], _decoded(frames, on_frame), path)
     except OSError as error:
         raise disk_error(path, error) from error
 

@@ -40,7 +40,12 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
         raise RunError(f"--out {out} is the mesh of the run, which stays as it is; choose another name")
     if path.is_file() and out.resolve() == path.resolve():
         raise RunError(f"--out {out} is the file that is read; choose another name")
-    splats = read_disks(path) if path.is_file() else finished_splats(open_run(path))
+    if path.is_file():
+        splats = read_disks(path)
+    else:
+        run = open_run(path)
+        run.sweep()
+        splats = finished_splats(run)
     splats = splats if bbox is None else within(splats, bbox)
     notes = write_layout(out, splats, layout)
     size = out.stat().st_size

@@ -120,8 +120,6 @@ def extract_mesh(
     result = fused(job, splats, options, on_event, subject=subject, seen=seen)
     trim()
     write_mesh(out, result.mesh)
-    if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
-        on_event(Notice(_cut_text(result, options)))
     limits = asdict(result.limits)
     return {
         "file": str(out),
@@ -161,7 +159,10 @@ def fused(
     depth = options.depth or job.protocol.fused_depth
     usable = seen is not None and seen.complete and depth == job.protocol.fused_depth
     frames = seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
-    return _extract(job, frames, options, on_event, subject)
+    result = _extract(job, frames, options, on_event, subject)
+    if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
+        on_event(Notice(_cut_text(result, options)))
+    return result
 
 
 def _cleaned_facts(result: Extraction) -> dict[str, Any]:

@@ -63,6 +63,7 @@ def page_run(
         raise RunError(f"--sh-degree must be 0, 1, 2 or 3, got {sh_degree}")
     if of_run:
         run = open_run(path)
+        run.sweep()
         splats = finished_splats(run)
         definition = run.definition()
         title = definition.get("title") or definition["scene"]["name"]

@@ -25,6 +25,7 @@ def report_run(path: Path, on_event: OnEvent = ignore) -> Path:
     from gs2d.report.write import write_report
 
     run = open_run(Path(path))
+    run.sweep()
     command = again("report", run.path)
 
     def failed(section: str, error: Exception) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 
 from gs2d.core.files import check_writable
 from gs2d.core.images import to_uint8
+from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
@@ -34,7 +34,7 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job, read_scene
-from gs2d.pipeline.mesh import extract_mesh, mesh_run
+from gs2d.pipeline.mesh import fused, mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import OPAQUE, meshed_subject
@@ -79,7 +79,7 @@ def texture_run(
     for view in job.scene.views:
         if view.path is not None and view.path.resolve() in {file.resolve() for file in files}:
             raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
-    mesh = _mesh(run, job, splats, mesh_options, target.parent, on_event)
+    mesh = _mesh(run, job, splats, mesh_options, on_event)
     baked = textured_mesh(job, splats, mesh, options, on_event, exposures=read_exposures(run, job.recipe))
     write_textured(target, baked.mesh, up=up_direction([view.camera for view in job.scene.train]))
     return {
@@ -139,14 +139,14 @@ def check_texture_options(options: TextureOptions) -> None:
         raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {options.texture_size}")
 
 
-def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, folder: Path, on_event: OnEvent) -> Mesh:
+def _mesh(run: RunFolder, job: Job, splats: Splats, options: MeshOptions, on_event: OnEvent) -> Mesh:
     """Return the run's mesh as it is, or one of its own for other options."""
     if options == MeshOptions() and run.file(MESH).exists():
         return read_mesh(run.file(MESH))
-    with tempfile.TemporaryDirectory(prefix=".gs2d-", dir=folder) as temporary:
-        subject = meshed_subject(run, job, splats, options, on_event)
-        extract_mesh(job, splats, options, Path(temporary) / MESH, on_event, subject=subject)
-        return read_mesh(Path(temporary) / MESH)
+    subject = meshed_subject(run, job, splats, options, on_event)
+    mesh = fused(job, splats, options, on_event, subject=subject).mesh
+    trim()
+    return mesh
 
 
 def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[View]:
