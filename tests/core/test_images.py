@@ -14,6 +14,7 @@ from gs2d.core.images import (
     area_downscale,
     composite,
     image_size,
+    is_number,
     mask_downscale,
     natural_key,
     read_image,
@@ -177,3 +178,50 @@ def test_names_are_in_the_order_in_which_people_count() -> None:
     names = ["r_10.png", "r_2.png", "a.png", "r_2b.png", "r_002.png", "3.png", "12.png"]
     counted = ["3.png", "12.png", "a.png", "r_002.png", "r_2.png", "r_2b.png", "r_10.png"]
     assert sorted(names, key=natural_key) == counted
+
+
+def png_of(path: Path, width: int, height: int, mode: str = "RGB") -> Path:
+    Image.new(mode, (width, height)).save(path)
+    return path
+
+
+def test_an_image_that_would_explode_is_not_decoded(tmp_path: Path) -> None:
+    """36 megapixels of black: a hundred kilobytes, and half a gigabyte on the way to an array."""
+    bomb = png_of(tmp_path / "bomb.png", 6000, 6000)
+    assert bomb.stat().st_size < 200_000
+    with pytest.raises(DataError, match=r"bomb\.png: an image \(6000x6000\) .* would take 144.0 MB"):
+        read_image(bomb)
+    with pytest.raises(DataError, match="would take 144.0 MB"):
+        read_mask(bomb)
+    assert image_size(bomb) == (6000, 6000)
+
+
+def test_a_mask_of_one_color_may_be_as_large_as_a_photograph(tmp_path: Path) -> None:
+    assert not read_mask(png_of(tmp_path / "mask.png", 9504, 6336, "L")).any()  # of a camera of 60 megapixels
+
+
+@pytest.mark.parametrize("format_", ["DDS", "EPS", "TGA", "ICO", "PCX"])
+def test_formats_that_nobody_photographs_in_are_never_tried(tmp_path: Path, format_: str) -> None:
+    """EPS would start Ghostscript; whatever the file is called, Pillow's other parsers do not see it."""
+    Image.new("RGB", (32, 32), "red").save(tmp_path / "a", format=format_)
+    path = (tmp_path / "a").rename(tmp_path / "a.png")
+    for read in (read_image, read_mask, image_size):
+        with pytest.raises(DataError, match=r"a\.png .*cannot identify image file"):
+            read(path)
+
+
+def test_formats_of_photographs_and_masks_are_read(tmp_path: Path) -> None:
+    for suffix in ("jpg", "png", "bmp", "tif", "webp", "gif", "ppm", "pgm", "jp2"):
+        Image.new("L", (20, 10), 255).save(tmp_path / f"a.{suffix}")
+        assert read_image(tmp_path / f"a.{suffix}").shape[:2] == (10, 20), suffix
+        assert read_mask(tmp_path / f"a.{suffix}").all(), suffix
+    Image.new("RGB", (20, 10)).save(
+        tmp_path / "phone.jpg", "MPO", save_all=True, append_images=[Image.new("RGB", (9, 9))]
+    )
+    assert read_image(tmp_path / "phone.jpg").shape == (10, 20, 3)
+
+
+def test_digits_of_other_scripts_are_no_number() -> None:
+    assert [is_number(text) for text in ("0", "00012", "", "-1", "1.0", "\u00b2", "\u0663", "9" * 19)] == [True] * 2 + [
+        False
+    ] * 6

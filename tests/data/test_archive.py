@@ -174,3 +174,13 @@ def test_an_archive_without_a_capture_says_what_is_in_it(tmp_path: Path) -> None
         file.writestr("holiday/readme.txt", b"hello")
     with pytest.raises(DataError, match=r"holiday must hold transforms_train\.json .*; got readme\.txt"):
         unpacked(tmp_path / "a.zip", tmp_path / "out")
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_archives_that_cannot_be_unpacked_in_bounded_memory_are_refused(tmp_path: Path, method: int) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", method) as file:
+        file.write(tmp_path / "capture/transforms.json", "transforms.json")
+    with pytest.raises(DataError, match="'transforms.json' is packed by method .*; pack it again with deflate"):
+        unpacked(tmp_path / "a.zip", tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -222,3 +223,46 @@ def test_equal_lists_and_ragged_lists_read_alike(tmp_path: Path) -> None:
     assert isinstance(fast, PlyList)
     assert fast.counts.tolist() == [3, 3, 3, 3]
     assert fast.values.tolist() == tetrahedron().faces.reshape(-1).tolist()
+
+
+def ply_file(path: Path, header: str, body: bytes) -> Path:
+    path.write_bytes(f"ply\n{header}end_header\n".encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian"])
+def test_a_list_whose_length_is_a_float_is_refused(tmp_path: Path, order: str) -> None:
+    """NaN as a length was a ValueError."""
+    header = f"format {order} 1.0\nelement face 1\nproperty list float int vertex_indices\n"
+    path = ply_file(tmp_path / "a.ply", header, struct.pack("<f", float("nan")) + bytes(60))
+    with pytest.raises(DataError, match="its header line 'property list float int vertex_indices' is not understood"):
+        read_ply(path)
+
+
+def test_a_long_word_does_not_make_all_words_long(tmp_path: Path) -> None:
+    """An array of words takes as much for each as for the longest: 30 MB here became 100 GB."""
+    words = b"0 " * 100_000 + b"1" * 1_000_000
+    path = ply_file(tmp_path / "a.ply", "format ascii 1.0\nelement vertex 100001\nproperty float x\n", words)
+    with pytest.raises(DataError, match="it has a number of more than 64 letters"):
+        read_ply(path)
+
+
+def test_harmonics_that_are_lists_are_none(tmp_path: Path) -> None:
+    names = [
+        "x",
+        "y",
+        "z",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        "opacity",
+        "scale_0",
+        "scale_1",
+        *(f"rot_{i}" for i in range(4)),
+    ]
+    header = "format ascii 1.0\nelement vertex 1\n" + "".join(f"property float {name}\n" for name in names)
+    lists = "".join(f"property list uchar float f_rest_{i}\n" for i in range(9))
+    path = ply_file(tmp_path / "a.ply", header + lists, b"0.5 " * 13 + b"1 0 " * 9)
+    assert read_splats(path).shN.shape == (1, 0, 3)
+    path = ply_file(tmp_path / "b.ply", header, b"1e300 " * 13)
+    assert read_splats(path).means.isinf().all()  # and no warning of numpy's

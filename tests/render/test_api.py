@@ -14,6 +14,7 @@ from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels import library
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import BACKENDS, Backend, backend_report, get_backend
+from gs2d.render.tensor_api import rasterize_2dgs
 from gs2d.render.types import RasterSettings
 from render_scenes import front_camera, splat
 
@@ -172,3 +173,23 @@ def test_arguments_of_other_types_or_in_another_order_are_named() -> None:
         rasterize(splats, camera, gradient_rows=np.ones(1, bool))  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="image must be a torch tensor, got ndarray"):
         splat_errors(splats, camera, np.zeros((9, 9, 3), np.float32))  # type: ignore[arg-type]
+
+
+def test_none_and_sparse_tensors_are_named() -> None:
+    splats, camera = splat(), front_camera()
+    with pytest.raises(ShapeError, match="means must be an array or a tensor, got NoneType"):
+        replace(splats, means=None)  # type: ignore[arg-type]
+    for name in ("means", "opacity_logits", "shN"):
+        sparse = replace(splats, **{name: getattr(splats, name).to_sparse()})
+        with pytest.raises(ShapeError, match=f"{name} must be a dense tensor, got the layout torch.sparse_coo"):
+            rasterize(sparse, camera)
+    with pytest.raises(ShapeError, match="screen_probe must be a dense tensor"):
+        rasterize(splats, camera, screen_probe=torch.zeros(1, 2).to_sparse())
+    with pytest.raises(ShapeError, match="image must be a torch tensor, got NoneType"):
+        splat_errors(splats, camera, None)  # type: ignore[arg-type]
+    eye, ones = torch.eye(4)[None], torch.ones(1, 3)
+    for wrong in (None, ones.to_sparse()):
+        with pytest.raises(ShapeError, match="means must be a"):
+            rasterize_2dgs(wrong, torch.ones(1, 4), ones[:, :2], ones[:, 0], ones, eye, eye[:, :3, :3], 8, 8)
+        with pytest.raises(ShapeError, match="colors must be a"):
+            rasterize_2dgs(ones, torch.ones(1, 4), ones[:, :2], ones[:, 0], wrong, eye, eye[:, :3, :3], 8, 8)

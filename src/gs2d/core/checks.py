@@ -43,6 +43,8 @@ def check_shapes(arrays: Mapping[str, tuple[Any, str]]) -> dict[str, int]:
     sizes: dict[str, int] = {}
     fixed_by: dict[str, str] = {}
     for name, (array, pattern) in arrays.items():
+        if not hasattr(array, "shape"):
+            raise ShapeError(f"{name} must be an array or a tensor, got {type(array).__name__}")
         words, shape = _parsed(pattern), tuple(array.shape)
         fits = len(words) == len(shape)
         for (word, number), size in zip(words, shape, strict=False):

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-import struct
-import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from PIL import Image
 
 from gs2d.core.checks import check_shapes
 from gs2d.core.files import atomic_write
+from gs2d.core.growth import check_growth
 from gs2d.errors import DataError, ShapeError
 
-_BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+#: What Pillow is let near: formats of photographs, masks and depths. The forty others, some of which start programs
+#: (EPS: Ghostscript) or which nobody has looked at for years, are never tried, whatever a file is called.
+FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "PPM", "GIF", "JPEG2000")
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
@@ -29,6 +31,37 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
     return parts, name
 
 
+def is_number(text: str) -> bool:
+    """Whether a name is a whole number: digits 0 to 9 (``str.isdigit`` takes ² too), and no more than a number has."""
+    return re.fullmatch("[0-9]{1,18}", text) is not None
+
+
+def open_image(path: str | os.PathLike[str]) -> Image.Image:
+    """Open an image of one of ``FORMATS`` by Pillow, which has then read its header; errors are Pillow's."""
+    Image.init()  # asked for a format that it has not loaded, Pillow raises KeyError
+    return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
+
+
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Image.Image]:
+    """Open an image, and turn whatever Pillow's parsers run into, here or in the body, into one line."""
+    try:
+        with open_image(path) as file:
+            yield file
+    except FileNotFoundError as error:
+        raise DataError(f"image {os.fspath(path)} does not exist") from error
+    except (DataError, MemoryError):
+        raise
+    except Exception as error:
+        raise DataError(expected.format(path=os.fspath(path), error=_first_line(error))) from error
+
+
+def _check_pixels(path: str | os.PathLike[str], file: Image.Image, bytes_per_pixel: int) -> None:
+    """Raise for an image of many more pixels than its file can hold of a photograph, before any is decoded."""
+    packed = os.stat(path).st_size
+    check_growth(path, packed, file.width * file.height * bytes_per_pixel, f"an image ({file.width}x{file.height})")
+
+
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """(width, height) of an image file, px, from its header only. EXIF orientation is not applied.
 
@@ -37,13 +70,11 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     DataError
         Missing, or not an image.
     """
-    try:
-        with Image.open(path) as file:
-            return file.size
-    except FileNotFoundError as error:
-        raise DataError(f"image {os.fspath(path)} does not exist") from error
-    except _BROKEN as error:
-        raise DataError(f"{os.fspath(path)} must be an image, got: {_first_line(error)}") from error
+    with _opened(path, "{path} must be an image, got: {error}") as file:
+        return file.size
+
+
+_UNDECODED = "image {path} does not decode: {error}; replace or remove the file"
 
 
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
@@ -60,35 +91,49 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     Raises
     ------
     DataError
-        Missing, not an image, or cut short; names the file.
+        Missing, not an image of ``FORMATS``, cut short, or of far more pixels than its bytes can hold; names the file.
     """
-    try:
-        with Image.open(path) as file:
-            if file.mode == "F":
-                raise ValueError("its pixels are floats of no known range, 8 or 16 bits are read; convert it")
-            if file.mode.startswith("I;16") or file.mode == "I":
-                grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
-                return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)
-            has_alpha = file.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in file.info
-            return np.array(file.convert("RGBA" if has_alpha else "RGB"))
-    except FileNotFoundError as error:
-        raise DataError(f"image {os.fspath(path)} does not exist") from error
-    except _BROKEN as error:
-        raise DataError(
-            f"image {os.fspath(path)} does not decode: {_first_line(error)}; replace or remove the file"
-        ) from error
+    with _opened(path, _UNDECODED) as file:
+        _check_pixels(path, file, 4)
+        if file.mode == "F":
+            raise ValueError("its pixels are floats of no known range, 8 or 16 bits are read; convert it")
+        if file.mode.startswith("I;16") or file.mode == "I":
+            grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
+            return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)
+        has_alpha = file.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in file.info
+        return np.array(file.convert("RGBA" if has_alpha else "RGB"))
+
+
+def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
+    """Decode the numbers of an image as they are, and its mode: [h, w] where that is a grey one.
+
+    Raises
+    ------
+    DataError
+        As :func:`read_image`.
+    """
+    with _opened(path, _UNDECODED) as file:
+        _check_pixels(path, file, 4)
+        return np.asarray(file), file.mode
 
 
 def read_mask(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode a mask: bool [H, W], True where the image is at least half white and half opaque.
 
-    In a file of zeros and ones, which would be all black, one is white.
+    In a file of zeros and ones, which would be all black, one is white. A mask of one colour is small at any size: of
+    8 bits it may have more pixels for its bytes than a photograph.
     """
-    image = read_image(path)
-    grey = image[:, :, :3].max(axis=2)
+    with _opened(path, _UNDECODED) as file:
+        plain = file.mode in ("1", "L") and "transparency" not in file.info
+        if plain:
+            _check_pixels(path, file, 1)
+            grey = np.array(file.convert("L"))
+    if not plain:
+        image = read_image(path)
+        grey = image[:, :, :3].max(axis=2)
     if grey.max() == 1:
         grey = grey * np.uint8(255)
-    if image.shape[2] == 4:
+    if not plain and image.shape[2] == 4:
         grey = np.minimum(grey, image[:, :, 3])
     return np.asarray(grey >= 128)
 

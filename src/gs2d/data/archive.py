@@ -5,17 +5,20 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
+import struct
 import tempfile
 import zipfile
 import zlib
 from pathlib import Path
 
 from gs2d.core.files import disk_error
+from gs2d.core.growth import check_entries
 from gs2d.data.load import detect_format
 from gs2d.errors import DataError
 
 _JUNK = "__MACOSX"  # what macOS adds: a shadow of every file
 _RATIO, _SMALL = 100, 1 << 30  # images are packed already: what grows a hundredfold to gigabytes is a trap
+_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, LookupError, struct.error, RuntimeError)  # a password
 _DEPTH = 3  # folders with nothing but a folder in them, above the capture
 
 
@@ -39,7 +42,7 @@ def unpack(path: Path, home: Path) -> Path:
     """
     try:
         with _opened(path) as file:
-            infos = [info for info in file.infolist() if info.filename.partition("/")[0] != _JUNK]
+            infos = [info for info in check_entries(path, file.infolist()) if info.filename.partition("/")[0] != _JUNK]
             _check(path, infos)
             rows = sorted(f"{info.filename} {info.file_size} {info.CRC}" for info in infos)
             digest = hashlib.sha256("\n".join(rows).encode("utf-8", "backslashreplace")).hexdigest()[:16]
@@ -50,7 +53,7 @@ def unpack(path: Path, home: Path) -> Path:
                     inside.mkdir(parents=True)
                     file.extractall(inside, infos)
                     os.replace(Path(hidden, digest), target)
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:  # RuntimeError: a password
+    except _BROKEN as error:
         raise DataError(f"{path} must be a whole ZIP file without a password, got: {error}; pack it again") from error
     except OSError as error:
         raise disk_error(home, error) from error

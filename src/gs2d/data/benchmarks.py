@@ -24,6 +24,7 @@ from gs2d.config.datasets import (
     get_dataset,
 )
 from gs2d.config.protocols import Protocol, get_protocol, protocol_for
+from gs2d.core.images import is_number
 from gs2d.core.json_files import read_json
 from gs2d.data.readers.colmap import read_images
 from gs2d.data.readers.dtu import CAMERA_FILES
@@ -99,17 +100,17 @@ def _archive_views(path: Path) -> set[int]:
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
-    except (OSError, zipfile.BadZipFile):
+    except (OSError, ValueError, RuntimeError, zipfile.BadZipFile):
         return set()  # reading it will say what is wrong with it
-    return {int(hit.group(1)) for name in names if (hit := re.fullmatch(r"world_mat_(\d+)\.npy", name))}
+    return {int(hit.group(1)) for name in names if (hit := re.fullmatch(r"world_mat_([0-9]{1,18})\.npy", name))}
 
 
 def _numbered(folder: Path, views: set[int], digits: int, purpose: str, source: str) -> list[MissingFile]:
     """Files named by the number of their view, one for each view."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in _IMAGES] if folder.is_dir() else []
-    numbers = {int(p.stem) for p in files if p.stem.isdigit()}
+    numbers = {int(p.stem) for p in files if is_number(p.stem)}
     suffix = files[0].suffix if files else ".png"
-    width = len(files[0].stem) if files and files[0].stem.isdigit() else digits
+    width = len(files[0].stem) if files and is_number(files[0].stem) else digits
     if files and not numbers:  # named otherwise: their count is all that can be said
         return []
     return [MissingFile(folder / f"{n:0{width}}{suffix}", purpose, source) for n in sorted(views - numbers)]

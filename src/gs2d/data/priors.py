@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
+from gs2d.core.arrays import read_npy
 from gs2d.core.camera import Camera
-from gs2d.core.images import image_size, read_image
+from gs2d.core.images import image_size, read_grey, read_image
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
@@ -208,18 +208,14 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
     """
     path = Path(path)
     if path.suffix == ".npy":
-        values = _read_array(path, "depth map")
+        values = read_npy(path, "depth map")
         values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
         values = values[0] if values.ndim == 3 and values.shape[0] == 1 else values
         if values.ndim != 2:
             raise DataError(f"depth map {path} must be an array [H, W], got {list(values.shape)}")
     else:
         size = image_size(path)  # a file that is no image is named here
-        try:
-            with Image.open(path) as file:
-                mode, values = file.mode, np.asarray(file)
-        except (OSError, SyntaxError, ValueError, EOFError) as error:
-            raise DataError(f"depth map {path} does not decode: {error}; replace or remove it") from error
+        values, mode = read_grey(path)
         if values.ndim != 2 or values.shape != (size[1], size[0]) or mode == "P":
             raise DataError(
                 f"depth map {path} must be a grey image of 16 bits (or 8, or floats), or .npy, got one of mode {mode}; "
@@ -243,7 +239,7 @@ def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
     """
     path = Path(path)
     if path.suffix == ".npy":
-        normals = _read_array(path, "normal map").astype(np.float32)
+        normals = read_npy(path, "normal map").astype(np.float32)
         normals = normals.transpose(1, 2, 0) if normals.ndim == 3 and normals.shape[0] == 3 else normals
         if normals.ndim != 3 or normals.shape[2] != 3:
             raise DataError(f"normal map {path} must be an array [H, W, 3], got {list(normals.shape)}")
@@ -258,18 +254,6 @@ def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
     if not valid.any():
         raise DataError(f"normal map {path} must hold unit vectors n as (n + 1) / 2 (or n in .npy), got none")
     return np.asarray(np.where(valid, 1 / np.maximum(length, 1e-6), 0)[..., None] * normals, dtype=np.float32)
-
-
-def _read_array(path: Path, what: str) -> np.ndarray:
-    try:
-        array = np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise DataError(f"{what} {path} does not exist") from error
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{what} {path} must be an array of numpy, got: {error}") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "uif":
-        raise DataError(f"{what} {path} must be an array of numbers, got {getattr(array, 'dtype', 'an archive')}")
-    return array
 
 
 def _check_shape(what: str, path: Path, shape: tuple[int, ...], k: Intrinsics) -> None:

@@ -138,7 +138,9 @@ def load_lpips(paths: str | Path | Iterable[str | Path], *, device: str = "cpu")
     for file in files:
         try:
             state = torch.load(file, map_location=device, weights_only=True)
-        except (OSError, RuntimeError, UnpicklingError, EOFError, ValueError) as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # whatever torch's readers of its old and new formats run into
             first = (str(error).splitlines() or [type(error).__name__])[0]
             first = first.split(".")[0] if isinstance(error, UnpicklingError) else first  # torch's advice is long
             raise DataError(f"{file} is not a readable PyTorch state dict ({first}); {REMEDY}") from error

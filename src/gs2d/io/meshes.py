@@ -7,6 +7,7 @@ import json
 import os
 import re
 import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,8 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     lists = face.properties.get("vertex_indices", face.properties.get("vertex_index"))
     if not isinstance(lists, PlyList):
         raise DataError(f"{path}: faces with a list vertex_indices were expected, got {sorted(face.properties)}")
+    if lists.values.dtype.kind == "f":
+        raise DataError(f"{path}: whole numbers as vertex indices were expected, got {lists.values.dtype}")
     faces = triangulate(lists.counts, lists.values)
     if len(faces) and (faces.min() < 0 or faces.max() >= vertex.count):
         raise DataError(f"{path}: vertex indices below {vertex.count} were expected, got {faces.max()}")
@@ -108,14 +111,17 @@ def _read_foreign(path: Path) -> Mesh:
     if kind == "obj":  # trimesh takes a comment behind a face for one of its corners
         data = re.sub(rb"#[^\n]*", b"", data)
     try:
-        loaded = trimesh.load_mesh(
-            io.BytesIO(data), file_type=kind, process=False, maintain_order=True, skip_materials=True
-        )
+        with warnings.catch_warnings():  # numpy's, of numbers that it cannot read: what comes of them is checked below
+            warnings.simplefilter("ignore")
+            loaded = trimesh.load_mesh(
+                io.BytesIO(data), file_type=kind, process=False, maintain_order=True, skip_materials=True
+            )
         vertices, faces = np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
         visual: Any = loaded.visual
         colors = np.array(visual.vertex_colors, np.uint8)[:, :3] if visual.kind == "vertex" else None
     except Exception as error:  # whatever its parsers run into
-        raise DataError(f"{path}: a mesh was expected, trimesh cannot read it ({error}); export it again") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DataError(f"{path}: a mesh was expected, trimesh cannot read it ({reason}); export it again") from error
     if not len(faces):
         raise DataError(f"{path}: a mesh was expected, the file has no faces; give a triangle mesh")
     if faces.min() < 0 or faces.max() >= len(vertices):

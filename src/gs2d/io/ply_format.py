@@ -24,6 +24,7 @@ _TYPES = {
 }  # fmt: skip
 _NAMES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}  # fmt: skip # noqa: E501
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_MAX_WORD = 64  # letters of a number
 _HEADER_LIMIT = 1 << 20  # bytes: a header longer than this is no PLY header
 
 
@@ -129,6 +130,8 @@ def _parse_header(path: object, data: bytes) -> _Header:
             elif words[0] == "element":
                 elements.append(_Element(words[1], int(words[2])))
             elif words[0] == "property" and words[1] == "list":
+                if _TYPES[words[2]][0] == "f":  # a length of 2.5, or of NaN
+                    raise ValueError
                 elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
             elif words[0] == "property":
                 elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
@@ -140,6 +143,9 @@ def _parse_header(path: object, data: bytes) -> _Header:
         raise _broken(path, "its header has no format line")
     if any(e.count < 0 for e in elements):
         raise _broken(path, "its header has a negative count")
+    most = max((e.count for e in elements), default=0)
+    if most > len(data):  # a row takes a byte at least
+        raise _broken(path, f"it ends early ({str(most)[:20]} rows were announced in a file of {len(data)} bytes)")
     if any(len({p.name for p in e.properties}) < len(e.properties) for e in elements):
         raise _broken(path, "its header names a property twice")
     return _Header(order, elements, tuple(comments), newline + 1)
@@ -256,6 +262,8 @@ class _AsciiReader:
         words = self.words[self.at : self.at + count]
         if len(words) < count:
             raise _broken(self.path, f"it ends early ({count} more numbers were announced, {len(words)} are left)")
+        if max(map(len, words), default=0) > _MAX_WORD:  # all words of an array of numpy take as much as the longest
+            raise _broken(self.path, f"it has a number of more than {_MAX_WORD} letters")
         self.at += count
         try:
             return np.array(words, dtype="S").astype(np.float64) if count else np.zeros(0)

@@ -35,9 +35,10 @@ from typing import Any
 from gs2d import __version__
 from gs2d.config.renamed import current_names
 from gs2d.core.files import atomic_write, disk_error, is_temporary, sweep
+from gs2d.core.growth import check_entries
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.locks import try_lock
-from gs2d.errors import RunError
+from gs2d.errors import DataError, RunError
 from gs2d.io.event_log import EventLog
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
@@ -354,11 +355,14 @@ def load_tensors(path: Path) -> dict[str, Any]:
 
     try:
         with zipfile.ZipFile(path) as archive:
+            packed = [e.filename for e in check_entries(path, archive.infolist()) if e.compress_size < e.file_size]
+            if packed:  # torch packs nothing
+                raise ValueError(f"{packed[0]} would grow when it is unpacked")
             damaged = archive.testzip()
         if damaged is not None:
             raise ValueError(f"the checksum of {damaged} is wrong")
         return dict(torch.load(path, map_location="cpu", weights_only=True))
-    except (*_UNREADABLE, pickle.UnpicklingError) as error:
+    except (*_UNREADABLE, DataError, pickle.UnpicklingError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise RunError(f"{path} is not a readable checkpoint ({reason}); delete it") from error
 

@@ -95,17 +95,17 @@ def read_gaussians(path: str | os.PathLike[str]) -> Gaussians:
 
 def _attributes(path: object, vertex: PlyElement, scales: tuple[str, ...]) -> dict[str, torch.Tensor]:
     """Return the fields of Splats of the rows of an element."""
-    names = set(vertex.properties)
+    names = {name for name, values in vertex.properties.items() if isinstance(values, np.ndarray)}
     n_rest = sum(name.startswith("f_rest_") for name in names)
-    degree = round((1 + n_rest / 3) ** 0.5) - 1
     rest = [f"f_rest_{i}" for i in range(n_rest)]
-    if n_rest != 3 * ((degree + 1) ** 2 - 1) or not names.issuperset(rest):
+    if n_rest not in (0, 9, 24, 45) or not names.issuperset(rest):
         raise DataError(f"{path}: 0, 9, 24 or 45 properties f_rest_* were expected, got {n_rest}; export it again")
 
     def columns(*wanted: str) -> torch.Tensor:
         table = np.empty((vertex.count, len(wanted)), np.float32)
-        for i, name in enumerate(wanted):
-            table[:, i] = vertex.scalar(name)
+        with np.errstate(over="ignore"):  # a double beyond float32 is infinite
+            for i, name in enumerate(wanted):
+                table[:, i] = vertex.scalar(name)
         return torch.from_numpy(table)
 
     return {

@@ -12,6 +12,7 @@ import numpy as np
 
 from gs2d.config.datasets import DataSet, SceneFacts
 from gs2d.config.surface_protocols import VISIBLE_SURFACE
+from gs2d.core.arrays import read_npy
 from gs2d.core.mesh import Mesh
 from gs2d.data.benchmarks import MESH_TRUTHS, find_truth, recognise
 from gs2d.errors import DataError
@@ -77,10 +78,7 @@ def read_truth(path: Path) -> Truth:
     counts = path.with_name(path.stem + SEEN_SUFFIX)
     if not counts.exists():
         return Truth(path, mesh, None)
-    try:
-        seen = np.load(counts, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{counts} must hold a count for each face of {path.name}, got: {error}") from error
+    seen = read_npy(counts, "counts of views")
     if seen.shape != (len(mesh.faces),):
         raise DataError(f"{counts} must hold {len(mesh.faces)} counts (faces of {path.name}), got {list(seen.shape)}")
     return Truth(path, mesh, seen)

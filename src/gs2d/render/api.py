@@ -220,6 +220,17 @@ def splat_errors(
     return chosen.splat_errors(splats, camera, image, settings, mask, occlusion)
 
 
+def check_dense(name: str, tensor: object) -> None:
+    """Raise ShapeError for anything but a torch tensor whose numbers are all there (not sparse)."""
+    if not isinstance(tensor, Tensor):
+        raise ShapeError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
+    if tensor.layout != torch.strided:
+        raise ShapeError(f"{name} must be a dense tensor, got the layout {tensor.layout}; use its to_dense()")
+
+
+_OPTIONAL = ("screen_probe", "gradient_rows", "mask")
+
+
 def _check_types(splats: object, camera: object, settings: object, **tensors: object) -> None:
     """One line instead of an AttributeError from within; the order of the arguments is what people get wrong."""
     for name, value, kind in (
@@ -230,8 +241,9 @@ def _check_types(splats: object, camera: object, settings: object, **tensors: ob
         if not isinstance(value, kind):
             raise ShapeError(f"{name} must be of type gs2d's {kind.__name__}, got {type(value).__name__}")
     for name, tensor in {**vars(splats), **tensors}.items():
-        if not isinstance(tensor, Tensor) and tensor is not None:
-            raise ShapeError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
+        if tensor is None and name in _OPTIONAL:
+            continue
+        check_dense(name, tensor)
     assert isinstance(camera, Camera)
     if not camera.is_at_pose:
         raise ShapeError(

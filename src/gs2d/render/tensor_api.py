@@ -20,7 +20,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
 from gs2d.core.splats import Splats
 from gs2d.errors import BackendError, ShapeError
-from gs2d.render.api import rasterize
+from gs2d.render.api import check_dense, rasterize
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import PLAIN_COLORS, RasterSettings, RenderOutput
 
@@ -152,6 +152,10 @@ def rasterize_2dgs(
             "with_transmittance_depth False"
         )
     tensors = (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, screen_probe)
+    if not torch.compiler.is_compiling():
+        for name, tensor in zip(_TENSOR_NAMES, tensors, strict=True):
+            if tensor is not None or name not in ("backgrounds", "screen_probe"):
+                check_dense(name, tensor)
     if torch.compiler.is_compiling() or not _is_plain(means):
         if not isinstance(backend, str):
             raise BackendError(f"a captured graph names its backend: give backend={backend.name!r}")
@@ -160,6 +164,9 @@ def rasterize_2dgs(
         degree = PLAIN_COLORS if sh_degree is None else sh_degree
         return Rasterization(*_operator(*tensors, width, height, degree, constants, *choices))
     return _render(*tensors, width, height, sh_degree, settings, backend)
+
+
+_TENSOR_NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds", "screen_probe")
 
 
 def _is_plain(tensor: object) -> bool:

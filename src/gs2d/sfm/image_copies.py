@@ -12,7 +12,7 @@ from pathlib import Path
 from PIL import ExifTags, Image
 
 from gs2d.core.files import atomic_write, disk_error
-from gs2d.core.images import read_image
+from gs2d.core.images import open_image, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.images import DAMAGED_EXIF, JPEG, Photo, turn
 
@@ -84,7 +84,7 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> str:
 
 def _kept(source: Path) -> dict[str, bytes]:
     """Return an image's colour profile (of RGB only: pixels are RGB now) and EXIF block for Pillow's ``save``."""
-    with Image.open(source) as file:
+    with open_image(source) as file:
         profile = file.info.get("icc_profile") if file.mode in ("RGB", "RGBA") else None
         kept = {"icc_profile": profile} if profile else {}
         with contextlib.suppress(*DAMAGED_EXIF):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import ExifTags, Image, features
 
-from gs2d.core.images import natural_key, read_image
+from gs2d.core.images import natural_key, open_image, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.video_frames import VIDEOS
 
@@ -185,7 +185,7 @@ def _exif(path: Path) -> tuple[int, tuple[str, ...]]:
     """Orientation, and what made the picture. A damaged EXIF block is none."""
     base = ExifTags.Base
     try:
-        with Image.open(path) as file:
+        with open_image(path) as file:
             exif = file.getexif()
             details = exif.get_ifd(ExifTags.IFD.Exif)
             orientation = exif.get(base.Orientation, 1)

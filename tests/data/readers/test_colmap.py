@@ -264,3 +264,14 @@ def test_points_that_are_not_finite_are_left_out_and_reported(tmp_path: Path) ->
     assert len(scene.points) == 19
     assert np.isfinite(scene.points.points).all()
     assert any("1 of 20 sparse points" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize("word", ["nan", "1e300", "-1", "256"])
+def test_colors_of_points_that_are_no_bytes_are_one_line(tmp_path: Path, word: str) -> None:
+    path = tmp_path / "points3D.txt"
+    path.write_text(f"1 0.5 0.5 0.5 10 {word} 30 0.1 1 1\n")
+    with pytest.raises(DataError, match=r"points3D\.txt must hold whole numbers as ids and colours, got: .* no uint8"):
+        read_points(tmp_path, "txt")
+    path.write_text("nan 0.5 0.5 0.5 10 20 30 0.1 1 1\n")
+    with pytest.raises(DataError, match="no int64"):
+        read_points(tmp_path, "txt")

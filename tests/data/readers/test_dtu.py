@@ -196,3 +196,23 @@ def test_of_two_archives_the_one_in_the_frame_of_the_model_is_read(tmp_path: Pat
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.T_metric_scene, SCALE_MAT @ wide)
     assert any("another frame" in note for note in scene.notes)
+
+
+def test_an_archive_of_matrices_that_would_explode_is_refused(tmp_path: Path) -> None:
+    small_dtu(tmp_path)
+    path = tmp_path / "cameras_sphere.npz"
+    np.savez_compressed(path, world_mat_0=np.zeros((20_000, 10_000), np.uint8), scale_mat_0=np.eye(4))
+    with pytest.raises(DataError, match="an archive of at most 400 times"):
+        load_scene(tmp_path)
+
+
+def test_numbers_of_other_scripts_are_no_numbers_of_views(tmp_path: Path) -> None:
+    """The superscript two is a digit to Python's isdigit, and none to its int."""
+    small_dtu(tmp_path)
+    (tmp_path / "image/000002.png").rename(tmp_path / "image/\u00b2.png")
+    write_image_of(tmp_path / "image/5.png")
+    with pytest.raises(DataError, match="as many images as"):
+        load_scene(tmp_path)
+    np.savez(tmp_path / "cameras_sphere.npz", **{"world_mat_\u00b2": np.eye(4), "scale_mat_0": np.eye(4)})
+    with pytest.raises(DataError, match="must be a 4x4 matrix of view NUMBER"):
+        load_scene(tmp_path)

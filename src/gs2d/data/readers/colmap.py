@@ -115,6 +115,9 @@ def read_points(folder: Path, kind: str) -> ColmapPoints | None:
     return _points_bin(path) if kind == "bin" else _points_txt(path)
 
 
+_CHUNK = 1 << 16  # points at a time
+
+
 class _Bytes:
     """A binary file that says where it was cut."""
 
@@ -221,8 +224,10 @@ def _points_bin(path: Path) -> ColmapPoints:
     file.at = at
     file.finish("point")
     raw = np.frombuffer(data, dtype=np.uint8)
-    records = raw[offsets[:, None] + np.arange(43)] if count else np.empty((0, 43), dtype=np.uint8)
-    records = np.ascontiguousarray(records)
+    records = np.empty((count, 43), dtype=np.uint8)
+    for start in range(0, count, _CHUNK):  # of indices, which are eight times as large
+        part = slice(start, start + _CHUNK)
+        records[part] = raw[offsets[part, None] + np.arange(43)]
     return ColmapPoints(
         ids=records[:, :8].copy().view("<u8")[:, 0].astype(np.int64),
         xyz=records[:, 8:32].copy().view("<f8").astype(np.float64),
@@ -280,13 +285,14 @@ def _image_txt(path: Path, number: int, line: str, points: str, observations: bo
     try:
         image_id, camera_id, name = int(words[0]), int(words[8]), words[9]
         pose = [float(word) for word in words[1:8]]
-        table = np.array(points.split(), dtype=np.float64).reshape(-1, 3) if observations else None
+        table = np.array(list(map(float, points.split()))).reshape(-1, 3) if observations else None
+        ids = None if table is None else _whole(table[:, 2], np.int64)
     except (ValueError, IndexError) as error:
         raise _wrong_line(path, number, expected, error) from error
     T = pose_matrix(pose[:4], pose[4:], f"{path}: image {name}")
     if table is None:
         return ColmapImage(image_id, camera_id, name, T)
-    return ColmapImage(image_id, camera_id, name, T, table[:, :2], table[:, 2].astype(np.int64))
+    return ColmapImage(image_id, camera_id, name, T, table[:, :2], ids)
 
 
 def _points_txt(path: Path) -> ColmapPoints:
@@ -302,9 +308,20 @@ def _points_txt(path: Path) -> ColmapPoints:
         except ValueError as error:
             raise _wrong_line(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK...", error) from error
     table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    return ColmapPoints(
-        table[:, 0].astype(np.int64), table[:, 1:4].copy(), table[:, 4:7].astype(np.uint8), table[:, 7].copy()
-    )
+    try:
+        ids, rgb = _whole(table[:, 0], np.int64), _whole(table[:, 4:7], np.uint8)
+    except ValueError as error:
+        raise DataError(f"{path} must hold whole numbers as ids and colours, got: {error}") from error
+    return ColmapPoints(ids, table[:, 1:4].copy(), rgb, table[:, 7].copy())
+
+
+def _whole(values: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
+    """Floats as whole numbers; ValueError for NaN and what the type does not hold."""
+    low, high = float(np.iinfo(dtype).min), float(np.iinfo(dtype).max)
+    wrong = values[~((values >= low) & (values <= high) & (values < 2.0**63))]
+    if wrong.size:
+        raise ValueError(f"{wrong.flat[0]:g}, which is no {np.dtype(dtype).name}")
+    return values.astype(dtype)
 
 
 def pose_matrix(quat: list[float], translation: list[float], where: str) -> np.ndarray:

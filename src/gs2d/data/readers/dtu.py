@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
+from gs2d.core.arrays import read_npz
 from gs2d.core.camera import Camera
-from gs2d.core.images import image_size, natural_key
+from gs2d.core.images import image_size, is_number, natural_key
 from gs2d.data.build import Capture, PosedImage
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.readers.colmap import (
@@ -179,22 +178,18 @@ def _matrices_of(root: Path, model: _Model | None) -> tuple[Path, dict[int, np.n
 
 def _read_matrices(path: Path) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
     """world_mat and scale_mat [4, 4] of each view."""
-    try:
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = {
-                key: np.asarray(file[key], dtype=np.float64)
-                for key in file.files
-                if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key
-            }
-    except (OSError, RuntimeError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{path} must be a numpy archive of camera matrices, got: {error}; copy it again") from error
+    arrays = read_npz(
+        path,
+        "camera archive",
+        lambda key: key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key,
+    )
     world: dict[int, np.ndarray] = {}
     scale: dict[int, np.ndarray] = {}
     for key, matrix in arrays.items():
         number = key.rsplit("_", 1)[1]
-        if not number.isdigit() or matrix.shape != (4, 4):
+        if not is_number(number) or matrix.shape != (4, 4):
             raise DataError(f"{path}: {key} must be a 4x4 matrix of view NUMBER, got shape {list(matrix.shape)}")
-        (world if key.startswith("world") else scale)[int(number)] = matrix
+        (world if key.startswith("world") else scale)[int(number)] = matrix.astype(np.float64)
     if not world or set(world) != set(scale):
         raise DataError(
             f"{path} must hold world_mat_i and scale_mat_i of every view, got {len(world)} and {len(scale)} of them"
@@ -217,7 +212,7 @@ def _view_indices(files: list[Path], views: list[int], path: Path) -> list[int]:
     """Index of the view of each file: its position if there are as many as cameras, else the number in its name."""
     if len(files) == len(views):
         return views
-    if all(file.stem.isdigit() for file in files):
+    if all(is_number(file.stem) for file in files):
         return [int(file.stem) for file in files]
     raise DataError(
         f"{files[0].parent} must hold as many images as {path.name} has views, {len(views)}, or be numbered; "

@@ -97,7 +97,7 @@ def _chunk(path: Path) -> tuple[ElementTree.Element, list[str]]:
     """Return the chunk with most cameras, and a note where there are several."""
     try:
         text = path.read_bytes()
-        if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+        if any(word in text.replace(b"\0", b"") for word in (b"<!DOCTYPE", b"<!ENTITY")):  # in UTF-16 too
             raise DataError(f"{path} must be XML as Metashape writes it, got one with definitions of its own")
         document = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:

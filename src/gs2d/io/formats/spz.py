@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.growth import check_growth
 from gs2d.core.json_files import atomic_write
 from gs2d.errors import DataError
 from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
@@ -33,6 +34,7 @@ _SH1_STEP, _SH_STEP = (
 )  # of 255: 7 bits for degree 1, 6 for the others; Niantic's library has 5 and 4 (see decisions)
 _ROOT = np.sqrt(0.5)  # no component but the largest exceeds it
 _WORDS = (1 << 9) - 1
+_SMALL, _RATIO = 16 << 20, 20  # unpacked bytes that any file may have, and those for one of a larger one: 2 is usual
 #: What (x, -y, -z) makes of the harmonics of degree 1 to 3
 _FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 _TURN = np.array([1.0, -1.0, -1.0], np.float32)
@@ -144,6 +146,9 @@ def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
         )
     wide, coefficients = 4 if version == 3 else 3, (degree + 1) ** 2 - 1
     sizes = [9, 1, 3, 3, wide, 3 * coefficients]
+    check_growth(
+        path, len(tail), count * sum(sizes), f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO
+    )
     data = _unpacked(path, unpack, unpack.unconsumed_tail, count * sum(sizes))
     _unpacked(path, unpack, unpack.unconsumed_tail, 1, or_end=True)  # its checksum
     parts, at = [], 0

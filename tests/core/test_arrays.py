@@ -1,0 +1,111 @@
+"""Arrays of numpy from foreign hands: what numpy writes is read, and every other header is one line."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs2d.core.arrays import read_npy, read_npz
+from gs2d.errors import DataError
+
+
+def header(text: str, version: int = 1) -> bytes:
+    """The head of a .npy file with any text where numpy writes a dictionary."""
+    layout = "<H" if version == 1 else "<I"
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack(layout, len(text)) + text.encode("latin-1")
+
+
+def plain(shape: str = "(2,)", descr: str = "'<f4'") -> str:
+    return f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}"
+
+
+@pytest.mark.parametrize("dtype", ["bool", "u1", ">u2", "<i8", "f2", ">f4", "f8"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_what_numpy_writes_comes_back(tmp_path: Path, dtype: str, order: str) -> None:
+    array = np.asarray(np.random.default_rng(0).uniform(0, 200, (3, 4, 5)).astype(dtype), order=order)  # type: ignore[call-overload]
+    np.save(tmp_path / "a.npy", array)
+    got = read_npy(tmp_path / "a.npy", "map")
+    np.testing.assert_array_equal(got, array)
+    assert got.dtype == array.dtype.newbyteorder("=")
+    assert got.flags.writeable
+    np.savez_compressed(tmp_path / "a.npz", one=array, two=np.float64(3))
+    both = read_npz(tmp_path / "a.npz", "archive", lambda name: True)
+    np.testing.assert_array_equal(both["one"], array)
+    assert both["two"].shape == ()
+    assert list(read_npz(tmp_path / "a.npz", "archive", lambda name: name == "two")) == ["two"]
+
+
+def test_a_shape_of_python_2_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.npy").write_bytes(header(plain("(2L, 1L)")) + struct.pack("<2f", 1, 2))
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy", "map"), [[1], [2]])
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "must be an array of numpy, got other bytes"),
+        (b"PK\3\4 and more", "must be an array of numpy, got other bytes"),
+        (header(plain())[:-5], "a header that ends early"),
+        (b"\x93NUMPY\3\0" + b"\xff" * 4, "a header that ends early"),
+        (header(plain("(2")), "a header that is not understood"),  # TokenError in numpy
+        (header("(" * 5000), "a header that is not understood"),  # RecursionError, or MemoryError
+        (header("[1, 2]"), "a header that is not understood"),
+        (header("{'descr': '<f4', b'x': 1, 'shape': (2,)}"), "a header that is not understood"),
+        (header("\0"), "a header that is not understood"),
+        (header(plain("'ab'")), "the shape ab"),
+        (header(plain("(-1,)")), "the shape"),
+        (header(plain("(True, 2.5)")), "the shape"),
+        (header(plain("(" + "1," * 200 + ")")), "the shape"),
+        (header(plain("(9" + "9" * 40 + ",)")), "the shape"),  # OverflowError in numpy
+        (header(plain("(0, 99999999999999, 99999999999999)")), "the shape"),
+        (header(plain("(10000000000000,)")), "must hold the 40000000000000 bytes of its array, got 0"),
+        (header(plain("(2,)")) + b"1234", "must hold the 8 bytes of its array, got 4"),
+        (header(plain("(1,)", "'|O'")) + bytes(8), r"an array of numbers, got \|O"),
+        (header(plain("(1,)", "[('a', '<f4')]")) + bytes(8), "an array of numbers, got"),
+        (header(plain("(1,)", "'<f3'")) + bytes(8), "an array of numbers, got <f3"),
+        (header(plain("(1,)", "'<c16'")) + bytes(16), "an array of numbers, got <c16"),
+    ],
+)
+def test_a_header_that_cannot_be_is_one_line(tmp_path: Path, data: bytes, words: str) -> None:
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(DataError, match=words) as caught:
+        read_npy(tmp_path / "a.npy", "depth map")
+    assert str(tmp_path / "a.npy") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    for name, read in (("a.npy", read_npy), ("a.npz", lambda path, what: read_npz(path, what, bool))):
+        with pytest.raises(DataError, match=f"map .*{name} does not exist"):
+            read(tmp_path / name, "map")
+    with pytest.raises(DataError, match="map .* cannot be read: Is a directory"):
+        read_npy(tmp_path, "map")
+
+
+def zeros(megabytes: int) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(megabytes << 20, np.uint8))
+    return buffer.getvalue()
+
+
+def test_an_archive_that_would_explode_is_not_unpacked(tmp_path: Path) -> None:
+    data = zeros(200)
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        archive.writestr("a.npy", data)
+    assert (tmp_path / "bomb.npz").stat().st_size < 400_000
+    with pytest.raises(DataError, match="an archive of at most 400 times the file's .* would take 209.7 MB"):
+        read_npz(tmp_path / "bomb.npz", "archive", lambda name: True)
+    assert read_npz(tmp_path / "bomb.npz", "archive", lambda name: name == "b") == {}
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_only_what_can_be_unpacked_bit_by_bit_is_read(tmp_path: Path, method: int) -> None:
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
+        archive.writestr("a.npy", zeros(1))
+    with pytest.raises(DataError, match="'a.npy' is packed by method .*; pack it again with deflate"):
+        read_npz(tmp_path / "a.npz", "archive", lambda name: True)
