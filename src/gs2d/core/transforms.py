@@ -36,13 +36,16 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
     Parameters
     ----------
     quats : Tensor [N, 4]
-        (w, x, y, z), any non-zero length. A zero quaternion gives NaN: the rasterizers cull it.
+        (w, x, y, z), any non-zero length that can be squared, and any longer one. A zero quaternion gives NaN: the
+        rasterizers cull it.
 
     Returns
     -------
     Tensor [N, 3, 3]
     """
     check_shapes({"quats": (quats, "N 4")})
+    too_long = quats.detach().abs().amax(dim=1, keepdim=True) > 1e15  # for a square in float32
+    quats = torch.where(too_long, quats * 2.0**-80, quats)
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -69,6 +69,11 @@ opacity o and colour c; a *pair* is a splat and a pixel; k^2 = 2 ln(o / alpha_mi
     depth_transmittance is the z with 1 - T(z) = alpha / 2, alpha the pixel of the alpha image: T = 1/2 where that is 1;
     0 where nothing was blended. Its gradient reaches alpha and depth of every blended pair (implicit function), with
     -dT/dz taken for at least 0.05 alpha / (kappa z); kappa carries none.
+23. *Range.* What float32 cannot square is kept out, alike on every backend. A splat is culled, as in 16, where a
+    coordinate of p or a scale is beyond 1e9 world units, where the absolute coefficients of its colour (SH: the
+    evaluated degree) add up to more than 1e15, and where no component of its quaternion reaches 1e-15, which counts as
+    a zero quaternion. A scale below 1e-18 world units counts as 1e-18. A quaternion of any greater length is its
+    direction, and an opacity logit may be any finite number.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.sh import num_coefficients, sh_to_rgb
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.render.types import PLAIN_COLORS, RasterSettings
+from gs2d.render.types import MAX_COLOR, MAX_SIZE, MIN_QUATERNION, MIN_SIZE, PLAIN_COLORS, RasterSettings
 
 TILE = 16  # px; side of the blocks of pixels that share a list of splats
 MAX_PAIRS = 1 << 21  # pairs of splat and pixel evaluated at once; bounds the memory
@@ -53,18 +53,22 @@ class Block:
 
 
 def visible_rows(splats: Splats, camera: Camera, settings: RasterSettings, *, for_errors: bool) -> Tensor:
-    """Rows that are not culled by rules 5, 6, 16 and 19, by increasing camera depth, ties by index (rule 2).
+    """Rows that are not culled by rules 5, 6, 16, 19 and 23, by increasing camera depth, ties by index (rule 2).
 
     Returns
     -------
     Tensor [M] int64
     """
     used = splats.detach()
-    keep = used.quats.norm(dim=1) > 0
+    keep = used.quats.abs().amax(dim=1) >= MIN_QUATERNION
     shN = used.shN[:, : num_coefficients(max(settings.sh_degree, 0)) - 1]
-    for tensor in (used.means, used.quats, used.scales, used.log_scales, used.opacity_logits, used.sh0, shN):
+    for tensor in (used.means, used.quats, used.log_scales, used.opacity_logits):
         keep &= tensor.isfinite().flatten(1).all(dim=1) if tensor.dim() > 1 else tensor.isfinite()
-    depth = _to_camera(used.means, camera)[:, 2]
+    keep &= (used.sh0.abs().sum(dim=(1, 2)) + shN.abs().sum(dim=(1, 2))) <= MAX_COLOR  # False for NaN, like all here
+    keep &= (used.scales <= MAX_SIZE).all(dim=1)
+    at = _to_camera(used.means, camera)
+    keep &= (at.abs() <= MAX_SIZE).all(dim=1)
+    depth = at[:, 2]
     keep &= depth > settings.near
     if settings.near_plane_policy == "cull":
         keep &= depth**2 > settings.error_cutoff**2 * _slant_squared(used, camera)
@@ -92,7 +96,7 @@ def project(splats: Splats, rows: Tensor, camera: Camera, settings: RasterSettin
     """
     means = splats.means[rows]
     frames = quats_to_matrices(splats.quats[rows])  # [M, 3, 3], columns t_u, t_v, t_w in the world
-    scales = splats.log_scales[rows].exp()  # [M, 2] world units
+    scales = splats.log_scales[rows].exp().clamp(min=MIN_SIZE)  # [M, 2] world units
     R = torch.as_tensor(camera.rotation, dtype=means.dtype, device=means.device)
 
     p = _to_camera(means, camera)  # [M, 3] world units

@@ -17,6 +17,11 @@ NEAR_PLANE_POLICIES = (
     "cull",
     "box",
 )  # the values of RasterSettings.near_plane_policy; the kernels know them by their place
+# Rule 23: splats beyond these are culled, as float32 could not hold what is worked out (core/project.h has the same).
+MAX_SIZE = 1e9  # world units: coordinates in the camera frame, scales
+MIN_SIZE = 1e-18  # world units: smaller scales count as this
+MAX_COLOR = 1e15  # sum of the absolute coefficients of a colour
+MIN_QUATERNION = 1e-15  # largest component; less is a zero quaternion
 
 
 @dataclass(frozen=True)

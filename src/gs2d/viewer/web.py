@@ -28,7 +28,7 @@ from gs2d.core.files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.data.subject import OBJECT, SCENE, Subject
 from gs2d.errors import DataError
-from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
+from gs2d.render.types import MAX_SIZE, NEAR_PLANE_POLICIES, RasterSettings
 
 # -- where the page opens ----------------------------------------------------------------------------------------------
 ROUND = math.radians(100.0)  # a gap between neighbouring directions from which a capture is one-sided
@@ -232,6 +232,8 @@ def _seen_rows(splats: Splats, alpha_min: float) -> torch.Tensor:
     for _, tensor in splats.items():
         if tensor.numel():
             seen &= tensor.reshape(len(tensor), -1).isfinite().all(dim=1)
+    if len(splats):  # rule 23 of the rasterizer, as far as it does not depend on where one stands
+        seen &= (splats.means.abs().amax(dim=1) <= MAX_SIZE) & (splats.scales.amax(dim=1) <= MAX_SIZE)
     return seen.nonzero().squeeze(1)
 
 

@@ -14,6 +14,12 @@ namespace gs2d {
 
 template <class V> using mask_t = decltype(V() < V());
 
+// Rule 23: what is beyond these is culled, so that no square below leaves float32 (render/types.py has the same numbers).
+constexpr double MAX_SIZE = 1e9;          // world units: coordinates in the camera frame, scales
+constexpr double MIN_SIZE = 1e-18;       // world units: smaller scales count as this
+constexpr double MAX_COLOR = 1e15;        // sum of the absolute coefficients of a colour
+constexpr double MIN_QUATERNION = 1e-15;  // largest component; less is a zero quaternion
+
 // A pinhole camera; x_cam = R x_world + t. S is a scalar.
 template <class S> struct PinholeCamera {
     S R[9], t[3], center[3];
@@ -78,12 +84,20 @@ template <class V> GS2D_HD Vec3<V> direction_of(Vec3<V> d, V& inverse_length) {
     return inverse_length * d;
 }
 
+// The largest component of the quaternion.
+template <class V> GS2D_HD V longest_of(const SplatParameters<V>& s) {
+    return max(max(abs(s.qw), abs(s.qx)), max(abs(s.qy), abs(s.qz)));
+}
+
 template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>& s, const PinholeCamera<S>& cam) {
     Frame3<V> f;
-    const V one = V(S(1)), two = V(S(2)), tiny = V(S(1e-18));
-    f.inverse_norm = one / sqrt(fma(s.qw, s.qw, fma(s.qx, s.qx, fma(s.qy, s.qy, s.qz * s.qz))));
-    f.qw = s.qw * f.inverse_norm, f.qx = s.qx * f.inverse_norm, f.qy = s.qy * f.inverse_norm,
-    f.qz = s.qz * f.inverse_norm;
+    const V one = V(S(1)), two = V(S(2)), tiny = V(S(MIN_SIZE));
+    // 2^-80 keeps the square of the largest quaternion; all others are multiplied by 1, which changes no bit.
+    const V shrink = select(longest_of(s) > V(S(1e15)), V(S(8.271806125530277e-25)), one);
+    const V qw = s.qw * shrink, qx = s.qx * shrink, qy = s.qy * shrink, qz = s.qz * shrink;
+    const V inverse = one / sqrt(fma(qw, qw, fma(qx, qx, fma(qy, qy, qz * qz))));
+    f.inverse_norm = inverse * shrink;
+    f.qw = qw * inverse, f.qx = qx * inverse, f.qy = qy * inverse, f.qz = qz * inverse;
     const V xx = f.qx * f.qx, yy = f.qy * f.qy, zz = f.qz * f.qz;
     const V xy = f.qx * f.qy, xz = f.qx * f.qz, yz = f.qy * f.qz, wx = f.qw * f.qx, wy = f.qw * f.qy, wz = f.qw * f.qz;
     f.tu = {one - two * (yy + zz), two * (xy + wz), two * (xz - wy)};
@@ -108,12 +122,18 @@ template <class V, class S> GS2D_HD Frame3<V> frame_of(const SplatParameters<V>&
     return f;
 }
 
-// Finite only if every parameter is, and if the scales and the inverse norm of the quaternion are: a sum of absolute values.
-// (gcc 12 folds 0 * x to 0 with -fno-signed-zeros.)
-template <class V> GS2D_HD V parameter_size(const SplatParameters<V>& p, const Frame3<V>& f) {
-    return abs(p.mean.x) + abs(p.mean.y) + abs(p.mean.z) + abs(p.logit) + abs(p.qw) + abs(p.qx) + abs(p.qy) +
-           abs(p.qz) + abs(p.log_su) + abs(p.log_sv) + exp(p.log_su) + exp(p.log_sv) + f.inverse_norm;
+// Rules 16 and 23, but for the colour: every parameter is finite and in the range that float32 can square. False for NaN.
+template <class V> GS2D_HD mask_t<V> in_range(const SplatParameters<V>& p, const Frame3<V>& f) {
+    // an eighth of each, so that finite numbers have a finite sum (gcc 12 folds 0 * x to 0 with -fno-signed-zeros)
+    const V part = V(0.125f), limit = V(float(MAX_SIZE));
+    const V size = part * abs(p.logit) + part * abs(p.qw) + part * abs(p.qx) + part * abs(p.qy) + part * abs(p.qz) +
+                   part * abs(p.log_su) + part * abs(p.log_sv);
+    return (size <= V(3.402823466e38f)) & (longest_of(p) >= V(float(MIN_QUATERNION))) & (abs(f.p.x) <= limit) &
+           (abs(f.p.y) <= limit) & (abs(f.p.z) <= limit) & (exp(p.log_su) <= limit) & (exp(p.log_sv) <= limit);
 }
+
+// The same of the sum of the absolute coefficients of a colour.
+template <class V> GS2D_HD mask_t<V> color_in_range(V sum) { return sum <= V(float(MAX_COLOR)); }
 
 // All of the record but the colour.
 template <class V, class S>

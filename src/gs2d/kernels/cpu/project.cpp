@@ -6,7 +6,7 @@
 namespace gs2d {
 namespace {
 
-// Reads LANES splats; `alive` is false for those culled by themselves (non-finite, behind, transparent).
+// Reads LANES splats; `alive` is false for those culled by themselves (out of range, behind, transparent).
 struct Group {
     SplatParameters<V> parameters;
     Frame3<V> frame;
@@ -19,12 +19,12 @@ inline Group project_group(const Frame& f, const Parameters& s, int64_t i, int l
     g.parameters = load_parameters(s, i, lanes);
     g.frame = frame_of(g.parameters, f.camera);
     g.record = project(g.parameters, g.frame, f.camera);
-    g.alive = is_finite(parameter_size(g.parameters, g.frame)) & (g.frame.p.z > V(real(f.view.near))) & first(lanes);
+    g.alive = in_range(g.parameters, g.frame) & (g.frame.p.z > V(real(f.view.near))) & first(lanes);
     if (opacity_counts) g.alive = g.alive & (g.record.log2_opacity >= V(real(log2(f.view.alpha_min))));
     return g;
 }
 
-// Evaluates the colour of the living; splats with non-finite coefficients die.
+// Evaluates the colour of the living; splats whose coefficients are out of range die.
 inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lanes, Group& g) {
     V sh[3 * SH_MAX], basis[SH_MAX];
     const int degree = f.view.sh_degree;
@@ -32,7 +32,7 @@ inline void color_group(const Frame& f, const Parameters& s, int64_t i, int lane
     sh_basis(g.frame.to_splat, degree, basis);
     V size = V(0);
     for (int k = 0; k < 3 * sh_count(degree); ++k) size = size + abs(sh[k]);
-    g.alive = g.alive & is_finite(size);
+    g.alive = g.alive & color_in_range(size);
     const Vec3<V> c = sh_color(sh, basis, degree);
     g.record.red = clamped_color(c.x, degree), g.record.green = clamped_color(c.y, degree),
     g.record.blue = clamped_color(c.z, degree);

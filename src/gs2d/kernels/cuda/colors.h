@@ -39,7 +39,7 @@ template <class F> __device__ __forceinline__ Vec3<float> with_degree(int degree
     }
 }
 
-// The colour + 1/2, not clamped; `size` is finite only if every coefficient is.
+// The colour + 1/2, not clamped; `size` is the sum of the absolute coefficients.
 __device__ __forceinline__ Vec3<float> color_of(int degree, const Coefficients& from, Vec3<float> direction,
                                                 float& size) {
     return with_degree(degree, [&](auto d) {

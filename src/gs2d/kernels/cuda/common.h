@@ -33,8 +33,6 @@ __device__ __forceinline__ BlendLimits<float> limits_of(const View& v) {
             v.inv_depth_width};
 }
 
-__device__ __forceinline__ bool is_finite(float a) { return abs(a) <= 3.402823466e38f; }  // false for NaN
-
 // A splat against the sub-blocks of a tile: cull record ex, ey, a, b, c, cx, cy, disc2. disc2 < 0: no ellipse but an outline, and ex is
 // its k; then every sub-block is reached as far as this test knows.
 struct Culling {

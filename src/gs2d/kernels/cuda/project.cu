@@ -46,14 +46,14 @@ extern "C" __global__ void __launch_bounds__(128) project_splats(ProjectArgument
     const SplatParameters<float> p = load_parameters(a, i);
     const Frame3<float> frame = frame_of(p, v.camera);
     Record<float> r = project(p, frame, v.camera);
-    if (!is_finite(parameter_size(p, frame)) || !(frame.p.z > v.near)) return;
+    if (!in_range(p, frame) || !(frame.p.z > v.near)) return;
     if (!a.errors && !(r.log2_opacity >= v.log2_alpha_min)) return;
     const bool crossing = v.near_plane_policy != NEAR_PLANE_DRAW && reaches_camera_plane(frame, v.error_k2);
     if (crossing && v.near_plane_policy == NEAR_PLANE_CULL) return;
     float sh_size;
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
     const Vec3<float> c = color_of(v.sh_degree, sh, frame.to_splat, sh_size);
-    if (!is_finite(sh_size)) return;
+    if (!color_in_range(sh_size)) return;
     r.red = clamped_color(c.x, v.sh_degree), r.green = clamped_color(c.y, v.sh_degree),
     r.blue = clamped_color(c.z, v.sh_degree);
 
