@@ -26,7 +26,7 @@ ALLOWED = {
     "scipy": "BSD; the text names the run-time library of gfortran in its wheel (GPL 3 with the exception for GCC's "
     "run-time libraries, which lets any program carry it)",
     "matplotlib": "its own; the text names FreeType, in its wheel, under the FTL or the GPL 2: the FTL is taken",
-    "nvidia-cuda-nvrtc": "NVIDIA's, of the extra `cuda` only: may be passed on with a program, as torch's wheels do",
+    "nvidia-cuda-nvrtc": "NVIDIA's, of extras only: may be passed on with a program, as torch's wheels do",
 }
 # Imported where a user has installed one of them, never declared: their wheels carry LGPL code (HEIC).
 USERS_OWN = {"pi_heif", "pillow_heif"}

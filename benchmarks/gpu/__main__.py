@@ -1,11 +1,13 @@
-"""Measure the CUDA backend on a GPU, in three commands (METHOD.md).
+"""Measure the CUDA backend on a GPU (METHOD.md); ``host`` needs none.
 
 ::
 
+    python -m benchmarks.gpu first       [--out FILE.json] [--dry-run]
+    python -m benchmarks.gpu host        [--out FILE.json]
     python -m benchmarks.gpu correctness [--out FILE.json] [--dry-run] [--only parity memcheck ...]
     python -m benchmarks.gpu kernels     [--out FILE.json] [--dry-run] [--only 1000000 ...]
     python -m benchmarks.gpu training    [--out FILE.json] [--dry-run] --capture FOLDER ... [--schedule-scale 1.0]
-                                         [--downscale 1] [--runs FOLDER]
+                                         [--downscale 1] [--runs FOLDER] [--synthetic]
 
 Each writes one file, after every part of it, and prints a short table last. ``--minutes M`` begins no part after so
 many, for machines that are lent by the minute. ``--dry-run`` goes through all of it on any machine, at toy size, with
@@ -49,18 +51,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.gpu", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("command", choices=("correctness", "kernels", "training", "exercise"))
+    parser.add_argument("command", choices=("first", "correctness", "kernels", "training", "exercise", "host"))
     parser.add_argument("--out", type=Path)
     parser.add_argument("--dry-run", action="store_true")
     parser.add_argument("--only", nargs="+", default=[], help="parts or scenes whose name contains one of these")
-    parser.add_argument("--capture", type=Path, nargs="+", default=[])
+    parser.add_argument("--capture", type=Path, nargs="*", default=[])
+    parser.add_argument("--synthetic", action="store_true", help="train on a capture that is made here, too")
     parser.add_argument("--schedule-scale", type=float, default=1.0)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--runs", type=Path, help="keep the run folders here")
     parser.add_argument("--minutes", type=float, default=math.inf, help="begin no part after so many")
     args = parser.parse_args(arguments)
-    if args.command == "training" and not args.capture and not args.dry_run:
-        parser.error("training needs --capture FOLDER")
+    if args.command == "training" and not args.capture and not args.dry_run and not args.synthetic:
+        parser.error("training needs --capture FOLDER or --synthetic")
     reason = unfit()
     if reason:
         print(f"error: {reason}", file=sys.stderr)
@@ -70,6 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from benchmarks.gpu.bench import RESULTS, opened
     from gs2d.errors import Gs2dError
 
+    if args.command == "host":
+        return host_alone(args.out or RESULTS / "gpu_host.json")
     try:
         with opened(args.dry_run, args.minutes) as bench:
             if args.command == "exercise":
@@ -82,9 +87,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
+def host_alone(out: Path) -> int:
+    """What an iteration costs the host, on any machine."""
+    from benchmarks.gpu import host
+    from benchmarks.gpu.bench import commit, write
+    from benchmarks.timing import machine
+
+    found = host.host_cost()
+    write(out, {"command": "host", "commit": commit(), "machine": machine(), "results": found})
+    print(*host.table(found), f"written: {out}", sep="\n")
+    return 0
+
+
 def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
     """One command to its file."""
-    from benchmarks.gpu import correctness, kernels, training
+    from benchmarks.gpu import correctness, first, kernels
     from benchmarks.gpu.bench import clocks, commit, facts, write
 
     document: dict[str, Any] = {"command": args.command, "commit": commit(), "machine": facts(bench)}
@@ -94,18 +111,27 @@ def run(args: argparse.Namespace, bench: Bench, out: Path) -> int:
 
     progress({})  # where it cannot be written is known before anything slow
     module: ModuleType
-    if args.command == "correctness":
+    if args.command == "first":
+        results, module = first.run(bench, args.only, progress), first
+    elif args.command == "correctness":
         results, module = correctness.run(bench, args.only, progress), correctness
     elif args.command == "kernels":
         results, module = kernels.run(bench, args.only, progress), kernels
     else:
+        from benchmarks.gpu.without_tyro import stand_in
+
+        stand_in()
+        from benchmarks.gpu import training  # the pipeline, which the other commands need not have
+
         captures = (args.capture, args.schedule_scale, args.downscale, args.runs)
-        results, module = training.run(bench, *captures, progress), training
+        results, module = training.run(bench, *captures, progress, synthetic=args.synthetic), training
     if not bench.dry:
         document["clocks_after"] = clocks()
     progress(results)
     print(*module.table(results), f"written: {out}", sep="\n")
-    wrong = args.command == "correctness" and correctness.wrong(results)
+    wrong = (args.command == "correctness" and correctness.wrong(results)) or (
+        args.command == "first" and first.wrong(results)
+    )
     return int(wrong and not bench.dry)
 
 

@@ -27,7 +27,7 @@ from gs2d.render import cuda, reference
 from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.types import RasterSettings
 
-TOOLS = ("memcheck", "racecheck", "initcheck")
+TOOLS = ("memcheck", "racecheck", "synccheck", "initcheck")
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 

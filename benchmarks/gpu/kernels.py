@@ -214,6 +214,21 @@ def disturbed(splats: Splats) -> Splats:
 
 def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor], *, stages: int = 3) -> dict[str, Any]:
     """Whole iterations of the trainer in the stages of 2DGS-R, with all losses; nothing is densified."""
+    trainer = bench_trainer(bench, scene, targets, stages=stages)
+    found: dict[str, Any] = {}
+    for index, stage in enumerate(trainer.recipe.stages):
+        trainer.enter(index)
+        for _ in scene.cameras:
+            trainer.step()  # every photograph is taken in
+        found[stage.name] = bench.times(lambda _: trainer.step(), repeats=REPEATS, warmup=WARMUP)
+        found[f"{stage.name}_peak_bytes"] = bench.peak_memory(trainer.step)
+        found[f"{stage.name}_kernels_ms"] = _in_iterations(bench, trainer)
+    return found
+
+
+def bench_trainer(bench: Bench, scene: GpuScene, targets: list[Tensor] | None = None, *, stages: int = 3) -> Trainer:
+    """A trainer of the stages of 2DGS-R that learns back pictures of the splats; all iterations do the same work."""
+    targets = images(bench, scene) if targets is None else targets
     views = tuple(
         View.from_arrays(f"{i}.png", camera, (target * 255).round().byte().cpu().numpy())
         for i, (camera, target) in enumerate(zip(scene.cameras, targets, strict=True))
@@ -224,16 +239,7 @@ def iterations(bench: Bench, scene: GpuScene, targets: list[Tensor], *, stages: 
     recipe = Recipe("bench", tuple(steady(stage) for stage in recipe.stages[:stages]))
     protocol = replace(GENERIC, near=0.2)
     state = TrainState(disturbed(scene.splats), torch.Generator().manual_seed(2))
-    trainer = Trainer(capture, recipe, protocol, backend=bench.backend, state=state, progress_every=10**9)
-    found: dict[str, Any] = {}
-    for index, stage in enumerate(recipe.stages):
-        trainer.enter(index)
-        for _ in views:
-            trainer.step()  # every photograph is taken in
-        found[stage.name] = bench.times(lambda _: trainer.step(), repeats=REPEATS, warmup=WARMUP)
-        found[f"{stage.name}_peak_bytes"] = bench.peak_memory(trainer.step)
-        found[f"{stage.name}_kernels_ms"] = _in_iterations(bench, trainer)
-    return found
+    return Trainer(capture, recipe, protocol, backend=bench.backend, state=state, progress_every=10**9)
 
 
 def _in_iterations(bench: Bench, trainer: Trainer) -> dict[str, float]:

@@ -1,60 +1,81 @@
 #!/bin/bash
-# Measures in three calls of at most ten minutes each, on a GPU that is lent by the minute (METHOD.md).
+# Measures in four calls on a GPU that is lent by the minute (METHOD.md); part 0 first: it says what the others are for.
 #
-#   bash benchmarks/gpu/lent.sh 1 OUT                ceilings, parity, tests, sanitizer as far as time allows
-#   bash benchmarks/gpu/lent.sh 2 OUT                kernels and iterations, beside gsplat and the official rasterizer
-#   bash benchmarks/gpu/lent.sh 3 OUT CAPTURE ...    whole runs: a tenth of the schedule, then all of it
+#   bash benchmarks/gpu/lent.sh 0 OUT                three minutes: facts, every kernel once, parity, where the time goes
+#   bash benchmarks/gpu/lent.sh 1 OUT                kernels and iterations, counters, what-ifs, beside gsplat
+#   bash benchmarks/gpu/lent.sh 2 OUT [CAPTURE ...]  whole runs: of captures, and of a synthetic one that is made there
+#   bash benchmarks/gpu/lent.sh 3 OUT                ceilings, parity, tests, sanitizers as far as time allows
 #
-# Results are in OUT/gpu_*.json after every part, whatever stops the rest. Needs no index and nothing installed: it takes
-# .venv or the first Python >= 3.11 whose torch is built with CUDA. MINUTES=9 and DRY=--dry-run (no GPU: toy sizes,
+# Results come to OUT/gpu_*.json as they are had, whatever stops the rest, and what belongs to them (reports, traces,
+# logs) to OUT/part_N.tar.gz: two files a part, none in a folder, and small enough to be brought home. Needs no index
+# and installs nothing: it takes .venv or the first Python >= 3.11 whose torch is built with CUDA. What is in carried/
+# is used: captures/*, *.whl (gsplat, for one: METHOD.md). MINUTES (8.3; of part 0: 3) and DRY=--dry-run (no GPU: toy sizes,
 # emulated) may be set. The exit status is that of the measurement: 0, 1 (something is wrong), 2 (cannot run), 124 (time).
+begun=$(date +%s)
 set -u
 cd "$(dirname "$0")/../.." || exit 2
 part=${1:-}; out=${2:-}
-case "$part" in 1 | 2 | 3) ;; *) sed -n '2,6s/^# \{0,1\}//p' "$0" >&2; exit 2 ;; esac
+case "$part" in 0 | 1 | 2 | 3) ;; *) sed -n '2,7s/^# \{0,1\}//p' "$0" >&2; exit 2 ;; esac
 [ -n "$out" ] && mkdir -p "$out" || { echo "error: lent.sh: a folder for results was expected after the part, got '$out'" >&2; exit 2; }
 out=$(cd "$out" && pwd)
 shift 2
-minutes=${MINUTES:-9}
+minutes=${MINUTES:-$([ "$part" = 0 ] && echo 3 || echo 8.3)}
+end=$(awk "BEGIN{print int($begun + 60 * $minutes)}")
 dry=${DRY:-}
-export PYTHONPATH="src${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
+work=$(mktemp -d "${TMPDIR:-/tmp}/gs2d.XXXXXX") || exit 2
+export PYTHONPATH="src${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1 GS2D_WORK=$work
 
-fits() {  # says why a Python does not
-    "$1" - "$dry" 2>&1 <<'PY' | tail -1
+left() { echo $(($(date +%s) < end ? end - $(date +%s) : 0)); }
+
+fits() {  # whether a Python does, by its exit status: what a package has to say while it loads is no reason
+    timeout -k 5 $(($(left) + 30)) "$1" -W ignore - "$dry" 2>"$work/python.err" <<'PY'
 import sys
 if sys.version_info < (3, 11):
-    sys.exit("Python %d.%d, 3.11 or newer is needed" % sys.version_info[:2])
-import numpy, PIL, scipy, torch
+    sys.exit(print("Python %d.%d, 3.11 or newer is needed" % sys.version_info[:2]) or 1)
+try:
+    import numpy, PIL, scipy, torch
+except ImportError as error:
+    sys.exit(print(error) or 1)
 if torch.version.cuda is None and not sys.argv[1]:
-    sys.exit("torch %s is built without CUDA" % torch.__version__)
+    sys.exit(print("torch %s is built without CUDA" % torch.__version__) or 1)
 PY
 }
 python=
 for candidate in .venv/bin/python python3 python3.13 python3.12 python3.11 python; do
     command -v "$candidate" >/dev/null || continue
-    why=$(fits "$candidate")
-    [ -z "$why" ] && { python=$candidate; break; }
-    echo "$candidate: $why" >&2
+    if why=$(fits "$candidate"); then
+        python=$candidate
+        break
+    fi
+    echo "$candidate: ${why:-$(tail -n 1 "$work/python.err")}" >&2
 done
-[ -n "$python" ] || { echo "error: lent.sh: no Python fits; run make install, or put one with torch's CUDA build on the PATH" >&2; exit 2; }
+[ -n "$python" ] || { echo "error: lent.sh: no Python fits; run make install, or put one with torch's CUDA build on the PATH" >&2; rm -rf "$work"; exit 2; }
 [ -n "${GS2D_COMMIT:-}" ] || GS2D_COMMIT=$(git describe --always --dirty 2>/dev/null) && export GS2D_COMMIT
-"$python" -m gs2d doctor >"$out/doctor.txt" 2>&1
-grep -h "cuda" "$out/doctor.txt" || true
+trap '"$python" -m benchmarks.gpu.archive "$work" "$out/part_$part.tar.gz"; rm -rf "$work"' EXIT
 
 measure() {  # a command within the time that is left; a kill comes half a minute after it was to stop by itself
-    local left=$(($(date +%s) < end ? end - $(date +%s) : 0))
-    timeout -k 5 $((left + 30)) "$python" -m benchmarks.gpu "$@" --minutes "$(awk "BEGIN{print $left/60}")" $dry
+    timeout -k 5 $(($(left) + 30)) "$python" -m benchmarks.gpu "$@" --minutes "$(awk "BEGIN{print $(left)/60}")" $dry \
+        > >(tee -a "$work/log.txt") 2> >(tee -a "$work/log.txt" >&2)
 }
-end=$(awk "BEGIN{print int($(date +%s) + 60 * $minutes)}")
+if ls carried/*.whl >/dev/null 2>&1; then  # pure Python, or for this one
+    timeout 60 "$python" -m pip install -q --no-index --no-deps --target "$work/.site" carried/*.whl >>"$work/log.txt" 2>&1
+    export PYTHONPATH="$PYTHONPATH:$work/.site"
+fi
 case "$part" in
-    1) measure correctness --out "$out/gpu_correctness.json" ;;
-    2) measure kernels --out "$out/gpu_kernels.json" ;;
-    3)
-        [ $# -gt 0 ] || [ -n "$dry" ] || { echo "error: lent.sh: part 3 needs captures after the folder" >&2; exit 2; }
-        captures=()
-        [ $# -eq 0 ] || captures=(--capture "$@")
-        short=(--schedule-scale 0.1 --runs "$out/runs-0.1" --out "$out/gpu_training_0.1.json")
-        measure training "${short[@]}" "${captures[@]}" &&
-            measure training --runs "$out/runs" --out "$out/gpu_training.json" "${captures[@]}"
+    0) measure first --out "$out/gpu_first.json" ;;
+    1)
+        export TORCH_EXTENSIONS_DIR="$work/.extensions"
+        if [ -z "$dry" ] && command -v nvcc >/dev/null && ls carried/gsplat-*.whl >/dev/null 2>&1; then
+            # its kernels are compiled beside what is measured first, on other cores; it is wanted last
+            (timeout -k 5 "$(left)" nice "$python" -W ignore -c 'from benchmarks.gpu.peers import build_gsplat as b; b()' \
+                >"$work/gsplat.txt" 2>&1 &)
+        fi
+        measure kernels --out "$out/gpu_kernels.json"
         ;;
+    2)
+        captures=("$@")
+        [ $# -gt 0 ] || for folder in carried/captures/*/; do [ -d "$folder" ] && captures+=("$folder"); done
+        measure training --runs "$work/runs" --out "$out/gpu_training.json" --synthetic --capture ${captures[@]+"${captures[@]}"}
+        ;;
+    3) measure correctness --out "$out/gpu_correctness.json" ;;
 esac

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -75,6 +76,13 @@ def _pose(camera: Camera, device: torch.device) -> Tensor:
     return torch.as_tensor(camera.T_cam_world, dtype=torch.float32, device=device)
 
 
+def build_gsplat() -> None:
+    """Let gsplat compile its kernels for this GPU alone, as its wheel does when it is first used: minutes."""
+    major, minor = torch.cuda.get_device_capability()
+    os.environ.setdefault("TORCH_CUDA_ARCH_LIST", f"{major}.{minor}")  # all it knows would take three times as long
+    _module("gsplat.cuda._backend")
+
+
 def gsplat() -> Peer:
     """gsplat's 2DGS, of versions 1.4 to 1.6.
 
@@ -84,6 +92,8 @@ def gsplat() -> Peer:
         It is not installed, or has no 2DGS.
     """
     module = _module("gsplat")
+    if torch.cuda.is_available():
+        build_gsplat()
     version = getattr(module, "__version__", "?")
     if not hasattr(module, "rasterization_2dgs"):
         raise BackendError(f"gsplat {version} has no rasterization_2dgs; install gsplat 1.4 or newer")

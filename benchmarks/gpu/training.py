@@ -10,26 +10,44 @@ from typing import Any
 import torch
 
 from benchmarks.gpu.bench import ROOT, Bench
-from gs2d.pipeline.events import Phase
+from benchmarks.gpu.capture import SYNTHETIC, write_capture
+from gs2d.pipeline.events import Phase, StageDone
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
 
+STAGE = ("name", "iterations", "seconds", "splats", "bytes", "train", "test", "after_clone")
+
 
 def run(
-    bench: Bench, captures: list[Path], scale: float, downscale: int, out: Path | None, progress: Any
+    bench: Bench,
+    captures: list[Path],
+    scale: float,
+    downscale: int,
+    out: Path | None,
+    progress: Any,
+    *,
+    synthetic: bool = False,
 ) -> dict[str, Any]:
-    """Every capture; ``progress`` gets the document so far after each."""
+    """Every capture, then a synthetic one; ``progress`` gets the document so far after each stage of each."""
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) if out is None else out
         if bench.dry:
             captures, scale = [toy_capture(Path(temporary))], 0.0005
-        for capture in captures:
-            found[capture.resolve().name] = bench.attempt(
-                str(capture),
-                lambda capture=capture: whole_run(bench, capture, scale, downscale, folder),  # type: ignore[misc]
-            )
-            progress(found)
+        jobs: dict[str, Any] = {capture.resolve().name: lambda capture=capture: capture for capture in captures}
+        if synthetic:
+            jobs[SYNTHETIC] = lambda: write_capture(bench, Path(temporary) / SYNTHETIC)
+        for name, make in jobs.items():
+
+            def report(partial: dict[str, Any], name: str = name) -> None:
+                found[name] = partial
+                progress(found)
+
+            def work(make: Any = make, report: Any = report) -> dict[str, Any]:
+                return whole_run(bench, make(), scale, downscale, folder, report)
+
+            result = bench.attempt(name, work)
+            report(found.get(name, {}) | result if "failed" in result else result)
     return found
 
 
@@ -43,8 +61,13 @@ def toy_capture(folder: Path) -> Path:
     return Path(tiny.write_capture(folder / "ball"))
 
 
-def whole_run(bench: Bench, capture: Path, scale: float, downscale: int, folder: Path) -> dict[str, Any]:
-    """Train to the end; seconds of each stage without loading and scoring, quality, memory, and all of it together."""
+def whole_run(
+    bench: Bench, capture: Path, scale: float, downscale: int, folder: Path, report: Any = lambda partial: None
+) -> dict[str, Any]:
+    """Train to the end; seconds of each stage without loading and scoring, quality, memory, and all of it together.
+
+    ``report`` gets the stages so far after each: a run that is cut off has told what it had.
+    """
     overrides = ("init_points=60", "surface.densify.max_splats=90") if bench.dry else ()
     options = TrainOptions(
         scene=capture,
@@ -61,7 +84,12 @@ def whole_run(bench: Bench, capture: Path, scale: float, downscale: int, folder:
     phases: dict[str, float] = {}
     started = [("start", time.perf_counter())]
 
+    ended: list[dict[str, Any]] = []
+
     def on_event(event: Any) -> None:
+        if isinstance(event, StageDone):
+            ended.append({k: event.metrics.get(k) for k in STAGE})
+            report({"schedule_scale": scale, "unfinished": True, "stages_so_far": ended})
         if isinstance(event, Phase):
             now = time.perf_counter()
             name, since = started[-1]
@@ -71,10 +99,7 @@ def whole_run(bench: Bench, capture: Path, scale: float, downscale: int, folder:
     begun = time.perf_counter()
     finished = train(options, on_event)
     metrics = finished.metrics()
-    stages = [
-        {k: stage.get(k) for k in ("name", "iterations", "seconds", "splats", "bytes", "train", "test", "after_clone")}
-        for stage in metrics["stages"]
-    ]
+    stages = [{k: stage.get(k) for k in STAGE} for stage in metrics["stages"]]
     return {
         "schedule_scale": scale,
         "stages": stages,

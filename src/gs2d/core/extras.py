@@ -8,6 +8,8 @@ from types import MappingProxyType
 # extra -> what pyproject.toml says of it (a test compares them)
 EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
+        "cuda12": ("cuda-bindings>=12.8,<13", "nvidia-cuda-nvrtc-cu12>=12.4"),
+        "cuda13": ("cuda-bindings>=13,<14", "nvidia-cuda-nvrtc>=13,<14"),
         "sfm": ("pycolmap>=4.2",),
         "texture": ("xatlas>=0.0.9",),
         "view": ("viser>=1.1,<2",),

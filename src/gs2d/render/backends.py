@@ -391,7 +391,8 @@ class CudaBackend(Backend):
         return FusionOnDevice(launch.launcher_for(device), device)
 
     def for_training(self) -> CudaBackend:
-        """Return one with a budget."""
+        """Return one with a budget; torch's memory grows with the splats from here on."""
+        launch.grow_in_place()
         return type(self)(PairBudget())
 
     def iterate(self, update: Callable[[], T], *, rollback: Callable[[], None], exact: bool) -> T:

@@ -33,7 +33,7 @@ from gs2d.kernels.cuda.arguments import (
     View,
 )
 from gs2d.kernels.cuda.launch import Launcher
-from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, room_for
+from gs2d.render.pair_budget import MAX_PAIRS, PairBudget, Rendering, room_for
 from gs2d.render.types import NEAR_PLANE_POLICIES, RasterSettings
 
 __all__ = ["DEPTH", "IMAGES", "PARAMETERS", "ForwardState", "Wanted", "backward", "errors", "forward", "view_of"]
@@ -44,6 +44,7 @@ PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MAX_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MAX_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
 ERROR_UNIT = 2.0**-24  # occluded.cu
+CAMERA_BYTES = View.near.offset  # pose and intrinsics: what tells views of a training apart
 IMAGES = ("color", "alpha", "normal", "depth_mean", "depth_median", "distortion")
 DEPTH = ("depth_transmittance", "slope")  # without pixels where that depth was not asked for
 
@@ -251,7 +252,8 @@ def _bin(
     tiles = int(view.tiles_x) * int(view.tiles_y)
     order = torch.sort(projected.depth_keys, stable=True).indices
     ends = torch.cumsum(projected.tile_counts[order], 0, dtype=torch.int64)
-    candidates = room_for(ends[-1], tiles, budget) if len(ends) else 0
+    camera = bytes(view)[:CAMERA_BYTES]
+    candidates = room_for(ends[-1], Rendering(tiles, len(order), camera), budget) if len(ends) else 0
     if candidates > MAX_PAIRS:
         raise BackendError(
             f"{candidates} pairs of splat and tile, expected fewer than 2^31: use fewer splats or pixels"

@@ -144,6 +144,18 @@ def test_a_read_only_home_costs_time_only(tmp_path: Path) -> None:
     assert blocked.read_text() == "not a folder"
 
 
+@needs_nvrtc
+def test_without_a_home_kernels_are_compiled_and_nothing_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container's user may be a number without a name or a home."""
+    for name in ("HOME", "GS2D_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # what it does where it finds no home
+    assert nvrtc_compile.cache_folder() is None
+    assert not nvrtc_compile.is_writable(None)
+    monkeypatch.setattr(nvrtc_compile, "_write", lambda path, code: pytest.fail(f"written: {path}"))
+    assert cubin("cuda/slots.cu", "sm_90").log
+
+
 def _compile_in(folder: Path) -> int:
     return len(cubin("cuda/emit.cu", "sm_90", folder).code)
 

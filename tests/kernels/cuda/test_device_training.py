@@ -30,6 +30,7 @@ from gs2d.kernels.cuda import launch
 from gs2d.render import cuda_passes
 from gs2d.render import pair_budget as cuda_budget
 from gs2d.render.backends import Backend, get_backend
+from gs2d.render.pair_budget import Rendering
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training import objective as views
@@ -222,6 +223,7 @@ def test_without_waiting_for_the_number_of_pairs_training_gives_the_same_bits(
     recipe = VARIANTS[variant]
     kept = train_toys.train(scene, recipe, backend=altered(emulated, for_training=lambda: emulated))[0]
     monkeypatch.setattr(cuda_budget, "SLACK", slack)
+    monkeypatch.setattr(cuda_budget, "VIEW_SLACK", slack)
     monkeypatch.setattr(cuda_budget, "STEP", 1)
     outcomes = []
     settle = cuda_budget.PairBudget.overflowed
@@ -254,7 +256,7 @@ def test_room_that_is_not_needed_holds_nothing_and_too_little_room_is_said(
     pairs = len(exact.entries)
     assert pairs > 6
     for slack, short in ((3.0, False), (0.5, True)):
-        monkeypatch.setattr(cuda_budget, "SLACK", slack)
+        monkeypatch.setattr(cuda_budget, "VIEW_SLACK", slack)
         frame = cuda_passes.forward(emulator, view, parameters, exact=False, budget=budget)
         assert len(frame.entries) == int(slack * pairs)
         assert bool(budget.overflow) == short
@@ -269,16 +271,54 @@ def test_room_that_is_not_needed_holds_nothing_and_too_little_room_is_said(
 def test_room_follows_the_number_of_pairs_up_at_once_and_down_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Room is sorted whether it is used or not: large splats of a start must not cost for the rest of a run."""
     monkeypatch.setattr(cuda_budget, "STEP", 1)
-    budget = cuda_budget.PairBudget()
-    budget.learn(7, 1_000_000)
-    assert budget.room(7) == 1_250_000
-    budget.learn(7, 100_000)
-    assert budget.room(7) == 1_248_779  # 1.25 * 1e6 * 1023 / 1024, rounded down to whole pairs
+    budget, size = cuda_budget.PairBudget(), Rendering(7)
+    budget.learn(size, 1_000_000)
+    assert budget.room(size) == 1_250_000
+    budget.learn(size, 100_000)
+    assert budget.room(size) == 1_248_779  # 1.25 * 1e6 * 1023 / 1024, rounded down to whole pairs
     for _ in range(10_000):
-        budget.learn(7, 100_000)
-    assert budget.room(7) == 125_000
-    budget.learn(7, cuda_budget.MAX_PAIRS)
-    assert budget.room(7) == cuda_budget.MAX_PAIRS  # 1.25 times as many would not fit in an index
+        budget.learn(size, 100_000)
+    assert budget.room(size) == 125_000
+    budget.learn(size, cuda_budget.MAX_PAIRS)
+    assert budget.room(size) == cuda_budget.MAX_PAIRS  # 1.25 times as many would not fit in an index
+
+
+def test_each_view_has_room_for_its_own_pairs_and_for_splats_that_were_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One number for all views of a size sorted 3.75 times as much as there was, where views differ by three."""
+    monkeypatch.setattr(cuda_budget, "STEP", 1)
+    budget = cuda_budget.PairBudget()
+    small, large = (Rendering(7, 1000, name) for name in (b"small", b"large"))
+    budget.learn(small, 300_000)
+    budget.learn(large, 900_000)
+    assert budget.room(small) == pytest.approx(330_000, abs=1)
+    assert budget.room(large) == pytest.approx(990_000, abs=1)
+    assert budget.room(Rendering(7, 1000, b"new")) == 1_125_000
+    assert budget.room(small._replace(splats=2000)) == pytest.approx(660_000, abs=1)
+    assert budget.room(small._replace(splats=500)) == pytest.approx(330_000, abs=1)  # the faint ones are few pairs
+    budget.learn(small, 200_000)
+    assert budget.room(small) == pytest.approx(220_000, abs=1)
+
+
+def test_cameras_that_are_new_each_time_do_not_fill_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda_budget, "MAX_VIEWS", 10)
+    budget = cuda_budget.PairBudget()
+    for k in range(25):
+        budget.learn(Rendering(7, 10, bytes([k])), 100)
+    assert len(budget._of_view) <= 10
+
+
+def test_a_fault_that_a_kernel_left_is_one_line_with_a_remedy_where_torch_meets_it() -> None:
+    class Broken:
+        def synchronize(self) -> None:
+            raise RuntimeError("CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be ...")
+
+    budget = cuda_budget.PairBudget()
+    budget.learn(Rendering(7), 10)
+    budget.ask(Rendering(7), 20, torch.tensor(5))
+    budget._event = Broken()
+    with pytest.raises(BackendError, match="GPU failed.*illegal memory access.*start it again") as error:
+        budget.overflowed()
+    assert "\n" not in str(error.value)
 
 
 def image_scene() -> tuple[View, ...]:

@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
+import fake_driver
+from fake_driver import FakeDriver
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda import diagnose
 from gs2d.kernels.cuda.diagnose import Facts, describe, missing
+from gs2d.kernels.cuda.driver import own_default_stream
 from gs2d.render.backends import backend_report, get_backend
 
 H200 = ("NVIDIA H200", (9, 0))
@@ -34,9 +37,9 @@ MENDING = (
     (
         {"torch_cuda": (13, 0)},
         "cuda.bindings is not here (No module named 'cuda')",
-        'pip install "cuda-bindings==13.*" "nvidia-cuda-nvrtc==13.*"',
+        "pip install 'cuda-bindings>=13,<14' 'nvidia-cuda-nvrtc>=13,<14' (the extra cuda13;",
     ),
-    ({"bindings_error": ""}, "NVRTC is not here (libnvrtc not found)", '"nvidia-cuda-nvrtc==13.*"'),
+    ({"bindings_error": ""}, "NVRTC is not here (libnvrtc not found)", "'nvidia-cuda-nvrtc>=13,<14'"),
     ({"nvrtc_error": "", "nvrtc": (13, 0)}, "no NVIDIA driver is here (libcuda not found)", "install NVIDIA's driver"),
     ({"driver_error": "", "driver": (12, 4)}, "driver supports CUDA 12.4, but torch is of CUDA 13.0", "update"),
     ({"torch_cuda": (12, 8)}, "driver supports CUDA 12.4, but NVRTC is of CUDA 13.0", "update"),
@@ -59,7 +62,31 @@ def test_each_missing_piece_is_named_in_order_with_its_remedy() -> None:
 def test_bindings_and_compiler_are_of_the_cuda_version_of_torch() -> None:
     lacking = missing(replace(WORKS, torch_cuda=(12, 8), bindings_error="none"))
     assert lacking is not None
-    assert 'pip install "cuda-bindings==12.*" nvidia-cuda-nvrtc-cu12 ' in lacking.remedy
+    assert "pip install 'cuda-bindings>=12.8,<13' 'nvidia-cuda-nvrtc-cu12>=12.4'" in lacking.remedy
+    assert "the extra cuda12" in lacking.remedy
+
+
+@pytest.mark.parametrize(("value", "refused"), [(None, False), ("0", False), ("1", True)])
+def test_bindings_that_mean_another_default_stream_than_torch_are_refused(
+    value: str | None, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernels would run beside torch's sorts, not after them: wrong images now and then, and no error."""
+    name = "CUDA_PYTHON_CUDA_PER_THREAD_DEFAULT_STREAM"
+    monkeypatch.setenv(name, value) if value else monkeypatch.delenv(name, raising=False)
+    assert own_default_stream() == refused
+    lacking = missing(replace(WORKS, own_default_stream=own_default_stream()))
+    assert (lacking is not None) == refused
+    if lacking is not None:
+        assert (lacking.reason.startswith(name), lacking.remedy) == (True, "unset it")
+        with pytest.raises(BackendError, match=f"{name} is set.*unset it"):
+            fake_driver.launcher(FakeDriver())
+    else:
+        fake_driver.launcher(FakeDriver())
+
+
+def test_without_a_home_kernels_are_compiled_each_time_and_the_reason_is_said() -> None:
+    text = describe(replace(WORKS, cache=None, cache_writable=False))
+    assert "there is no home folder (set GS2D_CACHE): kernels are compiled at every start" in text
 
 
 def test_a_newer_minor_version_than_the_drivers_is_no_obstacle() -> None:

@@ -22,6 +22,7 @@ from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import arguments, launch
 from gs2d.kernels.cuda.compile import kernel_sources
 from gs2d.render import cuda
+from gs2d.render.backends import CudaBackend
 from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
@@ -228,6 +229,22 @@ def test_the_real_bindings_errors_are_one_line_too(tmp_path: Path) -> None:
     assert "launch of project_splats (5 blocks of 128)" in said
     assert "CUDA_ERROR_ILLEGAL_ADDRESS" in said
     assert said.count("\n") == 1
+
+
+def test_torchs_memory_grows_in_place_in_training_unless_the_user_has_said_how(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda.memory, "_set_allocator_settings", told.append)
+    for name in launch.ALLOCATOR_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    CudaBackend().for_training()
+    assert told == ["expandable_segments:True"]
+    monkeypatch.setenv("PYTORCH_ALLOC_CONF", "max_split_size_mb:64")
+    CudaBackend().for_training()
+    assert len(told) == 1
+    monkeypatch.delenv("PYTORCH_ALLOC_CONF")
+    monkeypatch.delattr(torch.cuda.memory, "_set_allocator_settings")
+    assert not launch.grow_in_place()
 
 
 def test_every_kernel_of_the_sources_has_a_file() -> None:

@@ -250,17 +250,26 @@ def _bytes(nvrtc: Any, program: Any, what: str) -> bytes:
     return buffer
 
 
-def cache_folder() -> Path:
-    """``$GS2D_CACHE``, else ``$XDG_CACHE_HOME/gs2d``, else ``~/.cache/gs2d``; it need not exist."""
+def cache_folder() -> Path | None:
+    """``$GS2D_CACHE``, else ``$XDG_CACHE_HOME/gs2d``, else ``~/.cache/gs2d``; it need not exist. None without a home.
+
+    A user without a home (a number without a name, as containers have) compiles at every start: a folder that others
+    may write to is no place for what is executed.
+    """
     named = os.environ.get("GS2D_CACHE")
     if named:
         return Path(named)
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path("~/.cache").expanduser()) / "gs2d"
+    try:
+        return (Path(base) if base else Path("~/.cache").expanduser()) / "gs2d"
+    except RuntimeError:
+        return None
 
 
-def is_writable(folder: Path) -> bool:
+def is_writable(folder: Path | None) -> bool:
     """Whether cubins can be kept there; nothing is written."""
+    if folder is None:
+        return False
     there = next((part for part in (folder, *folder.parents) if part.exists()), None)
     return there is not None and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
@@ -292,12 +301,14 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
         As for :func:`compile_source`.
     """
     stem = name.rpartition("/")[2].removesuffix(".cu")
-    path = (folder or cache_folder()) / f"{stem}-{arch}-{_key(name, arch, nvrtc_version())}.cubin"
-    code = _read(path)
+    folder = folder or cache_folder()
+    path = None if folder is None else folder / f"{stem}-{arch}-{_key(name, arch, nvrtc_version())}.cubin"
+    code = None if path is None else _read(path)
     if code is not None:
         return Cubin(code, "")
     fresh = compile_source(name, arch)
-    _write(path, fresh.code)
+    if path is not None:
+        _write(path, fresh.code)
     return fresh
 
 

@@ -11,9 +11,17 @@ from pathlib import Path
 
 import torch
 
+from gs2d.core.extras import EXTRAS, install
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
-from gs2d.kernels.cuda.driver import DRIVER_REMEDY, OLD_DRIVER, driver_version, load_driver
+from gs2d.kernels.cuda.driver import (
+    DRIVER_REMEDY,
+    OLD_DRIVER,
+    PER_THREAD,
+    driver_version,
+    load_driver,
+    own_default_stream,
+)
 
 __all__ = ["Facts", "MissingFile", "describe", "gather", "missing"]
 
@@ -40,9 +48,11 @@ class Facts:
         What torch said when it was asked for devices.
     architecture_error : str
         Why nothing can be compiled for the current device; "" where it can.
-    cache : Path
-        Where machine code is kept.
+    cache : Path or None
+        Where machine code is kept; None where there is no home.
     cache_writable : bool
+    own_default_stream : bool
+        Whether the bindings were told to take torch's default stream for another one.
     """
 
     torch_version: str
@@ -55,8 +65,9 @@ class Facts:
     devices: tuple[tuple[str, tuple[int, int]], ...] = ()
     torch_error: str = ""
     architecture_error: str = ""
-    cache: Path = Path()
+    cache: Path | None = Path()
     cache_writable: bool = True
+    own_default_stream: bool = False
 
 
 @dataclass(frozen=True)
@@ -96,6 +107,8 @@ def missing(facts: Facts) -> MissingFile | None:
     if not facts.devices:
         said = f" ({facts.torch_error})" if facts.torch_error else ""
         return MissingFile(f"torch sees no CUDA device{said}", f"check `nvidia-smi` and CUDA_VISIBLE_DEVICES, {ANYWAY}")
+    if facts.own_default_stream:
+        return MissingFile(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it", "unset it")
     if facts.architecture_error:
         reason, _, remedy = facts.architecture_error.partition("; ")
         return MissingFile(f"{facts.devices[0][0]}: {reason}", remedy)
@@ -104,15 +117,22 @@ def missing(facts: Facts) -> MissingFile | None:
 
 def _install(major: int) -> str:
     """How to get bindings and compiler of the CUDA version of torch: a mixture does not find its libraries."""
-    compiler = f'"nvidia-cuda-nvrtc=={major}.*"' if major >= 13 else f"nvidia-cuda-nvrtc-cu{major}"
-    return f'pip install "cuda-bindings=={major}.*" {compiler} (torch\'s CUDA wheels bring the compiler), {ANYWAY}'
+    extra = f"cuda{major}"
+    if extra not in EXTRAS:
+        return f"install the cuda-bindings and the NVRTC of CUDA {major}, {ANYWAY}"
+    return f"{install(extra)} (the extra {extra}; torch's CUDA wheels bring the compiler), {ANYWAY}"
 
 
 def describe(facts: Facts) -> str:
     """One line about a machine that can run the backend."""
     names = [f"{name} (sm_{major}{minor})" for name, (major, minor) in facts.devices]
     versions = f"driver CUDA {_dotted(facts.driver)}, NVRTC {_dotted(facts.nvrtc)}"
-    kept = "" if facts.cache_writable else f"; {facts.cache} cannot be written: kernels are compiled at every start"
+    kept = ""
+    if not facts.cache_writable:
+        where = (
+            "there is no home folder (set GS2D_CACHE)" if facts.cache is None else f"{facts.cache} cannot be written"
+        )
+        kept = f"; {where}: kernels are compiled at every start"
     return f"{', '.join(names)}; {versions}{kept}"
 
 
@@ -156,6 +176,7 @@ def gather() -> Facts:
         architecture_error,
         folder,
         nvrtc.is_writable(folder),
+        own_default_stream(),
     )
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from gs2d.errors import BackendError
 
-__all__ = ["call", "driver_version", "load_driver"]
+__all__ = ["call", "driver_version", "fault_of", "load_driver", "own_default_stream"]
 
 BINDINGS_REMEDY = "pip install cuda-bindings (torch's CUDA wheels for Linux bring it), or use --backend cpu"
 DRIVER_REMEDY = "install NVIDIA's driver (`nvidia-smi` must list the GPU), or use --backend cpu"
@@ -30,6 +33,34 @@ REMEDIES = {
     "CUDA_ERROR_LAUNCH_TIMEOUT": "the display's watchdog stopped a kernel: use a GPU without a display, or --downscale",
     "CUDA_ERROR_ECC_UNCORRECTABLE": "the GPU's memory is failing: reset it, or use another one",
 }
+
+
+# With it cuda.bindings takes stream 0 for one of the calling thread, torch for the one of all threads.
+PER_THREAD = "CUDA_PYTHON_CUDA_PER_THREAD_DEFAULT_STREAM"
+
+
+def own_default_stream() -> bool:
+    """Whether kernels on torch's default stream would run beside torch's own work there, not after it."""
+    return os.environ.get(PER_THREAD, "0") not in ("", "0")
+
+
+@contextmanager
+def fault_of(what: str) -> Iterator[None]:
+    """Turn the error that a kernel has left on the device, which torch meets when it waits, into one of ours.
+
+    Raises
+    ------
+    BackendError
+        With torch's first line and what to do.
+    """
+    try:
+        yield
+    except RuntimeError as error:  # torch.AcceleratorError is one, since torch 2.8
+        words = one_line(error)
+        if not words.startswith("CUDA error"):
+            raise
+        remedy = REMEDIES["CUDA_ERROR_OUT_OF_MEMORY"] if "out of memory" in words else RESTART
+        raise BackendError(f"the GPU failed in {what} or before ({words}); {remedy}") from error
 
 
 def load_driver() -> Any:

@@ -8,6 +8,7 @@ the backward pass and, once a kernel has been launched before, in a captured gra
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,10 +19,11 @@ import torch
 
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import compile as nvrtc
-from gs2d.kernels.cuda.driver import call, failure, load_driver
+from gs2d.kernels.cuda.driver import PER_THREAD, call, failure, load_driver, own_default_stream
 
-__all__ = ["GpuLauncher", "Launcher", "launcher_for"]
+__all__ = ["GpuLauncher", "Launcher", "grow_in_place", "launcher_for"]
 
+ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
 STATIC_SHARED_BYTES = 48 << 10  # what a block may have without asking
 MAX_BLOCKS = (1 << 31) - 1
 
@@ -63,7 +65,7 @@ class GpuLauncher:
     Raises
     ------
     BackendError
-        The driver or its context of the device is not there.
+        The driver or its context of the device is not there, or streams mean something else to it than to torch.
     """
 
     def __init__(
@@ -76,6 +78,8 @@ class GpuLauncher:
         code_of: Callable[[str, str], bytes] = lambda name, arch: nvrtc.cubin(name, arch).code,
         source_of: Mapping[str, str] | None = None,
     ) -> None:
+        if own_default_stream():
+            raise BackendError(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it; unset it")
         self.device = device
         self._driver = load_driver() if driver is None else driver
         self._stream_of, self._code_of = stream_of, code_of
@@ -153,6 +157,26 @@ class GpuLauncher:
         kernel = self._driver.CUkernel(int(self._functions[name]))
         call(self._driver, "cuKernelSetAttribute", attribute, shared_bytes, kernel, self._handle)
         self._allowed[name] = shared_bytes
+
+
+def grow_in_place() -> bool:
+    """Let torch's segments of memory grow, unless the user has told its allocator something.
+
+    Each densification makes 18 tensors of new sizes, some 145 times a run: without, each time the pieces of before are
+    too small for the next ones, and the device waits while more memory is got.
+
+    Returns
+    -------
+    bool
+        Whether torch was told.
+    """
+    if torch.version.cuda is None or any(os.environ.get(name) for name in ALLOCATOR_VARIABLES):
+        return False
+    try:
+        torch.cuda.memory._set_allocator_settings("expandable_segments:True")
+    except (AttributeError, RuntimeError):  # not of this version or platform: slower, no worse
+        return False
+    return True
 
 
 @cache

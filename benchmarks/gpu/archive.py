@@ -1,0 +1,58 @@
+"""One archive of what a part leaves, small enough to be brought home: results first, what does not fit is named."""
+
+from __future__ import annotations
+
+import io
+import sys
+import tarfile
+from collections.abc import Sequence
+from pathlib import Path
+
+LIMIT_BYTES = 12 << 20
+# In this order; of a run folder the figures and the report, not splats, checkpoints and pictures.
+WANTED = ("*.json", "*.txt", "metrics.json", "report.html", "*.csv", "*.json.gz")
+LEFT_OUT = "left_out.txt"
+
+
+def chosen(folder: Path) -> list[Path]:
+    """What is worth bringing home, the most wanted first; not what lies under a name with a dot."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    found: dict[Path, None] = {}
+    for pattern in WANTED:
+        found.update(dict.fromkeys(sorted((f for f in files if f.match(pattern)), key=lambda f: f.stat().st_size)))
+    return list(found)
+
+
+def pack(folder: Path, archive: Path, limit_bytes: int = LIMIT_BYTES) -> list[str]:
+    """Write the archive, whole or not at all; returns what had no room, which the archive says too."""
+    temporary = archive.with_name(archive.name + ".part")
+    left_out: list[str] = []
+    with temporary.open("wb") as file, tarfile.open(fileobj=file, mode="w:gz") as tar:
+        for path in chosen(folder):
+            name, size = path.relative_to(folder).as_posix(), path.stat().st_size
+            # counted as if nothing of it could be compressed: pictures in a report are
+            if file.tell() + size > limit_bytes:
+                left_out.append(f"{name} ({size} bytes)")
+                continue
+            tar.add(path, name)
+            tar.fileobj.flush()  # type: ignore[union-attr]
+        text = "".join(f"{line}\n" for line in left_out).encode()
+        entry = tarfile.TarInfo(LEFT_OUT)
+        entry.size = len(text)
+        if text:
+            tar.addfile(entry, io.BytesIO(text))
+    temporary.rename(archive)
+    return left_out
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """``python -m benchmarks.gpu.archive FOLDER ARCHIVE``."""
+    folder, archive = map(Path, sys.argv[1:] if arguments is None else arguments)
+    for name in pack(folder, archive):
+        print(f"not in {archive.name}: {name}", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

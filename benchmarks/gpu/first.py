@@ -1,0 +1,146 @@
+"""Part 0, three minutes before everything else: is it right, and where does the time go.
+
+In the order of what one must know first: what the machine lacks; the first kernel that fails, by name; whether images
+and gradients are the reference's; how long an iteration is, what of it the host needs and what share of it the GPU
+works; a trace of it.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.gpu import correctness, host
+from benchmarks.gpu.bench import ROOT, Bench, rounded, run_program
+from benchmarks.gpu.kernels import bench_trainer
+from benchmarks.gpu.scenes import FIRST, TOY, gpu_scene, scene_name
+from gs2d.kernels.cuda import diagnose
+
+ITERATIONS, WARMUP, TRACED = 200, 16, 5
+
+
+def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
+    """All parts; ``progress`` gets the results so far after each."""
+    sizes = TOY if bench.dry else FIRST
+    parts: dict[str, Any] = {
+        "machine": machine,
+        "exercise": lambda: exercise(bench),
+        "parity": lambda: correctness.parity(bench, 1 if bench.dry else 10),
+        "host": lambda: host.host_cost(5 if bench.dry else 200, stages=1 if bench.dry else 3),
+        **{scene_name(*size, "A"): lambda size=size: speed(bench, *size) for size in sizes},
+    }
+    found: dict[str, Any] = {}
+    for name, work in parts.items():
+        if not only or any(word in name for word in only):
+            found[name] = bench.attempt(name, work)
+            progress(found)
+    return found
+
+
+def machine() -> dict[str, Any]:
+    """What the backend needs of this machine, as found: needs no command line and no package of one."""
+    facts = diagnose.gather()
+    lacking = diagnose.missing(facts)
+    found = {name: value if isinstance(value, bool | int) else str(value) for name, value in vars(facts).items()}
+    found["missing"] = None if lacking is None else f"{lacking.reason}; {lacking.remedy}"
+    try:
+        done = subprocess.run(["nvidia-smi"], capture_output=True, text=True, timeout=20, check=False)
+        found["nvidia_smi"] = done.stdout.splitlines()
+    except (OSError, subprocess.SubprocessError) as error:
+        found["nvidia_smi"] = str(error)
+    return found
+
+
+def exercise(bench: Bench) -> dict[str, Any]:
+    """Every kernel once, each waited for: a fault is then said at the launch that made it, with the kernel's name."""
+    command = [sys.executable, "-m", "benchmarks.gpu", "exercise", *(["--dry-run"] if bench.dry else [])]
+    environment = {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "CUDA_LAUNCH_BLOCKING": "1"}
+    done = run_program(command, seconds=bench.seconds_left(200 if bench.dry else 60), environment=environment)
+    return {"exit": done.exit, "clean": done.exit == 0, "last_lines": done.lines[-5:]}
+
+
+def speed(bench: Bench, count: int, width: int, height: int) -> dict[str, Any]:
+    """By stage: milliseconds of an iteration, of the host in it, share of the time that the GPU works, and a trace."""
+    scene = gpu_scene(count, width, height, "A", bench.device)
+    trainer = bench_trainer(bench, scene)
+    found: dict[str, Any] = {}
+    for index, stage in enumerate(trainer.recipe.stages):
+        trainer.enter(index)
+        for _ in range(1 if bench.dry else WARMUP):
+            trainer.step()
+        found[stage.name] = {**_timed(bench, trainer), **traced(bench, trainer, f"{scene.name}-{stage.name}")}
+    return found
+
+
+def _timed(bench: Bench, trainer: Any) -> dict[str, float]:
+    """Of all iterations together, and of the calls alone, which wait for the number of pairs of the one before."""
+    repeats = 2 if bench.dry else ITERATIONS
+    bench.wait()
+    begun, cpu = time.perf_counter(), time.thread_time()
+    for _ in range(repeats):
+        trainer.step()
+    queued = time.perf_counter() - begun
+    worked = time.thread_time() - cpu
+    bench.wait()
+    every = {"iteration": time.perf_counter() - begun, "host_calls": queued, "host_processor": worked}
+    return rounded({f"{name}_ms": 1e3 * seconds / repeats for name, seconds in every.items()})
+
+
+def traced(bench: Bench, trainer: Any, name: str) -> dict[str, Any]:
+    """Five iterations under torch's profiler: the share of them in which a kernel runs; the trace, gzipped."""
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    activities += [] if bench.dry else [torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=activities) as profile:
+        for _ in range(1 if bench.dry else TRACED):
+            trainer.step()
+        bench.wait()
+    spans = [
+        (event.time_range.start, event.time_range.end)
+        for event in profile.events() or ()
+        if event.device_type == torch.autograd.DeviceType.CUDA
+    ]
+    folder = Path(os.environ.get("GS2D_WORK", "."))
+    if "GS2D_WORK" in os.environ:
+        plain = folder / f"trace-{name}.json"
+        profile.export_chrome_trace(str(plain))
+        with plain.open("rb") as source, gzip.open(f"{plain}.gz", "wb", compresslevel=6) as packed:
+            shutil.copyfileobj(source, packed)
+        plain.unlink()
+    return {"gpu_kernels": len(spans) / (1 if bench.dry else TRACED), "gpu_busy_fraction": busy_fraction(spans)}
+
+
+def busy_fraction(spans: list[tuple[float, float]]) -> float | None:
+    """The share of the time from the first to the last in which at least one runs; None without any."""
+    if not spans:
+        return None
+    covered, reached = 0.0, min(start for start, _ in spans)
+    first = reached
+    for start, end in sorted(spans):
+        covered += max(0.0, end - max(start, reached))
+        reached = max(reached, end)
+    return round(covered / max(reached - first, 1e-9), 4)
+
+
+def wrong(found: dict[str, Any]) -> bool:
+    """Whether a kernel failed, or a part could not be done."""
+    return correctness.wrong({name: part for name, part in found.items() if isinstance(part, dict)})
+
+
+def table(found: dict[str, Any]) -> list[str]:
+    """A few lines for people."""
+    lines = [f"missing: {found.get('machine', {}).get('missing')}", f"exercise: {found.get('exercise')}"]
+    images = found.get("parity", {}).get("images", {})
+    lines += [f"{name}: median {row['median']:.1e}, flipped {row['flipped']:.1e}" for name, row in images.items()]
+    for name, part in found.items():
+        for stage, row in part.items():
+            if isinstance(row, dict) and "iteration_ms" in row:
+                lines.append(f"{name} {stage}: {row}")
+    return lines

@@ -1,0 +1,175 @@
+"""What an iteration costs the host: its time with kernels that do nothing, and what it gives the device to do.
+
+Needs no GPU: tensors lie in host memory and are so few that torch's work on them is its overhead. Kernels go the whole
+way to the driver, which does nothing. What a GPU adds is the driver's own time for a launch.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from benchmarks.gpu.bench import EmulatedBackend
+from benchmarks.iteration import steady
+from benchmarks.workload import PLACES, camera, room
+from gs2d.config.presets import two_dgs_r
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe
+from gs2d.data.scene import Scene, View
+from gs2d.kernels.cuda import launch
+from gs2d.render import pair_budget
+from gs2d.training import objective, trainer
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+
+SPLATS, WIDTH, HEIGHT = 256, 64, 48
+# Of torch on a GPU: what makes or looks at a tensor launches nothing, a sort by radix launches one kernel a pass of
+# 8 bits and five more (indices, histogram, offsets, two copies), everything else one.
+MADE = ("empty", "new_empty", "empty_like", "empty_strided")
+LOOKED_AT = frozenset(
+    "view slice select detach alias as_strided expand unsqueeze squeeze permute transpose t _unsafe_view "
+    "_reshape_alias split unbind unfold diagonal lift_fresh requires_grad_ set_ is_same_size".split()
+)
+
+
+class NullDriver:
+    """The functions of ``cuda.bindings.driver`` that a launch calls; nothing happens."""
+
+    CUresult = SimpleNamespace(CUDA_SUCCESS=0)
+    CUfunction_attribute = SimpleNamespace(CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES=8)
+    CUstream = CUfunction = CUkernel = staticmethod(int)
+
+    def __init__(self) -> None:
+        self.launches = 0
+
+    def __getattr__(self, name: str) -> Callable[..., tuple[int, int]]:
+        return lambda *_: (0, 1)
+
+    def cuLaunchKernel(self, *_: Any) -> tuple[int]:
+        self.launches += 1
+        return (0,)
+
+
+class OperationCount(TorchDispatchMode):
+    """Counts torch's operations by name, and what a GPU would launch for them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: Counter[str] = Counter()
+        self.launches = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        self.names[name] += 1
+        if name in ("sort", "argsort"):
+            self.launches += 5 + args[0].element_size()
+        elif name not in LOOKED_AT and name not in MADE:
+            self.launches += 1
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def nothing_runs() -> Iterator[NullDriver]:
+    """The cuda backend in host memory, over a driver that does nothing; numbers of pairs are not looked at."""
+    driver = NullDriver()
+    launcher = launch.GpuLauncher(
+        torch.device("cuda", 0),
+        driver=driver,
+        stream_of=lambda device: 1,
+        architecture_of=lambda device: "sm_90",
+        code_of=lambda name, arch: b"",
+    )
+    budget = pair_budget.PairBudget
+    changed: list[tuple[Any, str, Any]] = [
+        (launch, "launcher_for", lambda device: launcher),
+        (trainer, "is_async", lambda device: True),
+        (objective, "is_async", lambda device: True),
+        (trainer, "validate", lambda recipe: recipe),  # the row group that stage 2 learns is made, not ranked
+        (budget, "room", lambda self, rendering: 1 << 10),
+        (budget, "overflowed", lambda self: self._asked.clear()),
+    ]
+    before = [(where, name, getattr(where, name)) for where, name, _ in changed]
+    for where, name, value in changed:
+        setattr(where, name, value)
+    try:
+        yield driver
+    finally:
+        for where, name, value in before:
+            setattr(where, name, value)
+
+
+def null_trainer() -> Trainer:
+    """All three stages of 2DGS-R on a few splats; nothing is densified, no Progress event comes."""
+    splats = room(SPLATS)
+    rng = np.random.default_rng(0)
+    images = (rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in PLACES)
+    views = tuple(
+        View.from_arrays(f"{i}.png", camera(WIDTH, HEIGHT, place), image)
+        for i, (place, image) in enumerate(zip(PLACES, images, strict=True))
+    )
+    bounds = np.array([[-3.0] * 3, [3.0] * 3])
+    scene = Scene(name="null", format="blender", train=views, test=(), points=None, extent=3.0, bounds=bounds)
+    recipe = two_dgs_r()
+    recipe = Recipe("null", tuple(replace(steady(stage), on_enter=()) for stage in recipe.stages))
+    state = TrainState(splats, torch.Generator().manual_seed(0))
+    state.groups["high_error"] = torch.arange(SPLATS) < SPLATS // 100 + 1
+    return Trainer(
+        scene, recipe, replace(GENERIC, near=0.2), backend=EmulatedBackend(), state=state, progress_every=10**9
+    )
+
+
+def host_cost(repeats: int = 300, stages: int = 3) -> dict[str, Any]:
+    """By stage: microseconds of the host an iteration, its launches, torch operations and allocations."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    found: dict[str, Any] = {}
+    try:
+        with nothing_runs() as driver:
+            made = null_trainer()
+            for index, stage in enumerate(made.recipe.stages[:stages]):
+                made.enter(index)
+                for _ in range(3 * len(PLACES)):
+                    made.step()
+                found[stage.name] = {**_time(made, repeats), **_count(made, driver)}
+    finally:
+        torch.set_num_threads(threads)
+    return found
+
+
+def _time(made: Trainer, repeats: int) -> dict[str, float]:
+    """Of the thread, not of the clock: what others do on this machine does not count."""
+    times = []
+    for _ in range(repeats):
+        begun = time.thread_time_ns()
+        made.step()
+        times.append((time.thread_time_ns() - begun) / 1e3)
+    return {"host_us": round(statistics.median(times), 1), "best_us": round(min(times), 1)}
+
+
+def _count(made: Trainer, driver: NullDriver) -> dict[str, int]:
+    """Of one iteration."""
+    driver.launches = 0
+    with OperationCount() as count:
+        made.step()
+    allocations = sum(count.names[name] for name in MADE)
+    return {
+        "own_launches": driver.launches,
+        "torch_operations": sum(count.names.values()) - allocations,
+        "allocations": allocations,
+        "device_launches": driver.launches + count.launches,
+    }
+
+
+def table(found: dict[str, Any]) -> list[str]:
+    """A line for each stage."""
+    return [f"{stage}: " + ", ".join(f"{name} {value}" for name, value in row.items()) for stage, row in found.items()]
