@@ -36,7 +36,6 @@ def pack(folder: Path, archive: Path, limit_bytes: int = LIMIT_BYTES) -> list[st
                 left_out.append(f"{name} ({size} bytes)")
                 continue
             tar.add(path, name)
-            tar.fileobj.flush()  # type: ignore[union-attr]
         text = "".join(f"{line}\n" for line in left_out).encode()
         entry = tarfile.TarInfo(LEFT_OUT)
         entry.size = len(text)
