@@ -1,8 +1,9 @@
 """Compile the CUDA kernels with NVRTC and keep the cubins.
 
 No toolkit and no host compiler: NVRTC comes as a wheel, with torch or by itself. It is imported only when something
-must be compiled. A cubin is cached under a key of everything it depends on (sources, options, architecture, NVRTC
-version), so a changed package cannot meet a stale one. It is written under another name and renamed, so that two
+must be compiled: what the package brings (:mod:`gs2d.kernels.cuda.shipped`) or the cache holds is not. A cubin is
+cached under a key of the package's version, its sources, the options and the architecture, so a changed package cannot
+meet a stale one. It is written under another name and renamed, so that two
 processes or a killed one leave nothing or a whole file; it carries a digest, so that a damaged one is compiled again.
 """
 
@@ -17,8 +18,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import gs2d
 from gs2d.core.files import atomic_write
 from gs2d.errors import BackendError, DiskError
+from gs2d.kernels.cuda.shipped import INTEGRATED, SHIPPED, Shipped, digest_of
+from gs2d.kernels.cuda.shipped import shipped as _shipped
 
 __all__ = [
     "ARCHITECTURES",
@@ -32,18 +36,17 @@ __all__ = [
     "is_writable",
     "kernel_sources",
     "nvrtc_version",
+    "shipped_kernels",
     "source_names",
     "sources",
 ]
 
-ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120")
+ARCHITECTURES = SHIPPED
 # --fmad=false: every fused multiply-add is written out in core/, so that forward, backward and CPU decide alike.
 OPTIONS = ("--std=c++17", "--fmad=false", "--ptxas-options=-v", "--device-as-default-execution-space")
 REMEDY = "pip install nvidia-cuda-nvrtc cuda-bindings (torch's CUDA wheels bring both), or use --backend cpu"
 DIGEST_BYTES = 32
 MIN_CAPABILITY = (7, 5)
-# GPUs in one chip with a CPU (Xavier, Orin, Thor): their code runs on no other GPU of the same major version.
-INTEGRATED = frozenset({72, 87, 88, 101, 110})
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
 
 
@@ -117,6 +120,11 @@ def kernel_sources() -> dict[str, str]:
     return {kernel: name for name, text in sources().items() if name.endswith(".cu") for kernel in KERNEL.findall(text)}
 
 
+def shipped_kernels() -> Shipped | None:
+    """Return the machine code that this installation brought; None where it has none, or sources were edited."""
+    return _shipped(gs2d.__version__, digest_of(sources(), OPTIONS))
+
+
 def _nvrtc() -> Any:
     try:
         from cuda.bindings import nvrtc
@@ -149,8 +157,9 @@ def nvrtc_version() -> tuple[int, int]:
 def architecture_for(capability: tuple[int, int]) -> str:
     """Return what to compile for on a device of this compute capability: ``(9, 0)`` -> ``"sm_90"``.
 
-    A device newer than the compiler runs code for an older one of the same major version. Of a major version that the
-    compiler does not know it gets ``"compute_120"``, PTX of the newest known one, which the driver translates.
+    What the package brings comes first, and needs no compiler. A device newer than the compiler runs code for an older
+    one of the same major version. Of a major version that the compiler does not know it gets ``"compute_120"``, PTX of
+    the newest known one, which the driver translates. Without a compiler it is what the cache may hold.
 
     Raises
     ------
@@ -162,9 +171,11 @@ def architecture_for(capability: tuple[int, int]) -> str:
             f"the GPU must have compute capability 7.5 or more (Turing, 2018), got {capability[0]}.{capability[1]}; "
             "use --backend cpu"
         )
-    nvrtc = _nvrtc()
-    status, known = nvrtc.nvrtcGetSupportedArchs()
-    _check(nvrtc, status, "nvrtcGetSupportedArchs")
+    there = shipped_kernels()
+    brought = None if there is None else there.architecture_for(capability)
+    if brought is not None:
+        return brought
+    known = _known_architectures()
     wanted = 10 * capability[0] + capability[1]
     older = [arch for arch in known if arch <= wanted and (arch == wanted or arch not in INTEGRATED)]
     fitting = [arch for arch in older if arch // 10 == wanted // 10]
@@ -176,6 +187,17 @@ def architecture_for(capability: tuple[int, int]) -> str:
             f"{capability[0]}.{capability[1]}; install the NVRTC of torch's CUDA version"
         )
     return f"compute_{max(older)}"
+
+
+def _known_architectures() -> list[int]:
+    """Of the compiler; without one those for which this package is compiled somewhere."""
+    try:
+        nvrtc = _nvrtc()
+    except BackendError:
+        return [int(arch.removeprefix("sm_")) for arch in ARCHITECTURES]
+    status, known = nvrtc.nvrtcGetSupportedArchs()
+    _check(nvrtc, status, "nvrtcGetSupportedArchs")
+    return [int(arch) for arch in known]
 
 
 def compile_source(name: str, arch: str, options: Sequence[str] = OPTIONS) -> Cubin:
@@ -274,17 +296,13 @@ def is_writable(folder: Path | None) -> bool:
     return there is not None and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
-def _key(name: str, arch: str, version: tuple[int, int]) -> str:
-    """Of everything the machine code depends on; the length of each part separates it from the next."""
-    digest = hashlib.sha256()
-    for part in (name, arch, f"{version[0]}.{version[1]}", *OPTIONS, *(x for pair in sources().items() for x in pair)):
-        data = part.encode()
-        digest.update(len(data).to_bytes(8, "little") + data)
-    return digest.hexdigest()[:32]
+def _key(name: str, arch: str) -> str:
+    """Of the package's version and everything else that the machine code depends on but for the compiler's version."""
+    return digest_of(sources(), (gs2d.__version__, name, arch, *OPTIONS))[:32]
 
 
 def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
-    """Machine code of one file for one architecture, from the cache if it is there.
+    """Machine code of one file for one architecture: the package's own, from the cache, or compiled.
 
     A cache that cannot be read or written costs compile time, nothing else: a read-only home must not stop training.
 
@@ -301,8 +319,12 @@ def cubin(name: str, arch: str, folder: Path | None = None) -> Cubin:
         As for :func:`compile_source`.
     """
     stem = name.rpartition("/")[2].removesuffix(".cu")
+    there = shipped_kernels()
+    brought = None if there is None else there.code(name, arch)
+    if brought is not None:
+        return Cubin(brought, "")
     folder = folder or cache_folder()
-    path = None if folder is None else folder / f"{stem}-{arch}-{_key(name, arch, nvrtc_version())}.cubin"
+    path = None if folder is None else folder / f"{stem}-{arch}-{_key(name, arch)}.cubin"
     code = None if path is None else _read(path)
     if code is not None:
         return Cubin(code, "")

@@ -51,6 +51,8 @@ class Facts:
     cache : Path or None
         Where machine code is kept; None where there is no home.
     cache_writable : bool
+    shipped : (int, int) or None
+        CUDA version of the machine code that the package brought for the current device; None: it has none.
     own_default_stream : bool
         Whether the bindings were told to take torch's default stream for another one.
     """
@@ -68,6 +70,7 @@ class Facts:
     cache: Path | None = Path()
     cache_writable: bool = True
     own_default_stream: bool = False
+    shipped: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -94,11 +97,12 @@ def missing(facts: Facts) -> MissingFile | None:
         return MissingFile(
             f"the Python package cuda.bindings is not here ({facts.bindings_error})", _install(facts.torch_cuda[0])
         )
-    if facts.nvrtc_error:
+    if facts.nvrtc_error and facts.shipped is None:
         return MissingFile(f"the CUDA compiler NVRTC is not here ({facts.nvrtc_error})", _install(facts.torch_cuda[0]))
     if facts.driver_error or facts.driver is None:
         return MissingFile(f"no NVIDIA driver is here ({facts.driver_error})", DRIVER_REMEDY)
-    for name, needs in (("torch", facts.torch_cuda), ("NVRTC", facts.nvrtc)):
+    compiler = facts.nvrtc if facts.shipped is None else facts.shipped
+    for name, needs in (("torch", facts.torch_cuda), ("NVRTC" if facts.shipped is None else "gs2d", compiler)):
         if needs is not None and facts.driver[0] < needs[0]:  # within a major version newer code runs on older drivers
             return MissingFile(
                 f"the driver supports CUDA {_dotted(facts.driver)}, but {name} is of CUDA {_dotted(needs)}",
@@ -126,7 +130,10 @@ def _install(major: int) -> str:
 def describe(facts: Facts) -> str:
     """One line about a machine that can run the backend."""
     names = [f"{name} (sm_{major}{minor})" for name, (major, minor) in facts.devices]
-    versions = f"driver CUDA {_dotted(facts.driver)}, NVRTC {_dotted(facts.nvrtc)}"
+    compiler = f"NVRTC {_dotted(facts.nvrtc)}"
+    if facts.shipped is not None:
+        return f"{', '.join(names)}; driver CUDA {_dotted(facts.driver)}, kernels of the package"
+    versions = f"driver CUDA {_dotted(facts.driver)}, {compiler}"
     kept = ""
     if not facts.cache_writable:
         where = (
@@ -157,7 +164,10 @@ def gather() -> Facts:
     except BackendError as error:
         nvrtc_error = _inner(error)
     devices, torch_error = _devices()
-    if devices and compiler is not None:
+    shipped = nvrtc.shipped_kernels()
+    if shipped is not None and (not devices or shipped.architecture_for(devices[0][1]) is None):
+        shipped = None
+    if devices and (compiler is not None or shipped is not None):
         try:
             nvrtc.architecture_for(devices[0][1])
         except BackendError as error:
@@ -177,6 +187,7 @@ def gather() -> Facts:
         folder,
         nvrtc.is_writable(folder),
         own_default_stream(),
+        None if shipped is None else shipped.cuda,
     )
 
 
