@@ -53,6 +53,13 @@ class EventLog:
             kept = file.read(size)
             file.truncate(kept.rfind(b"\n") + 1)
 
+    def read_bytes(self, size: int) -> bytes:
+        """Return the first ``size`` bytes, as far as there are so many."""
+        if not self.path.exists():
+            return b""
+        with open(self.path, "rb") as file:
+            return file.read(size)
+
     def sync(self) -> None:
         """Bring the log to the disk, before a checkpoint that refers to it."""
         if self.path.exists():

@@ -125,7 +125,7 @@ class RunFolder:
             return {"stages": []}
         data = _object(path)
         stages = data.get("stages")
-        if not isinstance(stages, list) or not all(map(_is_stage, stages)):
+        if not are_stages(stages):
             raise RunError(
                 f"{path} must hold a list 'stages', each with {', '.join(sorted(_STAGE))}; it was damaged: delete it "
                 "and go on with --resume"
@@ -205,6 +205,11 @@ class RunFolder:
         self.clear()
         self.file(LOCK).unlink(missing_ok=True)
         remove_made(self.made)
+
+
+def are_stages(entries: Any) -> bool:
+    """Whether a value is the list of stages of ``metrics.json``."""
+    return isinstance(entries, list) and all(map(_is_stage, entries))
 
 
 def _is_stage(entry: Any) -> bool:

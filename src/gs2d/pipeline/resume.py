@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gs2d.errors import RunError
-from gs2d.io.run_dir import RunFolder, is_run, load_tensors, make_folder, open_run, remove_made, save_tensors
+from gs2d.core.files import sweep
+from gs2d.errors import RunError, ShapeError
+from gs2d.io.run_dir import (
+    CheckpointFile,
+    RunFolder,
+    are_stages,
+    is_run,
+    load_tensors,
+    make_folder,
+    open_run,
+    remove_made,
+    save_tensors,
+)
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import TrainOptions
+from gs2d.training.resumable import check_resumable
 from gs2d.training.state import TrainState
 
 
@@ -64,7 +77,7 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
         stage
         for stage in (
             _from_run(job, options.start_from) if options.start_from else None,
-            _from_cache(job, options.cache) if options.cache else None,
+            _from_cache(job, options.cache, on_event) if options.cache else None,
         )
         if stage is not None
     ]
@@ -93,8 +106,8 @@ def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> ResumePoint:
     checkpoints = run.checkpoints()
     for checkpoint in reversed(checkpoints):
         try:
-            payload = load_tensors(checkpoint.path)
-            state = TrainState.from_state_dict(payload["state"])
+            payload = _read(checkpoint.path)
+            state = _state_at(checkpoint, payload, job)
         except RunError as error:
             on_event(Notice(f"{error}; going back to the checkpoint before it"))
             continue
@@ -110,6 +123,61 @@ def _resume(run: RunFolder, job: Job, on_event: OnEvent) -> ResumePoint:
     raise RunError(f"no checkpoint in {run.path} is readable; train again with --overwrite")
 
 
+def _read(path: Path) -> dict[str, Any]:
+    """Return what a checkpoint holds: all of it is there, and of the types that ``RunLogger`` writes.
+
+    Raises
+    ------
+    RunError
+    """
+    payload = load_tensors(path)
+    try:
+        size, extra = payload["events_bytes"], json.loads(payload["extra"])
+        seconds, peak, at_entry = extra["seconds"], extra["peak_memory"], extra["at_entry"]
+        whole = isinstance(size, int) and isinstance(peak, int) and min(size, peak) >= 0
+        whole = whole and isinstance(seconds, int | float) and 0 <= seconds < math.inf and isinstance(at_entry, dict)
+        if not (whole and isinstance(payload["key"], str) and isinstance(payload["state"], dict)):
+            raise ValueError("a value of another type")
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    return payload
+
+
+def _unreadable(path: Path, reason: str) -> RunError:
+    return RunError(f"{path} is not a readable checkpoint ({' '.join(reason.split())[:300]}); delete it")
+
+
+def _state(path: Path, payload: dict[str, Any]) -> TrainState:
+    """Return the state in a checkpoint that was read.
+
+    Raises
+    ------
+    RunError
+    """
+    try:
+        return TrainState.from_state_dict(payload["state"])
+    except RunError as error:
+        raise _unreadable(path, str(error)) from error
+
+
+def _state_at(checkpoint: CheckpointFile, payload: dict[str, Any], job: Job) -> TrainState:
+    """Return the state in a checkpoint of this run, if it is where its name says and training can go on from it.
+
+    Raises
+    ------
+    RunError
+    """
+    state, ended = _state(checkpoint.path, payload), checkpoint.iteration is None
+    place = (checkpoint.stage_index + ended, 0 if ended else checkpoint.iteration)
+    try:
+        check_resumable(state, job.recipe, len(job.scene.train))
+    except (RunError, ShapeError) as error:
+        raise _unreadable(checkpoint.path, str(error)) from error
+    if (state.stage, state.step) != place:
+        raise _unreadable(checkpoint.path, f"it holds stage {state.stage}, iteration {state.step}")
+    return state
+
+
 def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) -> ResumePoint:
     """Make another run's finished stages this run's own."""
     name = job.recipe.stages[stage.index].name
@@ -118,7 +186,7 @@ def _adopt(run: RunFolder, job: Job, stage: FinishedStage, on_event: OnEvent) ->
     payload = {k: v for k, v in stage.payload.items() if k != "events_bytes"}
     run.save_checkpoint(stage.index, name, None, payload)
     on_event(Notice(f"stages up to {name!r} are taken from {stage.source}"))
-    return ResumePoint(TrainState.from_state_dict(stage.payload["state"]))
+    return ResumePoint(_state(Path(stage.source), stage.payload))
 
 
 def _from_run(job: Job, path: Path) -> FinishedStage:
@@ -134,10 +202,11 @@ def _from_run(job: Job, path: Path) -> FinishedStage:
         index = checkpoint.stage_index
         if index >= len(job.recipe.stages):
             continue
-        payload = load_tensors(checkpoint.path)
+        payload = _read(checkpoint.path)
         metrics = other.metrics()["stages"]
         if payload["key"] == job.stage_key(index) and len(metrics) > index:
-            log = other.events.path.read_bytes()[: payload["events_bytes"]]
+            _state_at(checkpoint, payload, job)
+            log = other.events.read_bytes(payload["events_bytes"])
             return FinishedStage(index, payload, metrics[: index + 1], log, str(path))
     have = ", ".join(c.stage for c in ends) or "none"
     raise RunError(
@@ -151,16 +220,40 @@ def _cache_file(folder: Path, key: str) -> Path:
     return folder / f"{key[:32]}.pt"
 
 
-def _from_cache(job: Job, folder: Path) -> FinishedStage | None:
+def _from_cache(job: Job, folder: Path, on_event: OnEvent) -> FinishedStage | None:
+    """Return the furthest stage that the cache has; what is damaged in it goes, and is trained and kept again."""
+    sweep(folder)
     for index in reversed(range(len(job.recipe.stages))):
         key = job.stage_key(index)
         path = _cache_file(folder, key)
         if path.exists():
-            payload = load_tensors(path)
-            if payload["key"] == key:
-                metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
-                return FinishedStage(index, payload, metrics, log, str(path))
+            try:
+                return _cached(job, index, path, key)
+            except RunError as error:
+                on_event(Notice(f"{error}: done, that stage is trained again"))
+                with contextlib.suppress(OSError):
+                    path.unlink()
     return None
+
+
+def _cached(job: Job, index: int, path: Path, key: str) -> FinishedStage:
+    """Return what a file of the cache holds.
+
+    Raises
+    ------
+    RunError
+        It is damaged.
+    """
+    payload = _read(path)
+    end = CheckpointFile(path, index, job.recipe.stages[index].name, None)
+    _state_at(end, payload, job)
+    try:
+        metrics, log = json.loads(payload.pop("metrics")), payload.pop("log").encode()
+    except (LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    if payload["key"] != key or not are_stages(metrics) or len(metrics) != index + 1:
+        raise _unreadable(path, "it is of another stage")
+    return FinishedStage(index, payload, metrics, log, str(path))
 
 
 def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
@@ -175,7 +268,7 @@ def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
     """
     for checkpoint in run.checkpoints():
         if (checkpoint.stage_index, checkpoint.iteration) == (index, None):
-            return TrainState.from_state_dict(load_tensors(checkpoint.path)["state"])
+            return _state_at(checkpoint, _read(checkpoint.path), job)
     stages = run.metrics()["stages"]
     source = Path(stages[index].get("reused_from") or "") if len(stages) > index else Path()
     key = job.stage_key(index)
@@ -185,9 +278,9 @@ def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
         paths = [c.path for c in ends if (c.stage_index, c.iteration) == (index, None)]
     for path in paths:
         with contextlib.suppress(RunError):  # somebody else's: gone or broken, it is not there
-            payload = load_tensors(path)
+            payload = _read(path)
             if payload["key"] == key:
-                return TrainState.from_state_dict(payload["state"])
+                return _state(path, payload)
     return None
 
 
@@ -201,6 +294,6 @@ def put_in_cache(folder: Path, run: RunFolder, payload: dict[str, Any]) -> None:
     make_folder(folder)
     path = _cache_file(folder, payload["key"])
     if not path.exists():
-        log = run.events.path.read_bytes()[: payload["events_bytes"]].decode()
+        log = run.events.read_bytes(payload["events_bytes"]).decode()
         stages = [{k: v for k, v in m.items() if k != "reused_from"} for m in run.metrics()["stages"]]
         save_tensors(path, {**payload, "metrics": json.dumps(stages), "log": log})

@@ -63,9 +63,9 @@ def subject_of(
     if known is not None:
         return known
     subject = subject_in(job, splats, box)
-    write_json(run.file(SUBJECT), subject.to_json())
     on_event(Notice(subject_line(subject, meshed=box is not None or job.protocol.fusion.subject)))
     _draw(run, job, subject, on_event)
+    write_json(run.file(SUBJECT), subject.to_json())  # last: where it is, the picture is too, after a kill as well
     return subject
 
 

@@ -255,7 +255,7 @@ def finish(
     write_splats(run.file(SPLATS), splats)
     with attempted(MESH, again("mesh", run.path), on_event):
         subject = meshed_subject(run, job, splats, mesh, on_event)
-        if not run.file(MESH).exists():
+        if not (run.file(MESH).exists() and "mesh" in run.metrics()):  # a kill may come between the two
             keep_facts(run, extract_mesh(job, splats, mesh, run.file(MESH), on_event, subject=subject, seen=frames))
     if with_page and not run.file(PAGE).exists():
         with attempted(PAGE, again("page", run.path), on_event):

@@ -11,11 +11,13 @@ from torch import Tensor
 
 from gs2d.core.checks import check_shapes
 from gs2d.core.splats import ATTRIBUTES, Splats
-from gs2d.errors import RunError
+from gs2d.errors import RunError, ShapeError
 from gs2d.training.exposure import Exposures
 from gs2d.training.poses import Poses
 
 FORMAT = 1  # of the state dict
+# What a mapping that is no state, or one with other values in it, makes of the steps of reading it.
+_BROKEN = (LookupError, TypeError, AttributeError, RuntimeError, ValueError, ArithmeticError)
 
 
 @dataclass(eq=False)
@@ -117,8 +119,9 @@ class TrainState:
         RunError
             If it is of another format, incomplete, or its tensors do not fit together.
         """
-        if data.get("format") != FORMAT:
-            raise RunError(f"checkpoint must be of format {FORMAT}, got {data.get('format')!r}; train again")
+        found = data.get("format") if isinstance(data, Mapping) else None
+        if found != FORMAT:
+            raise RunError(f"checkpoint must be of format {FORMAT}, got {str(found)[:40]!r}; train again")
         try:
             splats = Splats(**{name: data["splats"][name].clone() for name in ATTRIBUTES})
             generator = torch.Generator()
@@ -140,9 +143,15 @@ class TrainState:
                 Exposures.from_state_dict(data["exposures"]) if "exposures" in data else None,
                 Poses.from_state_dict(data["poses"]) if "poses" in data else None,
             )
-        except (KeyError, TypeError, AttributeError, RuntimeError) as error:
-            raise RunError(f"checkpoint is broken ({type(error).__name__}: {error}); train again") from error
-        state.check()
+            state.check()
+            learned = {"exposures": state.exposures, "poses": state.poses}
+            numbers = dict(state.splats.items()) | {name: it.offsets for name, it in learned.items() if it is not None}
+            for name, tensor in numbers.items():
+                if not bool(tensor.isfinite().all()):
+                    raise RunError(f"checkpoint is broken ({name} hold NaN or infinity); train again")
+        except _BROKEN as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+            raise RunError(f"checkpoint is broken ({reason}); train again") from error
         return state
 
     def move_to(self, device: torch.device | str) -> None:
@@ -157,22 +166,47 @@ class TrainState:
             self.exposures.move_to(device)
 
     def check(self) -> None:
-        """Raise ShapeError unless everything has the same N."""
+        """Raise unless everything has the same N, the types that training writes, and counts that can be.
+
+        Raises
+        ------
+        ShapeError
+            Another N, or another type.
+        RunError
+            A count below zero, or moments of what has none.
+        """
         parameters = dict(self.splats.items())
+        unknown = self.moments.keys() - parameters.keys()
+        if unknown:
+            raise RunError(f"moments must be of {', '.join(parameters)}, got {min(unknown)!r}; train again")
         arrays: dict[str, tuple[Tensor, str]] = {"means": (self.splats.means, "N 3")}
         for name, moments in self.moments.items():
             tail = " ".join(str(size) for size in parameters[name].shape[1:])
             arrays[f"moments of {name}"] = (moments.mean, f"N {tail}")
             arrays[f"squared moments of {name}"] = (moments.square, f"N {tail}")
-        arrays |= {f"group {name}": (mask, "N") for name, mask in self.groups.items()}
-        if self.statistics is not None:
-            for name, tensor in self.statistics.items():
-                arrays[f"statistics {name}"] = (tensor, " ".join(["N", *["_"] * (tensor.dim() - 1)]))
+        groups = {f"group {name}": mask for name, mask in self.groups.items()}
+        arrays |= {name: (mask, "N") for name, mask in groups.items()}
+        statistics = {f"statistics {name}": tensor for name, tensor in (self.statistics or {}).items()}
+        for name, tensor in statistics.items():
+            arrays[name] = (tensor, " ".join(["N", *["_"] * (tensor.dim() - 1)]))
         check_shapes(arrays)
-        if self.exposures is not None:
-            self.exposures.check()
-        if self.poses is not None:
-            self.poses.check()
+        dtype = self.splats.dtype
+        for name, tensor in [*parameters.items(), *((name, array) for name, (array, _) in arrays.items())]:
+            expected = torch.bool if name in groups else tensor.dtype if name in statistics else dtype
+            if tensor.dtype != expected or not dtype.is_floating_point:
+                raise ShapeError(f"{name} must be {expected}, got {tensor.dtype}")
+        for learned in (self.exposures, self.poses):
+            if learned is not None:
+                learned.check()
+        self._check_counts()
+
+    def _check_counts(self) -> None:
+        """Raise RunError for a count below zero."""
+        steps = [moments.steps for moments in self.moments.values()]
+        learned = [learned.steps for learned in (self.exposures, self.poses) if learned is not None]
+        least = min([self.stage, self.step, *steps, *self.queue, *(count for counts in learned for count in counts)])
+        if least < 0:
+            raise RunError(f"counts of iterations and views must be 0 or more, got {least}; train again")
 
 
 def _copy(tensor: Tensor) -> Tensor:

@@ -43,6 +43,7 @@ from gs2d.training.objective import (
 )
 from gs2d.training.priors import with_known_points
 from gs2d.training.rank_clone import clone_in_place, rank_by_error
+from gs2d.training.resumable import check_resumable
 from gs2d.training.robust import Robustness
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
@@ -117,7 +118,9 @@ class Trainer:
         goes_on = init is not None or (state is not None and self.recipe.free_space is None)
         begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe
         self._robust = Robustness(scene, begins, self.settings, self.backend)
-        self.state = self._new_state(dtype, init) if state is None else self._checked(state)
+        if state is not None:
+            check_resumable(state, self.recipe, len(scene.train))
+        self.state = self._new_state(dtype, init) if state is None else state
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
@@ -315,30 +318,6 @@ class Trainer:
         source = "sweep" if source == "points" and self.recipe.dense_start is not None else source
         self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped))
         return per_image.start(TrainState(self._robust.fitted(initial.splats), generator), self.recipe, self.scene)
-
-    def _checked(self, state: TrainState) -> TrainState:
-        """Return a state from outside, if it is of this recipe."""
-        state.check()
-        stages = self.recipe.stages
-        if state.splats.sh_degree != self.recipe.sh_degree:
-            raise RunError(
-                f"the checkpoint has SH degree {state.splats.sh_degree}, but recipe {self.recipe.name!r} trains "
-                f"{self.recipe.sh_degree}; start a new run"
-            )
-        inside = state.stage < len(stages) and state.step <= stages[state.stage].iterations
-        if not inside and not (state.stage == len(stages) and state.step == 0):
-            raise RunError(
-                f"the checkpoint is at stage {state.stage}, iteration {state.step}, which recipe {self.recipe.name!r} "
-                "does not have; start a new run"
-            )
-        last = max(state.queue, default=0)
-        if last >= len(self.scene.train):
-            raise RunError(
-                f"the checkpoint waits for training view {last}, but the scene has {len(self.scene.train)}; "
-                "is it of another scene?"
-            )
-        per_image.check(state, self.recipe, len(self.scene.train))
-        return state
 
     def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
         """Run an entry action."""

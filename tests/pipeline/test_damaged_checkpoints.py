@@ -1,0 +1,183 @@
+"""Checkpoints that torch reads and that are not whole: training goes on from the one before, and says so."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from ball_runs import Stop, comparable, options
+from gs2d.io.run_dir import CheckpointFile, RunFolder, load_tensors, save_tensors
+from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.job import Job, prepare_job
+from gs2d.pipeline.resume import ResumePoint, choose_start
+from gs2d.pipeline.train import train
+
+UNSEEN = {("key",), ("state", "entered")}  # a text is as good as any
+
+
+@pytest.fixture(scope="module")
+def stopped(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A run that was broken off in its first stage: two checkpoints, with moments, statistics and a queue."""
+
+    def listen(event: Event) -> None:
+        if isinstance(event, Step) and event.done >= 13 and "loss" in event.detail:
+            raise Stop
+
+    out = tmp_path_factory.mktemp("stopped") / "run"
+    with pytest.raises(Stop):
+        train(options(capture, out), listen)
+    return RunFolder(out)
+
+
+@pytest.fixture(scope="module")
+def job(capture: Path) -> Job:
+    return prepare_job(options(capture, Path("unused")), ignore)
+
+
+def resumed(run: RunFolder, job: Job, capture: Path, payload: dict[str, Any]) -> tuple[ResumePoint, list[str]]:
+    """Where training goes on when the last checkpoint holds ``payload``, and what is said."""
+    save_tensors(run.checkpoints()[-1].path, payload)
+    heard: list[Event] = []
+    start = choose_start(run, job, options(capture, run.path, resume=True), heard.append)
+    return start, [event.text for event in heard if isinstance(event, Notice)]
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the way to every entry of nested mappings."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield (*path, key)
+            yield from leaves(inner, (*path, key))
+
+
+def with_change(payload: dict[str, Any], path: tuple[Any, ...], change: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return a copy in which one entry is another; one that becomes ``...`` is left out."""
+    changed = copy.deepcopy(payload)
+    inside = changed
+    for key in path[:-1]:
+        inside = inside[key]
+    inside[path[-1]] = change(inside[path[-1]])
+    if inside[path[-1]] is ...:
+        del inside[path[-1]]
+    return changed
+
+
+@pytest.mark.parametrize("change", [lambda _: ..., lambda _: None, lambda _: "text"], ids=["gone", "none", "text"])
+def test_a_checkpoint_without_any_one_of_its_entries_is_passed_over(
+    capture: Path, stopped: RunFolder, job: Job, tmp_path: Path, change: Callable[[Any], Any]
+) -> None:
+    run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
+    payload = load_tensors(run.checkpoints()[-1].path)
+    paths = list(leaves(payload))
+    assert len(paths) > 40
+    for path in paths:
+        if path in UNSEEN and change(0) == "text":
+            continue
+        start, said = resumed(run, job, capture, with_change(payload, path, change))
+        assert start.state is not None, path
+        assert start.state.step == 8, path
+        assert "0-surface-0000012.pt is not a readable checkpoint" in said[0], path
+        assert said[0].endswith("going back to the checkpoint before it")
+        assert said[1] == "resuming after 0-surface-0000008"
+
+
+def half(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor[: len(tensor) // 2].clone()
+
+
+@pytest.mark.parametrize(
+    ("path", "change"),
+    [
+        (("state", "splats", "means"), half),
+        (("state", "splats", "means"), lambda t: t * torch.nan),
+        (("state", "splats", "shN"), lambda t: t.double()),
+        (("state", "splats", "quats"), lambda t: t.to_sparse()),
+        (("state", "moments", "quats", "mean"), half),
+        (("state", "moments", "quats", "square"), lambda t: t.int()),
+        (("state", "moments", "quats", "steps"), lambda _: -1),
+        (("state", "moments", "other"), lambda _: {"mean": torch.zeros(1), "square": torch.zeros(1), "steps": 1}),
+        (("state", "groups", "high_error"), lambda _: torch.zeros(3, dtype=torch.bool)),
+        (("state", "statistics", "count"), half),
+        (("state", "statistics"), lambda _: {}),
+        (("state", "generator"), half),
+        (("state", "generator"), lambda t: torch.zeros_like(t)),
+        (("state", "queue"), lambda _: [0, 99]),
+        (("state", "queue"), lambda _: [-1]),
+        (("state", "step"), lambda _: 11),
+        (("state", "step"), lambda _: float("inf")),
+        (("state", "stage"), lambda _: 7),
+        (("state", "entered"), lambda _: False),
+        (("state", "format"), lambda _: 2),
+        (("state",), lambda _: [1, 2]),
+        (("events_bytes",), lambda _: -5),
+        (("extra",), lambda _: '{"seconds": NaN, "peak_memory": 0, "at_entry": {}}'),
+        (("extra",), lambda _: "[" * 100_000),
+        (("state", "exposures"), lambda _: {"offsets": torch.zeros(6, 3, 4)}),
+    ],
+)
+def test_a_checkpoint_whose_entries_do_not_fit_together_is_passed_over(
+    capture: Path, stopped: RunFolder, job: Job, tmp_path: Path, path: tuple[str, ...], change: Callable[[Any], Any]
+) -> None:
+    run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
+    payload = load_tensors(run.checkpoints()[-1].path)
+    if path[-1] in ("other", "high_error", "exposures"):
+        payload = with_change(payload, path[:-1], lambda inner: inner | {path[-1]: None})
+    start, said = resumed(run, job, capture, with_change(payload, path, change))
+    assert start.state is not None
+    assert start.state.step == 8
+    assert "0-surface-0000012.pt is not a readable checkpoint" in said[0]
+    assert "\n" not in said[0]
+
+
+def test_training_from_the_one_before_ends_with_the_same_bytes(
+    capture: Path, stopped: RunFolder, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
+    last = run.checkpoints()[-1].path
+    save_tensors(last, with_change(load_tensors(last), ("state", "statistics", "signed"), lambda _: ...))
+    assert comparable(train(options(capture, run.path, resume=True))) == comparable(undisturbed)
+
+
+def test_a_group_that_an_earlier_stage_made_is_missed(capture: Path, undisturbed: RunFolder, tmp_path: Path) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    job = prepare_job(options(capture, run.path), ignore)
+    payload = with_change(load_tensors(run.checkpoints()[-1].path), ("state", "groups", "high_error"), lambda _: ...)
+    _, said = resumed(run, job, capture, payload)
+    assert "lacks the row group 'high_error'" in said[0]
+
+
+def test_a_damaged_stage_of_a_cache_is_trained_again_and_kept(
+    capture: Path, undisturbed: RunFolder, tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache"
+    train(options(capture, tmp_path / "first", cache=cache))
+    files = sorted(cache.glob("*.pt"), key=lambda path: load_tensors(path)["state"]["stage"])
+    whole = [path.read_bytes() for path in files]
+    files[2].write_bytes(whole[2][:1000])
+    save_tensors(files[1], with_change(load_tensors(files[1]), ("metrics",), lambda _: "[]"))
+    heard: list[Event] = []
+    run = train(options(capture, tmp_path / "second", cache=cache), heard.append)
+    assert comparable(run) == comparable(undisturbed)
+    said = [event.text for event in heard if isinstance(event, Notice)]
+    assert [sum(path.name in text for text in said) for path in files] == [1, 1, 1]
+    assert [bool(load_tensors(path)["metrics"]) for path in files] == [True] * 3
+    assert run.metrics()["stages"][0]["reused_from"] == str(files[0])
+
+
+def test_a_checkpoint_under_the_name_of_another_is_passed_over(
+    capture: Path, stopped: RunFolder, job: Job, tmp_path: Path
+) -> None:
+    run = RunFolder(Path(shutil.copytree(stopped.path, tmp_path / "run")))
+    last = run.checkpoints()[-1]
+    last.path.rename(last.path.with_name("0-surface-end.pt"))
+    start, said = resumed(run, job, capture, load_tensors(run.checkpoints()[-1].path))
+    assert isinstance(last, CheckpointFile)
+    assert start.state is not None
+    assert start.state.step == 8
+    assert "it holds stage 0, iteration 12" in said[0]
