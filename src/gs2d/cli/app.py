@@ -24,6 +24,7 @@ from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Doctor, Info, Rec
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
+from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
 from gs2d.experiments.options import TableOptions
 from gs2d.pipeline.options import HowItRuns
@@ -159,15 +160,19 @@ def _fail(message: str) -> int:
 
 def _complain(text: str) -> None:
     """Print a line on stderr; a terminal gets lines that break between words."""
-    screen = sys.stderr is not None and sys.stderr.isatty()
+    screen, text = sys.stderr is not None and sys.stderr.isatty(), printable(text)
     for line in layout.message(text, layout.terminal_width()) if screen else [text]:
         print(line, file=sys.stderr)
+
+
+def _trace(error: BaseException) -> None:
+    print(printable("".join(traceback.format_exception(error)), lines=True), end="", file=sys.stderr)
 
 
 def _report(error: Exception, debug: bool) -> int:
     """Print an error; the exit code says whose it is."""
     if debug:
-        traceback.print_exception(error)
+        _trace(error)
     if isinstance(error, Gs2dError):
         return _fail(str(error))
     if isinstance(error, OSError) and error.errno in _MENDABLE:
@@ -184,14 +189,14 @@ def _what_is_missing(console: Console, argv: Sequence[str], command: Common) -> 
     """Print what a finished command could not make and how to make it; 0 where that is nothing."""
     for event in console.missing:
         if command.debug and event.error is not None:
-            traceback.print_exception(event.error)
+            _trace(event.error)
         line = f"not made: {event.what}"
         if console.quiet:  # nobody has read why
             line += f" ({event.reason})"
         again = _resumed(argv) if event.command is None else event.command
         if again and sys.stderr is not None and sys.stderr.isatty():
             _complain(f"{line}; again:")
-            print(again, file=sys.stderr)  # whole, to be copied
+            print(printable(again), file=sys.stderr)  # whole, to be copied
         else:
             _complain(f"{line}; again: {again}" if again else line)
     return INCOMPLETE if console.missing else OK
@@ -215,5 +220,5 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
             line += "; nothing was kept, because training had not begun"
     if isinstance(command, TableOptions) and command.train:
         line += f"; go on with: gs2d {shlex.join(argv)}"
-    print(line, file=sys.stderr)
+    print(printable(line), file=sys.stderr)
     return INTERRUPTED

@@ -9,6 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from gs2d.cli.whole import WholeRun
+from gs2d.core.text import printable
 from gs2d.pipeline.events import Phase, duration
 
 _WIDEST, _LEAST = 32, 6  # columns of a bar; with fewer there is none
@@ -55,4 +56,5 @@ class Bar:
 
 
 def _cut(text: str, width: int) -> str:
+    text = printable(text)
     return text if len(text) <= width else text[: max(width - 3, 1)] + "..."

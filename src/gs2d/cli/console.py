@@ -18,6 +18,7 @@ from rich.table import Table
 from gs2d.cli.bar import Bar
 from gs2d.cli.layout import records, wrapped
 from gs2d.cli.whole import WholeRun
+from gs2d.core.text import printable
 from gs2d.pipeline.events import Event, Expected, MissingFile, Notice, Phase, Plan, StageDone, Step
 
 LOG_SECONDS, LOG_FRACTION = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
@@ -26,6 +27,10 @@ _NO_SCREENS = ("dumb", "unknown")  # values of TERM: no cursor that goes back
 
 
 class _Screen(RichConsole):
+    def print(self, *objects: Any, **how: Any) -> None:
+        """Print; names of files in a text do nothing to the terminal."""
+        super().print(*(printable(it, lines=True) if isinstance(it, str) else it for it in objects), **how)
+
     def on_broken_pipe(self) -> None:
         """Say that nobody reads, where rich would end the process itself."""
         raise BrokenPipeError
@@ -87,12 +92,16 @@ class Console:
         elif isinstance(event, Notice):
             self._note(event.text)
         elif isinstance(event, MissingFile):
-            self._err.print(f"[red]not made[/red] {escape(event.what)}: {escape(event.reason)}", soft_wrap=True)
+            self._err.print(
+                f"[red]not made[/red] {escape(printable(event.what))}: {escape(printable(event.reason))}",
+                soft_wrap=True,
+            )
         elif isinstance(event, StageDone):
             self._lines(wrapped(stage_line(event.metrics), self._err.width, rest="  "))
 
     def _note(self, text: str) -> None:
         """Print a notice; on a terminal its lines break between words."""
+        text = printable(text)
         first, *rest = wrapped(text, self._err.width - 5) if self._err.is_terminal else [text]
         self._err.print(f"[yellow]note[/yellow] {escape(first)}", soft_wrap=True)
         self._lines([f"     {line}" for line in rest])
@@ -106,7 +115,8 @@ class Console:
         self._bar = Bar(phase, self._whole)
         if not self._interactive:  # a log file: one line a phase, and now and then how far it is
             if phase.name not in self._named:
-                self._err.print(f"{phase.name} ({phase.total})" if phase.total else phase.name, markup=False)
+                name = printable(phase.name)
+                self._err.print(f"{name} ({phase.total})" if phase.total else name, markup=False)
             self._named.add(phase.name)
             self._logged = (time.monotonic(), phase.done)
         elif self._live is None:
@@ -123,7 +133,10 @@ class Console:
         late = time.monotonic() - at >= LOG_SECONDS
         if not self._interactive and total and late and LOG_FRACTION * total <= step.done - done:
             self._logged = (time.monotonic(), step.done)
-            words = [f"{self._bar.phase.name}: {step.done:,} of {total:,}, {self._bar.left()}", self._whole.line()]
+            words = [
+                f"{printable(self._bar.phase.name)}: {step.done:,} of {total:,}, {self._bar.left()}",
+                self._whole.line(),
+            ]
             self._err.print("; ".join(filter(None, words)), markup=False, soft_wrap=True)
 
     def close(self) -> None:
@@ -173,9 +186,11 @@ class Console:
         head, gap = escape(title) or None, "" if frame else " "
         table = Table(title=head, title_justify="left", box=frame, padding=(0, 1 if frame else 0), pad_edge=False)
         for i, column in enumerate(columns):
-            table.add_column(gap * bool(i) + escape(column), justify="left" if i == 0 else "right", no_wrap=True)
+            table.add_column(
+                gap * bool(i) + escape(printable(column)), justify="left" if i == 0 else "right", no_wrap=True
+            )
         for row in rows:
-            table.add_row(*(gap * bool(i) + escape(cell) for i, cell in enumerate(row)))
+            table.add_row(*(gap * bool(i) + escape(printable(cell)) for i, cell in enumerate(row)))
         return table, self._out.measure(table, options=self._out.options.update(max_width=_ANY_WIDTH)).maximum
 
     def result(self, value: Any) -> None:

@@ -26,6 +26,7 @@ from gs2d.config.recipe import Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.core.splats import Splats
+from gs2d.core.text import name_bytes
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.data.benchmarks import missing_lines, protocol_of
 from gs2d.data.load import reader_of
@@ -395,7 +396,7 @@ def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -
     train = set(map(id, scene.train))
     on_event(Phase("reading photographs", len(scene.views)))
     for done, view in enumerate(scene.preload(DECODE_THREADS), start=1):
-        digest.update(f"{view.name} {'train' if id(view) in train else 'test'}".encode())
+        digest.update(name_bytes(f"{view.name} {'train' if id(view) in train else 'test'}"))
         mask = view.mask()
         empty += [view] if uses_masks and mask is not None and not mask.any() else []
         for array in _arrays(view):

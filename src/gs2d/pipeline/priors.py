@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from gs2d.config.recipe import Recipe
+from gs2d.core.text import name_bytes
 from gs2d.data import Scene, View
 from gs2d.errors import DataError
 from gs2d.losses.priors import Depths, MetricDepth, NormalTarget, PointDepths
@@ -38,7 +39,7 @@ def with_priors(digest: str, scene: Scene, recipe: Recipe, on_event: OnEvent) ->
         depths += [] if depth is None else [depth]
         normals += normal is not None
         for array in _arrays(view, priors.plan, normal):
-            whole.update(f"{view.name} {array.shape} {array.dtype}".encode())
+            whole.update(name_bytes(f"{view.name} {array.shape} {array.dtype}"))
             whole.update(np.ascontiguousarray(array).data)
         on_event(Step(done))
     if priors.plan is not None:

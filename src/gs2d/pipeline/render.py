@@ -22,6 +22,7 @@ from gs2d.core.images import write_image
 from gs2d.core.json_files import write_json
 from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
+from gs2d.core.text import name_bytes
 from gs2d.data import Scene, View
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
@@ -66,7 +67,7 @@ def choose_views(scene: Scene, count: int) -> list[tuple[str, View]]:
 def file_name(view: View) -> str:
     """Return a view's name as the start of a file name; a long one is cut, and a hash of the whole is added."""
     name = Path(view.name.replace("/", "__")).stem
-    whole = name.encode()
+    whole = name_bytes(name)
     if len(whole) <= LONGEST_NAME:
         return name
     return whole[:LONGEST_NAME].decode(errors="ignore") + "-" + _short_hash(name)
@@ -83,7 +84,7 @@ def file_names(views: Sequence[View]) -> list[str]:
 
 
 def _short_hash(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
+    return hashlib.sha256(name_bytes(text)).hexdigest()[:8]
 
 
 def draw_stage(

@@ -20,6 +20,7 @@ from PIL import Image
 
 from gs2d.config.grades import GRADES
 from gs2d.core.images import composite, to_uint8
+from gs2d.core.text import name_bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,7 @@ def environment() -> jinja2.Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    env.globals |= {"GRADES": GRADES, "hexes": _hexes, "jpeg": _jpeg, "quoted": quote, "svg_source": _svg_source}
+    env.globals |= {"GRADES": GRADES, "hexes": _hexes, "jpeg": _jpeg, "quoted": _quoted, "svg_source": _svg_source}
     return env
 
 
@@ -101,6 +102,11 @@ def image_tag(image: np.ndarray, caption: str = "", *, alt: str, width: int = 36
 def drawing(svg: str, title: str) -> Markup:
     """Return a drawing inline as an image."""
     return macro("macros.html", "drawing", svg, title)
+
+
+def _quoted(path: object) -> str:
+    """Return a path as a part of an address; the bytes of a name that is not UTF-8 stay as they are."""
+    return quote(name_bytes(str(path)))
 
 
 def _jpeg(image: np.ndarray, width: int) -> Markup:

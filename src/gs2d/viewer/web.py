@@ -26,6 +26,7 @@ import torch
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
 from gs2d.core.splats import Splats
+from gs2d.core.text import printable
 from gs2d.data.subject import OBJECT, SCENE, Subject
 from gs2d.errors import DataError
 from gs2d.render.types import MAX_SIZE, NEAR_PLANE_POLICIES, RasterSettings
@@ -318,7 +319,7 @@ def write_page(
     is_dark = sum(settings.background) < 1.5
     told = json.dumps(_facts(packed, views, settings, unit, up, subject), allow_nan=False)
     values = {
-        "title": html.escape(title),
+        "title": html.escape(printable(title)),
         "count": f"{packed.count:,}",
         "background": shade,
         "ink": "#eee" if is_dark else "#222",

@@ -159,10 +159,7 @@ class _Bytes:
             self.need(len(self.data) - self.at + 1, what)
         raw = self.data[self.at : end]
         self.at = end + 1
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise DataError(f"{self.path}: {what} must be UTF-8, got {raw[:40]!r}; is this a COLMAP file?") from error
+        return raw.decode("utf-8", "surrogateescape")  # as the file system has it
 
     def finish(self, what: str) -> None:
         if self.at != len(self.data):
@@ -239,9 +236,7 @@ def _points_bin(path: Path) -> ColmapPoints:
 def _lines(path: Path) -> list[tuple[int, str]]:
     """(line number, text) of all lines but comments; empty lines stay (an image without 2-D points has one)."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path} must be text in UTF-8, got other bytes; is it a COLMAP file?") from error
+        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")  # names are as the file system has them
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     return [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1) if not line.lstrip().startswith("#")]

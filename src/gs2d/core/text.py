@@ -1,0 +1,43 @@
+r"""Text with names of files in it, which may be any bytes: as bytes again, and as what a terminal or a page may show.
+
+A name that is not UTF-8 is a string with surrogates (``os.fsdecode``); one with an escape sequence could write over the
+screen, change its title, or type.
+"""
+
+from __future__ import annotations
+
+import re
+
+# Controls of C0 and C1, lone surrogates, and what changes the direction or the line of the text that follows.
+_HIDDEN = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+_HIDDEN_IN_LINES = re.compile(_HIDDEN.pattern.replace(r"\x00-\x1f", r"\x00-\x08\x0b-\x1f"))
+
+
+def name_bytes(text: str) -> bytes:
+    """Return a text as UTF-8, and the bytes of a name in it that is not UTF-8 as they are."""
+    return text.encode("utf-8", "surrogateescape" if not _has_other_surrogates(text) else "surrogatepass")
+
+
+def _has_other_surrogates(text: str) -> bool:
+    """Whether there are surrogates that stand for no byte: a name that JSON was asked to hold, not a file system."""
+    return any("\ud800" <= letter <= "\udfff" and not "\udc80" <= letter <= "\udcff" for letter in text)
+
+
+def printable(text: str, *, lines: bool = False) -> str:
+    r"""Return a text that does nothing to a terminal: ``\x1b`` and the like are spelled out.
+
+    Parameters
+    ----------
+    text : str
+    lines : bool
+        Whether it has several lines: line ends and tabs stay.
+    """
+    return (_HIDDEN_IN_LINES if lines else _HIDDEN).sub(_spelled, text)
+
+
+def _spelled(found: re.Match[str]) -> str:
+    code = ord(found[0])
+    if 0xDC80 <= code <= 0xDCFF:  # a byte
+        code -= 0xDC00
+    named = {0x09: "\\t", 0x0A: "\\n", 0x0D: "\\r"}
+    return named.get(code) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")

@@ -1,0 +1,85 @@
+"""Names that are not UTF-8 and hold escape sequences: of photographs, captures and runs, through the commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from cli_runs import TINY
+from gs2d.cli import run
+from gs2d.cli.console import Console
+from gs2d.data import load_scene
+from gs2d.pipeline.events import MissingFile, Notice, Phase
+from tiny import write_capture
+
+NAME = os.fsdecode(b"\xe9\x1b]0;owned\x07\n\x9b")
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names of files are text")
+
+
+def named_capture(root: Path) -> Path:
+    """The ball in a folder and in files of that name."""
+    capture = write_capture(root / NAME, train=3, test=1, size=16)
+    for split in ("train", "test"):
+        file = capture / f"transforms_{split}.json"
+        meta = json.loads(file.read_text())
+        for i, frame in enumerate(meta["frames"]):
+            frame["file_path"] = f"./{split}/{NAME}{i}"
+            (capture / split / f"r_{i}.png").rename(capture / split / f"{NAME}{i}.png")
+        file.write_text(json.dumps(meta))
+    return capture
+
+
+def test_every_command_works_on_such_names_and_prints_none_of_their_bytes(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    capture, out = named_capture(tmp_path), tmp_path / f"{NAME}run"
+    for words in (
+        ["info", capture],
+        ["train", capture, "--out", out, "--threads", "1", *TINY],
+        ["report", out],
+        ["page", out],
+        ["page", out / "splats.ply"],
+        ["export", out, "--out", tmp_path / f"{NAME}.spz"],
+        ["render", out, "--split", "test"],
+        ["mesh", out],
+        ["info", out],
+        ["train", capture, "--out", out, "--threads", "1", *TINY, "--resume"],
+    ):
+        code = run([str(word) for word in words])
+        said = "".join(capfd.readouterr())
+        assert code == 0, (words, said)
+        assert not {"\x1b", "\x07", "\x9b", NAME[0]} & set(said), words
+    for words in (["train", capture, "--out", out], ["report", NAME], ["info", out / NAME]):
+        assert run([str(word) for word in words]) == 2
+        assert "\\xe9\\x1b]0;owned\\x07 \\x9b" in capfd.readouterr().err
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_a_notice_and_a_bar_are_one_line_whatever_they_name(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(quiet=False, as_json=False)
+    for event in (Notice(f"skipped {NAME}"), Phase(f"unpacking {NAME}", 3), MissingFile(NAME, NAME, None)):
+        console.on_event(event)
+    console.table("t", ["a"], [[NAME]])
+    lines = capsys.readouterr()
+    assert len(lines.err.splitlines()) == 3
+    assert not {"\x1b", "\x07", "\x9b", NAME[0]} & set(lines.err + lines.out)
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_colmap_names_are_the_bytes_of_the_file_system(tmp_path: Path, kind: str) -> None:
+    from capture_writers import small_colmap
+
+    small_colmap(tmp_path, kind=kind)
+    old = next((tmp_path / "images").iterdir())
+    new = old.with_name(os.fsdecode(b"\xe9" + os.fsencode(old.name)[1:]))
+    old.rename(new)
+    changed = [path for path in tmp_path.rglob("images.*") if os.fsencode(old.name) in path.read_bytes()]
+    for path in changed:
+        path.write_bytes(path.read_bytes().replace(os.fsencode(old.name), os.fsencode(new.name)))
+    assert changed
+    assert new.name in {view.name for view in load_scene(tmp_path, format="colmap", test_every=0).views}

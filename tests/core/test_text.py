@@ -1,0 +1,39 @@
+"""Names of files in texts: as bytes again, and harmless on a terminal."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from gs2d.core.text import name_bytes, printable
+
+
+@pytest.mark.parametrize("name", ["plain.png", "é.png", "日本", os.fsdecode(b"caf\xe9"), os.fsdecode(b"\xff\x1b[2J")])
+def test_a_name_is_its_bytes_again(name: str) -> None:
+    assert name_bytes(name) == os.fsencode(name)
+
+
+def test_half_a_character_that_only_json_can_hold_has_bytes_too() -> None:
+    assert name_bytes("\ud83d") == b"\xed\xa0\xbd"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain é 日本 [x]\\n", "plain é 日本 [x]\\n"),
+        ("\x1b]0;title\x07", "\\x1b]0;title\\x07"),
+        ("a\nb\tc\r", "a\\nb\\tc\\r"),
+        ("\x9b31m\x7f", "\\x9b31m\\x7f"),
+        (os.fsdecode(b"caf\xe9"), "caf\\xe9"),
+        ("x\u202egnp.exe", "x\\u202egnp.exe"),
+        ("\ud83d", "\\ud83d"),
+    ],
+)
+def test_what_would_steer_a_terminal_is_spelled_out(text: str, shown: str) -> None:
+    assert printable(text) == shown
+    assert printable(shown) == shown
+
+
+def test_lines_stay_where_there_are_to_be_several() -> None:
+    assert printable("a\n\tb\x1b", lines=True) == "a\n\tb\\x1b"
