@@ -28,6 +28,13 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         where = f"one of {m.neighbours} nearby views within {m.max_angle:g} degrees"
         yield f"views compared: {m.patches:,} patches of {m.side}x{m.side} px with {where}"
     yield from _describe_priors(recipe)
+    if recipe.dense_start is not None:
+        start = recipe.dense_start
+        fitted = ", its splats fitted to them" if start.fit is not None else ""
+        otherwise = "" if start.required else "; without where they agree on nothing"
+        yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{otherwise}"
+    if recipe.fused_depth is not None:
+        yield f"the mesh is of the {recipe.fused_depth} depth"
     for number, stage in enumerate(recipe.stages, start=1):
         yield f"{number}. {stage.name}: {stage.iterations:,} iterations"
         for line in _describe_stage(stage):

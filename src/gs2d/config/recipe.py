@@ -321,6 +321,7 @@ class Recipe:
     photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says. ``multiview``,
     ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses that do.
     ``dense_start``, ``free_space``, ``opacity_decay``, ``seen_area``: what keeps fog out where photographs are few.
+    ``fused_depth``: the depth that becomes the mesh ("mean", "median" or "transmittance"); None: the protocol says.
     """
 
     name: str
@@ -337,6 +338,7 @@ class Recipe:
     free_space: FreeSpace | None = None
     opacity_decay: OpacityDecay | None = None
     seen_area: SeenArea | None = None
+    fused_depth: str | None = field(default=None, metadata={"omit_empty": True})
 
     @property
     def iterations(self) -> int:
@@ -369,6 +371,8 @@ def validate(recipe: Recipe, *, to_train: bool = True) -> Recipe:
     kinds = [term.kind for stage in recipe.stages for term in stage.losses]
     check_multiview(f"{where}: multiview", recipe.multiview, kinds)
     check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
+    if recipe.fused_depth is not None:
+        one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)
     check_robust(where, recipe.dense_start, recipe.free_space, recipe.opacity_decay, recipe.seen_area)
     names = [stage.name for stage in recipe.stages]
     for name in names:

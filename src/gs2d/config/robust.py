@@ -68,6 +68,8 @@ class DenseStart:
     fit : StartFit or None
         How splats are fitted to the photographs; None: grey-opaque beginnings as from sparse points, in the colour of
         one photograph.
+    required : bool
+        Whether training stops where photographs agree on nothing; if not, it says so and starts without.
     """
 
     side: int = 200
@@ -82,6 +84,7 @@ class DenseStart:
     cell: float = 3.0
     max_views: int = 120
     fit: StartFit | None = field(default=None, metadata={"omit_empty": True})
+    required: bool = field(default=True, metadata={"omit_empty": True})
 
 
 @dataclass(frozen=True)

@@ -66,12 +66,17 @@ def longer_steps(recipe: Recipe, factor: float) -> Recipe:
     """Return the recipe with rates for a schedule ``factor`` times as long as they were chosen for.
 
     Adam's steps do not grow with gradients: in fewer of them a splat gets as far only if each is longer. All rates of
-    splats are multiplied by ``factor ** -LONGER`` (2.1 at a twentieth); at factor 1 and above nothing changes.
+    splats are multiplied by ``factor ** -LONGER`` (2.1 at a twentieth); at factor 1 and above nothing changes. Stages
+    whose own rates say how they grow (``LearningRates.stretch``) are left as they are.
     """
     if factor >= 1:
         return recipe
     times = factor**-LONGER
-    return replace(recipe, stages=tuple(replace(stage, lr=stage.lr.times(times)) for stage in recipe.stages))
+
+    def longer(stage: Stage) -> Stage:
+        return stage if stage.lr.stretch else replace(stage, lr=stage.lr.times(times))
+
+    return replace(recipe, stages=tuple(map(longer, recipe.stages)))
 
 
 def _scale_prior(prior: Prior, factor: float) -> Prior:

@@ -87,4 +87,5 @@ def start_text(event: Initialised) -> str:
     }
     source = sources[event.source]
     dropped = f" ({event.dropped:,} were not usable)" if event.dropped else ""
-    return f"starting from {event.splats:,} {source}{dropped}"
+    lacks = f"; no dense start: {event.lacks}" if event.lacks else ""
+    return f"starting from {event.splats:,} {source}{dropped}{lacks}"

@@ -13,6 +13,7 @@ from typing import Any
 
 from torch import Tensor
 
+from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
 from gs2d.core.mesh import Mesh
@@ -24,7 +25,7 @@ from gs2d.evaluation.images import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import named
-from gs2d.pipeline.job import choose_backend, choose_protocol, fit_recipe, with_backdrop
+from gs2d.pipeline.job import choose_backend, choose_protocol, fit_recipe, with_backdrop, with_fused_depth
 from gs2d.pipeline.mesh import fused
 from gs2d.pipeline.options import MeshOptions, Robust, TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
@@ -70,7 +71,7 @@ class Trained:
 
 def train(
     scene: Scene | str | os.PathLike[str],
-    recipe: str | Recipe = "2dgs-r",
+    recipe: str | Recipe = DEFAULT_RECIPE,
     *,
     protocol: str | Protocol = "auto",
     backend: str = "auto",
@@ -97,7 +98,7 @@ def train(
     backend : str
         "auto", "cpu", "cuda" or "reference".
     schedule_scale : float
-        Length of the schedule; 0.1 is a tenth of the paper's.
+        Length of the schedule; 0.1 is a tenth of the recipe's.
     overrides : tuple of str
         ``stage.field=value``, applied after the schedule is scaled.
     seed : int
@@ -121,7 +122,7 @@ def train(
     Examples
     --------
     >>> scene = gs2d.load_scene("captures/garden", downscale=4)  # doctest: +SKIP
-    >>> trained = gs2d.train(scene, "2dgs-r", schedule_scale=0.1)  # doctest: +SKIP
+    >>> trained = gs2d.train(scene, schedule_scale=0.1)  # doctest: +SKIP
     >>> gs2d.write_splats("garden.ply", trained.splats)  # doctest: +SKIP
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
@@ -141,7 +142,7 @@ def train(
     chosen = choose_backend(backend, on_event)
     rules = choose_protocol(options, scene.format, on_event)
     fitted = fit_recipe(options, scene, rules, on_event)
-    rules = with_backdrop(rules, fitted, scene, on_event)
+    rules = with_fused_depth(with_backdrop(rules, fitted, scene, on_event), fitted)
     trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=on_event)
     trainer.run()
     exposures = named(scene.train, trainer.state.exposures)

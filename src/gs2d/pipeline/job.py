@@ -146,6 +146,19 @@ class RenderedScene(typing.Protocol):
     def backend(self) -> Backend: ...
 
 
+def recipe_of(recipe: str | Recipe) -> Recipe:
+    """Return the recipe of a name, or the recipe itself.
+
+    Raises
+    ------
+    RecipeError
+    """
+    value = get_recipe(recipe) if isinstance(recipe, str) else recipe
+    if not isinstance(value, Recipe):
+        raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
+    return value
+
+
 def build_recipe(
     recipe: str | Recipe,
     *,
@@ -165,9 +178,7 @@ def build_recipe(
     ------
     RecipeError
     """
-    value = get_recipe(recipe) if isinstance(recipe, str) else recipe
-    if not isinstance(value, Recipe):
-        raise RecipeError(f"recipe must be a name that `gs2d recipes` lists or a Recipe, got {type(value).__name__}")
+    value = recipe_of(recipe)
     value = with_exposure(value) if exposure else value
     value = with_poses(value) if poses else value
     value = with_depth_prior(value, depth_prior) if depth_prior is not None else value
@@ -282,6 +293,12 @@ def with_backdrop(protocol: Protocol, recipe: Recipe, scene: Scene, on_event: On
     return replace(protocol, background=color)
 
 
+def with_fused_depth(protocol: Protocol, recipe: Recipe) -> Protocol:
+    """Return the protocol that fuses the depth which the recipe says, where it says one."""
+    depth = recipe.fused_depth
+    return protocol if depth is None else replace(protocol, fusion=replace(protocol.fusion, depth=depth))
+
+
 def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     """Check the options, cheapest first, then read the capture.
 
@@ -299,7 +316,7 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
     recipe = fit_recipe(options, scene, protocol, on_event)
-    protocol = with_backdrop(protocol, recipe, scene, on_event)
+    protocol = with_fused_depth(with_backdrop(protocol, recipe, scene, on_event), recipe)
     digest = with_priors(digest, scene, recipe, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, UseAppendAction, arg
 
+from gs2d.config.presets import DEFAULT_RECIPE
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe
 from gs2d.errors import RecipeError
@@ -57,7 +58,7 @@ class HowItRuns:
 class Training:
     """What is trained and how: options of `gs2d train`, and of every command that trains on photographs."""
 
-    recipe: Annotated[str | Recipe, arg(constructor=str)] = "2dgs-r"
+    recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
     """What is trained; `gs2d recipes` lists them."""
     protocol: Annotated[str | Protocol, arg(constructor=str)] = "auto"
     """What depends on the data set: background, depth, near plane, fusion limits."""
@@ -199,7 +200,7 @@ class ReconstructOptions(HowItRuns):
     """How long is trained on how large pictures. On a CPU: 0.03 of the full schedule at 400 px, 0.1 at 800, all at
     1600; on a GPU 0.1 at 800 px, 0.5 at 1600, all at 1600. The time it will take is told before it begins."""
     schedule_scale: float | None = None
-    """Fraction of the full schedule (default: by --quality)."""
+    """Fraction of the recipe's iterations (default: by --quality)."""
     downscale: int | None = None
     """Shrink the photographs by this integer for training (default: by --quality)."""
     texture: bool = False

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from gs2d.config.recipe import Recipe
 from gs2d.core.json_files import read_json
 from gs2d.data import detect_format, load_scene
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
@@ -18,7 +19,7 @@ from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Plan, ignore
-from gs2d.pipeline.job import check_train_options
+from gs2d.pipeline.job import check_train_options, recipe_of
 from gs2d.pipeline.options import (
     Finding,
     HowItRuns,
@@ -48,17 +49,21 @@ SHOWN_LOST = 3  # photographs without a place that are named; poses.json has all
 
 @dataclass(frozen=True)
 class Quality:
-    """How much is trained on what: a fraction of the full schedule, and about how long the longer side is, px."""
+    """How much is trained on what: iterations (None: as many as the recipe has), and the longer side in px, about."""
 
-    schedule_scale: float
+    iterations: int | None
     side: int
 
+    def schedule_scale(self, recipe: Recipe) -> float:
+        """Return the part of the recipe that is trained: never more than all of it."""
+        return 1.0 if self.iterations is None else min(1.0, self.iterations / max(1, recipe.iterations))
 
-_FULL = Quality(1.0, 1600)  # the side at which the official code trains, too
+
+_FULL = Quality(None, 1600)  # the side at which the official code trains, too
 QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> device -> what it means there
     {
-        "draft": {"cpu": Quality(0.03, 400), "cuda": Quality(0.1, 800)},
-        "normal": {"cpu": Quality(0.1, 800), "cuda": Quality(0.5, 1600)},
+        "draft": {"cpu": Quality(1_800, 400), "cuda": Quality(6_000, 800)},
+        "normal": {"cpu": Quality(6_000, 800), "cuda": Quality(30_000, 1600)},
         "full": {"cpu": _FULL, "cuda": _FULL},
     }
 )
@@ -138,10 +143,8 @@ def _check(options: ReconstructOptions) -> Quality:
         raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {options.quality}")
     device = get_backend(training.backend).device
     quality = QUALITIES[options.quality][device]
-    if options.schedule_scale is not None:
-        quality = replace(quality, schedule_scale=options.schedule_scale)
     downscale = 1 if options.downscale is None else options.downscale
-    check_train_options(replace(training, schedule_scale=quality.schedule_scale, downscale=downscale))
+    check_train_options(replace(training, schedule_scale=_scale(options, quality), downscale=downscale))
     check_claim(out, resume=options.resume, overwrite=options.overwrite, allowed=training.allowed)
     if options.texture:
         for package in TEXTURE_PACKAGES:
@@ -166,6 +169,15 @@ def _check(options: ReconstructOptions) -> Quality:
             f"{out} holds the cameras of photographs, and no run: go on with --resume, or begin anew with --overwrite"
         )
     return quality
+
+
+def _scale(options: ReconstructOptions, quality: Quality) -> float:
+    """Return the part of the recipe's schedule that is trained: as asked for, or by quality."""
+    return (
+        options.schedule_scale
+        if options.schedule_scale is not None
+        else quality.schedule_scale(recipe_of(options.training.recipe))
+    )
 
 
 def _check_photos(options: ReconstructOptions) -> None:
@@ -255,11 +267,12 @@ def _by_the_images(
     largest = max(cameras, key=lambda camera: max(camera.width, camera.height))
     side = max(largest.width, largest.height)
     downscale = options.downscale or max(1, math.floor(side / quality.side + 0.5))
-    chosen = replace(training, schedule_scale=quality.schedule_scale, downscale=downscale)
+    scale = _scale(options, quality)
+    chosen = replace(training, schedule_scale=scale, downscale=downscale)
     iterations, shown = check_train_options(chosen).iterations, largest.downscaled(downscale)
     on_event(
         Notice(
-            f"quality {options.quality}: {iterations:,} iterations (--schedule-scale {quality.schedule_scale:g}) "
+            f"quality {options.quality}: {iterations:,} iterations (--schedule-scale {scale:g}) "
             f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
         )
     )

@@ -11,12 +11,13 @@ class Initialised:
     """The start.
 
     ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths" (known ones too),
-    "random", or "splats" (given); ``dropped``: unusable.
+    "random", or "splats" (given); ``dropped``: unusable. ``lacks``: why there is no dense start where one was wished for.
     """
 
     splats: int
     source: str
     dropped: int
+    lacks: str = ""
 
 
 @dataclass(frozen=True)

@@ -39,12 +39,14 @@ class Robustness:
     ----------
     scene : Scene
         With the points that training starts from.
+    lacks : str
+        Why there is no dense start where the recipe has one that is not required; empty where there is one.
 
     Raises
     ------
     DataError
         From the constructor: free space is to be kept, and the capture does not say which sparse points its photographs
-        show; or a plane sweep finds nothing to start from.
+        show; or a plane sweep finds nothing to start from, and the recipe requires that.
     """
 
     def __init__(self, scene: Scene, recipe: Recipe, raster: RasterSettings, backend: Backend) -> None:
@@ -52,6 +54,7 @@ class Robustness:
         self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
         self._sweep: Sweep | None = None  # until the first splats are fitted
+        self.lacks = ""
         if recipe.dense_start is None and recipe.free_space is None:
             return
         if scene.observe is None and recipe.free_space is not None:
@@ -59,12 +62,24 @@ class Robustness:
                 f"{scene.name} must say which sparse points its photographs show (COLMAP does) for free space; "
                 "train with --robust off"
             )
-        sweep = sweep_views(scene, recipe.dense_start or DenseStart())
-        if recipe.dense_start is not None:
-            self.scene = replace(scene, points=start_points(scene, sweep, recipe.dense_start))
-            self._sweep = None if recipe.dense_start.fit is None else sweep
+        start = recipe.dense_start
+        try:
+            sweep = sweep_views(scene, start or DenseStart())
+            if start is not None:
+                self.scene = replace(scene, points=start_points(scene, sweep, start))
+        except DataError as error:
+            if start is None or start.required or recipe.free_space is not None:
+                raise
+            self.lacks = str(error)
+            return
+        self._sweep = None if start is None or start.fit is None else sweep
         if recipe.free_space is not None:
             self._free = FreeSpaceMaps(sweep, recipe.free_space)
+
+    @property
+    def starts_densely(self) -> bool:
+        """Whether training starts where photographs agree."""
+        return self._recipe.dense_start is not None and not self.lacks
 
     def fitted(self, splats: Splats) -> Splats:
         """Return the first splats as the dense start has them fitted; themselves where it fits none. Once."""

@@ -315,8 +315,9 @@ class Trainer:
             dtype=dtype,
         )
         source = initial.source if start is self._robust.scene else "depths"
-        source = "sweep" if source == "points" and self.recipe.dense_start is not None else source
-        self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped))
+        source = "sweep" if source == "points" and self._robust.starts_densely else source
+        lacks = self._robust.lacks
+        self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped, lacks))
         return per_image.start(TrainState(self._robust.fitted(initial.splats), generator), self.recipe, self.scene)
 
     def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
