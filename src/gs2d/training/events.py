@@ -11,7 +11,8 @@ class Initialised:
     """The start.
 
     ``source`` is "points" (the scene's), "sweep" (those of photographs that agree), "depths" (known ones too),
-    "random", or "splats" (given); ``dropped``: unusable. ``lacks``: why there is no dense start where one was wished for.
+    "random", or "splats" (given); ``dropped``: unusable. ``lacks``: why there is no dense start, where the recipe would
+    have one.
     """
 
     splats: int
