@@ -222,9 +222,11 @@ def told(capture: str, curve: dict[str, Any], row: dict[str, Any]) -> None:
 
 
 def table(captures: Sequence[dict[str, Any]]) -> str:
-    """The ends of all schedules as Markdown."""
-    head = "| capture | recipe | schedule | user CPU s | s | PSNR | worst view | F 0.25 % | Chamfer | splats |"
-    lines = [head, "|---" * 10 + "|"]
+    """Return the ends of all schedules as Markdown; the longest splat is a share of the scene's extent."""
+    head = (
+        "| capture | recipe | schedule | user CPU s | s | PSNR | worst view | F 0.25 % | Chamfer | splats | longest |"
+    )
+    lines = [head, "|---" * 11 + "|"]
     for capture in captures:
         for curve in capture["curves"]:
             for row in curve["runs"]:
@@ -232,7 +234,8 @@ def table(captures: Sequence[dict[str, Any]]) -> str:
                 cells = [capture["name"], curve["name"], f"{row['scale']:g}", f"{row['user_seconds']:.1f}"]
                 cells += [f"{row['seconds']:.1f}", text(images.get("psnr"), 2), text(images.get("worst_psnr"), 2)]
                 cells += [text(surface.get("f_scores", {}).get("0.0025"), 4), text(surface.get("chamfer"), 5)]
-                lines.append("| " + " | ".join([*cells, f"{row['splats']:,}"]) + " |")
+                cells += [f"{row['splats']:,}", text(row.get("longest_splat"), 2)]
+                lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

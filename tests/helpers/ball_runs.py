@@ -17,7 +17,10 @@ SCALE = 0.001  # 30 + 10 + 20 iterations
 
 
 def options(capture: Path, out: Path, **changes: Any) -> TrainOptions:
-    plain = TrainOptions(scene=capture, out=out, schedule_scale=SCALE, overrides=SMALL, threads=1, checkpoint_every=4)
+    """Options of a run through all three stages of 2DGS-R."""
+    plain = TrainOptions(
+        scene=capture, out=out, recipe="2dgs-r", schedule_scale=SCALE, overrides=SMALL, threads=1, checkpoint_every=4
+    )
     return replace(plain, **changes)
 
 

@@ -19,7 +19,7 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.library import available_variants
 from gs2d.meshing.tsdf import Add, Volume, integrator
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import check_same_run, reload_job
+from gs2d.pipeline.job import check_same_run, reload_job, with_fused_depth
 from gs2d.pipeline.mesh import extract_mesh, mesh_run
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.train import train
@@ -81,6 +81,9 @@ def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_re
     assert mesh_run(run, MeshOptions(voxel=0.05, depth="mean"), out=tmp_path / "b.ply", threads=1)["depth"] == "mean"
     folder = RunFolder(run)
     job = reload_job(folder, lambda _event: None)
+    of_recipe = with_fused_depth(job.protocol, replace(job.recipe, fused_depth="transmittance"))
+    assert (of_recipe.fused_depth, job.protocol.fused_depth) == ("transmittance", "median")
+    assert with_fused_depth(of_recipe, job.recipe) is of_recipe  # a recipe that says nothing changes nothing
     definition = json.loads((run / "run.json").read_text())
     del definition["protocol"]["fusion"]["depth"]
     old = RunFolder(tmp_path)

@@ -48,7 +48,8 @@ def ring(gains: np.ndarray, test: int = 0) -> Scene:
 
 
 def options(**changes: object) -> TrainOptions:
-    return TrainOptions(scene=Path("capture"), out=Path("run"), schedule_scale=0.1, **changes)  # type: ignore[arg-type]
+    given = {"recipe": "2dgs", **changes}
+    return TrainOptions(scene=Path("capture"), out=Path("run"), schedule_scale=0.1, **given)  # type: ignore[arg-type]
 
 
 EQUAL, VARIED = ring(np.ones(COUNT)), ring(1 + 0.2 * np.sin(np.arange(COUNT)))

@@ -18,6 +18,7 @@ import pytest
 from cli_runs import TINY, one_line
 from gs2d.cli import commands, run
 from gs2d.cli.app import parse
+from gs2d.config.presets import DEFAULT_RECIPE, get_recipe
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline import options as options_module
 from gs2d.pipeline import reconstruct as module
@@ -276,7 +277,10 @@ def test_the_help_states_the_qualities_that_are_there() -> None:
         numbers = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", said)]
         for quality in QUALITIES.values():
             assert quality[device].side in numbers
-            assert quality[device].schedule_scale in (*numbers, 1.0)
+            assert quality[device].iterations in (*numbers, None)
+    recipe = get_recipe("2dgs-r")
+    assert [QUALITIES[name]["cpu"].schedule_scale(recipe) for name in QUALITIES] == [0.03, 0.1, 1.0]
+    assert QUALITIES["normal"]["cuda"].schedule_scale(get_recipe("best")) == 1.0  # never more than the recipe has
 
 
 @pytest.mark.parametrize(("quality", "downscale"), [("draft", 4), ("normal", 2), ("full", 1)])
@@ -284,9 +288,7 @@ def test_the_size_of_the_pictures_is_by_the_quality(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quality: str, downscale: int
 ) -> None:
     sides = {"draft": 50, "normal": 95, "full": 10_000}  # of 200x200: 4, 2.1 and less than 1 times smaller
-    monkeypatch.setattr(
-        module, "QUALITIES", {name: {"cpu": module.Quality(0.0005, side)} for name, side in sides.items()}
-    )
+    monkeypatch.setattr(module, "QUALITIES", {name: {"cpu": module.Quality(9, side)} for name, side in sides.items()})
     asked: list[Any] = []
     monkeypatch.setattr(module, "train", lambda options, _: asked.append(options) or open_run(tmp_path))
     out = started(room, tmp_path)
@@ -294,7 +296,7 @@ def test_the_size_of_the_pictures_is_by_the_quality(
     with pytest.raises(Exception, match="expected a run folder"):
         reconstruct(options)
     assert asked[0].downscale == downscale
-    assert asked[0].schedule_scale == 0.0005
+    assert asked[0].schedule_scale == 9 / get_recipe(DEFAULT_RECIPE).iterations
     assert asked[0].test_every == 0
     assert FEW > 12
 

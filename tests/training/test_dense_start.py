@@ -20,8 +20,10 @@ from gs2d.core.sh import sh_to_rgb
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError, RecipeError
 from gs2d.evaluation.images import psnr_float
+from gs2d.pipeline.estimate import start_text
 from gs2d.render.api import rasterize
 from gs2d.training import start_fit
+from gs2d.training.events import Initialised
 from gs2d.training.plane_sweep import Sweep, _unique_rows, start_points, sweep_views
 from gs2d.training.start_fit import fit_start
 from gs2d.training.sweep_range import sweep_range
@@ -231,3 +233,36 @@ def test_one_of_each_cell_is_found_as_numpy_finds_it(spread: tuple[float, ...]) 
     for found, true in zip(_unique_rows(keys), np.unique(keys, axis=0, return_index=True), strict=True):
         np.testing.assert_array_equal(found, true)
     assert len(_unique_rows(keys[:0])[1]) == 0
+
+
+# -- a start that is wished for, not required -----------------------------------------------------------------------
+def unlike_anything() -> Scene:
+    """Photographs of noise: no two agree on anything."""
+    noise = np.random.default_rng(0)
+    views = [
+        View.from_arrays(view.name, view.camera, noise.integers(0, 255, (64, 64, 3), dtype=np.uint8))
+        for view in ball().train[:6]
+    ]
+    return replace(ball(), train=tuple(views))
+
+
+@pytest.mark.parametrize("kind", ["noise", "alone"])
+def test_where_photographs_agree_on_nothing_an_optional_start_is_left_out_and_that_is_said(kind: str) -> None:
+    scene = unlike_anything() if kind == "noise" else replace(ball(), train=ball().train[:1])
+    wished = replace(BALL, min_ncc=0.99, fit=StartFit(), required=False)
+    told: list[object] = []
+    trainer = Trainer(scene, recipe(wished), GENERIC, backend="reference", on_event=told.append)
+    trainer.enter(0)
+    (start,) = [event for event in told if isinstance(event, Initialised)]
+    assert start.source == "random"
+    assert start.splats > 0
+    assert "a plane sweep of ball" in start.lacks
+    assert start_text(start).endswith(f"; no dense start: {start.lacks}")
+    with pytest.raises(DataError, match="a plane sweep of ball"):
+        Trainer(scene, recipe(replace(wished, required=True)), GENERIC, backend="reference")
+
+
+def test_where_they_agree_it_is_as_if_it_were_required() -> None:
+    wished = Trainer(ball(), recipe(replace(BALL, required=False)), GENERIC, backend="reference").splats
+    needed = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
+    assert all(torch.equal(a, b) for (_, a), (_, b) in zip(wished.items(), needed.items(), strict=True))

@@ -262,7 +262,9 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
     lacks = _lacks_points(scene) if robust and options.robust == "auto" else None
     if lacks is not None:
         robust = False
-        on_event(Notice(f"no dense start and no known free space: {lacks}"))
+        own = recipe_of(options.recipe).dense_start is not None
+        what = "no known free space" if own else "no dense start and no known free space"
+        on_event(Notice(f"{what}: {lacks}"))
     exposure = bool(options.learns_exposure)
     if robust and options.learns_exposure is None and (found := point_gains(scene)) is not None:
         exposure = found.spread >= DIFFERS

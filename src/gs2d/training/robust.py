@@ -70,7 +70,7 @@ class Robustness:
         except DataError as error:
             if start is None or start.required or recipe.free_space is not None:
                 raise
-            self.lacks = str(error)
+            self.lacks = str(error).partition("; ")[0]  # without what to do about it
             return
         self._sweep = None if start is None or start.fit is None else sweep
         if recipe.free_space is not None:

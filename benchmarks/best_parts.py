@@ -1,0 +1,81 @@
+"""What every part of the recipe ``best`` is worth: the recipe with each part left out, and with what is not in it.
+
+::
+
+    python -m benchmarks.time_to_quality demo ../shared/data/nerf_synthetic_lego:2 --scales 0.1
+        --recipes best $(python -m benchmarks.best_parts)
+
+Run as a program it prints the variants as ``gs2d train --recipe`` takes them (``benchmarks/best_parts.py:median``).
+The figures are in docs/guides/recipes.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.config.presets import best, with_silhouette
+from gs2d.config.recipe import NORMAL_KINDS, GradDensify, LearningRates, LossTerm, Recipe, Stage
+
+
+def _stage(change: Callable[[Stage], Stage]) -> Recipe:
+    recipe = best()
+    return replace(recipe, stages=(change(recipe.stages[0]),))
+
+
+def _densify(**changes: Any) -> Recipe:
+    def changed(stage: Stage) -> Stage:
+        assert isinstance(stage.densify, GradDensify)
+        return replace(stage, densify=replace(stage.densify, **changes))
+
+    return _stage(changed)
+
+
+def _normals(**changes: Any) -> Recipe:
+    def changed(term: LossTerm) -> LossTerm:
+        return replace(term, **changes) if term.kind in NORMAL_KINDS else term
+
+    return _stage(lambda stage: replace(stage, losses=tuple(map(changed, stage.losses))))
+
+
+def _rates(stage: Stage) -> Stage:
+    """Official rates, whatever the length."""
+    return replace(stage, lr=LearningRates(means_decay_steps=stage.iterations))
+
+
+def _without_start() -> Recipe:
+    """The official start of random or sparse points, and its resets."""
+    changed = _densify(reset_every=3_000)
+    return replace(changed, dense_start=None)
+
+
+def _unfitted() -> Recipe:
+    recipe = best()
+    assert recipe.dense_start is not None
+    return replace(recipe, dense_start=replace(recipe.dense_start, fit=None))
+
+
+VARIANTS: dict[str, Recipe] = {
+    # Left out, one at a time.
+    "no_dense_start": _without_start(),
+    "start_not_fitted": _unfitted(),
+    "official_rates": _stage(_rates),
+    "with_resets": _densify(reset_every=3_000, scale_cull_start=0),
+    "no_size_cull": _densify(scale_cull_start=10**6),
+    "normals_of_the_image": _normals(where="image"),
+    "no_normals": _normals(weight=0.0),
+    "median": replace(best(), fused_depth="median"),
+    # Tried, and not in it.
+    "silhouette": with_silhouette(best(), name="best"),
+    "by_error": _densify(absolute=True, error_views=8, max_splats=40_000),
+    "normals_by_edges": _normals(edge_power=2.0),
+    "normals_of_transmittance": _normals(depth="transmittance"),
+    "half_size_first": _stage(lambda stage: replace(stage, downscale=2, halve_at=(round(0.3 * stage.iterations),))),
+}
+globals().update({name: replace(recipe, name=name.replace("_", "-")) for name, recipe in VARIANTS.items()})
+
+
+if __name__ == "__main__":
+    print(*(f"{Path(__file__).relative_to(Path.cwd())}:{name}" for name in VARIANTS))

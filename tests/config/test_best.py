@@ -1,0 +1,94 @@
+"""The recipes for users, and the choices that they brought."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from gs2d.config.describe import describe_recipe
+from gs2d.config.presets import DEFAULT_RECIPE, OFFICIAL_ITERATIONS, RECIPES, get_recipe, with_robustness
+from gs2d.config.recipe import GradDensify, LearningRates, Recipe, validate
+from gs2d.config.robust import DenseStart, FreeSpace, StartFit
+from gs2d.config.schedule import longer_steps, scale_schedule
+from gs2d.config.serialize import apply_overrides, from_json, to_json
+from gs2d.errors import RecipeError
+
+NAMES = ("best", "best-fast", "best-surface")
+
+
+def test_the_default_is_listed_first() -> None:
+    assert list(RECIPES)[:3] == list(NAMES)
+    assert DEFAULT_RECIPE == "best"
+
+
+def test_they_are_shorter_than_2dgs() -> None:
+    iterations = {name: get_recipe(name).iterations for name in (*NAMES, "2dgs")}
+    assert iterations == {"best": 15_000, "best-fast": 5_000, "best-surface": 15_000, "2dgs": 30_000}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_their_schedule_is_that_of_2dgs_in_fewer_iterations_with_longer_steps(name: str) -> None:
+    (stage,), (official,) = get_recipe(name).stages, get_recipe("2dgs").stages
+    part = stage.iterations / OFFICIAL_ITERATIONS
+    assert isinstance(stage.densify, GradDensify)
+    assert isinstance(official.densify, GradDensify)
+    assert stage.densify.stop == round(part * official.densify.stop)
+    assert stage.sh_interval == round(part * official.sh_interval)
+    assert stage.lr.sh0 == pytest.approx(official.lr.sh0 * part**-0.25)
+    assert stage.lr.means_at(stage.iterations) == pytest.approx(official.lr.means_final * part**-0.25)
+    # So a part of a part has the same rates as one schedule of that length.
+    short = scale_schedule(get_recipe(name), 0.1).stages[0]
+    assert short.lr.opacity_logits == pytest.approx(official.lr.opacity_logits * (0.1 * part) ** -0.25)
+
+
+def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
+    stage = get_recipe("best-surface").stages[0]
+    terms = {term.kind: (term.weight, term.start, term.every) for term in stage.losses if "multiview" in term.kind}
+    assert terms == {"multiview_photometric": (0.6, 12_000, 2), "multiview_geometric": (0.04, 12_000, 2)}
+    plain = tuple(term for term in stage.losses if "multiview" not in term.kind)
+    assert replace(stage, losses=plain) == get_recipe("best").stages[0]
+
+
+def test_rates_that_grow_by_themselves_do_not_grow_twice() -> None:
+    recipe = scale_schedule(get_recipe("best"), 0.1)
+    assert longer_steps(recipe, 0.1) == recipe
+    assert longer_steps(get_recipe("2dgs"), 0.1) != get_recipe("2dgs")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_they_are_written_read_and_described(name: str) -> None:
+    recipe = get_recipe(name)
+    assert from_json(to_json(recipe)) == recipe
+    said = "\n".join(describe_recipe(recipe))
+    assert "the mesh is of the transmittance depth" in said
+    assert "dense start: a sweep over photographs of about 256 px, its splats fitted to them; without where" in said
+
+
+def test_recipes_of_before_are_written_as_they_were() -> None:
+    written = to_json(get_recipe("2dgs-dense"))
+    assert "fused_depth" not in written
+    assert "required" not in written["dense_start"]
+
+
+def test_a_fused_depth_that_is_none_is_refused() -> None:
+    with pytest.raises(RecipeError, match="fused_depth must be one of mean, median, transmittance; got 'nearest'"):
+        validate(replace(get_recipe("best"), fused_depth="nearest"))
+
+
+def test_parts_can_be_left_out_by_name() -> None:
+    recipe: Recipe = apply_overrides(get_recipe("best"), ["dense_start=null", "surface.lr.stretch=0"])
+    assert recipe.dense_start is None
+    assert recipe.stages[0].lr.stretch == 0 == LearningRates().stretch
+
+
+def test_robust_training_sweeps_as_free_space_needs_it_and_spares_sky_and_ground() -> None:
+    robust = with_robustness(get_recipe("best"))
+    assert robust.dense_start == DenseStart(fit=StartFit())
+    assert robust.dense_start.required
+    (stage,) = robust.stages
+    assert isinstance(stage.densify, GradDensify)
+    assert not any(stage.densify.culls_scale(i) for i in range(1, stage.iterations + 1))
+    assert with_robustness(get_recipe("2dgs")).stages == get_recipe("2dgs").stages
+    own = replace(get_recipe("2dgs-dense"), free_space=FreeSpace())
+    assert with_robustness(own).dense_start == own.dense_start
