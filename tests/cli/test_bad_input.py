@@ -206,6 +206,9 @@ def test_a_mask_that_leaves_nothing_of_one_view_is_noted(tmp_path: Path) -> None
     [
         (["--recipe", "3dgs"], "no recipe '3dgs'"),
         (["--set", "appearance.train.sh0=nobody"], "row group 'nobody'"),
+        (["--set", "surface.densify.max_splats=0"], "densify.max_splats must be an integer >= 1, got 0"),
+        (["--set", "surface.halve_at=[99]"], "halve_at must lie in its 15 iterations, got 99"),
+        (["--set", "fused_depth=nearest"], "fused_depth must be one of mean, median, transmittance"),
         (["--protocol", "tanks"], "no protocol 'tanks'"),
         (["--downscale", "0"], "--downscale"),
         (["--downscale", "1000"], "1000"),

@@ -39,7 +39,7 @@ class Stop(Exception):
 
 def spawn(capture: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
     words = [sys.executable, "-m", "gs2d", "train", str(capture), "--out", str(out), "--schedule-scale", str(SCALE)]
-    words += ["--threads", "1", "--checkpoint-every", "4", "--quiet", *more]
+    words += ["--recipe", "2dgs-r", "--threads", "1", "--checkpoint-every", "4", "--quiet", *more]
     for override in SMALL:
         words += ["--set", override]
     return subprocess.Popen(words, env=dict(os.environ), stderr=subprocess.PIPE)

@@ -20,7 +20,7 @@ from gs2d.pipeline.options import MeshOptions
 @pytest.fixture(scope="module")
 def trained(capture: Path) -> Trained:
     """What ``undisturbed`` is, in memory."""
-    return gs2d.train(gs2d.load_scene(capture), schedule_scale=SCALE, overrides=SMALL)
+    return gs2d.train(gs2d.load_scene(capture), "2dgs-r", schedule_scale=SCALE, overrides=SMALL)
 
 
 def test_training_in_memory_ends_with_the_bytes_of_a_run(

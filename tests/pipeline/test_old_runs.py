@@ -63,6 +63,7 @@ def test_an_old_run_is_scored_exported_rendered_and_reported(runs: Path) -> None
 
 def test_an_old_interrupted_run_goes_on_from_its_checkpoint(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [word for text in SETS for word in ("--set", text)] + ["--schedule-scale", "0.03", "--resume"]
+    words += ["--recipe", "2dgs-r"]  # the default of that time
     options = [word for word in OPTIONS if word != "--quiet"]
     assert run(["train", str(runs / "capture"), "--out", str(runs / "interrupted"), *options, *words]) == 0
     assert "resuming after 0-surface-0000230" in "".join(capsys.readouterr())

@@ -155,7 +155,8 @@ def test_training_leaves_the_threads_of_torch_as_asked(capture: Path, undisturbe
 
 def test_the_demo_makes_its_capture_trains_scores_the_surface_and_reports(tmp_path: Path) -> None:
     out = tmp_path / "demo"
-    small = DemoOptions(out=out, threads=1, schedule_scale=0.0005, train_views=3, test_views=1, size=24)
+    few = {"train_views": 3, "test_views": 1, "size": 24}
+    small = DemoOptions(out=out, recipe="2dgs-r", threads=1, schedule_scale=0.0005, **few)
     run = demo(small)
     metrics = run.metrics()
     assert [stage["name"] for stage in metrics["stages"]] == ["surface", "appearance", "refine"]

@@ -220,8 +220,10 @@ class DemoOptions(HowItRuns):
 
     out: Path = Path("runs/demo")
     """Run folder; the capture goes to its sub-folder `capture`. An earlier demo there is replaced."""
+    recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
+    """What is trained, as in `gs2d train`."""
     schedule_scale: float | None = None
-    """Fraction of the full schedule (default: what fits five minutes on two cores)."""
+    """Fraction of the recipe's iterations (default: 0.2, a minute or two on two cores)."""
     vary_exposure: bool = False
     """Photograph as a camera on automatic does: training pictures differ in exposure and white balance."""
     exposure: bool = False
