@@ -9,7 +9,7 @@ import pytest
 from gs2d.config.describe import describe_recipe
 from gs2d.config.presets import DEFAULT_RECIPE, OFFICIAL_ITERATIONS, RECIPES, get_recipe, with_robustness
 from gs2d.config.recipe import GradDensify, LearningRates, Recipe, validate
-from gs2d.config.robust import DenseStart, FreeSpace, StartFit
+from gs2d.config.robust import DenseStart, FreeSpace
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.errors import RecipeError
@@ -82,10 +82,12 @@ def test_parts_can_be_left_out_by_name() -> None:
     assert recipe.stages[0].lr.stretch == 0 == LearningRates().stretch
 
 
-def test_robust_training_sweeps_as_free_space_needs_it() -> None:
+def test_robust_training_starts_as_it_was_tried_and_spares_sky_and_ground() -> None:
     robust = with_robustness(get_recipe("best"))
-    assert robust.dense_start == DenseStart(fit=StartFit())
-    assert robust.dense_start.required
-    assert robust.stages == get_recipe("best").stages
+    assert robust.dense_start == DenseStart()
+    (stage,) = robust.stages
+    assert isinstance(stage.densify, GradDensify)
+    assert not any(stage.densify.culls_scale(i) for i in range(1, stage.iterations + 1))
+    assert with_robustness(get_recipe("2dgs")).stages == get_recipe("2dgs").stages
     own = replace(get_recipe("2dgs-dense"), free_space=FreeSpace())
     assert with_robustness(own).dense_start == own.dense_start

@@ -237,14 +237,15 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
 
     Not in the paper: a dense start, free space that is kept free, opacity that decays, no large
     splat that is hardly photographed (docs/decisions/fog.md). The capture must say which sparse points its
-    photographs show. A dense start that is not required becomes one that is: it is swept as free space needs it, and
-    fitted as before.
+    photographs show. A dense start that is not required gives way to the one that was tried with the rest; and where
+    no resets delay the prune by size there is none, which would take sky and ground.
     """
     start = recipe.dense_start or DenseStart()
     return replace(
         recipe,
         name=name or recipe.name,
-        dense_start=start if start.required else DenseStart(fit=start.fit),
+        stages=tuple(map(_sparing_large_splats, recipe.stages)),
+        dense_start=start if start.required else DenseStart(),
         free_space=recipe.free_space or FreeSpace(),
         opacity_decay=recipe.opacity_decay or OpacityDecay(),
         seen_area=recipe.seen_area or SeenArea(),
@@ -252,6 +253,13 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
 
 
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())
+
+
+def _sparing_large_splats(stage: Stage) -> Stage:
+    densify = stage.densify
+    if not isinstance(densify, GradDensify) or densify.reset_every or densify.scale_cull_start is not None:
+        return stage
+    return replace(stage, densify=replace(densify, scale_cull_start=stage.iterations))
 
 
 def with_dense_start(recipe: Recipe, *, still: bool = False, name: str | None = None) -> Recipe:
