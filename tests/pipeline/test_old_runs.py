@@ -19,7 +19,9 @@ from gs2d.config.presets import get_recipe
 from gs2d.config.renamed import current_names
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
+from gs2d.data import load_scene
 from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline.job import scene_digest
 from gs2d.render.backends import get_backend
 
 FIXTURES = Path(__file__).resolve().parents[1] / "fixtures" / "runs_0_1"
@@ -29,12 +31,13 @@ SETS = ["surface.rates.sh0=0.003", "init_points=150", "sh_degree=1", "surface.de
 
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
-    """The capture and both runs, as if they had been made here: path of the capture, instruction set."""
+    """The capture and both runs, as if they had been made here: path of the capture, instruction set, last digits."""
     shutil.copytree(FIXTURES, tmp_path / "old")
+    digest = scene_digest(load_scene(FIXTURES / "capture"), lambda _: None)  # cameras differ in the last digit
     for name in ("finished", "interrupted"):
         path = tmp_path / "old" / name / "run.json"
         data = json.loads(path.read_text())
-        data["scene"]["path"] = str(tmp_path / "old" / "capture")
+        data["scene"] |= {"path": str(tmp_path / "old" / "capture"), "digest": digest}
         data["backend"] = get_backend(data["backend"]["name"]).facts()
         path.write_text(json.dumps(data))
     return tmp_path / "old"
@@ -63,7 +66,6 @@ def test_an_old_run_is_scored_exported_rendered_and_reported(runs: Path) -> None
 
 def test_an_old_interrupted_run_goes_on_from_its_checkpoint(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [word for text in SETS for word in ("--set", text)] + ["--schedule-scale", "0.03", "--resume"]
-    words += ["--recipe", "2dgs-r"]  # the default of that time
     options = [word for word in OPTIONS if word != "--quiet"]
     assert run(["train", str(runs / "capture"), "--out", str(runs / "interrupted"), *options, *words]) == 0
     assert "resuming after 0-surface-0000230" in "".join(capsys.readouterr())
