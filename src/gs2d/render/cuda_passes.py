@@ -25,6 +25,7 @@ from gs2d.kernels.cuda.arguments import (
     EmitArguments,
     ErrorArguments,
     OccludedArguments,
+    OrderArguments,
     ProjectArguments,
     ProjectColorsArguments,
     ProjectVjpArguments,
@@ -40,6 +41,7 @@ __all__ = ["DEPTH", "IMAGES", "PARAMETERS", "ForwardState", "Wanted", "backward"
 
 TILE = 16
 THREADS = 128
+ORDER_THREADS = 512  # order.cu
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 MAX_SPLATS = 1 << 24  # an entry holds the splat in 24 bits
 MAX_SLOTTED = 1 << 30  # four slots each, counted in 32 bits
@@ -277,8 +279,10 @@ def _bin(
         _fill(find, {"keys": sorted_keys, "permutation": permutation, "payloads": payloads})
         _fill(find, {"entries": entries, "ranges": ranges})
         launcher.launch(f"find_ranges_{bits}", _blocks(candidates), THREADS, find)
-    lengths = (ranges[:-1, 1] - ranges[:-1, 0]).to(torch.int32)  # half as many passes of the sort
-    heavy_first = torch.argsort(lengths, descending=True, stable=True).to(torch.int32)
+    heavy_first = torch.empty(tiles, dtype=torch.int32, device=device)
+    arrange = OrderArguments(tiles=tiles)
+    _fill(arrange, {"ranges": ranges, "order": heavy_first})
+    launcher.launch("order_tiles", 1, ORDER_THREADS, arrange)
     return _Lists(entries, ranges, heavy_first, order, ends, permutation)
 
 
@@ -380,8 +384,10 @@ class _Sums:
         self.frame = frame
         self.slots = frame.permutation if deterministic else None  # [M] int64
         rows = len(frame.records) if self.slots is None else 4 * len(self.slots)
-        self.extras = torch.zeros(rows, 4, dtype=torch.float32, device=frame.records.device)
-        self.gradients = self.extras.new_zeros(rows, columns) if columns else None
+        # one piece of memory, which is cleared at once; 64 bytes a row first, so that they begin where lines do
+        both = torch.zeros(rows * (columns + 4), dtype=torch.float32, device=frame.records.device)
+        self.extras = both[rows * columns :].view(rows, 4)
+        self.gradients = both[: rows * columns].view(rows, columns) if columns else None
 
     def of_splats(self, launcher: Launcher) -> tuple[Tensor | None, Tensor]:
         """[N, columns] and [N, 4]."""

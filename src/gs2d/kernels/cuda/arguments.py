@@ -20,6 +20,7 @@ __all__ = [
     "MeanArguments",
     "NormalArguments",
     "OccludedArguments",
+    "OrderArguments",
     "PhotometricArguments",
     "PhotometricVjpArguments",
     "ProjectArguments",
@@ -92,6 +93,12 @@ class RangeArguments(ctypes.Structure):
     """Of emit.cu."""
 
     _fields_ = (("candidates", ctypes.c_int64), *_pointers("keys", "permutation", "payloads", "entries", "ranges"))
+
+
+class OrderArguments(ctypes.Structure):
+    """Of order.cu."""
+
+    _fields_ = (("tiles", ctypes.c_int64), *_pointers("ranges", "order"))
 
 
 class BlendArguments(ctypes.Structure):

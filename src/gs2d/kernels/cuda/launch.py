@@ -25,6 +25,7 @@ __all__ = ["GpuLauncher", "Launcher", "grow_in_place", "launcher_for"]
 
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
 STATIC_SHARED_BYTES = 48 << 10  # what a block may have without asking
+MAX_STREAMS = 64  # that are known by their objects
 MAX_BLOCKS = (1 << 31) - 1
 
 
@@ -87,6 +88,8 @@ class GpuLauncher:
         call(self._driver, "cuInit", 0)
         self._handle = call(self._driver, "cuDeviceGet", device.index or 0)
         self._context = call(self._driver, "cuDevicePrimaryCtxRetain", self._handle)  # torch's; for good
+        self._context_number = int(self._context)
+        self._streams: dict[int, Any] = {}
         self._source_of = nvrtc.kernel_sources() if source_of is None else source_of
         self._libraries: dict[str, tuple[Any, bytes]] = {}  # by source; the code stays alive beside its library
         self._functions: dict[str, Any] = {}  # by kernel
@@ -107,24 +110,28 @@ class GpuLauncher:
         if blocks > MAX_BLOCKS:
             raise BackendError(f"{name} needs {blocks} blocks, expected at most 2^31 - 1; use fewer splats or pixels")
         driver = self._driver
-        with self._in_context():
-            function = self._functions.get(name) or self._load(name)
-            if shared_bytes > STATIC_SHARED_BYTES and shared_bytes > self._allowed.get(name, 0):
-                self._allow(name, shared_bytes)
-            stream = driver.CUstream(self._stream_of(self.device))
-            pointers = (ctypes.c_void_p * 1)(ctypes.addressof(arguments))  # the driver copies what they point to
-            grid, block = (blocks, 1, 1), (threads, 1, 1)
-            (status,) = driver.cuLaunchKernel(
-                function, *grid, *block, shared_bytes, stream, ctypes.addressof(pointers), 0
-            )
+        given = (name, blocks, threads, ctypes.c_void_p(ctypes.addressof(arguments)), shared_bytes)
+        if int(call(driver, "cuCtxGetCurrent")) == self._context_number:  # nearly always
+            status = self._start(*given)
+        else:
+            with self._in_context():
+                status = self._start(*given)
         if status != driver.CUresult.CUDA_SUCCESS:
             raise failure(f"the launch of {name} ({blocks} blocks of {threads})", status)
+
+    def _start(self, name: str, blocks: int, threads: int, argument: ctypes.c_void_p, shared_bytes: int) -> Any:
+        """Launch in the context that is current; the driver copies what the argument points to."""
+        function = self._functions.get(name) or self._load(name)
+        if shared_bytes > STATIC_SHARED_BYTES and shared_bytes > self._allowed.get(name, 0):
+            self._allow(name, shared_bytes)
+        stream, at = self._stream(self._stream_of(self.device)), ctypes.addressof(argument)
+        return self._driver.cuLaunchKernel(function, blocks, 1, 1, threads, 1, 1, shared_bytes, stream, at, 0)[0]
 
     @contextmanager
     def _in_context(self) -> Iterator[None]:
         """Make the device's context current: a thread that has only used torch's cached memory may have none."""
         driver = self._driver
-        if int(call(driver, "cuCtxGetCurrent")) == int(self._context):
+        if int(call(driver, "cuCtxGetCurrent")) == self._context_number:
             yield
             return
         call(driver, "cuCtxPushCurrent", self._context)
@@ -132,6 +139,14 @@ class GpuLauncher:
             yield
         finally:
             call(driver, "cuCtxPopCurrent")
+
+    def _stream(self, handle: int) -> Any:
+        """Return the driver's object for a stream; kept, as most launches are on one."""
+        if handle not in self._streams:
+            if len(self._streams) >= MAX_STREAMS:
+                self._streams.clear()
+            self._streams[handle] = self._driver.CUstream(handle)
+        return self._streams[handle]
 
     def _load(self, name: str) -> Any:
         """Return the handle of a kernel, loading its file if need be."""

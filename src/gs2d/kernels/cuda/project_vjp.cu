@@ -1,5 +1,9 @@
 // From gradients of records to gradients of parameters, SH and the densification signal: one thread per splat.
+//
+// Rows of SH and of three floats pass through shared memory (rows.h): of the 464 bytes a splat that this reads and writes
+// they are three quarters. So no lane of a warp leaves before the end.
 #include "cuda/colors.h"
+#include "cuda/rows.h"
 
 namespace gs2d {
 
@@ -16,57 +20,88 @@ struct ProjectVjpArguments {
     float* g_intrinsics;  // [N, 4]: what each splat says of fx, fy, cx, cy; or null
 };
 
-__device__ __forceinline__ void write_row(float* to, int64 i, int columns, float a, float b = 0.f, float c = 0.f,
-                                          float d = 0.f) {
-    if (!to) return;
-    to += i * columns;
-    to[0] = a;
-    if (columns > 1) to[1] = b;
-    if (columns > 2) to[2] = c;
-    if (columns > 3) to[3] = d;
+// Rows of tensors that were made for this kernel alone: they begin on a boundary.
+__device__ __forceinline__ void write_2(float* to, int64 i, float a, float b) {
+    reinterpret_cast<float2*>(to)[i] = {a, b};
+}
+__device__ __forceinline__ void write_4(float* to, int64 i, float a, float b, float c, float d) {
+    reinterpret_cast<float4*>(to)[i] = {a, b, c, d};
 }
 
-__device__ __forceinline__ void write_zeros(const ProjectVjpArguments& a, int64 i) {
-    write_row(a.g_means, i, 3, 0.f), write_row(a.g_quats, i, 4, 0.f), write_row(a.g_log_scales, i, 2, 0.f);
-    write_row(a.g_opacity_logits, i, 1, 0.f), write_row(a.g_sh0, i, 3, 0.f),
-        write_row(a.g_probe, i, int(a.probe_columns), 0.f);
-    write_row(a.g_intrinsics, i, 4, 0.f);
-    if (a.g_shN)
-        for (int64 k = 0; k < 3 * a.sh_rest; ++k) a.g_shN[3 * a.sh_rest * i + k] = 0.f;
+// A row of three floats of each lane.
+__device__ __forceinline__ void write_3(float* to, int64 begin, int count, int lane, float a, float b, float c,
+                                        float* rows) {
+    rows[3 * lane] = a, rows[3 * lane + 1] = b, rows[3 * lane + 2] = c;
+    store_rows(to, begin, count, 3, lane, rows);
+}
+
+__device__ __forceinline__ Vec3<float> mean_of(const ProjectVjpArguments& a, int64 i) {
+    const float* m = a.means + 3 * i;
+    return {m[0], m[1], m[2]};
+}
+
+// Gradients of the coefficients: of the first one to `first`, of the others over their row. Returns that of the direction.
+__device__ __forceinline__ Vec3<float> learn_colors(const ProjectVjpArguments& a, int64 i, Vec3<float> g_color,
+                                                    float* row, float* first) {
+    const Coefficients sh = {a.sh0 + 3 * i, row};
+    const CoefficientGradients g_sh = {first, a.g_shN ? row : nullptr};
+    float inverse_distance;
+    const Vec3<float> direction = direction_of(mean_of(a, i) - center_of<float>(a.view.camera), inverse_distance);
+    return color_vjp(a.view.sh_degree, sh, int(a.sh_rest), g_sh, direction, g_color);
 }
 
 extern "C" __global__ void __launch_bounds__(128, 5) project_splats_vjp(ProjectVjpArguments a) {
-    const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
-    if (i >= a.count) return;
-    if (a.tile_counts[i] == 0 || (a.learns && !a.learns[i])) return write_zeros(a, i);
-    const float *g = a.gradients + 16 * i, *e = a.extras + 4 * i, *m = a.means + 3 * i;
-    // Colours first, so that coefficients and geometry are not in registers at the same time.
-    const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
-    const CoefficientGradients g_sh = {a.g_sh0 ? a.g_sh0 + 3 * i : nullptr,
-                                       a.g_shN ? a.g_shN + 3 * a.sh_rest * i : nullptr};
-    float inverse_distance;
-    const Vec3<float> direction =
-        direction_of(Vec3<float>{m[0], m[1], m[2]} - center_of<float>(a.view.camera), inverse_distance);
-    const Vec3<float> g_direction =
-        color_vjp(a.view.sh_degree, sh, int(a.sh_rest), g_sh, direction, {g[10], g[11], g[12]});
+    __shared__ float4 staged[4][WARP_ROWS * MAX_ROW / 4];
+    const int lane = threadIdx.x & 31, length = int(3 * a.sh_rest);
+    const int64 begin = int64(blockIdx.x) * blockDim.x + (threadIdx.x & ~31u), i = begin + lane;
+    if (begin >= a.count) return;  // the same for all lanes
+    const int count = a.count - begin < WARP_ROWS ? int(a.count - begin) : WARP_ROWS;
+    float* rows = reinterpret_cast<float*>(staged[threadIdx.x >> 5]);
+    const bool drawn = lane < count && a.tile_counts[i] != 0 && (!a.learns || a.learns[i]);
+    const uint wanted = __ballot_sync(FULL_MASK, drawn);
+    if (length > 0 && a.view.sh_degree > 0) load_rows(a.shN, begin, count, length, wanted, lane, rows);
 
-    const float *q = a.quats + 4 * i, *l = a.log_scales + 2 * i;
-    const SplatParameters<float> p = {{m[0], m[1], m[2]}, q[0], q[1], q[2], q[3], l[0], l[1], a.opacity_logits[i]};
-    const Frame3<float> frame = frame_of(p, a.view.camera);
-    const Record<float> r = project(p, frame, a.view.camera);
-    const RecordGradient<float> gr = {g[0],  g[1],  g[2],  g[3],  g[4],  g[5],  g[6], g[7], g[8], g[9],
-                                      g[10], g[11], g[12], g[13], g[14], g[15], e[0], e[1], e[2], e[3]};
-    const ParameterGradient<float> d = project_vjp(p, frame, r, gr, g_direction, a.view.camera);
-    write_row(a.g_means, i, 3, d.mean.x, d.mean.y, d.mean.z);
-    write_row(a.g_quats, i, 4, d.qw, d.qx, d.qy, d.qz);
-    write_row(a.g_log_scales, i, 2, d.log_su, d.log_sv);
-    write_row(a.g_opacity_logits, i, 1, d.logit);
+    // Colours first, so that coefficients and geometry are not in registers at the same time.
+    const float4* g = reinterpret_cast<const float4*>(a.gradients) + 4 * i;
+    Vec3<float> g_direction = {0.f, 0.f, 0.f};
+    float first[3] = {0.f, 0.f, 0.f};
+    float* row = rows + lane * length;
+    if (drawn) {
+        const float4 g2 = g[2], g3 = g[3];
+        g_direction = learn_colors(a, i, {g2.z, g2.w, g3.x}, row, first);
+    } else if (a.g_shN)
+#pragma unroll 1
+        for (int k = 0; k < length; ++k) row[k] = 0.f;
+    if (a.g_shN && length > 0) store_rows(a.g_shN, begin, count, length, lane, rows);
+    __syncwarp();
+    if (a.g_sh0) write_3(a.g_sh0, begin, count, lane, first[0], first[1], first[2], rows);
+
+    ParameterGradient<float> d = {};
+    IntrinsicsGradient<float> intrinsics = {};
+    float abs_x = 0.f, abs_y = 0.f;
+    if (drawn) {
+        const float4 q = row_of_4(a.quats, i);
+        const float2 l = row_of_2(a.log_scales, i);
+        const SplatParameters<float> p = {mean_of(a, i), q.x, q.y, q.z, q.w, l.x, l.y, a.opacity_logits[i]};
+        const Frame3<float> frame = frame_of(p, a.view.camera);
+        const Record<float> r = project(p, frame, a.view.camera);
+        const float4 g0 = g[0], g1 = g[1], g2 = g[2], g3 = g[3], e = row_of_4(a.extras, i);
+        const RecordGradient<float> gr = {g0.x, g0.y, g0.z, g0.w, g1.x, g1.y, g1.z, g1.w, g2.x, g2.y,
+                                          g2.z, g2.w, g3.x, g3.y, g3.z, g3.w, e.x,  e.y,  e.z,  e.w};
+        d = project_vjp(p, frame, r, gr, g_direction, a.view.camera);
+        if (a.g_intrinsics) intrinsics = intrinsics_vjp(frame, r, gr, a.view.camera);
+        abs_x = gr.abs_x, abs_y = gr.abs_y;
+    }
+    if (a.g_means) write_3(a.g_means, begin, count, lane, d.mean.x, d.mean.y, d.mean.z, rows);
+    if (lane >= count) return;
+    if (a.g_quats) write_4(a.g_quats, i, d.qw, d.qx, d.qy, d.qz);
+    if (a.g_log_scales) write_2(a.g_log_scales, i, d.log_su, d.log_sv);
+    if (a.g_opacity_logits) a.g_opacity_logits[i] = d.logit;
     const float half_w = 0.5f * float(a.view.width), half_h = 0.5f * float(a.view.height);
-    write_row(a.g_probe, i, int(a.probe_columns), d.probe_x * half_w, d.probe_y * half_h, gr.abs_x * half_w,
-              gr.abs_y * half_h);
-    if (!a.g_intrinsics) return;
-    const IntrinsicsGradient<float> intrinsics = intrinsics_vjp(frame, r, gr, a.view.camera);
-    write_row(a.g_intrinsics, i, 4, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy);
+    if (a.g_probe && a.probe_columns == 2) write_2(a.g_probe, i, d.probe_x * half_w, d.probe_y * half_h);
+    if (a.g_probe && a.probe_columns == 4)
+        write_4(a.g_probe, i, d.probe_x * half_w, d.probe_y * half_h, abs_x * half_w, abs_y * half_h);
+    if (a.g_intrinsics) write_4(a.g_intrinsics, i, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy);
 }
 
 }  // namespace gs2d

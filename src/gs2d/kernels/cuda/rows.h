@@ -1,0 +1,61 @@
+// Rows of the splats of a warp, by way of shared memory: lanes side by side move 16 bytes each, where a lane that walked
+// along its own row would touch a line of memory for every 4.
+#pragma once
+
+#include "cuda/common.h"
+
+namespace gs2d {
+
+constexpr int WARP_ROWS = 32;
+constexpr int MAX_ROW = 45;  // floats: SH of the third degree without the first coefficient
+
+template <class T> __device__ __forceinline__ bool is_aligned(const void* at) {
+    return reinterpret_cast<unsigned long long>(at) % sizeof(T) == 0;
+}
+
+// Whether a row is wanted of which four floats are a part: of two rows at most, because a row is of three floats or more.
+__device__ __forceinline__ bool any_wanted(uint wanted, int first_float, int length) {
+    const int first = first_float / length, last = (first_float + 3) / length;
+    return (wanted >> first | wanted >> (last < WARP_ROWS ? last : first)) & 1u;
+}
+
+// From memory to `rows` [32 * length] those of 32 rows, from `begin` on, whose bit is set; the others may be left. All lanes
+// call it.
+__device__ __forceinline__ void load_rows(const float* from, int64 begin, int count, int length, uint wanted, int lane,
+                                          float* rows) {
+    const float* source = from + begin * length;
+    const int floats = count * length, quads = is_aligned<float4>(source) ? floats / 4 : 0;
+#pragma unroll 4
+    for (int q = lane; q < quads; q += WARP_ROWS)
+        if (any_wanted(wanted, 4 * q, length))
+            reinterpret_cast<float4*>(rows)[q] = reinterpret_cast<const float4*>(source)[q];
+#pragma unroll 1
+    for (int k = 4 * quads + lane; k < floats; k += WARP_ROWS) rows[k] = source[k];
+    __syncwarp();
+}
+
+// And back, all of them.
+__device__ __forceinline__ void store_rows(float* to, int64 begin, int count, int length, int lane,
+                                           const float* rows) {
+    float* target = to + begin * length;
+    const int floats = count * length, quads = is_aligned<float4>(target) ? floats / 4 : 0;
+    __syncwarp();
+#pragma unroll 4
+    for (int q = lane; q < quads; q += WARP_ROWS)
+        reinterpret_cast<float4*>(target)[q] = reinterpret_cast<const float4*>(rows)[q];
+#pragma unroll 1
+    for (int k = 4 * quads + lane; k < floats; k += WARP_ROWS) target[k] = rows[k];
+    __syncwarp();
+}
+
+// One row of two or four floats.
+__device__ __forceinline__ float2 row_of_2(const float* from, int64 i) {
+    if (is_aligned<float2>(from)) return reinterpret_cast<const float2*>(from)[i];
+    return {from[2 * i], from[2 * i + 1]};
+}
+__device__ __forceinline__ float4 row_of_4(const float* from, int64 i) {
+    if (is_aligned<float4>(from)) return reinterpret_cast<const float4*>(from)[i];
+    return {from[4 * i], from[4 * i + 1], from[4 * i + 2], from[4 * i + 3]};
+}
+
+}  // namespace gs2d

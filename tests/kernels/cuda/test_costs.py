@@ -1,0 +1,98 @@
+"""What an iteration gives host and device to do, and what the compiler makes of the kernels: gates, without a GPU.
+
+Counts, not times: they are the same on every machine. ``python -m benchmarks.gpu host`` and ``python -m
+benchmarks.gpu.sass`` print them with the times.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+
+import pytest
+import torch
+from benchmarks.gpu.host import host_cost
+from benchmarks.gpu.sass import disassembler, listing
+
+from emulate import Emulator
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda.arguments import OrderArguments, fill
+from gs2d.kernels.cuda.compile import compile_source, nvrtc_version
+from gs2d.render import cuda_passes
+
+pytestmark = pytest.mark.timeout(280)
+# own launches, device launches, torch operations, allocations
+LIMITS = {
+    "surface": (14, 70, 130, 36),
+    "appearance": (11, 55, 84, 27),
+    "refine": (14, 57, 110, 34),
+}
+
+
+def test_an_iteration_gives_the_device_no_more_to_do_than_before() -> None:
+    for stage, row in host_cost(repeats=2).items():
+        names = ("own_launches", "device_launches", "torch_operations", "allocations")
+        for name, most in zip(names, LIMITS[stage], strict=True):
+            assert 0 < row[name] <= most, f"{stage}: {name}"
+        assert row["host_us"] > 0
+
+
+def test_gradients_of_parameters_are_read_and_written_sixteen_bytes_at_a_time() -> None:
+    """It was 308 stores of 4 bytes, 45 of them a lane along its own row of 180."""
+    try:
+        nvrtc_version()
+    except BackendError as error:
+        pytest.skip(str(error))
+    if disassembler() is None:
+        pytest.skip("nvdisasm is not here")
+    compiled = compile_source("cuda/project_vjp.cu", "sm_90")
+    accesses = listing(compiled.code)["project_splats_vjp"].accesses()
+    assert accesses["LDG.128"] >= 8
+    assert accesses["STG.128"] >= 8
+    # a logit, and the ends of three tensors of rows of three, which are rest
+    assert accesses["STG.32"] <= 8, accesses
+    usage = compiled.usage()["project_splats_vjp"]
+    assert usage.registers <= 96
+    assert usage.shared_bytes <= 23 << 10  # five blocks in the 128 KiB of most GPUs, four in 100
+
+
+@pytest.mark.parametrize("lengths", [[0], [5, 700, 0, 33, 32, 40_000, 31, 1 << 20], list(range(0, 3000, 7))])
+def test_tiles_are_taken_longest_first_each_once(emulator: Emulator, lengths: list[int]) -> None:
+    ends = torch.tensor(lengths).cumsum(0)
+    ranges = torch.zeros(len(lengths) + 1, 2, dtype=torch.int64)
+    ranges[:-1, 1], ranges[1:-1, 0] = ends, ends[:-1]
+    order = torch.full((len(lengths),), -1, dtype=torch.int32)
+    arguments = OrderArguments(tiles=len(lengths))
+    fill(arguments, ranges=ranges, order=order)
+    emulator.launch("order_tiles", 1, cuda_passes.ORDER_THREADS, arguments)
+    assert sorted(order.tolist()) == list(range(len(lengths)))
+    chunks = [min(-(-lengths[tile] // 32), 511) for tile in order.tolist()]
+    assert chunks == sorted(chunks, reverse=True)
+    assert ctypes.sizeof(arguments) == 24
+
+
+def test_rows_that_begin_in_the_middle_of_sixteen_bytes_have_the_same_gradients(
+    emulator: Emulator, tmp_path: Path
+) -> None:
+    """A view of another tensor's rows is contiguous, and begins anywhere."""
+    import numpy as np
+
+    from gs2d.render import cuda
+    from gs2d.render.types import RasterSettings
+    from render_scenes import contraction, random_camera, random_cotangents, random_splats, requiring_grad
+
+    rng = np.random.default_rng(3)
+    camera = random_camera(rng).resized(40, 30)
+    splats, cotangents = random_splats(rng, camera, 70).to(dtype=torch.float32), random_cotangents(rng, camera)
+    found = []
+    for shift in (0, 1):
+        scene = requiring_grad(splats)
+        for name, tensor in list(scene.items()):
+            room = torch.zeros(len(tensor) + 1, *tensor.shape[1:])
+            room[shift : shift + len(tensor)] = tensor.detach()
+            setattr(scene, name, room[shift : shift + len(tensor)].requires_grad_())
+        output = cuda.rasterize_with(emulator, scene, camera, RasterSettings(), deterministic=True)
+        contraction(output, cotangents).backward()
+        found.append([tensor.grad for _, tensor in scene.items()])
+    assert scene.means.data_ptr() % 16 != 0
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
