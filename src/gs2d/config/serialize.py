@@ -154,6 +154,17 @@ def _is_left_out(entry: Field[Any], value: Any) -> bool:
     return bool(entry.metadata.get("omit_empty")) and value == default
 
 
+def decode(value: Any, kind: Any, where: str) -> Any:
+    """Return a JSON value as the annotated type, a dataclass for one; ``where`` is what an error calls it.
+
+    Raises
+    ------
+    RecipeError
+        An unknown or missing field, or a value of another type.
+    """
+    return _decode(value, kind, where)
+
+
 def _decode(value: Any, kind: Any, where: str) -> Any:
     """Return a JSON value as the annotated type."""
     origin = get_origin(kind)

@@ -239,7 +239,8 @@ def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
     """
     path = Path(path)
     if path.suffix == ".npy":
-        normals = read_npy(path, "normal map").astype(np.float32)
+        with np.errstate(over="ignore"):  # what is beyond float32 is no unit vector
+            normals = read_npy(path, "normal map").astype(np.float32)
         normals = normals.transpose(1, 2, 0) if normals.ndim == 3 and normals.shape[0] == 3 else normals
         if normals.ndim != 3 or normals.shape[2] != 3:
             raise DataError(f"normal map {path} must be an array [H, W, 3], got {list(normals.shape)}")
@@ -249,7 +250,8 @@ def read_normals(path: str | os.PathLike[str]) -> np.ndarray:
         image = read_image(path)
         normals = image[..., :3].astype(np.float32) / 127.5 - 1
         opaque = np.asarray(image[..., :3].any(axis=2) if image.shape[2] == 3 else image[..., 3] >= 128)
-    length = np.linalg.norm(normals, axis=2)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(normals, axis=2)
     valid = opaque & (length > UNIT_LENGTH[0]) & (length < UNIT_LENGTH[1])
     if not valid.any():
         raise DataError(f"normal map {path} must hold unit vectors n as (n + 1) / 2 (or n in .npy), got none")

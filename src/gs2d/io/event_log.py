@@ -81,7 +81,7 @@ class EventLog:
         for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
             try:
                 events.append(dict(json.loads(line)))
-            except (ValueError, TypeError) as error:
+            except (ValueError, TypeError, RecursionError) as error:
                 raise RunError(
                     f"{self.path} line {number} must be a JSON object, got {line[:40]!r}; "
                     "the log was damaged: remove that line"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import logging
 import os
 import re
 import struct
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,6 +102,20 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
     return Mesh(positions.astype(dtype), faces.astype(np.int32), _colors(vertex))
 
 
+@contextlib.contextmanager
+def _quiet_trimesh() -> Iterator[None]:
+    """Without numpy's warnings, and without the tracebacks that trimesh logs and goes on from."""
+    log = logging.getLogger("trimesh")
+    before = log.level
+    log.setLevel(logging.CRITICAL + 1)  # of those below it too
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(before)
+
+
 def _read_foreign(path: Path) -> Mesh:
     """Read a mesh by trimesh, corners in the order of the file."""
     import trimesh  # 0.6 s: for those who have such a file
@@ -111,8 +128,7 @@ def _read_foreign(path: Path) -> Mesh:
     if kind == "obj":  # trimesh takes a comment behind a face for one of its corners
         data = re.sub(rb"#[^\n]*", b"", data)
     try:
-        with warnings.catch_warnings():  # numpy's, of numbers that it cannot read: what comes of them is checked below
-            warnings.simplefilter("ignore")
+        with _quiet_trimesh():  # what comes of numbers that it cannot read is checked below
             loaded = trimesh.load_mesh(
                 io.BytesIO(data), file_type=kind, process=False, maintain_order=True, skip_materials=True
             )
@@ -145,7 +161,7 @@ def _colors(vertex: PlyElement) -> np.ndarray | None:
         return None
     if all(vertex.scalar(name).dtype.kind == "f" for name in COLORS):
         colors = colors * 255.0
-    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+    return np.clip(np.rint(np.nan_to_num(colors)), 0, 255).astype(np.uint8)
 
 
 def read_points(path: str | os.PathLike[str]) -> Points:

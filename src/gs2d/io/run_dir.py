@@ -25,6 +25,7 @@ import os
 import platform
 import re
 import shutil
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -40,6 +41,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.core.locks import try_lock
 from gs2d.errors import DataError, RunError
 from gs2d.io.event_log import EventLog
+from gs2d.io.run_schema import DEFINITION_SHAPE, METRICS_SHAPE, check_shape
 
 RUN_JSON, EVENTS, METRICS, LOCK = "run.json", "events.jsonl", "metrics.json", ".lock"
 CHECKPOINTS, RENDERS, SURFACE = "checkpoints", "renders", "surface"
@@ -48,7 +50,10 @@ SPLATS, MESH, TEXTURED, REPORT, PAGE = "splats.ply", "mesh.ply", "mesh.glb", "re
 EXPOSURE, POSES, SUBJECT, VERDICT = "exposure.json", "poses.json", "subject.json", "verdict.json"
 FORMAT = 1
 KEPT_CHECKPOINTS = 2
-_UNREADABLE = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
+_UNREADABLE = (
+    *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError),
+    *(zipfile.BadZipFile, zlib.error, struct.error),
+)
 _CHECKPOINT_NAME = re.compile(r"(\d+)-(.+)-(\d+|end)\.pt")
 
 
@@ -110,6 +115,7 @@ class RunFolder:
                 )
         if not isinstance(data["scene"]["path"], str):
             raise RunError(f"{self.file(RUN_JSON)} must hold the capture's path, got {data['scene']['path']!r}")
+        check_shape(self.file(RUN_JSON), data, DEFINITION_SHAPE, "restore it, or train again with --overwrite")
         return data
 
     def metrics(self) -> dict[str, Any]:
@@ -130,6 +136,7 @@ class RunFolder:
                 f"{path} must hold a list 'stages', each with {', '.join(sorted(_STAGE))}; it was damaged: delete it "
                 "and go on with --resume"
             )
+        check_shape(path, data, METRICS_SHAPE, "delete it and go on with --resume")
         return data
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:

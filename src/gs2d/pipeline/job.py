@@ -21,10 +21,10 @@ from gs2d.config.presets import (
     with_poses,
     with_robustness,
 )
-from gs2d.config.protocols import BLACK, GENERIC, FusionLimits, MetricConventions, Protocol, get_protocol, protocol_for
+from gs2d.config.protocols import BLACK, GENERIC, Protocol, get_protocol, protocol_for
 from gs2d.config.recipe import Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
-from gs2d.config.serialize import apply_overrides, from_json, to_json
+from gs2d.config.serialize import apply_overrides, decode, from_json, to_json
 from gs2d.core.splats import Splats
 from gs2d.core.text import name_bytes
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
@@ -459,11 +459,11 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
         raise RunError(f"the capture of {run.path} was at {where}, which is not there; put it back or link it there")
     try:
         recipe, protocol = from_json(data["recipe"], to_train=False), protocol_from_json(data["protocol"])
-        settings = RasterSettings(**{**data["raster"], "background": tuple(data["raster"]["background"])})
+        settings: RasterSettings = decode(data["raster"], RasterSettings, "raster")
         settings = settings.for_depths(protocol.depth, protocol.fused_depth)
         named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
         cache_bytes = int(data.get("stage2_cache_bytes", 0))  # runs of before there were cached views had none
-    except (KeyError, TypeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RecipeError) as error:
         raise RunError(
             f"{run.file(RUN_JSON)} must hold recipe, protocol, raster, backend, downscale and scene as gs2d writes "
             f"them, got another entry ({error}); restore it, or train again with --overwrite"
@@ -483,8 +483,8 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
 def protocol_from_json(data: dict[str, Any]) -> Protocol:
     """Return the protocol that ``asdict`` and JSON made of one."""
     old = {"subject": data["name"] == GENERIC.name}  # for runs of before there was such a field
-    fusion, metrics = FusionLimits(**{**old, **data["fusion"]}), MetricConventions(**data["metrics"])
-    return Protocol(**{**data, "background": tuple(data["background"]), "fusion": fusion, "metrics": metrics})
+    protocol: Protocol = decode({**data, "fusion": {**old, **data["fusion"]}}, Protocol, "protocol")
+    return protocol
 
 
 def as_begun(run: RunFolder, job: Job) -> Job:

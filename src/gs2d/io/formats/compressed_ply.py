@@ -67,7 +67,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
         rest = g.shN.transpose(0, 2, 1).reshape(n, 3 * g.shN.shape[1])  # by channel, as in a plain PLY
         sh = np.zeros(n, dtype=[(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])
         for i in range(rest.shape[1]):
-            sh[f"f_rest_{i}"] = np.clip(np.floor((rest[:, i] / 8.0 + 0.5) * 256.0), 0, 255)
+            sh[f"f_rest_{i}"] = np.clip(np.floor((np.clip(rest[:, i], -8.0, 8.0) / 8.0 + 0.5) * 256.0), 0, 255)
         elements["sh"] = sh
     write_ply(path, elements, comments=("written by gs2d",))
     steep = int((np.abs(g.shN) > 4.0).any(axis=(1, 2)).sum()) if g.shN.size else 0
@@ -78,6 +78,8 @@ def _morton_order(means: np.ndarray) -> np.ndarray:
     """Return an order in which neighbours in the list are neighbours in space: bits of x, y and z in turn."""
     if not len(means):
         return np.zeros(0, dtype=int)
+    if np.abs(means).max() > 1e38:  # the span of float32 numbers may be none
+        means = means.astype(np.float64)
     low, high = means.min(axis=0), means.max(axis=0)
     cell = ((means - low) / np.maximum(high - low, 1e-30) * ((1 << 21) - 1)).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
@@ -131,20 +133,21 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> Gaussians:
     file = read_ply(path)
     vertex, chunk = _elements(path, file)
     n = vertex.count
-    packed = [_column(path, vertex, name).astype(np.uint32) for name in _PACKED]
+    packed = [_words(path, vertex, name) for name in _PACKED]
     at = np.arange(n) // _CHUNK
     position = _between(path, chunk, "position", _unpack(packed[0], _BITS), at)
     scale = _between(path, chunk, "scale", _unpack(packed[2], _BITS), at)
     rgba = _unpack(packed[3], (8, 8, 8, 8))
     color = _between(path, chunk, "color", rgba[:, :3], at) if "min_r" in chunk.properties else rgba[:, :3]
-    return Gaussians(
-        position.astype(np.float32),
-        _quats(packed[1]),
-        scale.astype(np.float32),
-        logit_of_byte(to_byte(255.0 * rgba[:, 3])),
-        ((color - 0.5) / C0).astype(np.float32),
-        _sh(path, file.elements.get("sh"), n),
-    )
+    with np.errstate(over="ignore"):  # a double beyond float32 is infinite
+        return Gaussians(
+            position.astype(np.float32),
+            _quats(packed[1]),
+            scale.astype(np.float32),
+            logit_of_byte(to_byte(255.0 * rgba[:, 3])),
+            ((color - 0.5) / C0).astype(np.float32),
+            _sh(path, file.elements.get("sh"), n),
+        )
 
 
 def _elements(path: object, file: PlyFile) -> tuple[PlyElement, PlyElement]:
@@ -166,12 +169,21 @@ def _column(path: object, element: PlyElement, name: str) -> np.ndarray:
     return values
 
 
+def _words(path: object, vertex: PlyElement, name: str) -> np.ndarray:
+    """Return the packed words of a property, whose type may be another one that holds whole numbers."""
+    words = _column(path, vertex, name)
+    if words.dtype.kind not in "iu":
+        raise DataError(f"{path}: whole numbers as {name} were expected, got {words.dtype}; export the file again")
+    return words.astype(np.uint32)
+
+
 def _between(path: object, chunk: PlyElement, what: str, fractions: np.ndarray, at: np.ndarray) -> np.ndarray:
     low, high = (
         np.stack([_column(path, chunk, f"{end}_{x}").astype(np.float64) for x in _SPAN[what]], axis=1)
         for end in ("min", "max")
     )
-    return np.asarray(low[at] * (1.0 - fractions) + high[at] * fractions)
+    with np.errstate(over="ignore", invalid="ignore"):  # between infinite ends: what comes of it is checked
+        return np.asarray(low[at] * (1.0 - fractions) + high[at] * fractions)
 
 
 def _unpack(word: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:

@@ -132,7 +132,7 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
     if kind == "3dgs":
         return _told("3dgs (three scales, for viewers)", read_gaussians(path), path)
     splats = read_splats(path)  # names another kind
-    return SplatFile("2dgs", Gaussians.of(splats), splats)
+    return SplatFile("2dgs", _finite(Gaussians.of(splats), path), splats)
 
 
 def read_disks(path: str | os.PathLike[str]) -> Splats:
@@ -173,8 +173,12 @@ def read_surfels(path: str | os.PathLike[str]) -> tuple[Splats, str]:
 
 
 def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> SplatFile:
+    return SplatFile(kind, _finite(gaussians, path), gaussians.to_surfels(path) if gaussians.is_flat else None)
+
+
+def _finite(gaussians: Gaussians, path: str | os.PathLike[str]) -> Gaussians:
     for name in ("means", "log_scales", "quats", "sh0", "shN", "opacity_logits"):
         values = getattr(gaussians, name)
         if not np.isfinite(values).all():
             raise DataError(f"{os.fspath(path)}: finite numbers were expected, got NaN or infinity in its {name}")
-    return SplatFile(kind, gaussians, gaussians.to_surfels(path) if gaussians.is_flat else None)
+    return gaussians

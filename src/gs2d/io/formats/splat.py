@@ -33,7 +33,7 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     g = gaussians.rows(order)
     rows = np.empty(len(g), dtype=_RECORD)
     rows["position"] = g.means
-    rows["scales"] = np.exp(g.log_scales.astype(np.float64))
+    rows["scales"] = np.exp(np.clip(g.log_scales.astype(np.float64), None, 88.0))  # e^88 is a float32
     rows["rgba"][:, :3] = to_byte(255.0 * (0.5 + C0 * g.sh0.astype(np.float64)))
     rows["rgba"][:, 3] = to_byte(255.0 * opacity[order])
     rows["rotation"] = to_byte(128.0 * unit_quats(g.quats) + 128.0)

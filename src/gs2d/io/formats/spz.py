@@ -83,7 +83,7 @@ def _streams(g: Gaussians, bits: int) -> list[np.ndarray]:
     """Return the attributes in their order, uint8."""
     fixed = np.rint(g.means.astype(np.float64) * _TURN * (1 << bits)).astype("<i4")
     positions = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
-    sh = np.rint(g.shN * _FLIP[: g.shN.shape[1], None] * 128.0).astype(np.int64) + 128
+    sh = np.rint(np.clip(g.shN, -2.0, 2.0) * _FLIP[: g.shN.shape[1], None] * 128.0).astype(np.int64) + 128
     step = np.where(np.arange(g.shN.shape[1]) < 3, _SH1_STEP, _SH_STEP)[:, None]
     sh = np.clip((sh + step // 2) // step * step, 0, 255).astype(np.uint8)
     return [

@@ -1,0 +1,418 @@
+"""What is mutated and who reads it: small valid files of every kind that gs2d takes from others, and its readers."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import commands as c
+import mutations as m
+import numpy as np
+import torch
+from mutations import Mutation
+from PIL import Image
+
+from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
+from foreign_writers import Lens, small_alicevision, small_metashape, small_opensfm
+from gs2d.core.splats import Splats
+
+Files = dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class Family:
+    """Kinds of valid input, each a folder of files; what changes which of them; and what then reads the folder."""
+
+    name: str
+    seeds: Callable[[], list[Files]]
+    mutate: Mapping[str, Mutation]  # by the end of a file's name; files of no such end stay as they are
+    read: Callable[[Path], object]
+
+    def case(self, seed: int) -> tuple[Files, str]:
+        """Return input ``seed``, always the same one: its files, and the one that was changed."""
+        rng = random.Random(f"{self.name} {seed}")
+        files = dict(rng.choice(self.seeds_made()))
+        victims = sorted(name for name in files if self._mutation(name) is not None)
+        victim = rng.choice(victims)
+        mutation = self._mutation(victim)
+        assert mutation is not None
+        files[victim] = mutation(rng, files[victim])
+        return files, victim
+
+    def seeds_made(self) -> list[Files]:
+        """Return the seeds, made once a process."""
+        return _seeds(self.name)
+
+    def _mutation(self, name: str) -> Mutation | None:
+        return next((mutation for end, mutation in self.mutate.items() if name.endswith(end)), None)
+
+
+@cache
+def _seeds(name: str) -> list[Files]:
+    return FAMILIES[name].seeds()
+
+
+def files_of(root: Path) -> Files:
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def written(*writers: Callable[[Path], object]) -> Callable[[], list[Files]]:
+    """Seeds that functions write into empty folders."""
+
+    def make() -> list[Files]:
+        found = []
+        for write in writers:
+            with TemporaryDirectory(prefix="gs2d-seed-") as home:
+                root = Path(home, "a")
+                root.mkdir()
+                write(root)
+                found.append(
+                    {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+                )
+        return found
+
+    return make
+
+
+# -- captures ----------------------------------------------------------------------------------------------------------
+def read_capture(root: Path) -> None:
+    """As `gs2d train` does before it trains: the scene, one view with all that belongs to it, the points it shows."""
+    from gs2d.data import load_scene
+    from gs2d.data.benchmarks import missing_lines
+
+    missing_lines(root)
+    scene = load_scene(root)
+    view = scene.views[0]
+    view.image(), view.mask(), view.object_mask(), view.valid()
+    if view.maps is not None:
+        _ = view.maps.files.depth and view.maps.depth(), view.maps.files.normal and view.maps.normal()
+    if scene.observe is not None:
+        scene.observe()
+
+
+def _nerfstudio(root: Path) -> None:
+    """With everything that a file of nerfstudio may say."""
+    maps = {"depth_file_path": "depth.png", "normal_file_path": "normal.npy", "mask_path": "mask.png"}
+    meta = {"ply_file_path": "points.ply", "camera_model": "OPENCV", "k1": 0.01, "p1": 0.001}
+    meta |= {"train_filenames": ["images/f_00.png", "images/f_01.png"], "test_filenames": ["images/f_02.png"]}
+    small_nerfstudio(root, count=3, meta=meta, frame={**maps, "depth_unit_scale_factor": 0.001})
+    Image.fromarray(np.full((30, 40), 3000, np.uint16)).save(root / "depth.png")
+    np.save(root / "normal.npy", np.tile(np.float32([0, 0, 1]), (30, 40, 1)))
+    Image.new("L", (40, 30), 255).save(root / "mask.png")
+    ply_points(root / "points.ply")
+
+
+def _colmap(root: Path, kind: str, model: str = "PINHOLE") -> None:
+    params = {"PINHOLE": (35.0, 36.0, 18.5, 16.25), "OPENCV": (35.0, 36.0, 18.5, 16.25, 0.01, 0.0, 0.001, 0.0)}[model]
+    small_colmap(root, count=4, kind=kind, cameras={7: (model, 40, 30, params)})
+    Image.new("L", (40, 30), 255).save((root / "masks").mkdir() or root / "masks/0.png.png")
+
+
+# -- splats, meshes, points --------------------------------------------------------------------------------------------
+def some_splats(count: int = 20, degree: int = 1) -> Splats:
+    rng = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (2,), "opacity_logits": (), "sh0": (1, 3)}
+    shapes["shN"] = ((degree + 1) ** 2 - 1, 3)
+    return Splats(**{name: torch.randn((count, *shape), generator=rng) for name, shape in shapes.items()})
+
+
+def _splats(layout: str, name: str) -> Callable[[Path], object]:
+    def write(root: Path) -> None:
+        from gs2d.io.formats.registry import write_layout
+
+        write_layout(root / name, some_splats(), layout)
+
+    return write
+
+
+def as_ascii(name: str) -> Callable[[Path], object]:
+    """The same splats as text."""
+
+    def write(root: Path) -> None:
+        _splats("2dgs", name)(root)
+        from gs2d.io.ply_format import read_ply
+
+        vertex = read_ply(root / name).elements["vertex"]
+        head = "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 20\n"
+        head += "".join(f"property float {prop}\n" for prop in vertex.properties)
+        rows = np.stack([vertex.scalar(prop) for prop in vertex.properties], axis=1)
+        (root / name).write_text(head + "end_header\n" + "".join(" ".join(map(repr, r)) + "\n" for r in rows.tolist()))
+
+    return write
+
+
+def read_splats_everywhere(root: Path) -> None:
+    """As `gs2d info`, `gs2d export` and `--init` do."""
+    from gs2d.io.formats.registry import LAYOUTS, read_disks, read_splat_file, read_surfels, write_layout
+    from gs2d.pipeline.info import describe_file
+
+    (path,) = (p for p in root.iterdir() if p.is_file())
+    describe_file(path)
+    read_splat_file(path)
+    read_surfels(path)
+    disks = read_disks(path)
+    for layout in ("2dgs", "3dgs", "compressed", "spz", "splat"):
+        write_layout(root / f"out{LAYOUTS.get(layout).ending}", disks, layout)
+
+
+def ply_points(path: Path) -> None:
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 12\nproperty double x\nproperty double y\n"
+    head += "property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    rows = b"".join(struct.pack("<ddf3B", 0.1 * i, 0.2 * (i % 3), -0.1 * i, i, 20, 255) for i in range(12))
+    path.write_bytes(head.encode() + rows)
+
+
+_VERTICES = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0.5, 0.5, 1)]
+_FACES = [(0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
+
+
+def ply_mesh(path: Path, order: str, *, ragged: bool = True) -> None:
+    """A pyramid: a square and four triangles, or triangles alone; with colours and a property that nobody reads."""
+    faces = _FACES if ragged else [face[:3] for face in _FACES]
+    head = f"ply\nformat {order} 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "property float red\nproperty float green\nproperty float blue\n"
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nproperty short flags\nend_header\n"
+    if order == "ascii":
+        rows = "".join(f"{x} {y} {z} 0.5 0.25 1\n" for x, y, z in _VERTICES)
+        rows += "".join(f"{len(face)} {' '.join(map(str, face))} 7\n" for face in faces)
+        path.write_bytes((head + rows).encode())
+        return
+    mark = "<" if "little" in order else ">"
+    body = b"".join(struct.pack(mark + "6f", *v, 0.5, 0.25, 1) for v in _VERTICES)
+    body += b"".join(struct.pack(f"{mark}B{len(face)}ih", len(face), *face, 7) for face in faces)
+    path.write_bytes(head.encode() + body)
+
+
+_ORDERS = ("ascii", "binary_little_endian", "binary_big_endian")
+
+
+def _pyramid(root: Path, order: str, ragged: bool) -> None:
+    ply_mesh(root / "a.ply", order, ragged=ragged)
+
+
+def read_surface(root: Path) -> None:
+    """As `gs2d info` and `gs2d evaluate --mesh-gt` do."""
+    from gs2d.io.meshes import FOREIGN, read_mesh, read_points
+    from gs2d.pipeline.info import describe_file
+    from gs2d.pipeline.truth import read_truth
+
+    (path,) = (p for p in root.iterdir() if p.suffix != ".npy")
+    describe_file(path)
+    if path.suffix not in FOREIGN:
+        read_points(path)
+    read_truth(path)
+    read_mesh(path)
+
+
+def _obj(path: Path) -> None:
+    lines = ["# by hand", "mtllib a.mtl", "o pyramid"]
+    lines += [f"v {x} {y} {z} 0.5 0.25 1" for x, y, z in _VERTICES] + ["vt 0 0", "vt 1 0", "vn 0 0 1", "usemtl red"]
+    lines += ["f " + " ".join(f"{i + 1}/1/1" for i in face) for face in _FACES[:2]]
+    lines += ["g sides", *("f " + " ".join(str(i - 5) for i in face) for face in _FACES[2:])]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _off(path: Path) -> None:
+    lines = ["OFF", "5 5 0", *(f"{x} {y} {z}" for x, y, z in _VERTICES)]
+    path.write_text("\n".join([*lines, *(f"{len(face)} {' '.join(map(str, face))}" for face in _FACES)]) + "\n")
+
+
+def _stl(path: Path, *, text: bool) -> None:
+    faces = [[_VERTICES[i] for i in face[:3]] for face in _FACES]
+    if text:
+        corners = ["".join(f"vertex {x} {y} {z}\n" for x, y, z in face) for face in faces]
+        body = "".join(f"facet normal 0 0 1\nouter loop\n{c}endloop\nendfacet\n" for c in corners)
+        path.write_text(f"solid a\n{body}endsolid a\n")
+        return
+    rows = b"".join(struct.pack("<3f9fH", 0, 0, 1, *(x for corner in face for x in corner), 0) for face in faces)
+    path.write_bytes(bytes(80) + struct.pack("<I", len(faces)) + rows)
+
+
+# -- images and arrays -------------------------------------------------------------------------------------------------
+def _image(name: str, mode: str = "RGB", **options: object) -> Callable[[Path], object]:
+    def write(root: Path) -> None:
+        channels = {"L": 0, "I;16": 0, "F": 0, "1": 0, "P": 0, "RGBA": 4, "LA": 2}.get(mode, 3)
+        pixels = np.random.default_rng(0).integers(0, 256, (20, 24, channels) if channels else (20, 24))
+        dtype = {"I;16": np.uint16, "F": np.float32}.get(mode, np.uint8)
+        image = Image.fromarray(pixels.astype(dtype))
+        image = image if mode in ("I;16", "F", "RGBA", "RGB", "L", "LA") else image.convert(mode)
+        exif = Image.Exif()
+        exif[0x0112], exif[0x0110] = 6, "camera"
+        image.save(root / name, **({"exif": exif} if name.endswith(("jpg", "tif", "webp")) else {}), **options)
+
+    return write
+
+
+def read_picture(root: Path) -> None:
+    """As a photograph, as one without a camera yet, as a mask, as depths and as normals."""
+    from gs2d.core.images import image_size, read_image, read_mask
+    from gs2d.data.priors import read_depth, read_normals
+    from gs2d.errors import DataError
+    from gs2d.sfm.images import _read as looked_at
+
+    (path,) = (p for p in root.iterdir() if p.is_file())
+    refused: Exception | None = None
+    for read in (image_size, read_image, lambda p: looked_at(p, root, p.name), read_mask, read_depth, read_normals):
+        try:
+            read(path)
+        except DataError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
+def _array(name: str, array: object) -> Callable[[Path], object]:
+    return lambda root: np.save(root / name, np.asarray(array))
+
+
+def read_map(root: Path) -> None:
+    from gs2d.data.priors import read_depth, read_normals
+
+    (path,) = (p for p in root.iterdir() if p.is_file())
+    (read_normals if "normal" in path.name else read_depth)(path)
+
+
+def _counted(root: Path) -> None:
+    ply_mesh(root / "mesh.ply", "binary_little_endian", ragged=False)
+    np.save(root / "mesh_seen.npy", np.arange(len(_FACES)))
+
+
+# -- official ground truth ---------------------------------------------------------------------------------------------
+def _official(root: Path) -> None:
+    from scipy.io import savemat
+
+    observed = np.ones((5, 6, 7), np.uint8)
+    for packed in (True, False):
+        savemat(
+            root / f"mask{int(packed)}.mat",
+            {"ObsMask": observed, "BB": np.eye(3)[:2], "Res": 2.0},
+            do_compression=packed,
+        )
+    savemat(root / "plane.mat", {"P": np.ones((4, 1))})
+    ply_points(root / "scan.ply")
+    (root / "crop.json").write_text(json.dumps({
+        "axis_max": 1.0, "axis_min": -1.0, "bounding_polygon": [[0, 0, 0], [1, 0, 0], [1, 1, 0]], "class_name":
+        "SelectionPolygonVolume", "orthogonal_axis": "Z", "version_major": 1, "version_minor": 0,
+    }))  # fmt: skip
+    np.savetxt(root / "trans.txt", np.eye(4))
+    (root / "a.log").write_text("".join(f"{i} {i} 0\n1 0 0 0\n0 1 0 0\n0 0 1 {i}\n0 0 0 1\n" for i in range(3)))
+
+
+def read_official(root: Path) -> None:
+    from gs2d.errors import DataError
+    from gs2d.evaluation.dtu import read_dtu_truth
+    from gs2d.evaluation.tanks_and_temples import read_crop, read_trajectory, read_transform
+
+    refused: Exception | None = None
+    plane, scan = root / "plane.mat", root / "scan.ply"
+    reads = [partial(read_dtu_truth, 1, {"mask": root / f"mask{i}.mat", "plane": plane, "scan": scan}) for i in (0, 1)]
+    reads += [partial(read_crop, root / "crop.json"), partial(read_transform, root / "trans.txt")]
+    for read in (*reads, partial(read_trajectory, root / "a.log")):
+        try:
+            read()
+        except DataError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
+# -- archives, checkpoints, recipes ------------------------------------------------------------------------------------
+def _packed(method: int) -> Callable[[Path], object]:
+    def write(root: Path) -> None:
+        (files,) = written(partial(small_nerfstudio, count=3))()
+        with zipfile.ZipFile(root / "a.zip", "w", method) as file:
+            for name, data in files.items():
+                file.writestr(f"garden/{name}", data)
+
+    return write
+
+
+def read_archive(root: Path) -> None:
+    from gs2d.data.archive import unpack
+
+    (root / "home").mkdir()
+    read_capture(unpack(root / "a.zip", root / "home"))
+
+
+def _checkpoint(root: Path) -> None:
+    from gs2d.io.run_dir import save_tensors
+
+    splats = some_splats(5)
+    state = {"splats": dict(splats.items()), "queue": [1, 2], "generator": torch.Generator().get_state()}
+    save_tensors(root / "0-surface-0000004.pt", {"state": state, "key": "a" * 64, "events_bytes": 10, "extra": "{}"})
+
+
+def read_checkpoint(root: Path) -> None:
+    from gs2d.io.run_dir import load_tensors
+
+    payload = load_tensors(root / "0-surface-0000004.pt")
+    sum(t.double().sum() for t in payload.get("state", {}).get("splats", {}).values() if hasattr(t, "double"))
+
+
+def _recipe(root: Path) -> None:
+    from gs2d.config.presets import get_recipe
+    from gs2d.config.serialize import to_json
+
+    (root / "mine.json").write_text(json.dumps(to_json(get_recipe("2dgs-r"))))
+
+
+def read_recipe(root: Path) -> None:
+    from gs2d.config.describe import describe_recipe
+    from gs2d.config.recipe_files import read_recipe_file
+
+    list(describe_recipe(read_recipe_file(str(root / "mine.json"))))
+
+
+_JSON = m.either(m.of_json, m.of_json, m.of_text, m.of_bytes)
+_TEXT = m.either(m.of_text, m.of_text, m.of_bytes)
+_NPZ = m.of_zip(m.of_npy)
+_LENS = Lens()
+_TREE = {".json": _JSON, ".ply": m.of_ply, ".npy": m.of_npy, ".png": m.of_png}
+
+_ALL = (
+    Family("colmap-bin", written(partial(_colmap, kind="bin"), partial(_colmap, kind="bin", model="OPENCV")),
+           {".bin": m.of_bytes}, read_capture),
+    Family("colmap-txt", written(partial(_colmap, kind="txt"), partial(_colmap, kind="txt", model="OPENCV")),
+           {".txt": _TEXT}, read_capture),
+    Family("transforms", written(_nerfstudio, partial(small_blender, train=2, test=1)), _TREE, read_capture),
+    Family("dtu", written(partial(small_dtu, count=3)), {".npz": _NPZ, ".png": m.of_png}, read_capture),
+    Family("opensfm", written(lambda root: small_opensfm(root, _LENS)), {".json": _JSON}, read_capture),
+    Family("metashape", written(lambda root: small_metashape(root, _LENS)), {".xml": _TEXT}, read_capture),
+    Family("meshroom", written(lambda root: small_alicevision(root, _LENS)), {".sfm": _JSON}, read_capture),
+    Family("ply-splats", written(_splats("2dgs", "a.ply"), _splats("3dgs", "a.ply"), as_ascii("a.ply"),
+           _splats("compressed", "a.compressed.ply")), {".ply": m.of_ply}, read_splats_everywhere),
+    Family("ply-mesh", written(
+        *(partial(_pyramid, order=order, ragged=ragged) for order in _ORDERS for ragged in (True, False)),
+        lambda root: ply_points(root / "a.ply")), {".ply": m.of_ply}, read_surface),
+    Family("obj-stl-off", written(lambda root: _obj(root / "a.obj"), lambda root: _off(root / "a.off"),
+           lambda root: _stl(root / "a.stl", text=True), lambda root: _stl(root / "a.stl", text=False)),
+           {".obj": _TEXT, ".off": _TEXT, ".stl": m.either(m.of_text, m.of_bytes)}, read_surface),
+    Family("spz-splat", written(_splats("spz", "a.spz"), _splats("splat", "a.splat")),
+           {".spz": m.either(m.of_gzip, m.of_gzip, m.of_bytes), ".splat": m.of_bytes}, read_splats_everywhere),
+    Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),
+           {".npy": m.of_npy}, read_map),
+    Family("seen-counts", written(_counted), {".npy": m.of_npy}, read_surface),
+    Family("images", written(
+        _image("a.png"), _image("a.png", "P"), _image("a.png", "LA"), _image("a.png", "I;16"), _image("a.jpg"),
+        _image("a.jpg", "L", progressive=True), _image("a.tif"), _image("a.tif", "F"), _image("a.webp", "RGBA"),
+        _image("a.tif", compression="tiff_lzw"), _image("a.bmp"), _image("a.ppm"), _image("a.gif", "P"),
+        _image("a.jp2")),
+        {".png": m.of_png, "": m.of_bytes}, read_picture),
+    Family("official", written(_official), {".mat": m.of_bytes, ".json": _JSON, ".txt": _TEXT, ".log": _TEXT},
+           read_official),
+    Family("zip", written(_packed(zipfile.ZIP_DEFLATED), _packed(zipfile.ZIP_STORED)),
+           {".zip": m.either(m.of_zip(_JSON), m.of_bytes)}, read_archive),
+    Family("checkpoint", written(_checkpoint), {".pt": m.either(m.of_zip(m.of_bytes), m.of_bytes)}, read_checkpoint),
+    Family("recipe", written(_recipe), {".json": _JSON}, read_recipe),
+    Family("run-files", c.run_seeds, c.RUN_FILES, c.read_run),
+    Family("command-line", c.line_seeds, {".json": c.JSON_LINE}, c.read_line),
+    Family("rasterize", c.scene_seeds, {".splats": c.of_floats}, c.draw),
+)  # fmt: skip
+FAMILIES = {family.name: family for family in _ALL}
