@@ -3,6 +3,7 @@
 #   make test      ruff, mypy and the tests that take minutes, not hours
 #   make test-all  the slow tests too
 #   make test-gpu  what needs an NVIDIA GPU: the contract and parity on it, streams, waiting, training; skipped without one
+#   make fuzz      new mutated inputs, an hour a reader (SECONDS=60 FAMILIES="ply-mesh images"), findings in runs/fuzz
 #   make lint      ruff, its formatter and mypy (`make types`: mypy alone)
 #   make kernels   the native library into the source tree, for development with PYTHONPATH=src
 VENV := .venv
@@ -13,13 +14,15 @@ PYTHON ?= $(shell for p in python3.14 python3.13 python3.12 python3.11 python3 p
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
 WORKERS ?= 2
 TEST_ARGS ?=
+FAMILIES ?=
+SECONDS ?= 3600
 
 SOURCES := $(shell find src CMakeLists.txt pyproject.toml README.md LICENSE -type f \
 	-not -path '*/__pycache__/*' -not -path 'src/gs2d/kernels/lib/*' 2>/dev/null)
 # One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts.
 TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo test test-all test-gpu lint types kernels install clean
+.PHONY: demo test test-all test-gpu fuzz lint types kernels install clean
 
 demo: $(VENV)/installed
 	$(VENV)/bin/gs2d demo
@@ -33,6 +36,11 @@ test-all: lint
 # One process: the tests share the device.
 test-gpu: $(VENV)/installed
 	$(TEST_ENV) $(PY) -m pytest -m gpu -q $(TEST_ARGS)
+
+# New inputs each day: the number of the first one is the date's.
+fuzz: $(VENV)/installed
+	$(TEST_ENV) $(PY) tests/fuzz/drive.py $(FAMILIES) --seconds $(SECONDS) --first $$(date +%Y%m%d000000) \
+		--keep runs/fuzz
 
 lint: $(VENV)/installed
 	$(PY) -m ruff check .

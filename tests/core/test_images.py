@@ -200,7 +200,7 @@ def test_a_mask_of_one_color_may_be_as_large_as_a_photograph(tmp_path: Path) -> 
     assert not read_mask(png_of(tmp_path / "mask.png", 9504, 6336, "L")).any()  # of a camera of 60 megapixels
 
 
-@pytest.mark.parametrize("format_", ["DDS", "EPS", "TGA", "ICO", "PCX"])
+@pytest.mark.parametrize("format_", ["DDS", "EPS", "TGA", "ICO", "PCX", "GIF"])
 def test_formats_that_nobody_photographs_in_are_never_tried(tmp_path: Path, format_: str) -> None:
     """EPS would start Ghostscript; whatever the file is called, Pillow's other parsers do not see it."""
     Image.new("RGB", (32, 32), "red").save(tmp_path / "a", format=format_)
@@ -211,7 +211,7 @@ def test_formats_that_nobody_photographs_in_are_never_tried(tmp_path: Path, form
 
 
 def test_formats_of_photographs_and_masks_are_read(tmp_path: Path) -> None:
-    for suffix in ("jpg", "png", "bmp", "tif", "webp", "gif", "ppm", "pgm", "jp2"):
+    for suffix in ("jpg", "png", "bmp", "tif", "webp", "ppm", "pgm", "jp2"):
         Image.new("L", (20, 10), 255).save(tmp_path / f"a.{suffix}")
         assert read_image(tmp_path / f"a.{suffix}").shape[:2] == (10, 20), suffix
         assert read_mask(tmp_path / f"a.{suffix}").all(), suffix

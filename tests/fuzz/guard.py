@@ -142,7 +142,7 @@ def outcome(target: Callable[[Path], object], folder: Path, size: int) -> tuple[
         finding = f"outside: {watch.seen[0]}"
     if finding is None and said:
         finding = f"warning: {said[0].category.__name__}: {said[0].message} ({said[0].filename}:{said[0].lineno})"
-    printed = b"".join(line for line in printed.splitlines(True) if not line.startswith(_LIBTIFF))
+    printed = b"".join(line for line in printed.splitlines(True) if _LIBTIFF not in line)
     if finding is None and printed:
         finding = f"printed: {printed[:200]!r}"
     return finding, verdict, peak

@@ -88,7 +88,7 @@ def _from_json_file(path: Path) -> Recipe:
             f"{path} must be a recipe in JSON, got: {error.strerror or error}; `gs2d recipes show NAME --json` "
             "prints one"
         ) from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise RecipeError(
             f"{path} must hold a recipe in JSON, as `gs2d recipes show NAME --json` prints it, got: {error}"
         ) from error
@@ -96,6 +96,8 @@ def _from_json_file(path: Path) -> Recipe:
         raise RecipeError(f"{path} must hold a recipe, an object of JSON, got {type(data).__name__}")
     try:
         return from_json(data)
+    except RecursionError as error:
+        raise RecipeError(f"{path} must hold a recipe, got values nested too deeply to read") from error
     except RecipeError as error:
         raise RecipeError(f"{path}: {error}; `gs2d recipes show NAME --json` prints a whole one") from error
 

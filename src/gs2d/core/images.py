@@ -17,7 +17,7 @@ from gs2d.errors import DataError, ShapeError
 
 #: What Pillow is let near: formats of photographs, masks and depths. The forty others, some of which start programs
 #: (EPS: Ghostscript) or which nobody has looked at for years, are never tried, whatever a file is called.
-FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "PPM", "GIF", "JPEG2000")
+FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "WEBP", "AVIF", "HEIF", "BMP", "PPM", "JPEG2000")
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:

@@ -10,29 +10,23 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.io import loadmat
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from gs2d.config.surface_protocols import DTU_SURFACE, DtuSurface
 from gs2d.core.camera import Camera
-from gs2d.core.growth import check_growth
 from gs2d.core.mesh import Mesh
 from gs2d.errors import DataError
 from gs2d.evaluation.alignment import apply, similarity_scale
 from gs2d.evaluation.nearest import Cloud
 from gs2d.evaluation.surface import ScoredClouds
+from gs2d.io.matlab import read_matlab
 from gs2d.io.meshes import read_points
-
-_MAT_HEADER, _MAT_COMPRESSED = 128, 15  # bytes; the data type of an element that zlib packed
-_MAT_SMALL = 256 << 20  # bytes; observation masks are mostly air
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -101,37 +95,11 @@ def read_dtu_truth(scan: int, files: Mapping[str, Path]) -> DtuTruth:
 
 def _matrices(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Variables of a MATLAB file (version 5, as DTU has them)."""
-    try:
-        _check_unpacked(path)
-        content = loadmat(path, variable_names=names)
-    except FileNotFoundError as error:
-        raise DataError(f"cannot read {path}: no such file") from error
-    except (DataError, MemoryError):
-        raise
-    except Exception as error:  # whatever scipy's parser runs into
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DataError(f"{path} must be a MATLAB 5 file, got: {reason}; copy it again") from error
+    content = read_matlab(path, names)
     missing = [name for name in names if name not in content]
     if missing:
         raise DataError(f"{path} must hold {', '.join(names)}; {', '.join(missing)} is missing; copy it again")
     return {name: content[name] for name in names}
-
-
-def _check_unpacked(path: Path) -> None:
-    """Raise for a MATLAB 5 file whose compressed variables would take more than a scan's do."""
-    data = path.read_bytes()
-    order = ">" if data[126:128] == b"MI" else "<"
-    at = _MAT_HEADER
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(order + "II", data, at)
-        at += 8
-        if kind == _MAT_COMPRESSED:
-            unpack, rest, total = zlib.decompressobj(), data[at : at + size], 0
-            while rest and not unpack.eof:
-                total += len(unpack.decompress(rest, 1 << 20))
-                rest = unpack.unconsumed_tail
-                check_growth(path, len(data), total, "a variable", small=_MAT_SMALL)
-        at += size
 
 
 # -- the score ---------------------------------------------------------------------------------------------------------

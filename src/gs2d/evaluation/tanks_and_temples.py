@@ -108,7 +108,7 @@ def read_crop(path: Path) -> CropVolume:
         axis = "XYZ".index(str(data["orthogonal_axis"]).upper())
         low, high = float(data["axis_min"]), float(data["axis_max"])
         corners = np.asarray(data["bounding_polygon"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
             f"{path} must hold orthogonal_axis (X, Y or Z), axis_min, axis_max and bounding_polygon, "
             f"got another entry ({error}); copy it again from the ground truth"

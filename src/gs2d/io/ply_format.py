@@ -53,7 +53,8 @@ class PlyElement:
         """Return the named scalar properties as float64 columns [count, len(names)], or None where one is missing."""
         columns = [self.properties.get(name) for name in names]
         arrays = [column for column in columns if isinstance(column, np.ndarray)]
-        return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == len(names) else None
+        with np.errstate(invalid="ignore"):  # of a NaN that signals
+            return np.stack(arrays, axis=1).astype(np.float64) if len(arrays) == len(names) else None
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ import platform
 import re
 import shutil
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -373,7 +374,9 @@ def load_tensors(path: Path) -> dict[str, Any]:
             damaged = archive.testzip()
         if damaged is not None:
             raise ValueError(f"the checksum of {damaged} is wrong")
-        return dict(torch.load(path, map_location="cpu", weights_only=True))
+        with warnings.catch_warnings():  # torch's, of a damaged head
+            warnings.simplefilter("ignore")
+            return dict(torch.load(path, map_location="cpu", weights_only=True))
     except (*_UNREADABLE, DataError, pickle.UnpicklingError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise RunError(f"{path} is not a readable checkpoint ({reason}); delete it") from error
