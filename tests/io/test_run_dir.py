@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import json
 import multiprocessing
@@ -189,6 +190,17 @@ def test_a_log_line_that_does_not_fit_is_taken_back(tmp_path: Path, monkeypatch:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, previous)
     assert log.path.read_bytes() == b'{"a": 1}\n'
+
+
+def test_a_log_that_does_not_reach_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    log = EventLog(tmp_path / "events.jsonl")
+    log.append({"a": 1})
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(DiskError, match=r"cannot write .*events.jsonl: No space left on device; free some space"):
+        log.sync()
 
 
 def test_the_log_refuses_nan(tmp_path: Path) -> None:

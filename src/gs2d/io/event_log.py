@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.core.files import disk_error
-from gs2d.errors import RunError
+from gs2d.errors import DiskError, RunError
 
 
 class EventLog:
@@ -36,7 +36,7 @@ class EventLog:
             with open(self.path, "ab") as file:
                 file.write(lines)
         except OSError as error:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(DiskError):
                 self.cut(start)
             raise disk_error(self.path, error) from error
 
@@ -46,12 +46,20 @@ class EventLog:
         return self.path.stat().st_size if self.path.exists() else 0
 
     def cut(self, size: int) -> None:
-        """Forget everything after ``size`` bytes (and an unfinished last line)."""
+        """Forget everything after ``size`` bytes (and an unfinished last line).
+
+        Raises
+        ------
+        DiskError
+        """
         if not self.path.exists():
             return
-        with open(self.path, "r+b") as file:
-            kept = file.read(size)
-            file.truncate(kept.rfind(b"\n") + 1)
+        try:
+            with open(self.path, "r+b") as file:
+                kept = file.read(size)
+                file.truncate(kept.rfind(b"\n") + 1)
+        except OSError as error:
+            raise disk_error(self.path, error) from error
 
     def read_bytes(self, size: int) -> bytes:
         """Return the first ``size`` bytes, as far as there are so many."""
@@ -61,10 +69,19 @@ class EventLog:
             return file.read(size)
 
     def sync(self) -> None:
-        """Bring the log to the disk, before a checkpoint that refers to it."""
-        if self.path.exists():
+        """Bring the log to the disk, before a checkpoint that refers to it.
+
+        Raises
+        ------
+        DiskError
+        """
+        if not self.path.exists():
+            return
+        try:
             with open(self.path, "rb") as file:
                 os.fsync(file.fileno())
+        except OSError as error:
+            raise disk_error(self.path, error) from error
 
     def read(self) -> list[dict[str, Any]]:
         """All whole events.

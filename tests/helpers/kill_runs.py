@@ -1,0 +1,352 @@
+"""Runs commands of gs2d once for each call that changes a file, and ends them, or fills the disk, at that call.
+
+A program of its own: ``failing_files.c`` must be loaded before Python is (LD_PRELOAD), and everything is imported once,
+each run is a fork. It prints a JSON object for each command and action: how many calls there are, by name, how many
+were tried, and what went wrong. By hand (docs/reliability.md)::
+
+    cc -shared -fPIC -o /tmp/failing.so tests/helpers/failing_files.c -ldl
+    LD_PRELOAD=/tmp/failing.so GS2D_FAILING_FILES=/tmp/failing.so PYTHONPATH=src:tests/helpers OMP_NUM_THREADS=1 \
+        python tests/helpers/kill_runs.py --commands train,mesh --actions kill,tear,full --work /tmp/kills
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import ctypes
+import errno
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from ball_runs import comparable, options
+from gs2d.errors import Gs2dError
+from gs2d.io.run_dir import RunFolder, load_tensors
+from gs2d.pipeline.export import export_run
+from gs2d.pipeline.mesh import mesh_run
+from gs2d.pipeline.page import page_run
+from gs2d.pipeline.report import report_run
+from gs2d.pipeline.train import train
+from tiny import write_capture
+
+COMMANDS = ("train", "mesh", "export", "page", "report")
+AT_EACH_CALL = {"kill": -1, "tear": -2, "full": errno.ENOSPC}  # tear: half a write, or right after another call
+DONE, REFUSED, FAULT = 0, 2, 1  # exit codes, as of gs2d
+SHORT = {  # the three stages on few views: as many kinds of files as in a long run
+    "schedule_scale": 0.0002,
+    "overrides": ("init_points=40", "surface.densify.max_splats=60"),
+    "checkpoint_every": 2,
+    "shown_views": 1,
+    "page": True,
+}
+DATED = ("report.html", "run.json", "metrics.json", "verdict.json", "events.jsonl", ".lock")  # times, names of folders
+
+
+class Layer:
+    """The calls below a folder, counted and disturbed."""
+
+    def __init__(self) -> None:
+        self._library = ctypes.CDLL(os.environ["GS2D_FAILING_FILES"])
+
+    def arm(self, folder: Path, number: int = -1, action: int = 0, record: int = -1) -> None:
+        """Count from now on in this process; do ``action`` at call ``number``."""
+        self._library.failing_arm(os.fsencode(folder), ctypes.c_long(number), action, record)
+
+    def turn_back_the_clock(self) -> None:
+        """Let the wall clock of this process run backwards."""
+        self._library.failing_clock()
+
+
+def started(work: Callable[[], object]) -> int:
+    """Do something in a child; its process."""
+    child = os.fork()
+    if not child:
+        code = FAULT
+        try:
+            work()
+            code = DONE
+        except Gs2dError as error:
+            print(f"refused: {error}", file=sys.stderr)
+            code = REFUSED
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    return child
+
+
+def ended(child: int) -> int:
+    """Wait for a child; its exit code, or minus the signal that ended it."""
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def forked(work: Callable[[], object]) -> int:
+    """Do something in a child and wait for it."""
+    return ended(started(work))
+
+
+class Command:
+    """One command: how it is begun on a fresh folder, gone on with after a kill, and what it leaves."""
+
+    def __init__(self, name: str, work: Path) -> None:
+        self.name, self.work, self.capture = name, work, work / "ball"
+        if not self.capture.exists():
+            write_capture(self.capture, train=3, test=1, size=16)
+
+    def train(self, out: Path) -> None:
+        """Train from what is there."""
+        train(options(self.capture, out, resume=True, **SHORT))
+
+    def prepare(self, folder: Path) -> None:
+        """Make the folder as it is before the command."""
+        if self.name == "train":
+            folder.mkdir()
+            return
+        finished = self.work / "finished"
+        if not finished.exists() and forked(lambda: self.train(finished)) != DONE:
+            raise SystemExit("the training before the command failed")
+        shutil.copytree(finished, folder / "run")
+
+    def run(self, folder: Path) -> None:
+        """Do it, or go on with it."""
+        run = folder / "run"
+        if self.name == "train":
+            self.train(run)
+        elif self.name == "mesh":
+            mesh_run(run)
+        elif self.name == "export":
+            export_run(run, folder / "out.spz")
+            export_run(run, folder / "out.splat")
+        elif self.name == "page":
+            page_run(run)
+        elif self.name == "report":
+            report_run(run)
+
+    def leaves(self, folder: Path) -> dict[str, Any]:
+        """Return what may not depend on how often the command was killed: all names, and bytes without times."""
+        files = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
+        found: dict[str, Any] = {
+            name: None if path.name in DATED or path.suffix == ".pt" else path.read_bytes()
+            for name, path in files.items()
+        }
+        run = RunFolder(folder / "run")
+        splats, events, stages = comparable(run)
+        others = {key: value for key, value in run.metrics().items() if key != "stages"}
+        others["mesh"] = {key: value for key, value in others.get("mesh", {}).items() if key != "file"}
+        return found | {"the splats": splats, "the log": events, "the scores": stages, "the other facts": others}
+
+
+def half_written(folder: Path) -> list[str]:
+    """Return the files under their own names that are not whole."""
+    broken = []
+    for path in folder.rglob("*"):
+        if not path.is_file() or path.name.endswith(".tmp"):
+            continue
+        try:
+            if path.suffix == ".json":
+                json.loads(path.read_text())
+            elif path.suffix == ".pt":
+                load_tensors(path)
+            elif path.suffix == ".png":
+                Image.open(path).load()
+            elif path.suffix == ".html" and "</html>" not in path.read_text()[-100:]:
+                raise ValueError("it has no end")
+        except Exception as error:
+            broken.append(f"{path.relative_to(folder)} is not whole: {error}")
+    return broken
+
+
+@contextlib.contextmanager
+def scratch(work: Path) -> Iterator[Path]:
+    """A folder that is removed at the end."""
+    folder = work / "try"
+    shutil.rmtree(folder, ignore_errors=True)
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def differing(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """Return what differs, by name."""
+    names = sorted(expected.keys() | found.keys())
+    return [
+        f"{name} " + ("is missing" if name not in found else "is left over" if name not in expected else "differs")
+        for name in names
+        if name not in found or name not in expected or found[name] != expected[name]
+    ]
+
+
+def gone_on(command: Command, folder: Path, expected: dict[str, Any]) -> list[str]:
+    """Do the command again, and return what is then not as it should be."""
+    if forked(lambda: command.run(folder)) != DONE:
+        return ["cannot be gone on with"]
+    return differing(command.leaves(folder), expected)
+
+
+def at_call(command: Command, layer: Layer, number: int, action: str, expected: dict[str, Any]) -> list[str]:
+    """Disturb the command at one call, do it again, and return what is not as it should be."""
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+
+        def disturbed() -> None:
+            layer.arm(folder, number, AT_EACH_CALL[action])
+            command.run(folder)
+
+        code = forked(disturbed)
+        allowed = (-signal.SIGKILL,) if action != "full" else (REFUSED, DONE)
+        wrong = [] if code in allowed else [f"ended with {code}"]
+        wrong += half_written(folder)
+        if action == "full" and list(folder.rglob("*.tmp")):
+            wrong.append("left a temporary file on a full disk")
+        return wrong + gone_on(command, folder, expected)
+
+
+def at_random(command: Command, chance: random.Random, seconds: float, expected: dict[str, Any]) -> list[str]:
+    """Kill the command at a time by chance, and each time that it goes on once more, until it is through."""
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+        for _ in range(3):
+            child = started(lambda: command.run(folder))
+            time.sleep(chance.uniform(0, seconds))
+            os.kill(child, signal.SIGKILL)
+            ended(child)
+        return half_written(folder) + gone_on(command, folder, expected)
+
+
+def stopped_and_continued(command: Command, chance: random.Random, expected: dict[str, Any]) -> list[str]:
+    """Stop the command and let it go on, again and again."""
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+        child = started(lambda: command.run(folder))
+        while (status := os.waitpid(child, os.WNOHANG)) == (0, 0):
+            for number in (signal.SIGSTOP, signal.SIGCONT):
+                os.kill(child, number)
+                time.sleep(chance.uniform(0, 0.05))
+        wrong = [] if os.waitstatus_to_exitcode(status[1]) == DONE else ["does not end well"]
+        return wrong or differing(command.leaves(folder), expected)
+
+
+def with_the_clock_going_back(command: Command, layer: Layer, expected: dict[str, Any]) -> list[str]:
+    """Do the command while the clock on the wall runs backwards."""
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+
+        def disturbed() -> None:
+            layer.turn_back_the_clock()
+            command.run(folder)
+
+        wrong = [] if forked(disturbed) == DONE else ["does not end well"]
+        return wrong or differing(command.leaves(folder), expected)
+
+
+def twice_at_once(command: Command, chance: random.Random, expected: dict[str, Any]) -> list[str]:
+    """Do the command twice in one folder, the second a little later: one at least is through, and the other refused."""
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+        first = started(lambda: command.run(folder))
+        time.sleep(chance.uniform(0, 0.3))
+        second = started(lambda: command.run(folder))
+        codes = sorted((ended(first), ended(second)))
+        wrong = [] if codes in ([DONE, DONE], [DONE, REFUSED]) else [f"ended with {codes}"]
+        return wrong or differing(command.leaves(folder), expected)
+
+
+def with_another_photograph(command: Command, layer: Layer, calls: int, expected: dict[str, Any]) -> list[str]:
+    """Kill the training half-way, change a photograph: it is refused, and goes on when the photograph is back."""
+    photograph = command.capture / "train" / "r_0.png"
+    before = photograph.read_bytes()
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+
+        def killed() -> None:
+            layer.arm(folder, calls // 2, AT_EACH_CALL["kill"])
+            command.run(folder)
+
+        forked(killed)
+        try:
+            shutil.copyfile(command.capture / "train" / "r_1.png", photograph)
+            code = forked(lambda: command.run(folder))
+        finally:
+            photograph.write_bytes(before)
+        wrong = [] if code == REFUSED else [f"another photograph: ended with {code}"]
+        return wrong + gone_on(command, folder, expected)
+
+
+def undisturbed(command: Command, layer: Layer) -> tuple[list[str], dict[str, Any], float]:
+    """Return the calls of the command, one line each, what it leaves, and the seconds that it took."""
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+        record = command.work / "calls.txt"
+        descriptor = os.open(record, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600)
+
+        def counted() -> None:
+            layer.arm(folder, record=descriptor)
+            command.run(folder)
+
+        began = time.monotonic()
+        if forked(counted) != DONE:
+            raise SystemExit("the undisturbed command failed")
+        seconds = time.monotonic() - began
+        os.close(descriptor)
+        return record.read_text().splitlines(), command.leaves(folder), seconds
+
+
+def tries(command: Command, layer: Layer, action: str, given: argparse.Namespace) -> dict[str, Any]:
+    """Do all of one action to one command; the line that is printed."""
+    calls, expected, seconds = undisturbed(command, layer)
+    wrong: list[str] = []
+    tried, began, chance = 0, time.monotonic(), random.Random(given.seed)
+    numbers = range(given.first, len(calls), given.every) if action in AT_EACH_CALL else range(given.times)
+    for number in numbers:
+        if time.monotonic() - began > given.seconds:
+            break
+        if action in AT_EACH_CALL:
+            found = [f"{text} ({calls[number]})" for text in at_call(command, layer, number, action, expected)]
+        elif action == "random":
+            found = at_random(command, chance, seconds, expected)
+        elif action == "stop":
+            found = stopped_and_continued(command, chance, expected)
+        elif action == "clock":
+            found = with_the_clock_going_back(command, layer, expected)
+        elif action == "twice":
+            found = twice_at_once(command, chance, expected)
+        else:
+            found = with_another_photograph(command, layer, len(calls), expected)
+        wrong += [f"{number}: {text}" for text in found]
+        tried += 1
+    kinds = dict(collections.Counter(line.partition(" ")[0] for line in calls))
+    named = {"command": command.name, "action": action, "calls": len(calls), "kinds": kinds}
+    return {**named, "tried": tried, "wrong": wrong}
+
+
+def main() -> None:
+    """Disturb commands as the options say."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--commands", default=",".join(COMMANDS))
+    parser.add_argument("--actions", default=",".join(AT_EACH_CALL), help="and random, stop, clock, twice, photograph")
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--times", type=int, default=1, help="of the actions that are not at a call")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="for each command and action")
+    given = parser.parse_args()
+    layer, work = Layer(), given.work.resolve()
+    work.mkdir(parents=True, exist_ok=True)
+    for name in given.commands.split(","):
+        for action in given.actions.split(","):
+            print(json.dumps(tries(Command(name, work), layer, action, given)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

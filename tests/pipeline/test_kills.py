@@ -1,0 +1,109 @@
+"""What a kill, a full disk, a stop or a second command does at any call that changes a file: nothing is lost by it.
+
+``kill_runs`` says how; the counts that were reached are in docs/reliability.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HELPERS = Path(__file__).resolve().parents[1] / "helpers"
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the layer is for the libc of Linux")
+
+
+@pytest.fixture(scope="module")
+def layer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The layer that fails, compiled."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler here")
+    library = tmp_path_factory.mktemp("layer") / "failing_files.so"
+    words = [compiler, "-Wall", "-shared", "-fPIC", "-o", str(library), str(HELPERS / "failing_files.c"), "-ldl"]
+    subprocess.run(words, check=True)
+    return library
+
+
+def tried(layer: Path, work: Path, commands: str, actions: str, *more: str) -> list[dict[str, Any]]:
+    """What ``kill_runs`` says of each command and action, none of which did any harm."""
+    environment = {
+        **os.environ,
+        "LD_PRELOAD": str(layer),
+        "GS2D_FAILING_FILES": str(layer),
+        "OMP_NUM_THREADS": "1",
+        "MPLBACKEND": "Agg",
+        "PYTHONPATH": os.pathsep.join([str(HELPERS), os.environ.get("PYTHONPATH", "")]),
+    }
+    words = [sys.executable, str(HELPERS / "kill_runs.py"), "--commands", commands, "--actions", actions]
+    done = subprocess.run(
+        [*words, "--work", str(work), *more], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    results = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [result["wrong"] for result in results] == [[]] * len(results), done.stderr[-2000:]
+    assert len(results) == len(commands.split(",")) * len(actions.split(","))
+    return results
+
+
+def test_a_page_and_an_export_that_end_at_any_of_their_calls_leave_the_old_file_or_the_new_one(
+    layer: Path, tmp_path: Path
+) -> None:
+    for result in tried(layer, tmp_path, "page,export", "kill,tear,full"):
+        assert result["kinds"].keys() >= {"open", "write", "fsync", "rename"}
+        assert result["tried"] == result["calls"] >= 5
+
+
+def test_the_layer_would_notice_a_file_that_is_written_in_place(layer: Path, tmp_path: Path) -> None:
+    """A stand-in for an export that writes in place: killed half-way it leaves half a file, which must be found."""
+    code = (
+        "import kill_runs, sys\n"
+        "def write(run, out):\n"
+        "    with open(out.with_suffix('.json'), 'wb', buffering=0) as file:\n"
+        "        file.write(b'[' + b'1, ' * 50 + b'1]')\n"
+        "kill_runs.export_run = write\n"
+        "sys.argv = ['x', '--commands', 'export', '--actions', 'tear', '--work', sys.argv[1]]\n"
+        "kill_runs.main()\n"
+    )
+    paths = os.pathsep.join([str(HELPERS), os.environ.get("PYTHONPATH", "")])
+    environment = {"LD_PRELOAD": str(layer), "GS2D_FAILING_FILES": str(layer), "PYTHONPATH": paths}
+    words = [sys.executable, "-c", code, str(tmp_path)]
+    done = subprocess.run(words, env={**os.environ, **environment}, capture_output=True, text=True, check=True)
+    (result,) = map(json.loads, done.stdout.splitlines())
+    assert any("out.json is not whole" in text for text in result["wrong"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("action", ["kill", "tear", "full"])
+def test_a_training_that_ends_at_any_of_its_calls_is_resumed_to_the_same_bytes(
+    layer: Path, tmp_path: Path, action: str
+) -> None:
+    (result,) = tried(layer, tmp_path, "train", action)
+    assert result["tried"] == result["calls"] > 200
+
+
+@pytest.mark.slow
+def test_a_mesh_and_a_report_that_end_at_any_of_their_calls_are_made_again(layer: Path, tmp_path: Path) -> None:
+    for result in tried(layer, tmp_path, "mesh,report", "kill,tear,full"):
+        assert result["tried"] == result["calls"] >= 5
+
+
+@pytest.mark.slow
+def test_kills_by_chance_stops_and_a_clock_that_goes_back_change_nothing(layer: Path, tmp_path: Path) -> None:
+    tried(layer, tmp_path, "train", "random,stop,clock", "--times", "10")
+
+
+@pytest.mark.slow
+def test_two_commands_in_one_folder_end_as_one(layer: Path, tmp_path: Path) -> None:
+    tried(layer, tmp_path, "train,mesh,page", "twice", "--times", "10")
+
+
+@pytest.mark.slow
+def test_a_photograph_that_changes_between_kill_and_resume_is_refused(layer: Path, tmp_path: Path) -> None:
+    tried(layer, tmp_path, "train", "photograph")
