@@ -4,6 +4,7 @@
 #   make test-all  the slow tests too
 #   make test-gpu  what needs an NVIDIA GPU: the contract and parity on it, streams, waiting, training; skipped without one
 #   make fuzz      new mutated inputs, an hour a reader (SECONDS=60 FAMILIES="ply-mesh images"), findings in runs/fuzz
+#   make audit     licences and known vulnerabilities of what gs2d depends on (the latter by pip-audit, if installed)
 #   make lint      ruff, its formatter and mypy (`make types`: mypy alone)
 #   make kernels   the native library into the source tree, for development with PYTHONPATH=src
 VENV := .venv
@@ -22,7 +23,7 @@ SOURCES := $(shell find src CMakeLists.txt pyproject.toml README.md LICENSE -typ
 # One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts.
 TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo test test-all test-gpu fuzz lint types kernels install clean
+.PHONY: demo test test-all test-gpu fuzz audit lint types kernels install clean
 
 demo: $(VENV)/installed
 	$(VENV)/bin/gs2d demo
@@ -41,6 +42,9 @@ test-gpu: $(VENV)/installed
 fuzz: $(VENV)/installed
 	$(TEST_ENV) $(PY) tests/fuzz/drive.py $(FAMILIES) --seconds $(SECONDS) --first $$(date +%Y%m%d000000) \
 		--keep runs/fuzz
+
+audit: $(VENV)/installed
+	$(PY) scripts/audit.py
 
 lint: $(VENV)/installed
 	$(PY) -m ruff check .

@@ -19,9 +19,9 @@ from websockets.typing import Subprotocol
 class Client:
     """Listens in a thread until it is closed."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, url: str) -> None:
         protocol = Subprotocol(f"viser-v{viser.__version__}")
-        self._socket = connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None)
+        self._socket = connect(url.replace("http", "ws", 1), subprotocols=[protocol], max_size=None)
         self.counts: Counter[str] = Counter()  # of messages, by type
         self.bytes = 0
         self._widgets: dict[str, str] = {}  # label -> uuid

@@ -51,9 +51,9 @@ def test_a_watched_training_has_the_bytes_of_an_unwatched_one(
     wrong: list[BaseException] = []
     done = threading.Event()
 
-    def look(port: int) -> None:
+    def look(url: str) -> None:
         try:
-            client = Client(port)
+            client = Client(url)
             seen.append(client)
             client.wait(lambda: client.counts["GaussianSplatsMessage"] >= 3)  # empty ones, and two refreshes
             client.choose("pause training", True)
@@ -70,7 +70,7 @@ def test_a_watched_training_has_the_bytes_of_an_unwatched_one(
 
     def on_event(event: Event) -> None:
         if isinstance(event, Notice) and event.text.startswith("watch it at http://127.0.0.1:"):
-            threading.Thread(target=look, args=[int(event.text.rpartition(":")[2])], daemon=True).start()
+            threading.Thread(target=look, args=[event.text.rpartition(" ")[2]], daemon=True).start()
         if isinstance(event, Step) and event.detail and not done.is_set():
             time.sleep(0.2)
 

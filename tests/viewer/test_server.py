@@ -268,7 +268,7 @@ def test_a_file_of_splats_is_served_on_this_machine_until_the_viewer_is_closed(t
     viewer = open_viewer(path, ViewOptions(threads=1))
     try:
         assert set(viewer.nodes) == {"splats"}
-        assert viewer.url == f"http://127.0.0.1:{viewer.port}"
+        assert viewer.url == f"http://127.0.0.1:{viewer.port}/?token={viewer.token}"
         with urllib.request.urlopen(viewer.url, timeout=20) as page:
             assert b"<!doctype html>" in page.read(100)
         with pytest.raises(BackendError, match="a free port"):

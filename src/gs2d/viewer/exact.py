@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.camera import Camera
+from gs2d.errors import Gs2dError, ShapeError
 
 Render = Callable[[Camera, str], "Drawn"]
 
@@ -142,6 +143,10 @@ class ExactImages:
             wish, sharp, kind, render = found
             try:
                 camera = camera_of(wish.client.camera, self._frame, MAX_PIXELS if sharp else MOVING_PIXELS)
+            except (Gs2dError, ArithmeticError, AttributeError, TypeError, ValueError):
+                self._left(wish.client)  # no camera: nothing is drawn for this browser before it looks from somewhere
+                continue
+            try:
                 drawn = render()(camera, kind)
                 depth = np.minimum(drawn.depth / self._frame.unit, FARTHEST)
                 wish.client.scene.set_background_image(
@@ -161,6 +166,9 @@ def camera_of(view: Any, frame: ViewerFrame, most_pixels: int) -> Camera:
     """
     from scipy.spatial.transform import Rotation
 
+    numbers = np.array([*view.wxyz, *view.position, view.fov, view.image_width, view.image_height], np.float64)
+    if not np.isfinite(numbers).all() or not 0 < view.fov < np.pi:
+        raise ShapeError(f"a camera with finite numbers and an angle between 0 and pi was expected, got {numbers}")
     width, height = max(int(view.image_width), 1), max(int(view.image_height), 1)
     shrink = min(1.0, (most_pixels / (width * height)) ** 0.5)
     width, height = max(round(width * shrink), 1), max(round(height * shrink), 1)

@@ -23,6 +23,7 @@ from gs2d.core.transforms import focus_point
 from gs2d.errors import BackendError, Gs2dError
 from gs2d.viewer.clip import ClipBox
 from gs2d.viewer.exact import ExactImages, Render, ViewerFrame
+from gs2d.viewer.guard import Guard, guarded
 from gs2d.viewer.splats import Preview
 
 DEFAULT_PORT = 8080
@@ -107,7 +108,7 @@ def thumbnail(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
 
 
 class Viewer:
-    """A server with one scene; every browser that opens its page sees it.
+    """A server with one scene; every browser that opens its address, token and all, sees it.
 
     Parameters
     ----------
@@ -124,8 +125,18 @@ class Viewer:
         viser = required_viser()
         self._frame = frame
         self.host, self.port = host, free_port(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # it shows its addresses, whatever `verbose` says
+        self._guard = Guard()
+        # it shows its addresses, whatever `verbose` says
+        with contextlib.redirect_stdout(io.StringIO()), guarded(self._guard):
             self._server = viser.ViserServer(host=host, port=self.port, label=title, verbose=False)
+        if not self._guard.installed:
+            self._server.stop()
+            raise BackendError(
+                f"a viser that can be served through a gate was expected, got {viser.__version__}, which anybody could "
+                f"look at; {install('view')}"
+            )
+        # viser has no public way from the name in a message to its widget
+        self._guard.control = self._server.gui._gui_input_handle_from_uuid.get
         self._server.gui.configure_theme(show_share_button=False, show_logo=False)  # nothing leaves this machine
         self._server.scene.set_up_direction(tuple(up))
         self._nodes: dict[str, list[Any]] = {}
@@ -140,9 +151,15 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Where the page is, with the token without which nothing is shown."""
         shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.host, self.host)
-        return f"http://{f'[{shown}]' if ':' in shown and shown[0] != '[' else shown}:{self.port}"
+        place = f"http://{f'[{shown}]' if ':' in shown and shown[0] != '[' else shown}:{self.port}"
+        return f"{place}/?token={self._guard.token}"
+
+    @property
+    def token(self) -> str:
+        """What a browser must know to be let in."""
+        return self._guard.token
 
     @property
     def nodes(self) -> Mapping[str, Sequence[Any]]:

@@ -1,0 +1,61 @@
+"""Look at what gs2d depends on: licences, by their metadata, and known vulnerabilities, by pip-audit. `make audit`.
+
+Exit code 0: nothing found. 1: something is. 3: vulnerabilities could not be looked up here (pip-audit is not installed,
+or its database cannot be reached); licences were looked at nevertheless.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FOUND, NOT_CHECKED = 1, 3
+
+
+def licences() -> int:
+    """Run the test that knows which licences are allowed; 0 where all are."""
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        str(ROOT / "tests" / "test_dependencies.py"),
+    ]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, cwd=ROOT)
+    print(f"licences: {done.stdout.strip().splitlines()[-1] if done.stdout.strip() else done.stderr.strip()}")
+    return FOUND if done.returncode else 0
+
+
+def vulnerabilities(requirements: Path) -> int:
+    """Ask pip-audit about the pinned versions; says so where it cannot tell."""
+    if importlib.util.find_spec("pip_audit") is None:
+        print(f"vulnerabilities: not checked, pip-audit is not installed; {sys.executable} -m pip install pip-audit")
+        return NOT_CHECKED
+    words = [sys.executable, "-m", "pip_audit", "--no-deps", "--disable-pip", "-f", "json", "-r", str(requirements)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    try:
+        audited = json.loads(done.stdout)["dependencies"]
+    except (ValueError, KeyError, TypeError):
+        why = (done.stderr.strip().splitlines() or ["no answer"])[-1]
+        print(f"vulnerabilities: not checked, the database could not be asked: {why[:200]}")
+        return NOT_CHECKED
+    known = [(package, fault) for package in audited for fault in package.get("vulns", ())]
+    skipped = [package["name"] for package in audited if "skip_reason" in package]
+    for package, fault in known:
+        fixed = ", ".join(fault["fix_versions"]) or "no version yet"
+        print(f"vulnerability: {package['name']} {package['version']}: {fault['id']}; fixed in {fixed}")
+    print(f"vulnerabilities: {len(known)} known in {len(audited) - len(skipped)} packages of {requirements.name}")
+    if skipped:
+        print(f"vulnerabilities: not checked: {', '.join(skipped)}")
+    return FOUND if known else NOT_CHECKED if skipped else 0
+
+
+if __name__ == "__main__":
+    results = (licences(), vulnerabilities(ROOT / "constraints.txt"))
+    sys.exit(FOUND if FOUND in results else max(results))
