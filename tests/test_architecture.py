@@ -43,7 +43,7 @@ TOP = {"__init__.py", "__main__.py", "errors.py"}  # nothing else lies loose
 # Floors inside a room: a module imports from lower ones of its room only. A folder of a room is one entry.
 INSIDE = {
     "core": {
-        "checks growth locks extras memory text": 0,
+        "checks growth locks extras memory memory_limit text": 0,
         "files": 1,
         "arrays json_files camera images mesh sh splats": 2,
         "transforms": 3,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from gs2d.core.memory_limit import cache_bytes as room_for_cache
 from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
@@ -70,7 +71,7 @@ _PROJECTS = {  # files of other tools that do not hold cameras in the open
     ".rcproj": "in RealityCapture, export the registration as COLMAP",
     ".rsproj": "in RealityScan, export the registration as COLMAP",
 }
-DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures
+DEFAULT_CACHE_BYTES = 4 << 30  # 4 GiB of decoded pictures, where memory is not limited
 
 
 def detect_format(path: str | os.PathLike[str]) -> str:
@@ -144,7 +145,7 @@ def load_scene(
     format: str = "auto",
     downscale: int = 1,
     test_every: int | None = None,
-    cache_bytes: int = DEFAULT_CACHE_BYTES,
+    cache_bytes: int | None = None,
 ) -> Scene:
     """Read a capture; nothing is decoded but image headers, and nothing is ever written.
 
@@ -160,7 +161,8 @@ def load_scene(
         Every n-th view (sorted by name, from the first) is a test view where the data set has no split of its own;
         0 = all views train. None: 8, and 0 for DTU (whose protocol trains on all views).
     cache_bytes : int
-        Bound on decoded pictures held in memory.
+        Bound on decoded pictures held in memory. None: ``DEFAULT_CACHE_BYTES``, or a fifth of what the limits in force
+        (control group, address space, the machine) leave this process.
 
     Raises
     ------
@@ -173,6 +175,8 @@ def load_scene(
     reader = reader_of(format)
     if downscale < 1:
         raise DataError(f"downscale must be a whole number >= 1, got {downscale}")
+    if cache_bytes is None:
+        cache_bytes = room_for_cache(DEFAULT_CACHE_BYTES)
     capture = reader.read(root, downscale=downscale)
     if isinstance(capture, Scene):
         if downscale > 1:

@@ -35,6 +35,7 @@ from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.formats.registry import read_surfels
 from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.pipeline.memory import check_memory
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined_poses import with_found_poses
@@ -315,6 +316,7 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     reader_of(scene_format)  # a wrong name is told before anything is read
     protocol = choose_protocol(options, scene_format, on_event)
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
+    check_memory(scene, options.downscale, backend.device)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
     recipe = fit_recipe(options, scene, protocol, on_event)

@@ -5,8 +5,51 @@ from __future__ import annotations
 import gc
 
 from gs2d.core.memory import trim
+from gs2d.core.memory_limit import memory_limit
 from gs2d.data import Scene
+from gs2d.errors import DataError
 from gs2d.kernels.library import available_variants, load
+
+ITERATION_BYTES = 160  # of a pixel, at least: images, their gradients, losses (docs/reliability.md)
+DECODING_BYTES = 12  # of a pixel of the file: what a JPEG is decoded through
+MAX_DOWNSCALE = 64
+
+
+def check_memory(scene: Scene, downscale: int, device: str) -> None:
+    """Refuse to train on photographs that are too large for the memory that this process may have.
+
+    Parameters
+    ----------
+    scene : Scene
+    downscale : int
+        By which its photographs were made smaller than their files.
+    device : str
+        Where is trained: on a GPU, photographs are only decoded here.
+
+    Raises
+    ------
+    DataError
+        It cannot fit: the kernel would end the process without a word.
+    """
+    limit = memory_limit()
+    if limit is None:
+        return
+    pixels = max(view.camera.width * view.camera.height for view in (*scene.train, *scene.test))
+    on_host = device == "cpu"
+
+    def need(factor: int) -> float:
+        shrunk = pixels * (downscale / factor) ** 2
+        return shrunk * ITERATION_BYTES * on_host + pixels * downscale**2 * DECODING_BYTES
+
+    if need(downscale) <= limit.room:
+        return
+    fitting = next((f for f in range(downscale + 1, MAX_DOWNSCALE + 1) if need(f) <= limit.room), None)
+    smaller = f"--downscale {fitting}" if fitting is not None else "smaller files of the photographs"
+    raise DataError(
+        f"photographs of up to {pixels / 1e6:.3g} megapixels need about {need(downscale) / 2**30:.2g} GiB to train on, "
+        f"got {limit.room / 2**30:.2g} GiB that this process may still have of {limit.bytes / 2**30:.2g} GiB "
+        f"({limit.source}); use {smaller}, or raise the limit"
+    )
 
 
 def release(scene: Scene) -> None:

@@ -14,6 +14,7 @@ import torch
 from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.core.camera import Camera
+from gs2d.core.memory_limit import cache_bytes
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError
 from gs2d.losses.multiview import PatchImage, prepare_image
@@ -97,7 +98,7 @@ class ImageFiles:
     """Photographs of the training views as patches; the first that fit in ``limit_bytes`` are kept."""
 
     def __init__(self, views: tuple[View, ...], settings: MultiView, *, limit_bytes: int = 1 << 29) -> None:
-        self._views, self._settings, self._room = views, settings, limit_bytes
+        self._views, self._settings, self._room = views, settings, cache_bytes(limit_bytes)
         self._kept: dict[int, PatchImage] = {}
 
     def of(self, index: int, target: Target) -> PatchImage:

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from gs2d.config.priors import DepthPrior, NormalPrior
 from gs2d.config.recipe import Recipe
+from gs2d.core.memory_limit import cache_bytes
 from gs2d.data.priors import ObservedPoints, PointsInView, PriorDepth
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
@@ -181,7 +182,7 @@ class Priors:
     ) -> None:
         self._views, self._recipe, self._device = scene.train, recipe, device
         by_place = 1 << 30 if torch.device(device).type == "cpu" else 1 << 32
-        self._room = by_place if limit_bytes is None else limit_bytes
+        self._room = cache_bytes(by_place) if limit_bytes is None else limit_bytes
         self._kept: dict[int, tuple[Depths | None, NormalTarget | None]] = {}
         self.plan = None if recipe.depth_prior is None else plan_depths(scene, recipe.depth_prior)
         self.axes = None if recipe.normal_prior is None else plan_normals(scene, recipe.normal_prior)

@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from gs2d.core.memory_limit import cache_bytes
 from gs2d.data.scene import View
 from gs2d.losses.api import TargetMaps
 
@@ -76,7 +77,7 @@ class Targets:
         self._use_masks = use_masks
         self._maps, self._with_silhouettes = maps, with_silhouettes
         self._dtype, self._device = dtype, device
-        self._room = limit_bytes
+        self._room = cache_bytes(limit_bytes)
         self._kept: dict[int, Target] = {}
 
     def __getitem__(self, index: int) -> Target:

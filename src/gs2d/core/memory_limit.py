@@ -1,0 +1,121 @@
+"""How much memory this process may have: the least of what the kernel, the container and the machine set.
+
+What is beyond a cgroup's limit is no MemoryError but the end of the process by SIGKILL, without a word. So caches are
+made as large as fits under the limit that is in force, and work that cannot fit is refused before it begins.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["MemoryLimit", "cache_bytes", "memory_limit"]
+
+CACHE_FRACTION = 0.2  # of what is left, that a cache may take: what the work itself needs must fit beside it
+_UNLIMITED = 1 << 60  # cgroup v1 says 2^63 less a page where there is no limit
+
+
+@dataclass(frozen=True)
+class MemoryLimit:
+    """A limit, and what of it this process has already.
+
+    Attributes
+    ----------
+    bytes : int
+    used : int
+        Bytes of it that this process has.
+    source : str
+        Who sets it, in words.
+    """
+
+    bytes: int
+    used: int
+    source: str
+
+    @property
+    def room(self) -> int:
+        """Bytes that are left."""
+        return max(self.bytes - self.used, 0)
+
+
+def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
+    """Return the limit that leaves the least, of cgroup (v1 and v2), RLIMIT_AS and the machine; None: none is known.
+
+    Parameters
+    ----------
+    root : path
+        Where ``proc`` and ``sys`` are.
+    """
+    mapped, resident = _own_pages(root)
+    found = [MemoryLimit(limit, resident, source) for limit, source in (*_cgroups(root), *_physical(root))]
+    address_space = _address_space()
+    if address_space is not None:
+        found.append(MemoryLimit(address_space, mapped, "the limit on address space, ulimit -v"))
+    return min(found, key=lambda limit: limit.room, default=None)
+
+
+def cache_bytes(wanted: int) -> int:
+    """Return the bytes that a cache may take: ``wanted``, or less where memory is limited."""
+    limit = memory_limit()
+    return wanted if limit is None else min(wanted, int(CACHE_FRACTION * limit.room))
+
+
+def _own_pages(root: Path) -> tuple[int, int]:
+    """Bytes of this process: its address space, and what of it is in memory."""
+    try:
+        fields = (root / "proc/self/statm").read_text().split()
+        page = os.sysconf("SC_PAGE_SIZE")
+        return int(fields[0]) * page, int(fields[1]) * page
+    except (OSError, ValueError, IndexError):
+        return 0, 0
+
+
+def _cgroups(root: Path) -> Iterator[tuple[int, str]]:
+    """Yield the limits of the control groups that this process is in, and of those that these are in."""
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if number == "0" and not controllers:
+            mount, name, words = root / "sys/fs/cgroup", "memory.max", "the control group (memory.max)"
+        elif "memory" in controllers.split(","):
+            mount, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+            words = "the control group (memory.limit_in_bytes)"
+        else:
+            continue
+        parts = [part for part in path.split("/") if part not in ("", "..", ".")]
+        for depth in range(len(parts), -1, -1):  # in a container the path may be that of the host: what is there counts
+            try:
+                limit = int((mount.joinpath(*parts[:depth]) / name).read_text())
+            except (OSError, ValueError):  # not there, or "max"
+                continue
+            if 0 < limit < _UNLIMITED:
+                yield limit, words
+
+
+def _physical(root: Path) -> Iterator[tuple[int, str]]:
+    try:
+        for line in (root / "proc/meminfo").read_text().splitlines():
+            if line.startswith("MemTotal:"):
+                yield int(line.split()[1]) * 1024, "the memory of this machine"
+                return
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        yield os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), "the memory of this machine"
+    except (OSError, ValueError, AttributeError):
+        return
+
+
+def _address_space() -> int | None:
+    try:
+        import resource  # not on Windows
+    except ImportError:
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
