@@ -1,0 +1,101 @@
+"""Random scenes, the CPU kernels against the reference: images, radii, errors and gradients, the edges of float32 among
+them. A few in every run of the tests, two thousand in `make test-all`.
+
+What is compared how is that of ``test_parity``: the reference judges in float64 on the same float32 numbers; decisions
+at thresholds may flip for one pair in some 1e5, and gradients are compared where no decision is near its threshold.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import render_oracle
+from gs2d.core.camera import Camera
+from gs2d.core.splats import ATTRIBUTES, Splats
+from gs2d.render import reference
+from gs2d.render.backends import Backend
+from gs2d.render.types import RasterSettings
+from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
+
+SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
+
+
+def random_scene(seed: int) -> tuple[Splats, Camera]:
+    """Every second scene has numbers of any magnitude that float32 has in some of its splats."""
+    rng = np.random.default_rng(10_000 + seed)
+    camera = random_camera(rng)
+    camera = camera.resized(min(camera.width, 20), min(camera.height, 20))
+    splats = random_splats(rng, camera, int(rng.integers(1, 30))).to(dtype=torch.float32)
+    if seed % 2:
+        for name in ("means", "quats", "log_scales", "opacity_logits", "sh0"):
+            values = getattr(splats, name).numpy()
+            chosen = rng.uniform(size=values.shape) < 0.05
+            with np.errstate(over="ignore", under="ignore"):
+                edges = (rng.choice([-1.0, 1.0], values.shape) * 2.0 ** rng.uniform(-149, 128, values.shape)).astype(
+                    np.float32
+                )
+            values[chosen] = np.clip(edges, -3.4e38, 3.4e38)[chosen]
+    return splats, camera
+
+
+def gradients(native: Backend | None, splats: Splats, camera: Camera, seed: int) -> dict[str, Tensor]:
+    scene = requiring_grad(splats)
+    run = reference.rasterize if native is None else native.rasterize
+    cotangents = random_cotangents(np.random.default_rng(seed), camera)
+    contraction(run(scene, camera, SETTINGS), cotangents).backward()
+    return {name: getattr(scene, name).grad for name in ATTRIBUTES}
+
+
+def compare(native: Backend, seeds: range) -> None:
+    different, pixels, wrong_radii, count, compared = 0, 0, 0, 0, 0
+    errors: list[float] = []
+    for seed in seeds:
+        splats, camera = random_scene(seed)
+        double = splats.to(dtype=torch.float64)
+        low, high = native.rasterize(splats, camera, SETTINGS), reference.rasterize(double, camera, SETTINGS)
+        for name in IMAGES:
+            a, b = getattr(low, name).double(), getattr(high, name)
+            assert bool(a.isfinite().all()), (seed, name)
+            off = (a - b).abs() / b.abs().clamp(min=1)
+            different += int((off > 2 / 255).sum())
+            pixels += off.numel()
+        wrong_radii += int(((low.radii.double() - high.radii).abs() > 1e-3 * (1 + high.radii)).sum())
+        count += len(splats)
+        got = gradients(native, splats, camera, seed)
+        assert all(bool(grad.isfinite().all()) for grad in got.values()), seed
+        small = camera.resized(min(camera.width, 8), min(camera.height, 8))
+        few = splats.rows(torch.arange(min(len(splats), 12)))
+        if seed % 2 == 0 and render_oracle.render(few, small, SETTINGS).margin >= 1e-4:
+            compared += 1
+            ours, theirs = (
+                gradients(backend, scene, small, seed)
+                for backend, scene in ((native, few), (None, few.to(dtype=torch.float64)))
+            )
+            for name, expected in theirs.items():
+                if float(expected.norm()) > 1e-3:
+                    errors.append(float((ours[name].double() - expected).norm() / expected.norm()))
+    assert different / pixels < 4e-4, (different, pixels)
+    assert wrong_radii <= max(1, 3e-3 * count), (wrong_radii, count)
+    assert compared >= len(seeds) // 20, compared
+    assert np.median(errors) < 1e-5
+    assert max(errors) < 5e-3
+
+
+def test_random_scenes_agree_with_the_reference(native: Backend) -> None:
+    compare(native, range(40))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+@pytest.mark.parametrize("block", range(4))
+def test_two_thousand_random_scenes_agree_with_the_reference(native: Backend, block: int) -> None:
+    compare(native, range(500 * block, 500 * (block + 1)))
+
+
+def test_every_second_scene_has_edges() -> None:
+    plain, edged = (torch.cat([random_scene(2 * i + j)[0].means.abs() for i in range(30)]).max() for j in (0, 1))
+    assert float(plain) < 1e3
+    assert float(edged) > 1e9
