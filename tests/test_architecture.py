@@ -260,7 +260,9 @@ def test_importing_a_module_has_no_side_effect_on_torch() -> None:
 
 
 def test_tests_lie_where_their_modules_lie() -> None:
-    """``helpers`` is what they share, ``benchmarks`` tests what is beside the package, ``gpu`` needs a device."""
+    """``helpers`` is what they share, ``benchmarks`` and ``fuzz`` test what is beside the package, ``gpu`` a device."""
     root = Path(__file__).parent
-    folders = {path.parent.relative_to(root) for path in root.rglob("test_*.py")} - {Path("benchmarks"), Path("gpu")}
+    folders = {path.parent.relative_to(root) for path in root.rglob("test_*.py")} - {
+        *map(Path, ("benchmarks", "fuzz", "gpu"))
+    }
     assert not [str(folder) for folder in sorted(folders) if not (PACKAGE / folder).is_dir()]

@@ -50,7 +50,14 @@ __device__ __forceinline__ Vec3<float> learn_colors(const ProjectVjpArguments& a
     return color_vjp(a.view.sh_degree, sh, int(a.sh_rest), g_sh, direction, g_color);
 }
 
-extern "C" __global__ void __launch_bounds__(128, 5) project_splats_vjp(ProjectVjpArguments a) {
+// Blocks that a multiprocessor shall hold: five leave 96 registers, which sm_120 has too few of (8 bytes spilled).
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 1200
+#define PROJECT_VJP_BLOCKS 4
+#else
+#define PROJECT_VJP_BLOCKS 5
+#endif
+
+extern "C" __global__ void __launch_bounds__(128, PROJECT_VJP_BLOCKS) project_splats_vjp(ProjectVjpArguments a) {
     __shared__ float4 staged[4][WARP_ROWS * MAX_ROW / 4];
     const int lane = threadIdx.x & 31, length = int(3 * a.sh_rest);
     const int64 begin = int64(blockIdx.x) * blockDim.x + (threadIdx.x & ~31u), i = begin + lane;
