@@ -176,11 +176,10 @@ def draw(root: Path) -> None:
     high = rasterize(splats.to(dtype=torch.float64), camera, settings, backend="reference")
     for name in IMAGES:
         assert bool(getattr(low, name).isfinite().all()), f"{name} of the CPU is not finite"
-    apart = torch.maximum(
-        (low.alpha - high.alpha).abs().reshape(-1), (low.color - high.color).abs().amax(-1).reshape(-1)
-    )
+    colors = (low.color - high.color).abs() / high.color.abs().clamp_min(1)  # SH of 1e7 are rounded to 1e-7 of that
+    apart = torch.maximum((low.alpha - high.alpha).abs().reshape(-1), colors.amax(-1).reshape(-1))
     share = float((apart > 0.02).double().mean())
-    assert share <= 0.01, f"{share:.1%} of the pixels differ by more than 0.02"
+    assert share <= 0.01, f"{share:.1%} of the pixels differ by more than 0.02 (of their colour, where that is above 1)"
 
 
 JSON_LINE = m.either(m.of_json, m.of_json, m.of_text)
