@@ -44,6 +44,7 @@ DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 15_000, 5_000
+DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
 # reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
@@ -252,9 +253,6 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
     )
 
 
-DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())
-
-
 def _sparing_large_splats(stage: Stage) -> Stage:
     densify = stage.densify
     if not isinstance(densify, GradDensify) or densify.reset_every or densify.scale_cull_start is not None:
@@ -277,7 +275,7 @@ def best(iterations: int = BEST_ITERATIONS, *, name: str = "best") -> Recipe:
     """Return the recipe for the best pictures and surface per minute: 2DGS from a fitted dense start, in one stage.
 
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
-    make up for it; the mesh is of a depth in which no splat decides alone (docs/guides/recipes.md).
+    make up for it; the mesh is of a depth in which no splat decides alone (docs/recipes/best.md).
     """
     part = iterations / OFFICIAL_ITERATIONS
     nc = LossTerm("normal_consistency", 0.05, round(NC_START * part), where="object")

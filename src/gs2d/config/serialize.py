@@ -44,7 +44,7 @@ def from_json(data: Mapping[str, Any], *, to_train: bool = True) -> Recipe:
     RecipeError
         Where a key is unknown or missing, or a value has another type.
     """
-    recipe = _decode(current_names(data), Recipe, "recipe")
+    recipe = decode(current_names(data), Recipe, "recipe")
     assert isinstance(recipe, Recipe)
     return validate(recipe, to_train=to_train)
 
@@ -163,22 +163,17 @@ def decode(value: Any, kind: Any, where: str) -> Any:
     RecipeError
         An unknown or missing field, or a value of another type.
     """
-    return _decode(value, kind, where)
-
-
-def _decode(value: Any, kind: Any, where: str) -> Any:
-    """Return a JSON value as the annotated type."""
     origin = get_origin(kind)
     if origin in (Union, UnionType):
         return _decode_union(value, get_args(kind), where)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise RecipeError(f"{where} must be a list, got {value!r}")
-        return tuple(_decode(entry, get_args(kind)[0], f"{where}[{i}]") for i, entry in enumerate(value))
+        return tuple(decode(entry, get_args(kind)[0], f"{where}[{i}]") for i, entry in enumerate(value))
     if origin is not None and issubclass(origin, Mapping):
         if not isinstance(value, Mapping):
             raise RecipeError(f"{where} must be an object, got {value!r}")
-        return {str(key): _decode(entry, get_args(kind)[1], f"{where}.{key}") for key, entry in value.items()}
+        return {str(key): decode(entry, get_args(kind)[1], f"{where}.{key}") for key, entry in value.items()}
     if is_dataclass(kind):
         assert isinstance(kind, type)
         return _decode_dataclass(value, kind, where)
@@ -193,12 +188,12 @@ def _decode_union(value: Any, kinds: tuple[Any, ...], where: str) -> Any:
         named = isinstance(value, Mapping) and "name" in value
         kinds = (Densify if named else GradDensify,)
     if len(kinds) == 1:
-        return _decode(value, kinds[0], where)
+        return decode(value, kinds[0], where)
     tag = value.get(ACTION_KEY) if isinstance(value, Mapping) else None
     if tag not in ACTIONS:
         raise RecipeError(f"{where} needs {ACTION_KEY!r}, one of {', '.join(ACTIONS)}; got {tag!r}")
     rest = {key: entry for key, entry in value.items() if key != ACTION_KEY}
-    return _decode(rest, ACTIONS[str(tag)], where)
+    return decode(rest, ACTIONS[str(tag)], where)
 
 
 def _decode_dataclass(value: Any, kind: type, where: str) -> Any:
@@ -214,7 +209,7 @@ def _decode_dataclass(value: Any, kind: type, where: str) -> Any:
             raise RecipeError(f"{where} lacks the field {name!r}")
     label = value.get("name", "") if isinstance(value.get("name", ""), str) else ""
     inner = f"stage {label!r}" if kind.__name__ == "Stage" else where
-    return kind(**{name: _decode(entry, hints[name], f"{inner}.{name}") for name, entry in value.items()})
+    return kind(**{name: decode(entry, hints[name], f"{inner}.{name}") for name, entry in value.items()})
 
 
 def _decode_plain(value: Any, kind: Any, where: str) -> Any:
