@@ -54,6 +54,20 @@ class Bench:
             return {"skipped": "out of time (--minutes)"}
         return attempt(name, work)
 
+    def attempt_all(
+        self,
+        parts: Mapping[str, Callable[[], dict[str, Any]]],
+        only: Sequence[str],
+        progress: Callable[[dict[str, Any]], None],
+    ) -> dict[str, Any]:
+        """Return the results of the parts whose name has a word of ``only`` in it; ``progress`` sees them grow."""
+        found: dict[str, Any] = {}
+        for name, work in parts.items():
+            if not only or any(word in name for word in only):
+                found[name] = self.attempt(name, work)
+                progress(found)
+        return found
+
     def seconds_left(self, most: float) -> float:
         """Until the time is up, at most so many."""
         return max(1.0, min(most, self.end - time.monotonic()))

@@ -42,12 +42,7 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
         "tests": lambda: gpu_tests(bench),
         **{tool: lambda tool=tool: sanitize(bench, tool) for tool in TOOLS},
     }
-    found: dict[str, Any] = {}
-    for name, work in parts.items():
-        if not only or any(word in name for word in only):
-            found[name] = bench.attempt(name, work)
-            progress(found)
-    return found
+    return bench.attempt_all(parts, only, progress)
 
 
 def wrong(found: dict[str, Any]) -> bool:

@@ -37,12 +37,7 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
         "host": lambda: host.host_cost(5 if bench.dry else 200, stages=1 if bench.dry else 3),
         **{scene_name(*size, "A"): lambda size=size: speed(bench, *size) for size in sizes},
     }
-    found: dict[str, Any] = {}
-    for name, work in parts.items():
-        if not only or any(word in name for word in only):
-            found[name] = bench.attempt(name, work)
-            progress(found)
-    return found
+    return bench.attempt_all(parts, only, progress)
 
 
 def machine() -> dict[str, Any]:

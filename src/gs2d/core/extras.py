@@ -12,7 +12,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "cuda13": ("cuda-bindings>=13,<14", "nvidia-cuda-nvrtc>=13,<14"),
         "sfm": ("pycolmap>=4.2",),
         "texture": ("xatlas>=0.0.9",),
-        "view": ("viser>=1.1,<2",),
+        "view": ("viser>=1.1,<2", "msgspec>=0.18", "websockets>=14"),
     }
 )
 FFMPEG = "apt install ffmpeg, brew install ffmpeg, or ffmpeg.org"
