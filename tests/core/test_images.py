@@ -210,6 +210,19 @@ def test_formats_that_nobody_photographs_in_are_never_tried(tmp_path: Path, form
             read(path)
 
 
+def test_a_decoder_that_asks_for_more_memory_than_there_is_is_an_error_that_names_the_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = png_of(tmp_path / "a.png", 4, 4)
+
+    def load(_: Image.Image) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.load", load)
+    with pytest.raises(DataError, match=r"a\.png must decode in the memory there is"):
+        read_image(path)
+
+
 def test_formats_of_photographs_and_masks_are_read(tmp_path: Path) -> None:
     for suffix in ("jpg", "png", "bmp", "tif", "webp", "ppm", "pgm", "jp2"):
         Image.new("L", (20, 10), 255).save(tmp_path / f"a.{suffix}")

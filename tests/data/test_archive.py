@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import stat
 import struct
 import zipfile
@@ -77,6 +78,20 @@ def test_the_same_contents_are_unpacked_once_under_whatever_name_they_come(tmp_p
     (tmp_path / "capture" / "transforms.json").write_text("{}")
     assert first not in (other := unpack(pack(tmp_path / "capture", tmp_path / "a.zip"), tmp_path / "out")).parents
     assert not (other / "mark").exists()
+
+
+def test_two_processes_may_unpack_the_same_archive_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small_nerfstudio(tmp_path / "capture")
+    replace = os.replace
+
+    def later(source: Path, target: Path) -> None:
+        shutil.copytree(source, target)  # what the other one did while this one unpacked
+        replace(source, target)
+
+    monkeypatch.setattr(module.os, "replace", later)
+    capture = unpacked(pack(tmp_path / "capture", tmp_path / "a.zip"), tmp_path / "out")
+    assert len(load_scene(capture).views) == 9
+    assert len(list((tmp_path / "out").iterdir())) == 1
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_an_existing_capture_is_replaced_only_when_asked(
     assert poses_of(out).keys() == room.cameras.keys()
 
 
-def test_separate_pieces_and_photographs_without_a_place_are_named_and_the_same_seed_gives_the_same_bytes(
+def test_separate_pieces_and_photographs_without_a_place_are_named(
     colmap: None, pieces: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "capture"
@@ -140,6 +140,12 @@ def test_separate_pieces_and_photographs_without_a_place_are_named_and_the_same_
     assert "sparse/1 holds a separate piece: 4 photographs" in text.out
     assert "only 5 of 10 photographs have a place" in text.err
     assert load_scene(out).notes[0] == "only the model sparse/0 is read; others are there: 1"
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_bytes(colmap: None, pieces: Path, tmp_path: Path) -> None:
+    out = tmp_path / "capture"
+    assert poses(pieces, out, "--quiet") == 0
     models = {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))}
     assert len(models) == 10  # cameras, images, points3D, rigs, frames, twice
     assert poses(pieces, out, "--overwrite", "--quiet") == 0

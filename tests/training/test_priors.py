@@ -314,11 +314,11 @@ def test_known_depths_bring_the_splats_nearer_to_the_surface(scene: Scene) -> No
     plain = Recipe("plain", (replace(first, iterations=40, densify=None, losses=first.losses[:2], lr=lr),))
 
     def error(recipe: Recipe) -> float:
-        trainer, found = Trainer(made, recipe, GENERIC, backend="reference"), []
+        trainer, found = Trainer(made, recipe, GENERIC, backend="auto"), []
         trainer.run()
         for view in made.train:
             with torch.no_grad():
-                output = rasterize(trainer.splats, view.camera, trainer.settings, backend="reference")
+                output = rasterize(trainer.splats, view.camera, trainer.settings, backend="auto")
             truth = torch.from_numpy(view.maps.values)  # type: ignore[union-attr]
             there = (truth > 0) & (output.alpha > 0.5)
             found.append(float((output.depth_mean / truth - 1).abs()[there].mean()))

@@ -92,7 +92,14 @@ def least_after_resets(scene: Scene, recipe: Recipe, protocol: Protocol, backend
 
 @pytest.mark.parametrize(
     ("factor", "protocol", "resets"),
-    [(1.0, WHITE, 5), (0.5, BLACK, 2), (0.1, BLACK, 0), (0.1, WHITE, 1), (0.03, WHITE, 1), (0.01, WHITE, 0)],
+    [
+        pytest.param(1.0, WHITE, 5, marks=pytest.mark.slow),
+        (0.5, BLACK, 2),
+        (0.1, BLACK, 0),
+        (0.1, WHITE, 1),
+        (0.03, WHITE, 1),
+        (0.01, WHITE, 0),
+    ],
 )
 def test_half_of_the_splats_outlive_every_reset(scene: Scene, factor: float, resets: int, protocol: Protocol) -> None:
     ratios = least_after_resets(scene, first_stage(factor), protocol, opacity_model())

@@ -50,8 +50,13 @@ def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Image.Image
             yield file
     except FileNotFoundError as error:
         raise DataError(f"image {os.fspath(path)} does not exist") from error
-    except (DataError, MemoryError):
+    except DataError:
         raise
+    except MemoryError as error:  # JPEG 2000's decoder also says so of a damaged file
+        raise DataError(
+            f"image {os.fspath(path)} must decode in the memory there is, got a decoder that asked for more; "
+            "it is damaged, or too large for this machine"
+        ) from error
     except Exception as error:
         raise DataError(expected.format(path=os.fspath(path), error=_first_line(error))) from error
 

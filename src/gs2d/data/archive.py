@@ -52,12 +52,21 @@ def unpack(path: Path, home: Path) -> Path:
                     inside = Path(hidden, digest, path.stem.strip(". ") or "capture")
                     inside.mkdir(parents=True)
                     file.extractall(inside, infos)
-                    os.replace(Path(hidden, digest), target)
+                    _move(Path(hidden, digest), target)
     except _BROKEN as error:
         raise DataError(f"{path} must be a whole ZIP file without a password, got: {error}; pack it again") from error
     except OSError as error:
         raise disk_error(home, error) from error
     return _capture_in(target)
+
+
+def _move(made: Path, target: Path) -> None:
+    """Put a folder in its place; another process that put the same there in the meantime was as good."""
+    try:
+        os.replace(made, target)
+    except OSError:
+        if not target.is_dir():
+            raise
 
 
 def _opened(path: Path) -> zipfile.ZipFile:

@@ -506,6 +506,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         Names the first thing that differs.
     """
     before, after = run.definition(), {"init": None, **json.loads(json.dumps(job.definition()))}
+    after = {"backend": after.pop("backend"), **after}  # first: another processor reads cameras with other last digits
     for name, value in after.items():
         old = before.get(name)
         if name == "protocol" and isinstance(old, dict):
@@ -523,7 +524,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
         where = ""
         if name == "scene":
             old, value = old and old.get("digest"), value["digest"]
-            name = "scene: its photographs, cameras, points or maps changed"
+            name = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
         elif name == "init":
             name = "--init: another file, or none"
         else:

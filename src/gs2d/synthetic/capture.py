@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,20 +97,66 @@ def write_demo_capture(
             f"got {train_views}, {test_views} and {size}"
         )
     root = Path(folder)
-    workers = threads or min(os.cpu_count() or 1, 8)
     _make_folders(root, ("train", "test") if test_views else ("train",))
-    scene = build_scene(seed)
-    light = bake(scene, threads=workers)
     cameras = demo_cameras(seed, train_views, test_views, size)
-    jobs = [(split, k, camera) for split, split_cameras in cameras.items() for k, camera in enumerate(split_cameras)]
+    gains = random_gains(train_views, seed) if vary_exposure else None
+    _photograph(root, build_scene(seed), cameras, gains, on_progress, threads)
+    if gains is not None:
+        write_json(root / GAINS, {f"train/r_{k}.png": list(map(float, gain)) for k, gain in enumerate(gains)})
+    if vary_poses:
+        write_json(root / TRUTH, _transforms("train", cameras["train"]))
+        cameras["train"] = disturbed(cameras["train"], seed)
+    _write_cameras(root, cameras)
 
-    gains = random_gains(train_views, seed)
+
+def write_capture(
+    folder: str | os.PathLike[str],
+    scene: ToyScene,
+    cameras: Mapping[str, Sequence[Camera]],
+    *,
+    on_progress: Callable[[int, int], None] | None = None,
+    threads: int | None = None,
+) -> None:
+    """Write photographs of any scene as ``write_demo_capture`` writes those of the demo.
+
+    Parameters
+    ----------
+    folder : path
+    scene : ToyScene
+    cameras : mapping of "train" and "test" to cameras
+        Of ``CAMERA_ANGLE_X``, as those of ``demo_cameras`` are.
+    on_progress, threads
+        As in ``write_demo_capture``.
+
+    Raises
+    ------
+    DiskError
+        A file could not be written.
+    """
+    root = Path(folder)
+    _make_folders(root, tuple(split for split, of_split in cameras.items() if of_split))
+    _photograph(root, scene, cameras, None, on_progress, threads)
+    _write_cameras(root, cameras)
+
+
+def _photograph(
+    root: Path,
+    scene: ToyScene,
+    cameras: Mapping[str, Sequence[Camera]],
+    gains: np.ndarray | None,
+    on_progress: Callable[[int, int], None] | None,
+    threads: int | None,
+) -> None:
+    """Write pictures, the mesh, and how many training views see each face; training pictures get the gains."""
+    workers = threads or min(os.cpu_count() or 1, 8)
+    light = bake(scene, threads=workers)
+    jobs = [(split, k, camera) for split, split_cameras in cameras.items() for k, camera in enumerate(split_cameras)]
 
     def image(job: tuple[str, int, Camera]) -> np.ndarray:
         split, k, camera = job
         result = render_image(scene, light, camera)
-        varied = vary_exposure and split == "train"
-        write_image(root / split / f"r_{k}.png", with_gains(result.rgba, gains[k]) if varied else result.rgba)
+        rgba = result.rgba if gains is None or split != "train" else with_gains(result.rgba, gains[k])
+        write_image(root / split / f"r_{k}.png", rgba)
         return result.seen
 
     counts = np.zeros(len(scene.patch.faces), dtype=np.int64)
@@ -123,13 +169,12 @@ def write_demo_capture(
     write_mesh(root / "mesh_gt.ply", demo_mesh(scene))
     with atomic_write(root / "mesh_gt_seen.npy") as file:
         np.save(file, np.minimum(counts, 255).astype(np.uint8))
-    if vary_exposure:
-        write_json(root / GAINS, {f"train/r_{k}.png": list(map(float, gain)) for k, gain in enumerate(gains)})
-    if vary_poses:
-        write_json(root / TRUTH, _transforms("train", cameras["train"]))
-        cameras["train"] = disturbed(cameras["train"], seed)
-    for split in ("test", "train") if test_views else ("train",):  # the last file is what makes the folder a capture
-        write_json(root / f"transforms_{split}.json", _transforms(split, cameras[split]))
+
+
+def _write_cameras(root: Path, cameras: Mapping[str, Sequence[Camera]]) -> None:
+    for split in ("test", "train"):  # the last file is what makes the folder a capture
+        if cameras.get(split):
+            write_json(root / f"transforms_{split}.json", _transforms(split, cameras[split]))
 
 
 def _make_folders(root: Path, splits: tuple[str, ...]) -> None:
@@ -176,7 +221,7 @@ def _spiral(
     return cameras
 
 
-def _transforms(split: str, cameras: list[Camera]) -> dict[str, object]:
+def _transforms(split: str, cameras: Sequence[Camera]) -> dict[str, object]:
     """Return the content of transforms_<split>.json: OpenGL camera-to-world matrices."""
     frames = []
     for k, camera in enumerate(cameras):
