@@ -4,6 +4,7 @@
 #   make test-all  the slow tests too
 #   make test-gpu  what needs an NVIDIA GPU: the contract and parity on it, streams, waiting, training; skipped without one
 #   make fuzz      new mutated inputs, an hour a reader (SECONDS=60 FAMILIES="ply-mesh images"), findings in runs/fuzz
+#   make docs      the documentation as a site: build/site/index.html; warnings and dead links are errors
 #   make audit     licences and known vulnerabilities of what gs2d depends on (the latter by pip-audit, if installed)
 #   make lint      ruff, its formatter and mypy (`make types`: mypy alone)
 #   make kernels   the native library into the source tree, for development with PYTHONPATH=src
@@ -23,7 +24,7 @@ SOURCES := $(shell find src CMakeLists.txt pyproject.toml README.md LICENSE -typ
 # One thread per test worker: two workers share two cores. The kernels' own tests set their thread counts.
 TEST_ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo test test-all test-gpu fuzz audit lint types kernels install clean
+.PHONY: demo test test-all test-gpu docs fuzz audit lint types kernels install clean
 
 demo: $(VENV)/installed
 	$(VENV)/bin/gs2d demo
@@ -31,12 +32,16 @@ demo: $(VENV)/installed
 test: lint
 	$(TEST_ENV) $(PY) -m pytest -m "not slow" -n $(WORKERS) -q $(TEST_ARGS)
 
-test-all: lint
+test-all: lint $(VENV)/docs
 	$(TEST_ENV) $(PY) -m pytest -n $(WORKERS) -q $(TEST_ARGS)
 
 # One process: the tests share the device.
 test-gpu: $(VENV)/installed
 	$(TEST_ENV) $(PY) -m pytest -m gpu -q $(TEST_ARGS)
+
+docs: $(VENV)/installed $(VENV)/docs
+	$(PY) -m sphinx -E -W --keep-going -q -b html -c docs/site -d build/doctrees . build/site
+	@echo "build/site/index.html"
 
 # New inputs each day: the number of the first one is the date's.
 fuzz: $(VENV)/installed
@@ -69,6 +74,12 @@ clean:
 # The wheel as users get it (not editable): the tests test what is shipped. --no-build-isolation uses the pinned tools.
 $(VENV)/installed: $(VENV)/dependencies $(SOURCES)
 	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(PIP) install --no-deps --no-build-isolation --force-reinstall .
+	@touch $@
+
+$(VENV)/docs: $(VENV)/dependencies
+	$(PY) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+		print(*p["optional-dependencies"]["docs"], sep="\n")' > $(VENV)/docs-requirements.txt
+	$(PIP) install -c constraints.txt -r $(VENV)/docs-requirements.txt
 	@touch $@
 
 $(VENV)/dependencies: constraints.txt pyproject.toml

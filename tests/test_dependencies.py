@@ -18,7 +18,7 @@ import gs2d
 
 PACKAGE = Path(gs2d.__file__).parent
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-EXTRAS = {name: lines for name, lines in PROJECT["optional-dependencies"].items() if name != "dev"}
+EXTRAS = {name: lines for name, lines in PROJECT["optional-dependencies"].items() if name not in ("dev", "docs")}
 DECLARED = [*PROJECT["dependencies"], *(line for lines in EXTRAS.values() for line in lines)]
 UNFREE = re.compile(r"\bA?GPL|(?<!Lesser )General Public License|non-?commercial|proprietary", re.IGNORECASE)
 # Packages whose metadata name such a licence, each looked into.

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 import gs2d
 from gs2d.cli.commands import COMMANDS
@@ -48,6 +49,27 @@ def test_the_program_of_the_migration_page_runs(tmp_path: Path, monkeypatch: pyt
     monkeypatch.chdir(tmp_path)
     write_capture(tmp_path / "capture")
     run_blocks(DOCS / "migration.md", 6)
+
+
+def test_the_loss_of_the_tutorial_reaches_the_splats_and_its_recipe_trains(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_blocks(DOCS / "tutorials" / "own-loss.md", 2)
+    scene = gs2d.load_scene(write_capture(tmp_path / "capture"))
+    plain, crisp = (gs2d.train(scene, one, schedule_scale=0.001) for one in ("best", names["recipe"](weight=5.0)))
+    assert not torch.equal(plain.splats.opacity_logits, crisp.splats.opacity_logits)
+
+
+def test_the_program_of_the_quickstart_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / "capture")
+    page = tmp_path / "quickstart.md"
+    text = (DOCS / "quickstart.md").read_text(encoding="utf-8")
+    assert "schedule_scale=0.1)" in text
+    page.write_text(text.replace("schedule_scale=0.1)", "schedule_scale=0.001)"), encoding="utf-8")  # seconds
+    run_blocks(page, 1)
+    assert (tmp_path / "splats.ply").is_file()
 
 
 def test_the_program_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ import gs2d
 from cli_runs import one_line, spawn
 from gs2d.cli import run
 from gs2d.cli.catalogue import options_of
-from gs2d.cli.help import _FIRST, _GROUPS, command_help
+from gs2d.cli.help import _FIRST, GROUPS, command_help
 from gs2d.cli.layout import message
 from gs2d.cli.usage import NAMES
 
@@ -86,7 +86,7 @@ def test_gs2d_alone_shows_the_commands_of_a_first_day_and_help_shows_all(capsys:
     assert 4 <= len(shown) <= 7
     assert "reconstruct" in shown
     assert "--version" in whole
-    assert sorted(name for names in _GROUPS.values() for name in names) == sorted(NAMES)
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(NAMES)
     assert all(f"\n  {name} " in whole for name in NAMES)
 
 

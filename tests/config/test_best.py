@@ -91,3 +91,10 @@ def test_robust_training_starts_as_it_was_tried_and_spares_sky_and_ground() -> N
     assert with_robustness(get_recipe("2dgs")).stages == get_recipe("2dgs").stages
     own = replace(get_recipe("2dgs-dense"), free_space=FreeSpace())
     assert with_robustness(own).dense_start == own.dense_start
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_normal_consistency_is_asked_of_the_object_alone(name: str) -> None:
+    terms = [term for stage in get_recipe(name).stages for term in stage.losses if term.kind == "normal_consistency"]
+    assert terms
+    assert all(term.where == "object" for term in terms)

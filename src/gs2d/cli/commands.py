@@ -39,7 +39,7 @@ class Common:
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(DemoOptions, Common):
-    """Make a small synthetic capture, train 2DGS-R on it, extract and score the mesh, write the report."""
+    """Make a small synthetic capture, train on it, extract and score the mesh, write the report."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ _FIRST_DAY = (
     ("gs2d mesh RUN --texture", "the mesh once more, with a texture or other settings"),
     ("gs2d info PATH", "what a run, a capture or a file holds"),
 )
-_GROUPS: dict[str, tuple[str, ...]] = {
+GROUPS: dict[str, tuple[str, ...]] = {
     "To begin with": ("doctor", "demo", "reconstruct", "view"),
     "Step by step": ("poses", "train", "mesh"),
     "Look, keep and share": ("info", "render", "page", "export", "report"),
@@ -45,7 +45,7 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
     "sweep": ("recipes", "data", "out", "seeds", "schedule_scale", "train"),
 }  # fmt: skip
 _OWN = "Of this command"
-_TITLES = {  # in the order in which they are shown
+TITLES = {  # in the order in which they are shown
     Finding: "Cameras of photographs",
     Training: "Training",
     HowItRuns: "How it runs",
@@ -75,11 +75,11 @@ def program_help(*, everything: bool = False) -> list[str]:
     """Return the help of ``gs2d``: all commands in groups; with ``everything`` all options of each, too."""
     width = terminal_width()
     lines = ["usage: gs2d COMMAND [OPTIONS]", "", *wrapped(_SLOGAN, width)]
-    for title, names in _GROUPS.items():
+    for title, names in GROUPS.items():
         lines += ["", f"{title}:", *entries([(name, about(NAMES[name])) for name in names], width)]
     lines += ["", "Options:", *entries(_PROGRAM_OPTIONS, width)]
     if everything:
-        for names in _GROUPS.values():
+        for names in GROUPS.values():
             for name in names:
                 lines += ["", "-" * min(width, 40), *command_help(name, everything=True)]
     return lines
@@ -118,19 +118,19 @@ def _needed_first(options: Sequence[Option]) -> list[Option]:
 
 def _groups(name: str, options: Sequence[Option]) -> dict[str, list[Option]]:
     """All options by heading: those of the first help, the others of the command itself, then what it shares."""
-    groups: dict[str, list[Option]] = {title: [] for title in ("First", _OWN, *_TITLES.values())}
+    groups: dict[str, list[Option]] = {title: [] for title in ("First", _OWN, *TITLES.values())}
     groups["First"] = first = _first(name, options)
     for option in options:
         if option not in first:
-            groups[_TITLES.get(option.group, _OWN)].append(option)
+            groups[TITLES.get(option.group, _OWN)].append(option)
     return {title: group for title, group in groups.items() if group}
 
 
 def _explained(options: Sequence[Option], width: int) -> list[str]:
-    return entries([(option.usage, _text(option)) for option in options], width)
+    return entries([(option.usage, option_text(option)) for option in options], width)
 
 
-def _text(option: Option) -> str:
+def option_text(option: Option) -> str:
     """Return the help of an option: its docstring, the values where no room was before, and the default."""
     values = "" if all(choice in option.usage for choice in option.choices) else f" {', '.join(option.choices)}."
     said = "default:" in option.about or option.kind is bool or option.default in (None, (), "")

@@ -203,7 +203,7 @@ def splat_errors(
     Returns
     -------
     Tensor [N]
-        Sum over pixels and channels of |c_i - image|; no gradient.
+        Sum over pixels and channels of ``|c_i - image|``; no gradient.
 
     Raises
     ------

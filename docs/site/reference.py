@@ -1,0 +1,94 @@
+"""The generated pages: commands from the options that the program parses, Python from the public face's docstrings."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+
+import gs2d
+from gs2d.cli.catalogue import Option, about, options_of
+from gs2d.cli.help import GROUPS, TITLES, option_text
+from gs2d.cli.usage import NAMES
+
+_SPOKEN = re.compile(r"(`[^`]*`)")  # what is code already
+
+
+def commands() -> str:
+    """Return every command with every option, as Markdown; options of several commands once, at the end."""
+    owners: dict[type, list[str]] = defaultdict(list)
+    for name in _names():
+        for group in {option.group for option in options_of(NAMES[name])}:
+            owners[group].append(name)
+    shared = {group for group, names in owners.items() if len(names) > 1}
+    lines = []
+    for title, names in GROUPS.items():
+        lines += [f"## {title}", ""]
+        for name in names:
+            lines += _command(name, shared)
+    lines += ["## Options of several commands", ""]
+    for group in sorted(shared, key=lambda group: -len(owners[group])):
+        used = ", ".join(f"[`{name}`](#gs2d-{name})" for name in owners[group])
+        lines += [f"### {_heading(group)}", "", f"Of {used}.", ""]
+        options = {option.field: option for name in owners[group] for option in options_of(NAMES[name])}
+        lines += _explained([option for option in options.values() if option.group is group])
+    return "\n".join(lines)
+
+
+def _names() -> Iterator[str]:
+    for names in GROUPS.values():
+        yield from names
+
+
+def _command(name: str, shared: set[type]) -> list[str]:
+    """Return a command: how it is called, what it does, its own options, and where the others are."""
+    options = options_of(NAMES[name])
+    needed = sorted((o for o in options if o.required or not o.flags), key=lambda o: bool(o.flags))
+    usage = " ".join(o.usage if o.required else f"[{o.usage}]" for o in needed)
+    lines = [f"### gs2d {name}", "", "```text", f"gs2d {name} {usage} [OPTIONS]".replace("  ", " "), "```", ""]
+    lines += [_plain(about(NAMES[name])), "", *_explained([o for o in options if o.group not in shared])]
+    others = list(dict.fromkeys(o.group for o in options if o.group in shared))
+    if others:
+        links = ", ".join(f"[{_heading(group)}](#{_anchor(_heading(group))})" for group in others)
+        lines += [f"Also: {links}.", ""]
+    return lines
+
+
+def _explained(options: list[Option]) -> list[str]:
+    lines = []
+    for option in options:
+        lines += [f"`{option.usage}`", f": {_plain(option_text(option))}", ""]
+    return lines
+
+
+def _heading(group: type) -> str:
+    """Return what a group of options is called."""
+    return TITLES.get(group) or re.sub(r"(?<=[a-z])(?=[A-Z])", " ", group.__name__).capitalize()
+
+
+def _anchor(heading: str) -> str:
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def _plain(text: str) -> str:
+    """Return text in which only what is in backticks is marked up."""
+    pieces = _SPOKEN.split(text)
+    return "".join(p if p.startswith("`") else re.sub(r"([*_<>\[\]{}|\\$])", r"\\\1", p) for p in pieces)
+
+
+def python() -> str:
+    """Return the public face as directives for Sphinx's autodoc: functions first, then types."""
+    names = [name for name in gs2d.__all__ if name != "__version__"]
+    kinds = {
+        "Functions": [name for name in names if not inspect.isclass(getattr(gs2d, name))],
+        "Types": [name for name in names if inspect.isclass(getattr(gs2d, name))],
+    }
+    lines = []
+    for title, found in kinds.items():
+        lines += [f"## {title}", ""]
+        for name in found:
+            kind = "autofunction" if title == "Functions" else "autoclass"
+            members = ["   :members:"] if kind == "autoclass" else []
+            lines += [f"### {name}", "", "```{eval-rst}", f".. {kind}:: gs2d.{name}", *members, "```", ""]
+    return "\n".join(lines)

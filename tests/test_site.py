@@ -1,0 +1,138 @@
+"""The documentation as a site: each page is in its navigation, each link leads to a heading, each reference is whole.
+
+What needs no Sphinx is asked here in seconds; the slow test builds the site, as `make docs` does.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import gs2d
+from gs2d.cli.catalogue import options_of
+from gs2d.cli.usage import NAMES
+
+ROOT = Path(__file__).resolve().parents[1]
+SITE = ROOT / "docs" / "site"
+TEST_NAME = re.compile(r"`(tests/[\w/]+\.py)(?:::(test_\w+))?`(?::\s+`(test_\w+)`)?")
+
+
+def module(name: str) -> ModuleType:
+    """Return a module of docs/site, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"site_{name}", SITE / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+navigation = module("navigation")
+PAGES: list[str] = navigation.pages()
+
+
+def headings(page: str) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub and the site make them."""
+    text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
+    titles = [re.sub(r"[`*]|\[([^]]*)\]\([^)]*\)", r"\1", title) for title in re.findall(r"^#+ (.+)$", text, re.M)]
+    return {re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-") for title in titles}
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    assert navigation.missing() == [], "add them to docs/README.md (decisions: docs/decisions/README.md)"
+
+
+def test_the_navigation_names_a_page_that_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "docs" / "guides").mkdir(parents=True)
+    (tmp_path / "README.md").write_text("# Home\n")
+    (tmp_path / "docs" / "README.md").write_text(
+        "# All\n\n## Guides\n\n- [one](guides/one.md#part), [home](../README.md)\n"
+    )
+    for name in ("one", "two"):
+        (tmp_path / "docs" / "guides" / f"{name}.md").write_text(f"# {name}\n")
+    monkeypatch.setattr(navigation, "ROOT", tmp_path)
+    assert navigation.parts("docs/README.md") == [("Guides", ["docs/guides/one.md"])]
+    assert navigation.missing() == ["docs/guides/two.md"]
+
+
+def test_the_parts_of_the_site_are_the_headings_of_its_contents() -> None:
+    trees = "".join(navigation.toctrees("README.md"))
+    for title, below in navigation.parts("docs/README.md"):
+        assert f":caption: {title}\n" in trees
+        assert below
+    assert "/docs/decisions/README\n" in trees
+    assert "/docs/decisions/libraries\n" not in trees  # one level deeper
+    assert "/docs/decisions/libraries\n" in "".join(navigation.toctrees("docs/decisions/README.md"))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_to_headings_lead_to_headings(page: str) -> None:
+    text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", text):
+        if "://" not in target and (not target or target.endswith(".md")):
+            goal = (ROOT / page).parent.joinpath(target).resolve() if target else ROOT / page
+            found = headings(goal.relative_to(ROOT).as_posix())
+            assert anchor in found, f"{page} links to {target}#{anchor}; there are {sorted(found)}"
+
+
+def test_every_picture_is_on_a_page() -> None:
+    texts = "".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES)
+    pictures = [
+        path for path in (ROOT / "docs" / "images").iterdir() if path.suffix in (".png", ".svg", ".jpg", ".webp")
+    ]
+    assert len(pictures) > 5
+    assert [path.name for path in pictures if f"images/{path.name})" not in texts] == []
+    assert [path.name for path in pictures if path.stat().st_size > 500_000] == []
+
+
+def test_each_known_fault_names_tests_that_exist() -> None:
+    parts = re.split(r"^## ", (ROOT / "docs" / "known-faults.md").read_text(encoding="utf-8"), flags=re.M)[1:]
+    assert len(parts) == 10  # the list of complaints that this page answers
+    for part in parts:
+        named = TEST_NAME.findall(part)
+        assert named, part.splitlines()[0]
+        for path, one, other in named:
+            text = (ROOT / path).read_text(encoding="utf-8")
+            name = one or other
+            assert not name or f"\ndef {name}(" in text, f"{path}::{name}"
+
+
+def test_the_command_reference_has_every_option_of_every_command() -> None:
+    text = module("reference").commands()
+    for name, command in NAMES.items():
+        assert f"\n### gs2d {name}\n" in text
+        for option in options_of(command):
+            assert f"\n`{option.usage}`\n: " in text, f"{name} {option.usage}"
+    anchors = {line[4:].lower().replace(" ", "-") for line in text.splitlines() if line.startswith("### ")}
+    assert set(re.findall(r"\]\(#([^)]+)\)", text)) <= anchors
+
+
+def test_the_python_reference_has_the_public_face() -> None:
+    text = module("reference").python()
+    for name in set(gs2d.__all__) - {"__version__"}:
+        assert f":: gs2d.{name}\n" in text
+
+
+@pytest.mark.parametrize("page", ["docs/reference/commands.md", "docs/reference/python.md"])
+def test_generated_pages_say_where_the_generated_part_goes(page: str) -> None:
+    assert (ROOT / page).read_text(encoding="utf-8").count("<!-- generated -->") == 1
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    for name in ("sphinx", "myst_parser", "furo"):
+        pytest.importorskip(name, reason="the extra `docs` is not installed: make docs")
+    command = [sys.executable, "-m", "sphinx", "-E", "-W", "--keep-going", "-q", "-b", "html", "-c", str(SITE)]
+    done = subprocess.run([*command, "-d", str(tmp_path / "trees"), str(ROOT), str(tmp_path / "site")],
+                          capture_output=True, text=True, check=False)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for page in PAGES:
+        html = (tmp_path / "site" / page).with_suffix(".html").read_text(encoding="utf-8")
+        for target in re.findall(r'<a class="reference internal" href="([^"#]+)', html):
+            assert (tmp_path / "site" / page).parent.joinpath(target).exists(), f"{page}: {target}"
