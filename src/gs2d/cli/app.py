@@ -20,7 +20,18 @@ from typing import NoReturn
 
 import gs2d
 from gs2d.cli import layout
-from gs2d.cli.commands import COMMANDS, Command, Common, Demo, Doctor, Info, Recipes, Reconstruct, Train
+from gs2d.cli.commands import (
+    COMMANDS,
+    Command,
+    Common,
+    Completion,
+    Demo,
+    Doctor,
+    Info,
+    Recipes,
+    Reconstruct,
+    Train,
+)
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
@@ -45,7 +56,7 @@ _MENDABLE = {
     errno.EISDIR,
     errno.EIO,
 }
-_HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info))
+_HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info, Completion))
 _NO_MEMORY = re.compile("can't allocate memory|out of memory")  # how torch says it, on the CPU and on a GPU
 
 

@@ -180,6 +180,14 @@ class Doctor(Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Completion(Common):
+    """Print what completes commands, options and values in a shell: source <(gs2d completion bash)."""
+
+    shell: Positional[Literal["bash", "zsh", "fish"]]
+    """The shell; the first line of what is printed says where it goes."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Info(Common):
     """Show what a run folder, a capture or a file of splats, mesh or points holds."""
 
@@ -189,7 +197,7 @@ class Info(Common):
 
 COMMANDS: tuple[type[Common], ...] = (
     Demo, Reconstruct, Poses, Train, Mesh, Render, View, Page, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor,
-    Info
+    Info, Completion
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
@@ -208,4 +216,5 @@ Command = (
     | Annotated[Sweep, subcommand("sweep")]
     | Annotated[Doctor, subcommand("doctor")]
     | Annotated[Info, subcommand("info")]
+    | Annotated[Completion, subcommand("completion")]
 )

@@ -34,6 +34,7 @@ def execute(command: Common, console: Console) -> None:
         c.Sweep: table,
         c.Doctor: doctor,
         c.Info: info,
+        c.Completion: completion,
     }
     try:
         actions[type(command)](command, console)
@@ -238,6 +239,16 @@ def poses(command: c.Poses, console: Console) -> None:
     for line in poses_lines(result):
         console.say(line)
     console.result(result)
+
+
+def completion(command: c.Completion, console: Console) -> None:
+    """Print a script for a shell, unwrapped."""
+    from gs2d.cli.completion import script  # start-up time
+
+    if console.as_json:
+        console.result({"shell": command.shell, "script": script(command.shell)})
+    else:
+        print(script(command.shell), end="")
 
 
 def doctor(command: c.Doctor, console: Console) -> None:

@@ -18,10 +18,9 @@ _FIRST_DAY = (
     ("gs2d reconstruct PHOTOS --out RUN", "photographs or a video to cameras, splats, mesh, report and page"),
     ("gs2d view RUN", "look at a run in the browser, while it is served"),
     ("gs2d mesh RUN --texture", "the mesh once more, with a texture or other settings"),
-    ("gs2d info PATH", "what a run, a capture or a file holds"),
 )
 GROUPS: dict[str, tuple[str, ...]] = {
-    "To begin with": ("doctor", "demo", "reconstruct", "view"),
+    "To begin with": ("doctor", "demo", "reconstruct", "view", "completion"),
     "Step by step": ("poses", "train", "mesh"),
     "Look, keep and share": ("info", "render", "page", "export", "report"),
     "Measure and compare": ("evaluate", "recipes", "sweep", "paper"),
@@ -54,7 +53,7 @@ TITLES = {  # in the order in which they are shown
 
 
 def first_day() -> list[str]:
-    """Return what ``gs2d`` alone shows: the handful of commands of a first day."""
+    """Return what ``gs2d`` alone shows: the five commands of a first day."""
     width = terminal_width()
     return [
         *wrapped(f"gs2d {gs2d.__version__}. {_SLOGAN}", width),

@@ -1,0 +1,134 @@
+"""Completion in the shells themselves, and one meaning for each option."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from gs2d.cli import run
+from gs2d.cli.catalogue import Option, options_of
+from gs2d.cli.completion import SHELLS, script
+from gs2d.cli.usage import NAMES
+
+# Options whose words differ between commands, and why. Kind, number and values are the same even of these.
+SAID_OTHERWISE = {
+    "--out": "what is written is another thing: a run, a mesh, a picture, a table",
+    "--overwrite": "gs2d poses replaces a capture, the others a run",
+    "--seed": "cameras of photographs are the same bytes under conditions only",
+    "--threads": "of one run, or of each of several",
+    "--backend": "short where it is explained by gs2d train",
+    "--recipe": "short where it is explained by gs2d train",
+    "--schedule-scale": "defaults differ, and gs2d demo and reconstruct say theirs",
+    "--downscale": "defaults differ",
+    "--exposure": "short where it is explained by gs2d train",
+    "--refine-poses": "short where it is explained by gs2d train",
+    "--no-page": "short where it is explained by gs2d train",
+    "--viewer": "short where it is explained by gs2d train",
+    "--texture": "of the run's mesh, or of the one that is extracted",
+    "--protocol": "of one capture, or of all",
+    "--cache": "the default differs",
+    "--set": "of one recipe, or of all that have the stage",
+    "--subject-box": "at first, or from now on",
+    "--bbox": "of a mesh's volume, or of splats by their centres",
+}
+
+
+def uses() -> dict[str, list[tuple[str, Option]]]:
+    """Return, by flag, the commands that have it."""
+    found: dict[str, list[tuple[str, Option]]] = defaultdict(list)
+    for name, command in NAMES.items():
+        for option in options_of(command):
+            for flag in option.flags:
+                found[flag].append((name, option))
+    return found
+
+
+def test_an_option_takes_the_same_values_in_every_command() -> None:
+    for flag, having in uses().items():
+        kinds = {(option.kind, option.count, option.choices, option.flags) for _, option in having}
+        assert len(kinds) == 1, f"{flag}: {[name for name, _ in having]}"
+        assert len({option.field for _, option in having}) == 1, flag
+
+
+def test_an_option_is_said_in_the_same_words_or_the_reason_is_known() -> None:
+    differing = {flag for flag, having in uses().items() if len({option.about for _, option in having}) > 1}
+    assert differing == set(SAID_OTHERWISE)
+
+
+def bash(*words: str) -> list[str]:
+    """Return what bash proposes for the last word."""
+    code = script("bash") + f"COMP_WORDS=({' '.join(map(repr, words))}); COMP_CWORD={len(words) - 1}; _gs2d\n"
+    code += 'printf "%s\\n" "${COMPREPLY[@]}"'
+    done = subprocess.run(["bash", "--norc", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return done.stdout.split()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+def test_bash_completes_commands_options_and_values() -> None:
+    assert set(bash("gs2d", "re")) == {name for name in NAMES if name.startswith("re")}
+    assert set(bash("gs2d", "")) == {*NAMES, "--help", "--help-all", "--version"}
+    assert bash("gs2d", "train", "here", "--over") == ["--overwrite"]
+    assert bash("gs2d", "train", "here", "--no-p") == ["--no-page"]
+    assert bash("gs2d", "reconstruct", "here", "--quality", "") == ["draft", "normal", "full"]
+    assert bash("gs2d", "reconstruct", "here", "--quality", "d") == ["draft"]
+    assert bash("gs2d", "completion", "f") == ["fish"]
+    assert bash("gs2d", "train", "here", "--out", "") == []  # files, by bash itself
+    assert bash("gs2d", "train", "--quality", "") == []  # of another command
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
+def test_fish_completes_commands_options_and_values(tmp_path: Path) -> None:
+    (tmp_path / "gs2d.fish").write_text(script("fish"))
+
+    def proposed(line: str) -> list[str]:
+        code = f"source {tmp_path}/gs2d.fish; complete -C '{line}'"
+        done = subprocess.run(
+            ["fish", "--no-config", "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+        )
+        assert done.stderr == ""
+        return [proposal.partition("\t")[0] for proposal in done.stdout.splitlines()]
+
+    assert set(proposed("gs2d re")) == {name for name in NAMES if name.startswith("re")}
+    assert proposed("gs2d train here --over") == ["--overwrite"]
+    assert set(proposed("gs2d reconstruct here --quality ")) == {"draft", "normal", "full"}
+    assert set(proposed("gs2d completion ")) == set(SHELLS)
+    assert "gs2d.fish" in proposed("gs2d train ")
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
+def test_zsh_takes_the_script_and_its_function_knows_every_command(tmp_path: Path) -> None:
+    (tmp_path / "_gs2d").write_text(script("zsh"))
+    # _describe and _arguments need an editor; here they say what they were given.
+    code = f"""
+    compdef() {{ :; }}; _describe() {{ print -l ${{(P)2}}; }}; _arguments() {{ print -l "$@"; }}
+    source {tmp_path}/_gs2d
+    words=(gs2d ''); CURRENT=2; _gs2d
+    words=(gs2d reconstruct ''); CURRENT=3; _gs2d
+    """
+    done = subprocess.run(["zsh", "-f", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert {line.partition(":")[0] for line in lines[: len(NAMES)]} == set(NAMES)
+    assert any(line.startswith("*--quality[") and line.endswith("(draft normal full)") for line in lines)
+    assert sum(line.startswith("*--") for line in lines) == sum(
+        len(option.flags) for option in options_of(NAMES["reconstruct"])
+    )
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_the_command_prints_the_script_and_nothing_else(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["completion", shell]) == 0
+    out, err = capsys.readouterr()
+    assert out == script(shell)
+    assert err == ""
+    assert "`" not in out
+
+
+def test_a_shell_that_is_none_of_them_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["completion", "tcsh"]) == 2
+    assert "SHELL must be bash, zsh or fish, got 'tcsh'" in capsys.readouterr().err
