@@ -1,0 +1,21 @@
+#!/bin/sh
+# Installs a wheel into an empty environment, from wheels alone (no compiler), and runs a short demo from it.
+# Usage: scripts/check_release.sh WHEEL [PYTHON]     (the environment is a temporary folder; torch is downloaded)
+set -eu
+wheel=$(cd "$(dirname "$1")" && pwd)/$(basename "$1")
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+"${2:-python3}" -m venv "$work/env"
+pip="$work/env/bin/pip --disable-pip-version-check -q install --only-binary :all:"
+cd "$work"    # nothing of a checkout is importable
+unset PYTHONPATH
+started=$(date +%s)
+$pip torch
+with_torch=$(date +%s)
+$pip "$wheel"
+done_=$(date +%s)
+echo "torch $((with_torch - started)) s, gs2d and the rest $((done_ - with_torch)) s"
+env/bin/gs2d --version
+env/bin/gs2d doctor | grep 'yes  cpu' || { echo "error: the wheel must bring the native kernels" >&2; exit 1; }
+env/bin/gs2d demo --out demo --schedule-scale 0.02 --no-page
+[ -s demo/mesh.ply ] && [ -s demo/report.html ]
