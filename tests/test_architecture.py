@@ -27,6 +27,7 @@ FLOORS = {
     "kernels": 2,
     "data": 3,
     "render": 3,
+    "geo": 4,
     "losses": 4,
     "meshing": 4,
     "sfm": 4,
@@ -44,7 +45,7 @@ TOP = {"__init__.py", "__main__.py", "errors.py"}  # nothing else lies loose
 INSIDE = {
     "core": {
         "checks growth locks extras memory memory_limit text": 0,
-        "files": 1,
+        "files georeference similarity": 1,
         "arrays json_files camera images mesh sh splats": 2,
         "transforms": 3,
     },

@@ -7,17 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from gs2d.core.similarity import apply, ransac_similarity, rotation_degrees, similarity_scale, umeyama
 from gs2d.errors import DataError
-from gs2d.evaluation.alignment import (
-    apply,
-    icp,
-    ransac_similarity,
-    rotation_degrees,
-    similarity_scale,
-    umeyama,
-    uniform_downsample,
-    voxel_downsample,
-)
+from gs2d.evaluation.alignment import icp, uniform_downsample, voxel_downsample
 from gs2d.evaluation.nearest import Cloud
 from oracle_scenes import moved, rotation, similarity
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gs2d.core.mesh import Mesh
-from gs2d.evaluation.alignment import ransac_similarity, umeyama
+from gs2d.core.similarity import ransac_similarity, umeyama
 from gs2d.evaluation.dtu import DtuTruth, evaluate_dtu, mesh_points
 from gs2d.evaluation.tanks_and_temples import CropVolume, TntTruth, evaluate_tnt
 from oracle_scenes import OBSERVED_RESOLUTION, TAU, dtu_scene, moved, tnt_scene

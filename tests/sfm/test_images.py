@@ -13,11 +13,12 @@ from PIL import ExifTags, Image, ImageOps
 
 from gs2d.core.camera import look_at
 from gs2d.core.images import image_size, read_image
+from gs2d.core.similarity import rotation_to_z
 from gs2d.errors import DataError
 from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import AVIF, HEIF, Photo, camera_groups, find_photos, read_photos, turn
 from gs2d.sfm.pairs import neighbour_pairs, similar_pairs
-from gs2d.sfm.upright import rotation_to_z, up_direction
+from gs2d.sfm.upright import up_direction
 
 DETAILS = ExifTags.IFD.Exif
 

@@ -13,6 +13,7 @@ from gs2d.pipeline.options import (
     BoxOption,
     DemoOptions,
     EvaluateOptions,
+    GeoreferenceOptions,
     MeshOptions,
     Overrides,
     PosesOptions,
@@ -68,6 +69,8 @@ class Mesh(TextureOptions, MeshOptions, Common):
     texture: bool = False
     """Write it with a texture from the photographs: mesh.glb, or what --out names, .glb or .obj. Without options that
     change the mesh it is the run's mesh.ply."""
+    georeferenced: bool = False
+    """In metres of the world (`gs2d georeference`), less an offset that is said in the file and beside it."""
     threads: int | None = None
     """CPU threads."""
 
@@ -140,6 +143,16 @@ class Export(Common):
     PlayCanvas's and SuperSplat's PLY; spz: Niantic's, the smallest; splat: antimatter15's, one colour a splat."""
     bbox: BoxOption = None
     """Only the splats with their centres in this box (`gs2d view` and subject.json have numbers)."""
+    georeferenced: bool = False
+    """In metres of the world (`gs2d georeference`), less an offset that is said in the file and beside it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Georeference(GeoreferenceOptions, Common):
+    """Find where a run is in the world: scale, up and place, from GPS, control points, a distance or markers."""
+
+    run: RunPath
+    """Run folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,8 +209,8 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Page, Evaluate, Export, Report, Recipes, Paper, Sweep, Doctor,
-    Info, Completion
+    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Page, Evaluate, Export, Georeference, Report, Recipes,
+    Paper, Sweep, Doctor, Info, Completion
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
@@ -210,6 +223,7 @@ Command = (
     | Annotated[Page, subcommand("page")]
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[Georeference, subcommand("georeference")]
     | Annotated[Report, subcommand("report")]
     | Annotated[Recipes, subcommand("recipes")]
     | Annotated[Paper, subcommand("paper")]

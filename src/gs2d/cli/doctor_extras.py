@@ -69,6 +69,12 @@ OPTIONAL = (
         _programs(FFMPEG, "ffmpeg", "ffprobe"),
     ),
     Wanted("heic", "HEIC photographs, as of an iPhone", _heic),
+    Wanted("geo", "map projections (gs2d georeference --gps)", _packages("geo", "pyproj")),
+    Wanted(
+        "markers",
+        "printed markers (gs2d georeference --markers)",
+        _packages("markers", "opencv-python-headless"),
+    ),
     Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas")),
     Wanted("view", "viewer in the browser (gs2d view, --viewer)", _packages("view", "viser")),
 )

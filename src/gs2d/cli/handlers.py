@@ -10,7 +10,7 @@ from typing import Any
 from gs2d.cli import commands as c
 from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
-from gs2d.cli.tables import score_rows, show_run, show_surface
+from gs2d.cli.tables import say_where_it_is, score_rows, show_run, show_surface
 from gs2d.errors import DataError, ProtocolError, RecipeError
 from gs2d.pipeline.options import MeshOptions, TextureOptions, values
 
@@ -28,6 +28,7 @@ def execute(command: Common, console: Console) -> None:
         c.Page: page,
         c.Evaluate: evaluate,
         c.Export: export,
+        c.Georeference: georeference,
         c.Report: report,
         c.Recipes: recipes,
         c.Paper: table,
@@ -69,21 +70,39 @@ def mesh(command: c.Mesh, console: Console) -> None:
         _textured_mesh(command, options, console)
         return
     _refuse_texture_options(command)
-    result = mesh_run(command.run, options, console.on_event, out=command.out, threads=command.threads)
+    result = mesh_run(
+        command.run,
+        options,
+        console.on_event,
+        out=command.out,
+        threads=command.threads,
+        georeferenced=command.georeferenced,
+    )
     console.close()
     console.say(f"{result['file']}: {result['vertices']:,} vertices, {result['faces']:,} triangles")
-    console.say(f"voxel {result['voxel']:.4g}, truncation {result['truncation']:.4g}, depth {result['depth']}")
+    if "voxel" in result:
+        console.say(f"voxel {result['voxel']:.4g}, truncation {result['truncation']:.4g}, depth {result['depth']}")
+    say_where_it_is(result, console)
     console.result(result)
 
 
 def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None:
     from gs2d.pipeline.texture import texture_run
 
-    result = texture_run(command.run, command, mesh_options, console.on_event, out=command.out, threads=command.threads)
+    result = texture_run(
+        command.run,
+        command,
+        mesh_options,
+        console.on_event,
+        out=command.out,
+        threads=command.threads,
+        georeferenced=command.georeferenced,
+    )
     console.close()
     size, unseen = result["texture_size"], result["texels_unseen"] / max(result["texels"], 1)
     console.say(f"{result['files'][0]}: {result['faces']:,} triangles, {result['bytes'] / 1e6:.1f} MB")
     console.say(f"texture {size}x{size} in {result['charts']:,} charts, {unseen:.2%} of it seen by no photograph")
+    say_where_it_is(result, console)
     console.result(result)
 
 
@@ -166,13 +185,29 @@ def export(command: c.Export, console: Console) -> None:
     """``gs2d export``."""
     from gs2d.pipeline.export import export_run
 
-    result = export_run(command.run, command.out, command.layout, bbox=command.bbox)
+    result = export_run(
+        command.run, command.out, command.layout, bbox=command.bbox, georeferenced=command.georeferenced
+    )
     console.say(
         f"{result['file']}: {result['splats']:,} splats, {result['bytes'] / 1e6:.1f} MB, layout {result['layout']}"
     )
     for note in result["notes"]:
         console.say(note)
+    say_where_it_is(result, console)
     console.result(result)
+
+
+def georeference(command: c.Georeference, console: Console) -> None:
+    """``gs2d georeference``."""
+    from gs2d.pipeline.georeference import georeference_run
+
+    found = georeference_run(command.run, command, console.on_event)
+    console.close()
+    for line in [] if found is None else found.lines():
+        console.say(line)
+    if found is None:
+        console.say("no georeference: --gps, --positions, --control, --known-distance or --markers finds one")
+    console.result({"run": str(command.run), "georeference": None if found is None else found.to_json()})
 
 
 def report(command: c.Report, console: Console) -> None:

@@ -23,6 +23,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "To begin with": ("doctor", "demo", "reconstruct", "view", "completion"),
     "Step by step": ("poses", "train", "mesh"),
     "Look, keep and share": ("info", "render", "page", "export", "report"),
+    "Real-world coordinates": ("georeference",),
     "Measure and compare": ("evaluate", "recipes", "sweep", "paper"),
 }
 _PROGRAM_OPTIONS = (

@@ -13,17 +13,21 @@ from torch import Tensor
 
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
+from gs2d.core.sh import num_coefficients, sh_basis
+from gs2d.core.splats import Splats
 from gs2d.errors import ShapeError
 
 __all__ = [
     "camera_extent",
     "common_motion",
     "focus_point",
+    "harmonics_rotation",
     "nearest_distances",
     "perturb_pose",
     "quats_to_matrices",
     "se3_exp",
     "similarity_motions",
+    "transform_splats",
     "up_direction",
 ]
 
@@ -215,3 +219,46 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
         raise ShapeError("camera_extent needs at least one camera, got none")
     centers = np.stack([camera.center for camera in cameras])
     return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
+    """Return what a rotation [3, 3] of the world does to the SH coefficients of degrees 1 to ``degree``, [K-1, K-1].
+
+    Seen along d the colour was Y(d) c; in the turned world it is seen along R d, so that Y(R d) c' = Y(d) c. Each
+    degree turns into itself; its block is solved from more directions than it has functions, exact to rounding.
+    """
+    directions = torch.from_numpy(np.random.default_rng(0).normal(size=(64, 3)))
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    turned = directions @ torch.from_numpy(np.asarray(rotation, np.float64)).T
+    before, after = (np.asarray(sh_basis(d, degree)) for d in (directions, turned))
+    count = num_coefficients(degree)
+    matrix = np.zeros((count, count))
+    for level in range(degree + 1):
+        block = slice(level**2, (level + 1) ** 2)
+        matrix[block, block] = np.linalg.lstsq(after[:, block], before[:, block], rcond=None)[0]
+    return matrix[1:, 1:]
+
+
+def transform_splats(splats: Splats, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Splats:
+    """Return splats after a similarity of the world, x to scale * rotation @ x + translation; colours turn with it.
+
+    Computed in float64; float32 on the CPU comes back.
+    """
+    from scipy.spatial.transform import Rotation
+
+    R = torch.from_numpy(np.asarray(rotation, np.float64))
+    x, y, z, w = Rotation.from_matrix(np.asarray(rotation, np.float64)).as_quat()
+    left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    a = {name: tensor.detach().to("cpu", torch.float64) for name, tensor in splats.items()}
+    shN = a["shN"]
+    if shN.shape[1]:
+        turn = torch.from_numpy(harmonics_rotation(rotation, splats.sh_degree))
+        shN = torch.einsum("jk,nkc->njc", turn, shN)
+    return Splats(
+        means=scale * (a["means"] @ R.T) + torch.from_numpy(np.asarray(translation, np.float64)),
+        quats=a["quats"] @ left.T,
+        log_scales=a["log_scales"] + float(np.log(scale)),
+        opacity_logits=a["opacity_logits"],
+        sh0=a["sh0"],
+        shN=shN,
+    ).to(torch.float32)

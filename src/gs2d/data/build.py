@@ -301,7 +301,7 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
     except ShapeError as error:
         raise DataError(f"view {frame.name}: {error}") from error
     maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera, lens_maps)
-    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps)
+    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps, k)
 
 
 def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], tuple[str, ...]]:

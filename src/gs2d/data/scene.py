@@ -15,6 +15,7 @@ from gs2d.core.images import composite
 from gs2d.core.memory import trim
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.priors import ObservedPoints, PriorMaps
+from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 
@@ -36,6 +37,8 @@ class View:
         The photograph's file.
     maps : PriorMaps or None
         Its depth and normal maps, where the capture has such.
+    intrinsics : Intrinsics or None
+        Of the photograph's file, before its lens was taken out and before it was shrunk; None: as ``camera``.
     """
 
     name: str
@@ -44,6 +47,7 @@ class View:
     cache: ImageCache = field(repr=False, default_factory=lambda: ImageCache(0))
     path: Path | None = None
     maps: PriorMaps | None = None
+    intrinsics: Intrinsics | None = None
 
     @classmethod
     def from_arrays(
@@ -64,7 +68,7 @@ class View:
     def at(self, T_cam_world: np.ndarray) -> View:
         """Return the same photograph, taken from elsewhere; its picture stays in the cache of this one."""
         camera = replace(self.camera, T_cam_world=T_cam_world)
-        return View(self.name, camera, self._image, path=self.path, maps=self.maps)
+        return View(self.name, camera, self._image, path=self.path, maps=self.maps, intrinsics=self.intrinsics)
 
     def downscaled(self, factor: int) -> View:
         """Return the same photograph at 1 / ``factor`` of its size, with its camera, masks and maps.
@@ -75,7 +79,19 @@ class View:
             return self
         camera = self.camera.downscaled(factor)
         maps = None if self.maps is None else replace(self.maps, camera=camera)
-        return View(self.name, camera, lambda: self._image().downscaled(factor), path=self.path, maps=maps)
+        return View(
+            self.name,
+            camera,
+            lambda: self._image().downscaled(factor),
+            path=self.path,
+            maps=maps,
+            intrinsics=self.intrinsics,
+        )
+
+    def file_intrinsics(self) -> Intrinsics:
+        """Return the intrinsics of the photograph's file, lens and all."""
+        c = self.camera
+        return self.intrinsics or Intrinsics(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
 
     def image(self) -> np.ndarray:
         """Return the photograph, uint8 [H, W, 3] or [H, W, 4] with straight alpha; read-only.

@@ -24,6 +24,8 @@ from scipy.optimize import brentq
 
 from gs2d.errors import DataError
 
+_NEWTON = 20  # steps at the most, from the bent point to the ideal one
+
 _COLMAP_PINHOLE = {"SIMPLE_PINHOLE", "PINHOLE"}
 #: COLMAP model -> (kind, order of its distortion parameters)
 _COLMAP_LENSES = {
@@ -136,6 +138,37 @@ class Intrinsics:
     cx: float
     cy: float
     lens: Lens | None = None
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return the pixels [..., 2] of the file where ideal points [..., 2] on the plane z = 1 are seen."""
+        bent = points if self.lens is None else self.lens.distort(points)
+        return np.asarray(bent * (self.fx, self.fy) + (self.cx, self.cy))
+
+    def ideal(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the points [P, 2] on the plane z = 1 that are seen at pixels [P, 2] of the file: Newton's method.
+
+        Raises
+        ------
+        DataError
+            A pixel that nothing is seen at through this lens.
+        """
+        bent = (np.asarray(pixels, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if self.lens is None:
+            return bent
+        lens, x, h = self.lens, bent.copy(), 1e-6
+        du, dv = np.array([h, 0.0]), np.array([0.0, h])
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON):
+                across = (lens.distort(x + du) - lens.distort(x - du)) / (2 * h)
+                along = (lens.distort(x + dv) - lens.distort(x - dv)) / (2 * h)
+                left = lens.distort(x) - bent
+                x = x - np.linalg.solve(np.stack([across, along], axis=-1), left[..., None])[..., 0]
+            off = np.linalg.norm(lens.distort(x) - bent, axis=-1) * max(self.fx, self.fy)
+            known = (off < 1e-3) & (np.linalg.norm(x, axis=-1) < lens.largest_radius())
+        if not known.all():
+            u, v = np.asarray(pixels)[np.flatnonzero(~known)[0]]
+            raise DataError(f"a pixel that the lens maps to was expected, got {u:g}, {v:g} beyond its reach")
+        return x
 
     def scaled(self, width: int, height: int) -> Intrinsics:
         """Return the same camera for another size of its images (a lens is free of scale)."""

@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 from gs2d.config.surface_protocols import DTU_SURFACE, DtuSurface
 from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
+from gs2d.core.similarity import apply, similarity_scale
 from gs2d.errors import DataError
-from gs2d.evaluation.alignment import apply, similarity_scale
 from gs2d.evaluation.nearest import Cloud
 from gs2d.evaluation.surface import ScoredClouds
 from gs2d.io.matlab import read_matlab

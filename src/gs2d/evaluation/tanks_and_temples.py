@@ -24,18 +24,9 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.images import natural_key
 from gs2d.core.json_files import read_json
 from gs2d.core.mesh import Mesh
+from gs2d.core.similarity import RobustFit, apply, ransac_similarity, rotation_degrees, similarity_scale
 from gs2d.errors import DataError
-from gs2d.evaluation.alignment import (
-    IcpResult,
-    RobustFit,
-    apply,
-    icp,
-    ransac_similarity,
-    rotation_degrees,
-    similarity_scale,
-    uniform_downsample,
-    voxel_downsample,
-)
+from gs2d.evaluation.alignment import IcpResult, icp, uniform_downsample, voxel_downsample
 from gs2d.evaluation.nearest import Cloud
 from gs2d.evaluation.surface import ScoredClouds
 from gs2d.io.meshes import read_points

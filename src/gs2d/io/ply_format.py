@@ -105,6 +105,26 @@ def read_ply(path: str | os.PathLike[str]) -> PlyFile:
     return PlyFile({e.name: reader.element(e) for e in header.elements}, header.comments)
 
 
+def read_ply_comments(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Return the comment lines of a PLY file; its rows are not read. Nothing of what is no PLY.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEADER_LIMIT)
+    except OSError as error:
+        raise DataError(f"{path}: a PLY file was expected, it cannot be read: {error.strerror}") from error
+    end = head.find(b"end_header")
+    if not head.startswith((b"ply\n", b"ply\r")) or end < 0:
+        return ()
+    lines = (line.strip() for line in head[:end].decode("latin-1").splitlines())
+    return tuple(line.removeprefix("comment").strip() for line in lines if line.startswith("comment "))
+
+
 def _broken(path: object, what: str) -> DataError:
     return DataError(f"{path}: a well-formed PLY file was expected, {what}; export or copy the file again")
 

@@ -13,10 +13,13 @@ from gs2d.io.run_dir import (
 )
 from gs2d.pipeline.finished import checked_output, finished_splats
 from gs2d.pipeline.options import Box
+from gs2d.pipeline.placed import place_of, placed_splats, say_where
 from gs2d.pipeline.subject import within
 
 
-def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None) -> dict[str, Any]:
+def export_run(
+    path: Path, out: Path, layout: str | None = None, *, bbox: Box | None = None, georeferenced: bool = False
+) -> dict[str, Any]:
     """Write the splats of a run, or of a file of flat splats, in another layout.
 
     Parameters
@@ -24,7 +27,9 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
     layout : str or None
         A name of ``io.formats.registry.LAYOUTS``; None: by the ending of ``out``.
     bbox : six floats, optional
-        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units.
+        Only the splats with their centres in this box, x0 y0 z0 x1 y1 z1, world units of the run.
+    georeferenced : bool
+        In metres of the world, less an offset that is said in the file and beside it.
 
     Raises
     ------
@@ -47,6 +52,8 @@ def export_run(path: Path, out: Path, layout: str | None = None, *, bbox: Box | 
         run.sweep()
         splats = finished_splats(run)
     splats = splats if bbox is None else within(splats, bbox)
-    notes = write_layout(out, splats, layout)
+    place = place_of(path, asked=georeferenced)
+    notes = write_layout(out, splats if place is None else placed_splats(splats, place), layout)
+    told = {} if place is None else say_where(out, place)
     size = out.stat().st_size
-    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes)}
+    return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes), **told}

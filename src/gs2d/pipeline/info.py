@@ -11,6 +11,7 @@ from gs2d.data.archive import is_archive, unpack
 from gs2d.data.benchmarks import missing_lines
 from gs2d.errors import DataError
 from gs2d.io.formats.registry import is_splat_file, read_splat_file
+from gs2d.io.georeference import georeference_of_file
 from gs2d.io.meshes import FOREIGN, read_mesh, read_points
 from gs2d.io.splat_ply import ply_kind
 
@@ -61,6 +62,14 @@ def describe_file(path: Path) -> dict[str, Any]:
             f"{path}: a file of splats, a mesh or points was expected, got a file of a capture; give its folder"
         )
     size = path.stat().st_size
+    place = georeference_of_file(path)
+    return {
+        **_facts_of(path, size),
+        **({} if place is None else {"frame": place.frame, "offset": place.origin.tolist()}),
+    }
+
+
+def _facts_of(path: Path, size: int) -> dict[str, Any]:
     kind = "mesh" if path.suffix.lower() in FOREIGN else "splats" if is_splat_file(path) else ply_kind(path)
     if kind == "mesh":
         mesh = read_mesh(path)

@@ -15,13 +15,14 @@ import numpy as np
 import torch
 
 from gs2d.core.files import disk_error
+from gs2d.core.georeference import Georeference
 from gs2d.core.memory import trim
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError
 from gs2d.evaluation.images import ImageMetrics
-from gs2d.io.meshes import write_mesh
+from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.run_dir import (
     MESH,
     PAGE,
@@ -39,6 +40,7 @@ from gs2d.pipeline.job import Job, RenderedScene
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.page import page_run
+from gs2d.pipeline.placed import placed_mesh, placed_output, say_where
 from gs2d.pipeline.report import report_again
 from gs2d.pipeline.scoring import SeenView
 from gs2d.pipeline.subject import OPAQUE, meshed_subject
@@ -98,6 +100,7 @@ def extract_mesh(
     *,
     subject: Subject | None = None,
     seen: MeshFrames | None = None,
+    place: Georeference | None = None,
 ) -> dict[str, Any]:
     """Render depth of all training views, fuse it, write the mesh: of the subject, or of everything.
 
@@ -105,6 +108,8 @@ def extract_mesh(
     ----------
     seen : MeshFrames, optional
         Depth maps of these splats, by the protocol's kind of depth; where they are complete, nothing is rendered.
+    place : Georeference, optional
+        Where the run is in the world: the file is in local metres then.
 
     Returns
     -------
@@ -119,7 +124,8 @@ def extract_mesh(
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     result = fused(job, splats, options, on_event, subject=subject, seen=seen)
     trim()
-    write_mesh(out, result.mesh)
+    write_mesh(out, result.mesh if place is None else placed_mesh(result.mesh, place))
+    told = {} if place is None else say_where(out, place)
     limits = asdict(result.limits)
     return {
         "file": str(out),
@@ -135,6 +141,7 @@ def extract_mesh(
         "components": result.components,
         "faces_removed": result.faces_removed,
         **_cleaned_facts(result),
+        **told,
     }
 
 
@@ -305,18 +312,29 @@ def mesh_run(
     *,
     out: Path | None = None,
     threads: int | None = None,
+    georeferenced: bool = False,
 ) -> dict[str, Any]:
     """Extract the mesh of a finished run; returns its file, counts and limits.
+
+    Parameters
+    ----------
+    georeferenced : bool
+        Write ``out`` in metres of the world; without options it is the run's mesh.ply, which is not made again.
 
     Raises
     ------
     RunError, DataError, ProtocolError, DiskError
     """
     path, out = Path(path), None if out is None else checked_output(path, out)
+    place = placed_output(path, out, MESH) if georeferenced else None
+    if place is not None and out is not None and options == MeshOptions() and (path / MESH).exists():
+        mesh = read_mesh(path / MESH)
+        write_mesh(out, placed_mesh(mesh, place))
+        return {"file": str(out), "vertices": len(mesh.vertices), "faces": len(mesh.faces), **say_where(out, place)}
     run, job, splats = open_job(path, threads, on_event)
     if out is not None and out.resolve() != run.file(MESH).resolve():
         subject = meshed_subject(run, job, splats, options, on_event)
-        return extract_mesh(job, splats, options, out, on_event, subject=subject)
+        return extract_mesh(job, splats, options, out, on_event, subject=subject, place=place)
     with run.locked():
         subject = meshed_subject(run, job, splats, options, on_event)
         result = extract_mesh(job, splats, options, run.file(MESH), on_event, subject=subject)

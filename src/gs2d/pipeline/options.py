@@ -20,6 +20,7 @@ from gs2d.errors import RecipeError
 Robust = Literal["auto", "on", "off"]
 LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
+KnownDistance = tuple[float, float, float, float, float, float, float]  # two points of the run, metres
 BoxOption = Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]
 Overrides = Annotated[tuple[str, ...], arg(name="set", metavar="STAGE.FIELD=VALUE"), UseAppendAction]
 Photos = Annotated[Positional[Path], arg(metavar="PHOTOS")]
@@ -305,6 +306,37 @@ class EvaluateOptions:
 
     def __post_init__(self) -> None:
         paths_of(self, "ground_truth", "lpips_weights")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoreferenceOptions:
+    """Where a run is in the world; one source at a time, none: what the run says is shown."""
+
+    gps: bool = False
+    """From the positions in the EXIF of the photographs."""
+    positions: Annotated[Path | None, arg(metavar="FILE")] = None
+    """From a file of positions of photographs: CSV (name,lat,lon,height or name,x,y,z), or OpenDroneMap's geo.txt."""
+    control: Annotated[Path | None, arg(metavar="FILE")] = None
+    """From control points: CSV with name,x,y,z,photo,u,v (pixels) or name,x,y,z,run_x,run_y,run_z, or gcp_list.txt."""
+    check_points: tuple[str, ...] = ()
+    """With --control: names of points that are held out and only measured (also by a column `check`)."""
+    known_distance: Annotated[KnownDistance | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1 METRES")] = None
+    """From the distance between two points of the run (`gs2d view RUN` measures them and prints this option)."""
+    markers: Annotated[float | None, arg(metavar="METRES")] = None
+    """From printed ArUco markers with a side of so many metres, found in the photographs."""
+    marker_dictionary: str = "4x4_50"
+    """With --markers: which ones: 4x4_50 to 7x7_1000, aruco_original, apriltag_36h11."""
+    epsg: int | None = None
+    """The world's projected coordinate system, in metres (default: as the file says, or the UTM zone)."""
+    enu: bool = False
+    """With --gps or --positions: metres east, north and up of their middle, not a map projection; needs no package."""
+    up: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z")] = None
+    """What is up in the run (default: by the places if they tell it well, else by how the cameras were held)."""
+    remove: bool = False
+    """Forget where the run is."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "positions", "control")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,6 +36,7 @@ from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job, read_scene
 from gs2d.pipeline.mesh import fused, mesh_run
 from gs2d.pipeline.options import MeshOptions, TextureOptions
+from gs2d.pipeline.placed import placed_output, placed_textured, say_where
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import OPAQUE, meshed_subject
 from gs2d.render.exposure import remove_exposure
@@ -51,6 +52,7 @@ def texture_run(
     *,
     out: Path | None = None,
     threads: int | None = None,
+    georeferenced: bool = False,
 ) -> dict[str, Any]:
     """Write the mesh of a finished run with a texture; returns its files and counts.
 
@@ -65,6 +67,7 @@ def texture_run(
     for package in PACKAGES:
         required(package)  # before minutes are spent
     path = Path(path)
+    place = placed_output(path, out, TEXTURED) if georeferenced else None
     target = path / TEXTURED if out is None else Path(out)
     files = written_files(target)
     if not target.parent.is_dir() and out is not None:
@@ -81,7 +84,12 @@ def texture_run(
             raise RunError(f"--out {target} would write over the photograph {view.name}; choose another name")
     mesh = _mesh(run, job, splats, mesh_options, on_event)
     baked = textured_mesh(job, splats, mesh, options, on_event, exposures=read_exposures(run, job.recipe))
-    write_textured(target, baked.mesh, up=up_direction([view.camera for view in job.scene.train]))
+    up = up_direction([view.camera for view in job.scene.train])
+    if place is None:
+        write_textured(target, baked.mesh, up=up)
+    else:
+        write_textured(target, placed_textured(baked.mesh, place), up=np.array([0.0, 0.0, 1.0]))
+    told = {} if place is None else say_where(target, place)
     return {
         "files": [str(file) for file in files],
         "faces": len(baked.mesh.faces),
@@ -93,6 +101,7 @@ def texture_run(
         "texels_unseen": baked.unseen,
         "texture_from": options.texture_from,
         "bytes": sum(file.stat().st_size for file in files),
+        **told,
     }
 
 

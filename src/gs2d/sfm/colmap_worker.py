@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.similarity import rotation_to_z
 from gs2d.sfm import second_round as second
 from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
 from gs2d.sfm.pairs import neighbour_pairs, similar_pairs
-from gs2d.sfm.upright import rotation_to_z, up_direction
+from gs2d.sfm.upright import up_direction
 
 Say = Callable[..., None]
 REPEATABLE = 50  # photographs: up to so many, one thread places them, and the same seed gives the same bytes

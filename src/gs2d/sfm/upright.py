@@ -25,12 +25,3 @@ def up_direction(rotations: np.ndarray) -> np.ndarray | None:
     spread = right.T @ right / len(right) - _TOWARDS_MEAN * np.outer(mean_up, mean_up)
     up = np.linalg.eigh(spread)[1][:, 0]
     return np.asarray(up if up @ mean_up > 0 else -up)
-
-
-def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """Return the shortest rotation [3, 3] that takes the unit vector ``up`` to +z."""
-    x, y, z = up
-    if z < -1 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    k = 1 / (1 + z)  # Rodrigues' formula for the axis up x e_z
-    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])

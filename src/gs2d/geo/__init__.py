@@ -1,0 +1,1 @@
+"""Where a run is in the world: positions of photographs, control points, markers, and the similarity that they tell."""
