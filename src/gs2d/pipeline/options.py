@@ -321,7 +321,7 @@ class GeoreferenceOptions:
     check_points: tuple[str, ...] = ()
     """With --control: names of points that are held out and only measured (also by a column `check`)."""
     known_distance: Annotated[KnownDistance | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1 METRES")] = None
-    """From the distance between two points of the run (`gs2d view RUN` measures them and prints this option)."""
+    """From the distance between two points in coordinates of the run, as a mesh viewer shows them of mesh.ply."""
     markers: Annotated[float | None, arg(metavar="METRES")] = None
     """From printed ArUco markers with a side of so many metres, found in the photographs."""
     marker_dictionary: str = "4x4_50"
