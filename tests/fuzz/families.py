@@ -162,6 +162,45 @@ def read_splats_everywhere(root: Path) -> None:
         write_layout(root / f"out{LAYOUTS.get(layout).ending}", disks, layout)
 
 
+_FIELD = """#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 1
+    upAxis = "Y"
+    customLayerData = {
+        dictionary gs2d = {
+            string georeference = "{}"
+        }
+    }
+)
+
+def Xform "World"
+{
+    float3 xformOp:rotateXYZ = (90, 0, 30)
+    double3 xformOp:translate = (1, -2, 3.5)
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]
+
+    def ParticleField3DGaussianSplat "Balls"
+    {
+        float[] opacities = [0.5, 1]
+        quath[] orientationsh = [(1, 0, 0, 0), (0.5, 0.5, 0.5, 0.5)]
+        point3f[] positions = [(0, 1, 2), (-1.5, 2, 1e-3)]
+        half3[] radiance:sphericalHarmonicsCoefficientsh = [(0, 0.5, 1), (-1, 2, 0.25)]
+        uniform int radiance:sphericalHarmonicsDegree = 0
+        float3[] scales = [(0.1, 0.2, 1e-6), (0.2, 0.1, 1e-6)]
+    }
+}
+"""
+
+
+def read_usd_once(root: Path) -> None:
+    """As `--init` does: each reading is a process."""
+    from gs2d.io.formats.registry import read_surfels
+
+    (path,) = (p for p in root.iterdir() if p.is_file())
+    read_surfels(path)
+
+
 def ply_points(path: Path) -> None:
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 12\nproperty double x\nproperty double y\n"
     head += "property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
@@ -396,6 +435,8 @@ _ALL = (
            {".obj": _TEXT, ".off": _TEXT, ".stl": m.either(m.of_text, m.of_bytes)}, read_surface),
     Family("spz-splat", written(_splats("spz", "a.spz"), _splats("splat", "a.splat")),
            {".spz": m.either(m.of_gzip, m.of_gzip, m.of_bytes), ".splat": m.of_bytes}, read_splats_everywhere),
+    Family("usd", written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD)),
+           {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
     Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),
            {".npy": m.of_npy}, read_map),
     Family("seen-counts", written(_counted), {".npy": m.of_npy}, read_surface),

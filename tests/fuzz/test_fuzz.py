@@ -22,6 +22,7 @@ from guard import outcome  # noqa: E402
 from gs2d.errors import DataError  # noqa: E402
 
 COUNTS = dict.fromkeys(FAMILIES, 60) | {"run-files": 12, "zip": 40, "dtu": 30, "obj-stl-off": 40, "rasterize": 20}
+COUNTS["usd"] = 8  # a process each
 FINDINGS = sorted(path for path in (HERE / "findings").rglob("*") if path.is_file())
 
 

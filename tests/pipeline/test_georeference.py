@@ -267,7 +267,13 @@ def placed(run: Path) -> Georeference:
 
 @pytest.mark.parametrize(
     ("name", "inside", "exact"),
-    [("a.ply", True, 1e-3), ("a.compressed.ply", True, 0.05), ("a.spz", False, 0.02), ("a.splat", False, 1e-3)],
+    [
+        ("a.ply", True, 1e-3),
+        ("a.compressed.ply", True, 0.05),
+        ("a.spz", False, 0.02),
+        ("a.splat", False, 1e-3),
+        ("a.usd", True, 1e-3),
+    ],
 )
 def test_splats_a_million_metres_away_come_back_to_a_millimetre(
     run: Path, tmp_path: Path, name: str, inside: bool, exact: float

@@ -14,6 +14,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "markers": ("opencv-python-headless>=4.7",),
         "sfm": ("pycolmap>=4.2",),
         "texture": ("xatlas>=0.0.9",),
+        "usd": ("usd-core>=26.3",),
         "view": ("viser>=1.1,<2", "msgspec>=0.18", "websockets>=14"),
     }
 )

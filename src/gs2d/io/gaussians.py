@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 
 from gs2d.core.splats import Splats
+from gs2d.core.transforms import transform_splats
 from gs2d.errors import DataError
 
 FLAT_LOG_SCALE = math.log(1e-6)  # world units, the thickness that files of three scales are told
@@ -56,6 +58,40 @@ class Gaussians:
         flat = np.full((len(splats), 1), FLAT_LOG_SCALE, np.float32)
         scales = np.concatenate([a["log_scales"], flat], axis=1)
         return cls(a["means"], a["quats"], scales, a["opacity_logits"], a["sh0"].reshape(-1, 3), a["shN"])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Gaussians]) -> Gaussians:
+        """All of several; those of lower SH degree have zeros in the higher ones."""
+        places = max(part.shN.shape[1] for part in parts)
+        padded = [np.pad(part.shN, ((0, 0), (0, places - part.shN.shape[1]), (0, 0))) for part in parts]
+        others = {
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(cls)
+            if field.name != "shN"
+        }
+        return cls(**others, shN=np.concatenate(padded))
+
+    def placed(self, matrix: np.ndarray) -> Gaussians:
+        """Return them after a transform [4, 4] of their frame, which may turn, shift and scale alike in all directions.
+
+        Raises
+        ------
+        ValueError
+            It does something else.
+        """
+        linear = matrix[:3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            scale = float(np.cbrt(np.linalg.det(linear)))
+            rotation = linear / scale if scale > 0 else linear
+            turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        if not (turns and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)):
+            raise ValueError("a transform that turns, shifts and scales alike in all directions was expected")
+        tensors = [torch.from_numpy(np.ascontiguousarray(a, dtype=np.float32)) for a in (
+            self.means, self.quats, self.log_scales[:, :2], self.opacity_logits, self.sh0[:, None, :], self.shN
+        )]  # fmt: skip
+        moved = Gaussians.of(transform_splats(Splats(*tensors), scale, rotation, matrix[:3, 3]))
+        thickness = (self.log_scales[:, 2:].astype(np.float64) + math.log(scale)).astype(np.float32)
+        return replace(moved, log_scales=np.concatenate([moved.log_scales[:, :2], thickness], axis=1))
 
     def rows(self, index: np.ndarray) -> Gaussians:
         """Return the rows of an index or a mask."""
@@ -120,6 +156,18 @@ def unit_quats(quats: np.ndarray) -> np.ndarray:
 def sigmoid(x: np.ndarray) -> np.ndarray:
     """1 / (1 + exp(-x)), float64, without overflow."""
     return 0.5 + 0.5 * np.tanh(0.5 * x.astype(np.float64))
+
+
+def logit(opacities: np.ndarray) -> np.ndarray:
+    """Opacity logits, float32, of float32 opacities; 0 and 1 are a little inside, for their logits are infinite."""
+    o = np.clip(opacities.astype(np.float64), 1e-30, 1.0 - 2.0**-25)
+    return np.asarray(np.log(o) - np.log1p(-o)).astype(np.float32)
+
+
+def log_scales_of(scales: np.ndarray) -> np.ndarray:
+    """Return logarithms, float32, of scales of 0 or more; that of 0 is -80."""
+    with np.errstate(divide="ignore"):
+        return np.maximum(np.log(scales.astype(np.float64)), -80.0).astype(np.float32)
 
 
 def logit_of_byte(alpha: np.ndarray) -> np.ndarray:

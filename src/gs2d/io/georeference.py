@@ -1,7 +1,7 @@
 """Georeferences on disk: that of a run, and what files in local metres say of where they are.
 
 A file in local metres says its origin and its EPSG code wherever its format has room (comments of a PLY or an OBJ,
-``asset.extras`` of a .glb), and always in files beside it, as other tools read them::
+``asset.extras`` of a .glb, ``customLayerData`` of OpenUSD), and always in files beside it, as other tools read them::
 
     scene.ply                        scene.ply.georeference.json   all of it, read back by gs2d
     scene_offset.xyz                 the origin, three numbers (as Pix4D writes it)
@@ -21,6 +21,8 @@ from gs2d.core.files import atomic_write
 from gs2d.core.georeference import Georeference
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import DataError
+from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
+from gs2d.io.formats.usd import stamp_usd, usd_georeference
 from gs2d.io.ply_format import read_ply_comments
 from gs2d.io.run_dir import GEOREFERENCE
 
@@ -73,6 +75,10 @@ def stamp(path: Path, georeference: Georeference) -> bool:
     """
     path = Path(path)
     kind = path.suffix.lower()
+    if kind == ".usd":
+        x, y, z = (float(value) for value in georeference.origin)
+        stamp_usd(path, _json(georeference), georeference.epsg, (x, y, z))
+        return True
     if kind not in (".ply", ".obj", ".glb"):
         return False
     with open(path, "rb") as old, atomic_write(path) as new:
@@ -89,10 +95,10 @@ def stamp(path: Path, georeference: Georeference) -> bool:
 
 def _comments(georeference: Georeference) -> list[str]:
     """Return what a file says in its comments: for people, then for gs2d."""
-    told = json.dumps(_short(georeference), separators=(",", ":"), allow_nan=False)
     x, y, z = georeference.origin
     epsg = [] if georeference.epsg is None else [f"epsg {georeference.epsg}"]
-    return [*epsg, f"offset {x:.17g} {y:.17g} {z:.17g}", f"frame {georeference.frame}, metres", _COMMENT + told]
+    frame = f"frame {georeference.frame}, metres"
+    return [*epsg, f"offset {x:.17g} {y:.17g} {z:.17g}", frame, _COMMENT + _json(georeference)]
 
 
 def _stamped_glb_head(old: IO[bytes], georeference: Georeference) -> bytes:
@@ -103,6 +109,10 @@ def _stamped_glb_head(old: IO[bytes], georeference: Georeference) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     return _GLB.pack(magic, version, length + len(text) - size, len(text), kind) + text
+
+
+def _json(georeference: Georeference) -> str:
+    return json.dumps(_short(georeference), separators=(",", ":"), allow_nan=False)
 
 
 def _short(georeference: Georeference) -> dict[str, Any]:
@@ -173,7 +183,7 @@ def _told(path: Path) -> Any:
         return _after_mark([line[1:].strip() for line in lines if line.startswith("#")])
     if kind == ".glb":
         return _of_glb(path)
-    return None
+    return usd_georeference(path) if kind in USD_ENDINGS else None
 
 
 def _after_mark(lines: Sequence[str]) -> str | None:

@@ -14,7 +14,6 @@ import torch
 from scipy.spatial import cKDTree
 
 from gs2d.core.sh import sh_basis
-from gs2d.core.splats import Splats
 from gs2d.errors import DataError, DiskError
 from gs2d.io.formats import compressed_ply
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
@@ -24,28 +23,9 @@ from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.gaussians import FLAT_LOG_SCALE, Gaussians, sigmoid, unit_quats
 from gs2d.io.ply_format import read_ply, write_ply
 from gs2d.io.splat_ply import read_gaussians, write_splats
+from splat_scenes import a_scene, turned_by
 
 C0 = 0.28209479177387814
-
-
-def a_scene(n: int = 700, degree: int = 3, seed: int = 1) -> Splats:
-    """Splats as training makes them: small disks in a box of 4 units."""
-    g = torch.Generator().manual_seed(seed)
-    k = (degree + 1) ** 2 - 1
-    return Splats(
-        means=torch.rand((n, 3), generator=g) * 4 - 1,
-        quats=torch.randn((n, 4), generator=g),
-        log_scales=torch.randn((n, 2), generator=g) * 0.7 - 4.5,
-        opacity_logits=torch.randn((n,), generator=g) * 3,
-        sh0=torch.randn((n, 1, 3), generator=g) * 0.8,
-        shN=torch.randn((n, k, 3), generator=g).clamp(-3, 3) * 0.2,
-    )
-
-
-def turned_by(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Degrees between rotations."""
-    dot = np.abs((unit_quats(a) * unit_quats(b)).sum(axis=1))
-    return np.degrees(2 * np.arccos(np.clip(dot, 0, 1)))
 
 
 # -- .splat ----------------------------------------------------------------------------------------------------
@@ -287,7 +267,14 @@ def test_three_dimensional_gaussians_are_told_from_disks(tmp_path: Path, shared:
 
 @pytest.mark.parametrize(
     ("name", "layout"),
-    [("a.ply", "3dgs"), ("a.Compressed.PLY", "compressed"), ("a.spz", "spz"), ("a.SPLAT", "splat"), ("a.obj", None)],
+    [
+        ("a.ply", "3dgs"),
+        ("a.Compressed.PLY", "compressed"),
+        ("a.spz", "spz"),
+        ("a.SPLAT", "splat"),
+        ("a.Usd", "usd"),
+        ("a.obj", None),
+    ],
 )
 def test_the_ending_says_the_layout(name: str, layout: str | None) -> None:
     assert layout_of(Path(name)) == layout
@@ -303,14 +290,14 @@ def test_spz_is_a_tenth_of_the_plain_ply(tmp_path: Path) -> None:
     assert size["a.compressed.ply"] < size["a.ply"] / 3.9
 
 
-@pytest.mark.parametrize("layout", ["compressed", "spz", "splat"])
+@pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "usd"])
 def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, layout: str) -> None:
     with pytest.raises(DiskError, match="the folder does not exist"):
         write_layout(tmp_path / "no" / f"a{LAYOUTS.get(layout).ending}", a_scene(5), layout)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("layout", ["compressed", "spz", "splat"])
+@pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "usd"])
 @pytest.mark.parametrize("kept", [0, 1, 10, 200, -1])
 def test_a_file_cut_anywhere_is_one_line_that_names_it(tmp_path: Path, layout: str, kept: int) -> None:
     path = tmp_path / f"cut{LAYOUTS.get(layout).ending}"

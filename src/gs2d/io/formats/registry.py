@@ -15,10 +15,13 @@ from gs2d.errors import DataError
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
+from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
+from gs2d.io.formats.usd import read_usd, write_usd
 from gs2d.io.gaussians import Gaussians
 from gs2d.io.splat_ply import ply_kind, read_gaussians, read_splats, write_splats
 
 Writer = Callable[[Path, Splats], tuple[str, ...] | None]
+Reader = Callable[[str | os.PathLike[str]], tuple[Gaussians, str]]
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Layout:
 LAYOUTS: Registry[Layout] = Registry(
     "layout",
     "gs2d.formats",
-    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat"), __name__),
+    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat", "usd"), __name__),
     error=DataError,
 )
 """Names of formats that splats are written in."""
@@ -76,7 +79,18 @@ def _write_splat(path: Path, splats: Splats) -> None:
     write_splat(path, Gaussians.of(splats))
 
 
-_BY_ENDING = ((".compressed.ply", "compressed"), (".ply", "3dgs"), (".spz", "spz"), (".splat", "splat"))
+@register_format("usd", ending=".usd")
+def _write_usd(path: Path, splats: Splats) -> None:
+    write_usd(path, Gaussians.of(splats))
+
+
+_BY_ENDING = (
+    (".compressed.ply", "compressed"),
+    (".ply", "3dgs"),
+    (".spz", "spz"),
+    (".splat", "splat"),
+    (".usd", "usd"),
+)
 ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
 
@@ -108,9 +122,30 @@ def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
     return LAYOUTS.get(layout).write(path, splats) or ()
 
 
+def _read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
+    gaussians, version = read_spz(path)
+    return gaussians, f"SPZ version {version}"
+
+
+def _read_splat(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
+    return read_splat(path), ".splat"
+
+
+_READERS: tuple[tuple[tuple[str, ...], Reader], ...] = (
+    ((".spz",), _read_spz),
+    ((".splat",), _read_splat),
+    (USD_ENDINGS, read_usd),
+)  # of what is no PLY, by the ends of names
+
+
+def _reader_of(path: str | os.PathLike[str]) -> Reader | None:
+    name = str(path).lower()
+    return next((read for endings, read in _READERS if name.endswith(endings)), None)
+
+
 def is_splat_file(path: str | os.PathLike[str]) -> bool:
     """Whether a file is one of splats that are no PLY, by its ending."""
-    return str(path).lower().endswith((".spz", ".splat"))
+    return _reader_of(path) is not None
 
 
 def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
@@ -121,11 +156,10 @@ def read_splat_file(path: str | os.PathLike[str]) -> SplatFile:
     DataError
         Missing, broken, or no splats.
     """
-    if str(path).lower().endswith(".spz"):
-        gaussians, version = read_spz(path)
-        return _told(f"SPZ version {version}", gaussians, path)
-    if str(path).lower().endswith(".splat"):
-        return _told(".splat", read_splat(path), path)
+    reader = _reader_of(path)
+    if reader is not None:
+        gaussians, kind = reader(path)
+        return _told(kind, gaussians, path)
     kind = ply_kind(path)
     if kind == "compressed":
         return _told("compressed PLY", read_compressed_ply(path), path)

@@ -1,0 +1,154 @@
+"""Read the particle fields of an OpenUSD file in a process of its own: ``python usd_process.py FILE BYTES SECONDS``.
+
+A file that was damaged on purpose ends OpenUSD's parser by a signal or takes all memory, so that it works here, where
+neither hurts: under limits of address space and of a processor's time. On stdout comes a line of JSON, what was found
+or ``{"error": ...}``, then the arrays that it names, float32 one after the other. Nothing of gs2d is imported: starting
+is to be quick.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_KERNELS = {
+    "ParticleFieldKernelGaussianSurfletAPI": "surflet",
+    "ParticleFieldKernelGaussianEllipsoidAPI": "ellipsoid",
+    "ParticleFieldKernelConstantSurfletAPI": "constant",
+}
+_ARRAYS = {"positions": 3, "orientations": 4, "scales": 3, "opacities": 1}  # and as halves, with an h behind the name
+_HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+_OWN = "userProperties:gs2d:"  # what training had, beside what the schema has of it
+_OWN_ARRAYS = {"logScales": 2, "opacityLogits": 1, "quaternions": 4}
+_OUTSIDE = "everything in the file itself or in its folder was expected, it refers to {}; flatten it into one file"
+
+
+class _UnfitError(Exception):
+    """What is wrong with the file, in words."""
+
+
+def _limit(most: int, seconds: int) -> None:
+    """Let this process have so many bytes of addresses and seconds of a processor, where the system knows limits."""
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return
+    for kind, value in ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, seconds), (resource.RLIMIT_CORE, 0)):
+        _, hard = resource.getrlimit(kind)
+        resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+
+
+def _check_inside(Sdf: Any, root: Any, home: Path) -> None:
+    """Raise where layers beside those in the file's own folder are referred to; none of them is opened."""
+    layers, seen = [root], set()
+    while layers:
+        layer = layers.pop()
+        for asset in layer.GetCompositionAssetDependencies():
+            name = layer.ComputeAbsolutePath(asset)
+            if name in seen:
+                continue
+            seen.add(name)
+            path = Path(os.path.realpath(name.partition("[")[0]))
+            if not (path.is_file() and path.is_relative_to(home)):
+                raise _UnfitError(_OUTSIDE.format(repr(asset)))
+            found = Sdf.Layer.FindOrOpen(name)
+            if found is not None:
+                layers.append(found)
+
+
+def _values(prim: Any, name: str, width: int, when: Any, *, half: bool) -> np.ndarray | None:
+    """Return the array [N, width] of an attribute; None where nothing is said."""
+    for full in (name, name + "h") if half else (name,):
+        attribute = prim.GetAttribute(full)
+        value = attribute.Get(when) if attribute else None
+        if value is None:
+            continue
+        array = np.asarray(value)
+        if array.dtype.kind != "f" or array.size != len(value) * width:
+            raise _UnfitError(f"{width} numbers a splat as {full} were expected, got {attribute.GetTypeName()}")
+        return array.reshape(-1, width).astype(np.float32)
+    return None
+
+
+def _field(prim: Any, when: Any, cache: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """Return what is said of one particle field, and its arrays. Those too short are left out, as the schema says."""
+    applied = prim.GetAppliedSchemas()
+    kernels = [kernel for api, kernel in _KERNELS.items() if api in applied]
+    arrays = {name: _values(prim, name, width, when, half=True) for name, width in _ARRAYS.items()}
+    positions = arrays["positions"]
+    count = 0 if positions is None else len(positions)
+    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree")
+    degree = degree.Get() if degree else None
+    degree = 3 if degree is None else int(degree)
+    if not 0 <= degree <= 3:
+        raise _UnfitError(f"SH degree 0 to 3 was expected, got {degree}")
+    harmonics = _values(prim, _HARMONICS, 3, when, half=True)
+    coefficients = (degree + 1) ** 2
+    if harmonics is not None and len(harmonics) >= count * coefficients:
+        arrays["harmonics"] = harmonics[: count * coefficients].reshape(count, 3 * coefficients)
+    arrays |= {name: _values(prim, _OWN + name, width, when, half=False) for name, width in _OWN_ARRAYS.items()}
+    kept = {name: array[:count] for name, array in arrays.items() if array is not None and len(array) >= count}
+    matrix = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
+    if not np.isfinite(matrix).all():
+        raise _UnfitError(f"a transform of finite numbers was expected of {prim.GetPath()}")
+    facts = {
+        "path": str(prim.GetPath()),
+        "kernel": kernels[-1] if kernels else "none",
+        "count": count,
+        "matrix": matrix.T.tolist(),  # USD's vectors are rows
+        "arrays": {name: array.shape[1] for name, array in kept.items()},
+    }
+    return facts, list(kept.values())
+
+
+def _found(path: str) -> tuple[dict[str, Any], list[np.ndarray]]:
+    from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol
+
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # nothing is said on the terminal
+    try:
+        root = Sdf.Layer.FindOrOpen(path)
+        if root is None:
+            raise _UnfitError("OpenUSD was expected, its reader does not know it as such; copy or export it again")
+        _check_inside(Sdf, root, Path(os.path.realpath(path)).parent)
+        stage = Usd.Stage.Open(root)
+        if stage is None:
+            raise _UnfitError("OpenUSD was expected, its stage does not open; copy or export it again")
+        when = Usd.TimeCode.EarliestTime()
+        cache = UsdGeom.XformCache(when)
+        prims = [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdVol.ParticleField)]
+        fields = [_field(prim, when, cache) for prim in prims]
+        told = root.customLayerData.get("gs2d")
+    except Tf.ErrorException as error:
+        words = " ".join(str(error).split())[:200]
+        raise _UnfitError(f"OpenUSD was expected, its reader says: {words}; copy or export it again") from error
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
+    place = told.get("georeference") if isinstance(told, dict) else None
+    facts = {"fields": [fact for fact, _ in fields], "georeference": place if isinstance(place, str) else None}
+    return facts, [array for _, arrays in fields for array in arrays]
+
+
+def main(path: str, most: str, seconds: str) -> None:
+    """Write what is found to stdout, and end."""
+    _limit(int(most), int(seconds))
+    arrays: list[np.ndarray] = []
+    try:
+        facts, arrays = _found(path)
+    except _UnfitError as error:
+        facts = {"error": str(error)}
+    except MemoryError:
+        facts = {"error": "splats that fit into the memory that a file of this size may take were expected"}
+    sys.stdout.buffer.write(json.dumps(facts).encode() + b"\n")
+    for array in arrays:
+        sys.stdout.buffer.write(np.ascontiguousarray(array, "<f4").data)
+    sys.stdout.buffer.flush()
+    os._exit(0)  # what OpenUSD holds need not be taken down piece by piece
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
