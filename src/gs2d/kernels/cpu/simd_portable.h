@@ -123,14 +123,16 @@ GS2D_HD V sqrt(V a) {
     return per_lane([&](int i) { return __builtin_sqrtf(a[i]); });
 }
 GS2D_HD V round(V a) { return (a + V(12582912.f)) - V(12582912.f); }  // |a| < 2^22; needs value-safe floating point
+// Bits of numbers in arithmetic that wraps around: lanes that a mask leaves out later may hold any number here.
+typedef uint32_t PartBits __attribute__((vector_size(16)));
 GS2D_HD V scale2(V a, V n) {
     return per_part<V>(
-        [&](int k) { return a.of[k] * (Part)(((PartMask)(n.of[k] + 12582912.f) - 0x4b400000 + 127) << 23); });
+        [&](int k) { return a.of[k] * (Part)(((PartBits)(n.of[k] + 12582912.f) - 0x4b400000u + 127u) << 23); });
 }
 GS2D_HD V split2(V x, V& e) {
-    const auto exponent = [](Part part) { return ((PartMask)part - 0x3f3504f3) >> 23; };
+    const auto exponent = [](Part part) { return (PartMask)((PartBits)part - 0x3f3504f3u) >> 23; };
     e = per_part<V>([&](int k) { return __builtin_convertvector(exponent(x.of[k]), Part); });
-    return per_part<V>([&](int k) { return (Part)((PartMask)x.of[k] - (exponent(x.of[k]) << 23)); });
+    return per_part<V>([&](int k) { return (Part)((PartBits)x.of[k] - ((PartBits)exponent(x.of[k]) << 23)); });
 }
 #endif
 
