@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import random
 import struct
@@ -199,6 +200,19 @@ def read_usd_once(root: Path) -> None:
 
     (path,) = (p for p in root.iterdir() if p.is_file())
     read_surfels(path)
+
+
+def _gltf_text(root: Path) -> None:
+    """The same as text, with the bytes in base64."""
+    _splats("gltf", "a.glb")(root)
+    data = (root / "a.glb").read_bytes()
+    (root / "a.glb").unlink()
+    (length,) = struct.unpack_from("<I", data, 12)
+    document = json.loads(data[20 : 20 + length])
+    document["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(data[28 + length :]).decode()
+    document["nodes"] = [{"mesh": 0, "rotation": [0, 0.6, 0, 0.8], "scale": [2, 2, 2]}, {"children": [0]}]
+    document["scenes"] = [{"nodes": [1]}]
+    (root / "a.gltf").write_text(json.dumps(document))
 
 
 def ply_points(path: Path) -> None:
@@ -435,6 +449,8 @@ _ALL = (
            {".obj": _TEXT, ".off": _TEXT, ".stl": m.either(m.of_text, m.of_bytes)}, read_surface),
     Family("spz-splat", written(_splats("spz", "a.spz"), _splats("splat", "a.splat")),
            {".spz": m.either(m.of_gzip, m.of_gzip, m.of_bytes), ".splat": m.of_bytes}, read_splats_everywhere),
+    Family("gltf", written(_splats("gltf", "a.glb"), _gltf_text), {".glb": m.of_glb, ".gltf": _JSON},
+           read_splats_everywhere),
     Family("usd", written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD)),
            {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
     Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),

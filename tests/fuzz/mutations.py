@@ -231,6 +231,17 @@ def of_zip(inside: Mutation) -> Mutation:
     return mutate
 
 
+def of_glb(rng: Random, data: bytes) -> bytes:
+    """The JSON changes, with the right lengths before it, or the bytes behind it."""
+    if not data.startswith(b"glTF") or rng.random() < 0.3:
+        return of_bytes(rng, data)
+    (length,) = struct.unpack_from("<I", data, 12)
+    text = of_json(rng, data[20 : 20 + length])
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    return data[:8] + struct.pack("<II", 20 + len(text) + len(rest), len(text)) + b"JSON" + text + rest
+
+
 def of_npy(rng: Random, data: bytes) -> bytes:
     """The header's text changes, with the right length before it."""
     if not data.startswith(b"\x93NUMPY") or rng.random() < 0.3:

@@ -93,6 +93,18 @@ class Gaussians:
         thickness = (self.log_scales[:, 2:].astype(np.float64) + math.log(scale)).astype(np.float32)
         return replace(moved, log_scales=np.concatenate([moved.log_scales[:, :2], thickness], axis=1))
 
+    def half_turned_about_z(self) -> Gaussians:
+        """Return them after a half turn of their frame about z: signs and places change, and no number."""
+        w, x, y, z = self.quats.T
+        orders = [m for degree in range(1, self.sh_degree + 1) for m in range(-degree, degree + 1)]
+        signs = np.array([-1 if m % 2 else 1 for m in orders], np.float32)[:, None]  # Y(-x, -y, z) = (-1)^m Y(x, y, z)
+        return replace(
+            self,
+            means=self.means * np.array([-1, -1, 1], np.float32),
+            quats=np.stack([-z, -y, x, w], axis=1),
+            shN=self.shN * signs,
+        )
+
     def rows(self, index: np.ndarray) -> Gaussians:
         """Return the rows of an index or a mask."""
         return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))

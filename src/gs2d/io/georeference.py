@@ -21,6 +21,7 @@ from gs2d.core.files import atomic_write
 from gs2d.core.georeference import Georeference
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import DataError
+from gs2d.io.formats.gltf import EXTENSION, UPRIGHT
 from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
 from gs2d.io.formats.usd import stamp_usd, usd_georeference
 from gs2d.io.ply_format import read_ply_comments
@@ -105,6 +106,8 @@ def _stamped_glb_head(old: IO[bytes], georeference: Georeference) -> bytes:
     """Return the header and the JSON of a .glb file, with a georeference in the extras of its asset."""
     magic, version, length, size, kind = _GLB.unpack(old.read(_GLB.size))
     document = json.loads(old.read(size))
+    if EXTENSION in document.get("extensionsUsed", ()):
+        document["nodes"][0]["rotation"] = UPRIGHT  # splats, whose z is up now
     document["asset"]["extras"] = {**(document["asset"].get("extras") or {}), _KEY: _short(georeference)}
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -161,7 +164,7 @@ def georeference_of_file(path: Path) -> Georeference | None:
         return _parsed(beside, read_json(beside)) if beside.is_file() else None
     try:
         return _parsed(path, json.loads(told) if isinstance(told, str) else told)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: its georeference must be JSON, got: {error}; export it again") from error
 
 
@@ -196,5 +199,5 @@ def _of_glb(path: Path) -> Any:
             length = _GLB.unpack(file.read(_GLB.size))[3]
             extras = json.loads(file.read(length))["asset"].get("extras")
         return extras.get(_KEY) if isinstance(extras, dict) else None
-    except (ValueError, KeyError, TypeError, AttributeError, struct.error):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, struct.error):
         return None  # whoever reads the mesh says what is wrong with it

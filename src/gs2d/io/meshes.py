@@ -30,7 +30,7 @@ _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942  # "glTF", "JSON", "BIN
 _FLOAT, _UINT, _USHORT = 5126, 5125, 5123  # component types
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 _SRGB = np.arange(256) / 255
-_LINEAR_U16 = np.rint(65535 * np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)).astype("<u2")
+LINEAR_U16 = np.rint(65535 * np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)).astype("<u2")
 _CLAMP, _LINEAR, _MIPMAPS = 33071, 9729, 9987  # CLAMP_TO_EDGE, LINEAR, LINEAR_MIPMAP_LINEAR
 
 
@@ -255,7 +255,7 @@ def glb_bytes(mesh: Mesh | TexturedMesh, *, up: np.ndarray | None = None) -> byt
         png = png_bytes(mesh.texture)
     elif mesh.colors is not None:
         linear = np.ones((count, 4), "<u2")  # with the fourth, vertices are aligned to 4 bytes
-        linear[:, :3], linear[:, 3] = _LINEAR_U16[mesh.colors], 65535
+        linear[:, :3], linear[:, 3] = LINEAR_U16[mesh.colors], 65535
         parts.append(("COLOR_0", linear.tobytes(), {"componentType": _USHORT, "type": "VEC4", "normalized": True}))
     indices = np.ascontiguousarray(mesh.faces, "<u4").tobytes()
     blobs = [*(blob for _, blob, _ in parts), indices, *([png] if png else [])]

@@ -13,6 +13,7 @@ from gs2d.config.registry import Registry
 from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gs2d.io.formats.gltf import read_gltf, write_gltf
 from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
@@ -35,7 +36,7 @@ class Layout:
 LAYOUTS: Registry[Layout] = Registry(
     "layout",
     "gs2d.formats",
-    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat", "usd"), __name__),
+    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat", "usd", "gltf"), __name__),
     error=DataError,
 )
 """Names of formats that splats are written in."""
@@ -84,12 +85,18 @@ def _write_usd(path: Path, splats: Splats) -> None:
     write_usd(path, Gaussians.of(splats))
 
 
+@register_format("gltf", ending=".glb")
+def _write_gltf(path: Path, splats: Splats) -> None:
+    write_gltf(path, Gaussians.of(splats))
+
+
 _BY_ENDING = (
     (".compressed.ply", "compressed"),
     (".ply", "3dgs"),
     (".spz", "spz"),
     (".splat", "splat"),
     (".usd", "usd"),
+    (".glb", "gltf"),
 )
 ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
@@ -135,6 +142,7 @@ _READERS: tuple[tuple[tuple[str, ...], Reader], ...] = (
     ((".spz",), _read_spz),
     ((".splat",), _read_splat),
     (USD_ENDINGS, read_usd),
+    ((".glb", ".gltf"), read_gltf),
 )  # of what is no PLY, by the ends of names
 
 
