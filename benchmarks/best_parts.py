@@ -63,11 +63,11 @@ VARIANTS: dict[str, Recipe] = {
     "start_not_fitted": _unfitted(),
     "official_rates": _stage(_rates),
     "with_resets": _densify(reset_every=3_000, scale_cull_start=0),
-    "no_size_cull": _densify(scale_cull_start=10**6),
     "normals_of_the_image": _normals(where="image"),
     "no_normals": _normals(weight=0.0),
     "median": replace(best(), fused_depth="median"),
     # Tried, and not in it.
+    "size_cull": _densify(scale_cull_start=0),
     "silhouette": with_silhouette(best(), name="best"),
     "by_error": _densify(absolute=True, error_views=8, max_splats=40_000),
     "normals_by_edges": _normals(edge_power=2.0),

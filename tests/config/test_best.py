@@ -24,7 +24,7 @@ def test_the_default_is_listed_first() -> None:
 
 def test_they_are_shorter_than_2dgs() -> None:
     iterations = {name: get_recipe(name).iterations for name in (*NAMES, "2dgs")}
-    assert iterations == {"best": 15_000, "best-fast": 5_000, "best-surface": 15_000, "2dgs": 30_000}
+    assert iterations == {"best": 20_000, "best-fast": 6_600, "best-surface": 20_000, "2dgs": 30_000}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -45,7 +45,7 @@ def test_their_schedule_is_that_of_2dgs_in_fewer_iterations_with_longer_steps(na
 def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
     stage = get_recipe("best-surface").stages[0]
     terms = {term.kind: (term.weight, term.start, term.every) for term in stage.losses if "multiview" in term.kind}
-    assert terms == {"multiview_photometric": (0.6, 12_000, 2), "multiview_geometric": (0.04, 12_000, 2)}
+    assert terms == {"multiview_photometric": (0.6, 16_000, 2), "multiview_geometric": (0.04, 16_000, 2)}
     plain = tuple(term for term in stage.losses if "multiview" not in term.kind)
     assert replace(stage, losses=plain) == get_recipe("best").stages[0]
 

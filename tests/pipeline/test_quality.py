@@ -28,7 +28,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 @pytest.fixture(scope="module")
 def best(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    return _demo(tmp_path_factory, "best", 0.04)
+    return _demo(tmp_path_factory, "best", 0.03)
 
 
 def test_new_views_have_the_psnr_that_they_had(run: RunFolder) -> None:

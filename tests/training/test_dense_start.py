@@ -184,6 +184,19 @@ def test_a_splat_has_the_colour_that_the_views_show_its_opacity_and_a_bounded_si
     assert (fitted.shN[:, 3:] == 0).all()
 
 
+def test_a_splat_that_a_sparse_point_sized_keeps_its_opacity_and_size() -> None:
+    plain = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
+    kept = torch.arange(len(plain)) % 3 == 0
+    fit = StartFit(opacity=0.7, max_size=0.5, max_sparse_size=1e3)
+    fitted = fit_start(plain, swept_ball(), replace(BALL, fit=fit), kept)
+    assert torch.equal(fitted.log_scales[kept], plain.log_scales[kept])
+    small = fit_start(plain, swept_ball(), replace(BALL, fit=replace(fit, max_sparse_size=0.7)), kept)
+    assert (small.scales[kept] <= 0.7 * 1.1 * PIXEL).all()
+    assert torch.equal(fitted.opacity_logits[kept], plain.opacity_logits[kept])
+    assert (fitted.log_scales[~kept] < plain.log_scales[~kept]).any()
+    torch.testing.assert_close(fitted.opacities[~kept], torch.full_like(fitted.opacities[~kept], 0.7))
+
+
 def test_a_splat_that_no_view_sees_keeps_its_colour() -> None:
     plain = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
     hidden = plain.rows(torch.arange(len(plain)) < 3)

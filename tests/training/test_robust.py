@@ -13,7 +13,7 @@ from fake_backends import lacking
 from gs2d.config.presets import refine, surface, two_dgs, with_exposure, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe, validate
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, StartFit
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.splats import Splats
@@ -24,6 +24,7 @@ from gs2d.render.types import RasterSettings
 from gs2d.training import events
 from gs2d.training.backdrop import backdrop_color
 from gs2d.training.free_space import FreeSpaceMaps
+from gs2d.training.initialize import initial_splats
 from gs2d.training.plane_sweep import start_points, sweep_views
 from gs2d.training.point_gains import point_gains
 from gs2d.training.robust import Robustness
@@ -93,6 +94,24 @@ def test_sparse_points_start_splats_where_no_swept_one_is_near() -> None:
     assert (cloud.points == alone).all(axis=1).sum() == 1
     assert len(cloud) - len(start_points(scene, swept_wall(), SMALL)) == 1  # type: ignore[arg-type]
     assert len(cloud) < len(scene.points) + sum((d > 0).sum() for d in swept_wall().depths)  # type: ignore[attr-defined]
+
+
+def test_a_sparse_point_far_from_swept_ones_starts_a_splat_as_large_as_among_sparse_ones() -> None:
+    scene = wall()
+    assert scene.points is not None
+    alone = np.array([[0.0, 0.0, 9.0], [0.3, 0.0, 9.0], [0.0, 0.4, 9.0], [0.0, 0.0, 8.5]])
+    more = replace(scene, points=PointCloud(np.concatenate([scene.points.points, alone])))
+    assert start_points(more, swept_wall(), SMALL).sizes is None  # type: ignore[arg-type]
+    cloud = start_points(more, swept_wall(), replace(SMALL, fit=StartFit()))  # type: ignore[arg-type]
+    assert cloud.sizes is not None
+    assert np.flatnonzero(cloud.sizes).tolist() == list(range(len(cloud) - 4, len(cloud)))
+    assert cloud.sizes[-4] == pytest.approx(np.sqrt((0.3**2 + 0.4**2 + 0.5**2) / 3))
+    generator = torch.Generator().manual_seed(0)
+    first = initial_splats(
+        replace(more, points=cloud), sh_degree=0, random_points=9, near=0.01, generator=generator, dtype=torch.float64
+    )
+    assert first.sized.tolist() == (cloud.sizes > 0).tolist()
+    torch.testing.assert_close(first.splats.scales[-4:, 0], torch.from_numpy(cloud.sizes[-4:]))
 
 
 def test_pixels_that_a_mask_leaves_out_have_no_depth() -> None:

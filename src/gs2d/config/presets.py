@@ -43,7 +43,7 @@ MULTIVIEW_WEIGHT = 0.3  # docs/decisions/multiview.md
 DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
-BEST_ITERATIONS, FAST_ITERATIONS = 15_000, 5_000
+BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
@@ -275,7 +275,8 @@ def best(iterations: int = BEST_ITERATIONS, *, name: str = "best") -> Recipe:
     """Return the recipe for the best pictures and surface per minute: 2DGS from a fitted dense start, in one stage.
 
     Not in the paper. A scene that begins near its end needs no opacity resets, and half the iterations with rates that
-    make up for it; the mesh is of a depth in which no splat decides alone (docs/recipes/best.md).
+    make up for it; large splats stay, which are what surroundings are made of; the mesh is of a depth in which no splat
+    decides alone (docs/recipes/best.md).
     """
     part = iterations / OFFICIAL_ITERATIONS
     nc = LossTerm("normal_consistency", 0.05, round(NC_START * part), where="object")
@@ -284,7 +285,9 @@ def best(iterations: int = BEST_ITERATIONS, *, name: str = "best") -> Recipe:
         iterations,
         losses=(*PHOTOMETRIC, nc),
         lr=replace(LearningRates(means_decay_steps=iterations).times(part**-LONGER), stretch=LONGER),
-        densify=GradDensify(start=round(500 * part), stop=round(15_000 * part), reset_every=0),
+        densify=GradDensify(
+            start=round(500 * part), stop=round(15_000 * part), reset_every=0, scale_cull_start=iterations
+        ),
         sh_interval=round(1_000 * part),
     )
     start = replace(DENSE_START, required=False)

@@ -26,7 +26,10 @@ class StartFit:
     size : float
         Times the mean distance to the three nearest splats: the standard deviations of a splat.
     max_size : float, px
-        A splat is not larger than so many pixels of the view that it was found in: what lies apart stays small.
+        A splat is not larger than so many pixels of the nearest view that shows it: what lies apart stays small.
+    max_sparse_size : float, px
+        The same for splats at sparse points that are apart from all swept places. They stand for surroundings on which
+        no photographs agree (bare tables, cloth), begin as large as 2DGS's and must reach far.
     """
 
     sh_degree: int = 0
@@ -34,6 +37,7 @@ class StartFit:
     opacity: float = 0.5
     size: float = 0.7
     max_size: float = 6.0
+    max_sparse_size: float = 24.0
 
 
 @dataclass(frozen=True)
@@ -211,9 +215,8 @@ def check_robust(
 
 def _check_fit(at: str, fit: StartFit) -> None:
     require(fit.sh_degree in (0, 1, 2, 3), f"{at}.sh_degree must be 0, 1, 2 or 3, got {fit.sh_degree!r}")
-    for name in ("ridge", "opacity", "size", "max_size"):
+    for name in ("ridge", "opacity"):
         number(f"{at}.{name}", getattr(fit, name), low=0.0)
     require(0 < fit.opacity < 1, f"{at}.opacity must be in (0, 1), got {fit.opacity}")
-    require(
-        fit.size > 0 and fit.max_size > 0, f"{at}.size and max_size must be positive, got {fit.size}, {fit.max_size}"
-    )
+    for name in ("size", "max_size", "max_sparse_size"):
+        require(getattr(fit, name) > 0, f"{at}.{name} must be positive, got {getattr(fit, name)}")

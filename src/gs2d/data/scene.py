@@ -173,11 +173,14 @@ class PointCloud:
     colors : ndarray [P, 3] uint8 sRGB, or None
     normals : ndarray [P, 3] or None
         Of the surface, unit, either way round; 0 where unknown.
+    sizes : ndarray [P] float64 world units, or None
+        Standard deviations of the splats that start there; 0: as large as the points around leave room for.
     """
 
     points: np.ndarray
     colors: np.ndarray | None = None
     normals: np.ndarray | None = None
+    sizes: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shapes = {"points": (self.points, "P 3")}
@@ -185,6 +188,8 @@ class PointCloud:
             shapes["colors"] = (self.colors, "P 3")
         if self.normals is not None:
             shapes["normals"] = (self.normals, "P 3")
+        if self.sizes is not None:
+            shapes["sizes"] = (self.sizes, "P")
         check_shapes(shapes)
 
     def __len__(self) -> int:

@@ -21,7 +21,7 @@ from gs2d.synthetic.perturb_poses import TRUTH as TRUE_POSES
 CAPTURE, TRUTH = "capture", "mesh_gt.ply"
 CAPTURE_FILES = ("train", "test", "transforms_train.json", "transforms_test.json", GAINS, TRUE_POSES)  # and mesh_gt*
 TITLE = "gs2d demo: a still life whose true surface is known"
-SCHEDULE_SCALE = 0.2
+SCHEDULE_SCALE = 0.15
 
 
 def demo(

@@ -22,11 +22,23 @@ RELATIVE_SCALE_FLOOR = 1e-4  # of the extent, where that is smaller: a scene may
 
 @dataclass(frozen=True, eq=False)
 class Initial:
-    """The first splats, whether they are the scene's "points" or "random", and how many points were not usable."""
+    """The first splats.
+
+    Attributes
+    ----------
+    splats : Splats
+    source : str
+        What they lie on: the scene's "points", or "random" places.
+    dropped : int
+        Points that were not usable.
+    sized : Tensor [N] bool
+        Splats whose size their point gave.
+    """
 
     splats: Splats
     source: str
     dropped: int
+    sized: Tensor
 
 
 def initial_splats(
@@ -71,7 +83,9 @@ def initial_splats(
     if len(kept) < 2:
         raise _no_points(points, scene, near)
     floor = min(SCALE_FLOOR, RELATIVE_SCALE_FLOOR * scene.extent)
-    scales = np.maximum(nearest_distances(kept, k=3), floor)
+    scales = nearest_distances(kept, k=3)
+    known = np.zeros(len(kept)) if cloud is None or cloud.sizes is None else cloud.sizes[usable]
+    scales = np.maximum(np.where(known > 0, known, scales), floor)
     quats = random_rotations(len(kept), generator)
     if cloud is not None and cloud.normals is not None:
         quats = turned_to(torch.as_tensor(cloud.normals[usable], dtype=torch.float64), quats)
@@ -83,7 +97,7 @@ def initial_splats(
         sh0=rgb_to_sh0(torch.as_tensor(colors[usable]).to(dtype)),
         shN=torch.zeros(len(kept), num_coefficients(sh_degree) - 1, 3, dtype=dtype),
     )
-    return Initial(splats, source, len(points) - len(kept))
+    return Initial(splats, source, len(points) - len(kept), torch.from_numpy(known > 0))
 
 
 def splats_as_start(splats: Splats, *, sh_degree: int, dtype: torch.dtype = torch.float32) -> Splats:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gs2d.config.robust import DenseStart
 from gs2d.core.memory import trim
+from gs2d.core.transforms import nearest_distances
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
 from gs2d.errors import DataError
@@ -152,6 +153,8 @@ def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
 def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud:
     """Return points to start from: swept ones, and sparse ones where none of those is near.
 
+    For a fitted start, sparse ones keep the size that they have among all sparse points (:attr:`PointCloud.sizes`).
+
     Raises
     ------
     DataError
@@ -165,7 +168,9 @@ def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud
         )
     found = [_swept(sweep, index, settings) for index in range(len(sweep.views))]
     swept = _thin(_joined(found), settings.cell)
-    parts = [(swept.places, swept.colors, swept.normals)]
+    parts: list[tuple[np.ndarray, ...]] = [
+        (swept.places, swept.colors, swept.normals, np.zeros(len(swept.places))),
+    ]
     if scene.points is not None and _has_points(scene):
         parts.append(_apart(scene.points, swept, settings.cell))
     elif len(swept.places) < 2:
@@ -173,8 +178,9 @@ def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud
             f"a plane sweep of {scene.name} found {len(swept.places)} places on which photographs agree, expected at "
             "least 2; do photographs and cameras belong together? Train with --set dense_start=null"
         )
-    places, colors, normals = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return PointCloud(places, np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8), normals)
+    places, colors, normals, sizes = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    colors = np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
+    return PointCloud(places, colors, normals, None if settings.fit is None else sizes)
 
 
 def _has_points(scene: Scene) -> bool:
@@ -228,17 +234,18 @@ def _swept(sweep: Sweep, index: int, settings: DenseStart) -> _Found:
     return _Found(places[kept], colors[kept], normals[kept], (depth / view.K[0, 0])[kept], sweep.scores[index][kept])
 
 
-def _apart(points: PointCloud, swept: _Found, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sparse points that lie apart from the swept ones: places, colours in [0, 1], unknown normals."""
+def _apart(points: PointCloud, swept: _Found, cell: float) -> tuple[np.ndarray, ...]:
+    """Sparse points that lie apart from the swept ones: places, colours in [0, 1], unknown normals, sizes."""
     from scipy.spatial import cKDTree
 
-    places = np.asarray(points.points, dtype=np.float64)
-    apart = np.logical_and.reduce(np.isfinite(places), axis=1)
+    finite = np.logical_and.reduce(np.isfinite(points.points), axis=1)
+    places = np.asarray(points.points, dtype=np.float64)[finite]
+    colors = np.full((len(places), 3), 0.5) if points.colors is None else points.colors[finite] / 255.0
+    sizes = nearest_distances(places) if len(places) > 1 else np.zeros(len(places))
+    apart: np.ndarray = np.ones(len(places), dtype=bool)
     if len(swept.places):
-        distance = cKDTree(swept.places).query(np.where(apart[:, None], places, 0.0))[0]
-        apart &= distance > REPEATED * cell * float(np.median(swept.pixel))
-    colors = np.full((len(places), 3), 0.5) if points.colors is None else points.colors / 255.0
-    return places[apart], colors[apart], np.zeros((int(apart.sum()), 3))
+        apart &= cKDTree(swept.places).query(places)[0] > REPEATED * cell * float(np.median(swept.pixel))
+    return places[apart], colors[apart], np.zeros((int(apart.sum()), 3)), sizes[apart]
 
 
 def _shrunk(view: View, known: SweepRange, factor: int) -> SmallView:

@@ -257,7 +257,11 @@ def with_known_points(scene: Scene, recipe: Recipe) -> Scene:
         points.append(scene.points.points)
         colors.append(grey if scene.points.colors is None else scene.points.colors)
         normals.append(np.zeros_like(scene.points.points))
-    return replace(scene, points=PointCloud(*map(np.concatenate, (points, colors, normals))))
+    places = np.concatenate(points)
+    sizes = np.zeros(len(places))
+    if scene.points is not None and scene.points.sizes is not None:
+        sizes[-len(scene.points) :] = scene.points.sizes
+    return replace(scene, points=PointCloud(places, np.concatenate(colors), np.concatenate(normals), sizes))
 
 
 def plane_normals(points: np.ndarray, neighbours: int = 16) -> np.ndarray:

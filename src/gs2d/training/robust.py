@@ -17,6 +17,7 @@ from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
 from gs2d.training.free_space import FreeSpaceMaps
+from gs2d.training.initialize import Initial
 from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
 from gs2d.training.rows import keep_rows
 from gs2d.training.seen_area import mostly_unseen
@@ -81,10 +82,12 @@ class Robustness:
         """Whether training starts where photographs agree."""
         return self._recipe.dense_start is not None and not self.lacks
 
-    def fitted(self, splats: Splats) -> Splats:
+    def fitted(self, first: Initial) -> Splats:
         """Return the first splats as the dense start has them fitted; themselves where it fits none. Once."""
         settings, sweep, self._sweep = self._recipe.dense_start, self._sweep, None
-        return splats if settings is None or sweep is None else fit_start(splats, sweep, settings)
+        if settings is None or sweep is None:
+            return first.splats
+        return fit_start(first.splats, sweep, settings, first.sized)
 
     def move_to(self, device: torch.device | str) -> None:
         """Move all tensors to a device."""

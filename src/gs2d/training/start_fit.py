@@ -18,7 +18,7 @@ AT_ONCE = 1 << 16  # splats whose equations are solved together
 
 
 @torch.no_grad()
-def fit_start(splats: Splats, sweep: Sweep, settings: DenseStart) -> Splats:
+def fit_start(splats: Splats, sweep: Sweep, settings: DenseStart, kept: Tensor | None = None) -> Splats:
     """Return the splats with colour, opacity and size fitted to the views of a sweep (formulas: docs/math.md).
 
     A view sees a splat where its swept depth is that of the splat, to ``settings.agree``. Splats that none sees keep
@@ -31,6 +31,9 @@ def fit_start(splats: Splats, sweep: Sweep, settings: DenseStart) -> Splats:
     sweep : Sweep
     settings : DenseStart
         With ``fit``.
+    kept : Tensor [N] bool, optional
+        Splats of sparse points apart from the swept ones: they keep their opacity, and their size up to
+        ``fit.max_sparse_size``.
     """
     assert settings.fit is not None
     fit = settings.fit
@@ -42,9 +45,12 @@ def fit_start(splats: Splats, sweep: Sweep, settings: DenseStart) -> Splats:
     sh0, shN = splats.sh0.clone(), splats.shN.clone()
     sh0[seen_at_all] = colors[seen_at_all, :1]
     shN[seen_at_all, : num_coefficients(degree) - 1] = colors[seen_at_all, 1:]
-    largest = torch.from_numpy(np.log(fit.max_size * pixel)).to(splats.log_scales)
-    log_scales = torch.minimum(splats.log_scales + math.log(fit.size), largest[:, None])
+    of_pixel = torch.from_numpy(np.log(pixel)).to(splats.log_scales)[:, None]
+    log_scales = torch.minimum(splats.log_scales + math.log(fit.size), of_pixel + math.log(fit.max_size))
     logits = torch.full_like(splats.opacity_logits, math.log(fit.opacity / (1 - fit.opacity)))
+    if kept is not None:
+        log_scales[kept] = torch.minimum(splats.log_scales, of_pixel + math.log(fit.max_sparse_size))[kept]
+        logits[kept] = splats.opacity_logits[kept]
     return replace(splats, log_scales=log_scales, opacity_logits=logits, sh0=sh0, shN=shN)
 
 

@@ -318,7 +318,7 @@ class Trainer:
         source = "sweep" if source == "points" and self._robust.starts_densely else source
         lacks = self._robust.lacks
         self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped, lacks))
-        return per_image.start(TrainState(self._robust.fitted(initial.splats), generator), self.recipe, self.scene)
+        return per_image.start(TrainState(self._robust.fitted(initial), generator), self.recipe, self.scene)
 
     def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
         """Run an entry action."""
