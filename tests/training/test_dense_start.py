@@ -231,7 +231,7 @@ def test_a_fit_is_written_only_where_there_is_one_and_read_again() -> None:
     [
         (StartFit(sh_degree=4), "dense_start.fit.sh_degree must be 0, 1, 2 or 3, got 4"),
         (StartFit(opacity=1.0), r"dense_start.fit.opacity must be in \(0, 1\), got 1.0"),
-        (StartFit(size=0.0), "dense_start.fit.size and max_size must be positive"),
+        (StartFit(size=0.0), "dense_start.fit.size must be positive, got 0.0"),
         (StartFit(ridge=-1.0), "dense_start.fit.ridge"),
     ],
 )
