@@ -133,6 +133,7 @@ def test_info_describes_a_run_a_capture_and_a_ply(
         ("a.splat", ".splat"),
         ("a.usd", "OpenUSD, surflets"),
         ("a.glb", "glTF"),
+        ("a.sog", "SOG"),
     ],
 )
 def test_the_ending_of_an_export_is_its_format_and_info_reads_it(
@@ -169,7 +170,9 @@ def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(
     assert run(["export", str(trained), "--out", str(tmp_path / "a.spz"), "--layout", "3dgs"]) == 2
     assert "--out must name a .ply file, which is what layout 3dgs is, got" in capsys.readouterr().err
     assert run(["export", str(trained), "--out", str(tmp_path / "a.fbx")]) == 2
-    assert "--out must end in .compressed.ply, .ply, .spz, .splat, .usd, .glb, which say" in capsys.readouterr().err
+    assert (
+        "--out must end in .compressed.ply, .ply, .spz, .splat, .usd, .glb, .sog, which say" in capsys.readouterr().err
+    )
     assert list(tmp_path.iterdir()) == []
 
 

@@ -429,6 +429,8 @@ _NPZ = m.of_zip(m.of_npy)
 _LENS = Lens()
 _TREE = {".json": _JSON, ".ply": m.of_ply, ".npy": m.of_npy, ".png": m.of_png}
 
+_SOG = m.either(m.of_json, m.of_bytes)  # of_json takes what is none as text
+
 _ALL = (
     Family("colmap-bin", written(partial(_colmap, kind="bin"), partial(_colmap, kind="bin", model="OPENCV")),
            {".bin": m.of_bytes}, read_capture),
@@ -450,6 +452,8 @@ _ALL = (
     Family("spz-splat", written(_splats("spz", "a.spz"), _splats("splat", "a.splat")),
            {".spz": m.either(m.of_gzip, m.of_gzip, m.of_bytes), ".splat": m.of_bytes}, read_splats_everywhere),
     Family("gltf", written(_splats("gltf", "a.glb"), _gltf_text), {".glb": m.of_glb, ".gltf": _JSON},
+           read_splats_everywhere),
+    Family("sog", written(_splats("sog", "a.sog")), {".sog": m.either(m.of_zip(_SOG), m.of_zip(_SOG), m.of_bytes)},
            read_splats_everywhere),
     Family("usd", written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD)),
            {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),

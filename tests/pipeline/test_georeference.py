@@ -274,6 +274,7 @@ def placed(run: Path) -> Georeference:
         ("a.splat", False, 1e-3),
         ("a.usd", True, 1e-3),
         ("a.glb", True, 1e-3),
+        ("a.sog", False, 0.02),
     ],
 )
 def test_splats_a_million_metres_away_come_back_to_a_millimetre(

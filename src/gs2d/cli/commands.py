@@ -105,7 +105,7 @@ class View(ViewOptions, Common):
     """Look at a trained run in the browser: splats, mesh and cameras, served from this machine only."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd or .glb."""
+    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,7 @@ class Page(Common):
     """Write the splats as one HTML file that any browser draws exactly: no server, no network, to mail or to host."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd or .glb."""
+    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """HTML file (default: scene.html in the run, or beside the file)."""
     sh_degree: int = 3
@@ -135,14 +135,15 @@ class Export(Common):
     """Write the splats of a run in another layout."""
 
     run: RunPath
-    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd or .glb."""
+    """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
     out: Annotated[Path, arg(metavar="FILE")]
     """File to write; by its ending .ply is 3dgs, .compressed.ply compressed, .spz spz, .splat splat, .usd usd, .glb
-    gltf."""
+    gltf, .sog sog."""
     layout: str | None = None
     """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open; compressed:
     PlayCanvas's and SuperSplat's PLY; spz: Niantic's, the smallest; splat: antimatter15's, one colour a splat;
-    usd: OpenUSD, to the bit; gltf: Khronos' KHR_gaussian_splatting, as flat 3D Gaussians."""
+    usd: OpenUSD, to the bit; gltf: Khronos' KHR_gaussian_splatting, as flat 3D Gaussians;
+    sog: PlayCanvas's pictures, for the web."""
     bbox: BoxOption = None
     """Only the splats with their centres in this box (`gs2d view` and subject.json have numbers)."""
     georeferenced: bool = False
@@ -207,7 +208,7 @@ class Info(Common):
     """Show what a run folder, a capture or a file of splats, mesh or points holds."""
 
     path: Annotated[Positional[Path], arg(metavar="PATH")]
-    """Run folder, capture (folder or .zip), or file: PLY, .spz, .splat, .usd or .glb."""
+    """Run folder, capture (folder or .zip), or file: PLY, .spz, .splat, .usd, .glb or .sog."""
 
 
 COMMANDS: tuple[type[Common], ...] = (

@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 from collections.abc import Iterator, Sequence
+from typing import IO
 
 import numpy as np
 from PIL import Image
@@ -36,7 +37,7 @@ def is_number(text: str) -> bool:
     return re.fullmatch("[0-9]{1,18}", text) is not None
 
 
-def open_image(path: str | os.PathLike[str]) -> Image.Image:
+def open_image(path: str | os.PathLike[str] | IO[bytes]) -> Image.Image:
     """Open an image of one of ``FORMATS`` by Pillow, which has then read its header; errors are Pillow's."""
     Image.init()  # asked for a format that it has not loaded, Pillow raises KeyError
     return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])

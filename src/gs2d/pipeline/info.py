@@ -57,7 +57,7 @@ def describe_file(path: Path) -> dict[str, Any]:
     DataError
         The file is none of these, or is broken.
     """
-    if path.suffix.lower() in _OF_CAPTURES:
+    if path.suffix.lower() in _OF_CAPTURES and not is_splat_file(path):
         raise DataError(
             f"{path}: a file of splats, a mesh or points was expected, got a file of a capture; give its folder"
         )

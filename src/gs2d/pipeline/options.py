@@ -155,8 +155,8 @@ class TrainOptions(Training, HowItRuns):
     schedule_scale: float = 1.0
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
     init: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Start from the splats of a file (PLY of 2DGS or 3DGS, .spz, .splat, .usd, .glb) in the frame of the capture, not
-    from points. 3D Gaussians lose their smallest scale, along which the normal then points."""
+    """Start from the splats of a file (PLY of 2DGS or 3DGS, .spz, .splat, .usd, .glb, .sog) in the frame of the
+    capture, not from points. 3D Gaussians lose their smallest scale, along which the normal then points."""
     title: Annotated[str | None, Fixed, Suppress] = None
     """Heading of the report; None: the name of the capture."""
     shown_views: Annotated[int, Fixed, Suppress] = 3

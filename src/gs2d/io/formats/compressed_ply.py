@@ -42,7 +42,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
         If the file could not be written.
     """
     n = len(gaussians)
-    g = gaussians.rows(_morton_order(gaussians.means))
+    g = gaussians.rows(morton_order(gaussians.means))
     chunks = -(-n // _CHUNK)
     values = {
         "position": g.means.astype(np.float64),
@@ -74,7 +74,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
     return (f"{steep} of {n} splats have SH coefficients beyond 4, which is what the format holds",) if steep else ()
 
 
-def _morton_order(means: np.ndarray) -> np.ndarray:
+def morton_order(means: np.ndarray) -> np.ndarray:
     """Return an order in which neighbours in the list are neighbours in space: bits of x, y and z in turn."""
     if not len(means):
         return np.zeros(0, dtype=int)

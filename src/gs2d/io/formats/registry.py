@@ -14,6 +14,7 @@ from gs2d.core.splats import Splats
 from gs2d.errors import DataError
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gs2d.io.formats.gltf import read_gltf, write_gltf
+from gs2d.io.formats.sog import read_sog, write_sog
 from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
@@ -36,7 +37,7 @@ class Layout:
 LAYOUTS: Registry[Layout] = Registry(
     "layout",
     "gs2d.formats",
-    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat", "usd", "gltf"), __name__),
+    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat", "usd", "gltf", "sog"), __name__),
     error=DataError,
 )
 """Names of formats that splats are written in."""
@@ -90,6 +91,11 @@ def _write_gltf(path: Path, splats: Splats) -> None:
     write_gltf(path, Gaussians.of(splats))
 
 
+@register_format("sog", ending=".sog")
+def _write_sog(path: Path, splats: Splats) -> None:
+    write_sog(path, Gaussians.of(splats))
+
+
 _BY_ENDING = (
     (".compressed.ply", "compressed"),
     (".ply", "3dgs"),
@@ -97,6 +103,7 @@ _BY_ENDING = (
     (".splat", "splat"),
     (".usd", "usd"),
     (".glb", "gltf"),
+    (".sog", "sog"),
 )
 ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
@@ -143,11 +150,12 @@ _READERS: tuple[tuple[tuple[str, ...], Reader], ...] = (
     ((".splat",), _read_splat),
     (USD_ENDINGS, read_usd),
     ((".glb", ".gltf"), read_gltf),
+    ((".sog", "/meta.json", "/lod-meta.json"), read_sog),
 )  # of what is no PLY, by the ends of names
 
 
 def _reader_of(path: str | os.PathLike[str]) -> Reader | None:
-    name = str(path).lower()
+    name = str(Path(path).absolute()).lower().replace(os.sep, "/")
     return next((read for endings, read in _READERS if name.endswith(endings)), None)
 
 
