@@ -15,6 +15,7 @@ from gs2d.pipeline.options import (
     EvaluateOptions,
     GeoreferenceOptions,
     MeshOptions,
+    OrthophotoOptions,
     Overrides,
     PosesOptions,
     ReconstructOptions,
@@ -159,6 +160,18 @@ class Georeference(GeoreferenceOptions, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Orthophoto(OrthophotoOptions, Common):
+    """Write a georeferenced run from straight above: orthophoto and elevation model, as GeoTIFF."""
+
+    run: RunPath
+    """Run folder, with mesh.ply and `gs2d georeference`."""
+    out: Annotated[Path | None, arg(metavar="FILE.tif")] = None
+    """The orthophoto (default: orthophoto.tif in the run); heights go to NAME_elevation.tif beside it."""
+    threads: int | None = None
+    """CPU threads."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report(Common):
     """Write report.html of a run again."""
 
@@ -212,8 +225,8 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Page, Evaluate, Export, Georeference, Report, Recipes,
-    Paper, Sweep, Doctor, Info, Completion
+    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Page, Evaluate, Export, Georeference, Orthophoto, Report,
+    Recipes, Paper, Sweep, Doctor, Info, Completion
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
@@ -227,6 +240,7 @@ Command = (
     | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Georeference, subcommand("georeference")]
+    | Annotated[Orthophoto, subcommand("orthophoto")]
     | Annotated[Report, subcommand("report")]
     | Annotated[Recipes, subcommand("recipes")]
     | Annotated[Paper, subcommand("paper")]

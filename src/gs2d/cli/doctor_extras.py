@@ -69,7 +69,7 @@ OPTIONAL = (
         _programs(FFMPEG, "ffmpeg", "ffprobe"),
     ),
     Wanted("heic", "HEIC photographs, as of an iPhone", _heic),
-    Wanted("geo", "map projections (gs2d georeference --gps)", _packages("geo", "pyproj")),
+    Wanted("geo", "maps (gs2d georeference --gps, orthophoto)", _packages("geo", "pyproj", "tifffile")),
     Wanted(
         "markers",
         "printed markers (gs2d georeference --markers)",

@@ -29,6 +29,7 @@ def execute(command: Common, console: Console) -> None:
         c.Evaluate: evaluate,
         c.Export: export,
         c.Georeference: georeference,
+        c.Orthophoto: orthophoto,
         c.Report: report,
         c.Recipes: recipes,
         c.Paper: table,
@@ -208,6 +209,22 @@ def georeference(command: c.Georeference, console: Console) -> None:
     if found is None:
         console.say("no georeference: --gps, --positions, --control, --known-distance or --markers finds one")
     console.result({"run": str(command.run), "georeference": None if found is None else found.to_json()})
+
+
+def orthophoto(command: c.Orthophoto, console: Console) -> None:
+    """``gs2d orthophoto``."""
+    from gs2d.pipeline.orthophoto import orthophoto_run
+
+    result = orthophoto_run(command.run, command.out, command, console.on_event, threads=command.threads)
+    console.close()
+    for file in result["files"]:
+        console.say(file)
+    unseen = result["cells_unseen"] / result["cells"]
+    console.say(
+        f"{result['rows']:,} x {result['columns']:,} cells of {result['resolution']:g} m, {result['frame']}; "
+        f"{unseen:.0%} of the surface in colours of the mesh, as no photograph sees it"
+    )
+    console.result(result)
 
 
 def report(command: c.Report, console: Console) -> None:

@@ -23,7 +23,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "To begin with": ("doctor", "demo", "reconstruct", "view", "completion"),
     "Step by step": ("poses", "train", "mesh"),
     "Look, keep and share": ("info", "render", "page", "export", "report"),
-    "Real-world coordinates": ("georeference",),
+    "Real-world coordinates": ("georeference", "orthophoto"),
     "Measure and compare": ("evaluate", "recipes", "sweep", "paper"),
 }
 _PROGRAM_OPTIONS = (

@@ -19,6 +19,7 @@ _PAIRS_PER_CHUNK = 60_000  # a step of one chunk stays in the cache of a core
 NEAR = 1e-3  # world units
 _MARGIN = 1e-6  # samples around the box of a triangle, for rounding
 _NO_HIT = np.uint64(0xFFFFFFFFFFFFFFFF)
+Size = tuple[int, int]  # rows, columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +93,54 @@ def cast_camera(
     hits = _hits(nearest, edges, directions_x, directions_y)
     numbers = np.append(met, -1).astype(np.int32)  # -1 where nothing was hit
     return Hits(numbers[hits.face], hits.depth, hits.weights)
+
+
+def cast_down(vertices: np.ndarray, faces: np.ndarray, corner: tuple[float, float], step: float, size: Size) -> Hits:
+    """Cast a ray straight down (-z) through every cell of a raster and keep the highest triangle of each.
+
+    A cell's centre (x, y, 1) and the corners (x, y, 1) of a triangle take the places of a ray and of camera axes in
+    :func:`cast_camera`: the three volumes are twice the areas of the parts of the triangle, seen from above.
+
+    Parameters
+    ----------
+    vertices : ndarray [P, 3] world units
+        z is up.
+    faces : ndarray [F, 3] int
+    corner : (float, float), world units
+        x and y of the upper left corner of the raster: of the lowest x and the highest y.
+    step : float, world units
+        Side of a cell. Columns go to higher x, rows to lower y.
+    size : (int, int)
+        Rows and columns.
+
+    Returns
+    -------
+    Hits
+        Of size [rows, columns]; ``depth`` is below the highest vertex, plus one.
+    """
+    height, width = size
+    flat = np.stack([(vertices[:, 0] - corner[0]) / step, (corner[1] - vertices[:, 1]) / step], axis=1)  # in cells
+    top = float(vertices[:, 2].max()) + 1.0
+    corners = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)[faces]  # [F, 3, 3]
+    a, b, c = (corners[:, k] for k in range(3))
+    edges = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
+    below = top - vertices[faces, 2]  # [F, 3]
+    limit = np.array([width, height])
+    low = np.clip(np.ceil(corners[:, :, :2].min(axis=1) - 0.5 - _MARGIN), 0, limit).astype(np.int64)
+    high = np.clip(np.floor(corners[:, :, :2].max(axis=1) - 0.5 + _MARGIN) + 1, 0, limit).astype(np.int64)
+    columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
+
+    nearest = np.full(width * height, _NO_HIT, dtype=np.uint64)
+    for face, x, y in _pairs(low, high):
+        e = [edges[face, k, 0] * columns[x] + edges[face, k, 1] * rows[y] + edges[face, k, 2] for k in range(3)]
+        inside = _same_sign(*e)
+        total = sum(part[inside] for part in e)
+        met = face[inside]
+        depth = sum(part[inside] * below[met, k] for k, part in enumerate(e)) / np.where(total == 0, np.inf, total)
+        flat_on = depth > 0  # else it is seen from its edge
+        key = depth[flat_on].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+        np.minimum.at(nearest, (y[inside] * width + x[inside])[flat_on], key | met[flat_on].astype(np.uint64))
+    return _hits(nearest, edges, columns, rows)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

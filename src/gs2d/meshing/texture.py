@@ -280,14 +280,7 @@ def bake(
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise ProtocolError(f"--texture-size must be {MIN_SIZE} to {MAX_SIZE} texels, got {size}")
     texels = texels_of(atlas, size)
-    chooser = _Chooser(atlas, texels, best, threads or os.cpu_count() or 1)
-    for image in images:
-        chooser.add(image)
-    colors, seen = chooser.colors()
-    if not seen.any():
-        raise ProtocolError(
-            f"photographs that see the mesh were expected, none of {chooser.count} does; is it of this capture?"
-        )
+    colors, seen = surface_colors(atlas.mesh, texels, images, best=best, threads=threads)
     fill_unseen(atlas, texels, colors, seen)
     mesh = TexturedMesh(
         vertices=atlas.mesh.vertices[atlas.source],
@@ -299,21 +292,53 @@ def bake(
     return Baked(mesh, len(seen), int(len(seen) - seen.sum()), atlas.charts)
 
 
+def surface_colors(
+    mesh: Mesh, texels: Texels, images: Iterable[ColorSource], *, best: int = BEST, threads: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return colours [T, 3] uint8 of places on a mesh from photographs, and which of them some photograph sees [T].
+
+    Parameters
+    ----------
+    mesh : Mesh
+    texels : Texels
+        On the faces of the mesh.
+    images : iterable of ColorSource
+        Read once, one at a time.
+    best : int
+        Photographs that a colour is made of.
+    threads : int, optional
+
+    Raises
+    ------
+    ProtocolError
+        No photograph sees any of them.
+    """
+    chooser = _Chooser(mesh, texels, best, threads or os.cpu_count() or 1)
+    for image in images:
+        chooser.add(image)
+    colors, seen = chooser.colors()
+    if not seen.any():
+        raise ProtocolError(
+            f"photographs that see the mesh were expected, none of {chooser.count} does; is it of this capture?"
+        )
+    return colors, seen
+
+
 class _Chooser:
     """The best photographs of each texel so far."""
 
-    def __init__(self, atlas: Atlas, texels: Texels, best: int, threads: int) -> None:
-        self._mesh = atlas.mesh
-        self._origin = atlas.mesh.vertices.astype(np.float64).mean(axis=0)
+    def __init__(self, mesh: Mesh, texels: Texels, best: int, threads: int) -> None:
+        self._mesh = mesh
+        self._origin = mesh.vertices.astype(np.float64).mean(axis=0)
         self._threads = threads
         self.count = 0
         n = len(texels.index)
         self._parts = [slice(start, min(start + _CHUNK, n)) for start in range(0, n, _CHUNK)]
-        places, normals = atlas.mesh.vertices - self._origin, vertex_normals(atlas.mesh)
+        places, normals = mesh.vertices - self._origin, vertex_normals(mesh)
         self._places, self._normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         for part in self._parts:
-            self._places[part] = texels.interpolated(places, atlas.mesh.faces, part)
-            normal = texels.interpolated(normals, atlas.mesh.faces, part)
+            self._places[part] = texels.interpolated(places, mesh.faces, part)
+            normal = texels.interpolated(normals, mesh.faces, part)
             self._normals[part] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         self._heights = (self._places * self._normals).sum(axis=1)  # n . x
         self._scores = np.zeros((n, best + 1), np.float32)

@@ -340,6 +340,14 @@ class GeoreferenceOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class OrthophotoOptions:
+    """How the view from above is made."""
+
+    resolution: Annotated[float | None, arg(metavar="METRES")] = None
+    """Side of a cell (default: that of the photographs' pixels on the surface, rounded up to 1, 2, 2.5 or 5)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewOptions:
     """How the page of the viewer is served."""
 

@@ -184,11 +184,11 @@ def _images(
             image = view.image()
             if view.name in exposures:
                 image = remove_exposure(image, exposures[view.name].numpy())
-            yield ColorSource(view.camera, image, _usable(view, job))
+            yield ColorSource(view.camera, image, usable_pixels(view, job))
 
 
-def _usable(view: View, job: Job) -> np.ndarray | None:
-    """Pixels of a photograph that show the surface: not masked out, and on the object if fusion looked only there."""
+def usable_pixels(view: View, job: Job) -> np.ndarray | None:
+    """Return the pixels that show the surface: not masked out, and on the object if fusion looked only there."""
     masks = [view.mask(), view.object_mask() if job.protocol.use_mask_in_fusion else None]
     given = [mask for mask in masks if mask is not None]
     return np.logical_and.reduce(given) if given else None

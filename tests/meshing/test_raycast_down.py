@@ -1,0 +1,45 @@
+"""Rays straight down: which triangle of several is met, where, and how far below."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gs2d.meshing.raycast import cast_down
+
+SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
+HALVES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def two_floors() -> tuple[np.ndarray, np.ndarray]:
+    """A floor at height 1, and above its east half one that rises from 2 to 3 towards the north."""
+    low = np.concatenate([SQUARE, np.full((4, 1), 1.0)], axis=1)
+    high = np.concatenate([SQUARE * (0.5, 1) + (2, 0), (2 + SQUARE[:, 1:] / 4)], axis=1)
+    return np.concatenate([low, high]), np.concatenate([HALVES, HALVES + 4])
+
+
+def test_the_highest_surface_is_met_and_interpolated() -> None:
+    vertices, faces = two_floors()
+    hits = cast_down(vertices, faces, (0.0, 4.0), 1.0, (4, 4))
+    heights = (vertices[faces[hits.face], 2] * hits.weights).sum(axis=-1)
+    north = np.array([3.5, 2.5, 1.5, 0.5])  # of the rows: the first is the northernmost
+    np.testing.assert_allclose(heights[:, :2], 1.0, atol=1e-6)
+    np.testing.assert_allclose(heights[:, 2:], np.repeat((2 + north / 4)[:, None], 2, axis=1), atol=1e-6)
+    np.testing.assert_allclose(hits.depth, 4.0 - heights, atol=1e-5)  # one more than below the highest vertex, 3
+    x = (vertices[faces[hits.face], 0] * hits.weights).sum(axis=-1)
+    np.testing.assert_allclose(x, np.tile(np.arange(4) + 0.5, (4, 1)), atol=1e-6)
+
+
+def test_winding_does_not_matter_and_what_stands_upright_is_not_met() -> None:
+    vertices, faces = two_floors()
+    turned = cast_down(vertices, faces[:, ::-1], (0.0, 4.0), 1.0, (4, 4))
+    assert (turned.face == cast_down(vertices, faces, (0.0, 4.0), 1.0, (4, 4)).face).all()
+    wall = np.array([[0.0, 0.5, 0.0], [4.0, 0.5, 0.0], [4.0, 0.5, 3.0]])
+    assert (cast_down(wall, np.array([[0, 1, 2]]), (0.0, 4.0), 1.0, (4, 4)).face == -1).all()
+
+
+def test_beside_the_surface_there_is_none_and_no_ray_slips_between_triangles() -> None:
+    vertices, faces = two_floors()
+    hits = cast_down(vertices, faces, (-1.0, 5.0), 0.25, (24, 24))
+    inside = np.zeros((24, 24), dtype=bool)
+    inside[4:20, 4:20] = True
+    assert ((hits.face >= 0) == inside).all()

@@ -1,0 +1,136 @@
+"""`gs2d orthophoto`: cells where the ground is, colours of the photographs, heights, and what other programs read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ball_runs import options as training
+from gs2d.cli import run as gs2d
+from gs2d.core.georeference import Georeference
+from gs2d.core.mesh import Mesh
+from gs2d.io.georeference import write_georeference
+from gs2d.io.meshes import write_mesh
+from gs2d.pipeline import orthophoto
+from gs2d.pipeline.train import train
+from tiny import RADIUS, write_ball_mesh, write_capture
+
+tifffile = pytest.importorskip("tifffile")
+SCALE, ORIGIN = 10.0, np.array([500_100.0, 5_300_200.0, 430.0])
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # the run's x is north
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the ball, 16 m wide, in UTM."""
+    root = tmp_path_factory.mktemp("ortho")
+    run = train(training(write_capture(root / "ball", train=16, test=2, size=64), root / "run")).path
+    write_ball_mesh(run / "mesh.ply", rings=64)
+    place = Georeference(
+        scale=SCALE, rotation=TURN, translation=np.zeros(3), origin=ORIGIN, method="a test", epsg=32632
+    )
+    write_georeference(run, place)
+    return run
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "run"))
+
+
+def cells(tags: dict[str, Any], shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Easting and northing of the middles of cells, as a reader of GeoTIFF finds them."""
+    scale, tie = tags["ModelPixelScale"], tags["ModelTiepoint"]
+    column, row = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
+    return tie[3] + (column - tie[0]) * scale[0], tie[4] - (row - tie[1]) * scale[1]
+
+
+def test_heights_and_colours_lie_where_the_ball_is(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert gs2d(["orthophoto", str(run), "--resolution", "0.25", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["epsg"], told["resolution"]) == (32632, 0.25)
+    with tifffile.TiffFile(run / "orthophoto_elevation.tif") as file:
+        heights, tags = file.asarray(), file.pages[0].geotiff_tags
+        assert float(file.pages[0].tags[42113].value) == -9999
+    assert tags["ProjectedCSTypeGeoKey"] == 32632
+    assert tags["GTRasterTypeGeoKey"] == 1
+    east, north = (axis - at for axis, at in zip(cells(tags, heights.shape), ORIGIN[:2], strict=True))
+    radius = SCALE * RADIUS
+    off = np.hypot(east, north)
+    known = heights > -9999
+    assert known[off < 0.98 * radius].all()
+    assert not known[off > 1.01 * radius].any()
+    inner = off < 0.9 * radius
+    true = np.sqrt(radius**2 - off[inner] ** 2) + ORIGIN[2]
+    assert np.abs(heights[inner] - true).max() < 0.05
+
+    image = np.asarray(Image.open(run / "orthophoto.tif"))  # another reader
+    assert image.shape == (*heights.shape, 4)
+    assert ((image[..., 3] == 255) == known).all()
+    place = np.stack([north, -east, np.sqrt(np.maximum(radius**2 - off**2, 0))], axis=-1) / SCALE  # in the run
+    expected = 255 * np.clip(0.5 + 0.4 * place / RADIUS + 0.1 * np.sin(9 * place), 0, 1)
+    middle = off < 0.7 * radius
+    assert np.abs(image[middle, :3] - expected[middle]).mean() < 8
+    assert told["cells"] == known.sum()
+    assert told["cells_unseen"] < 0.05 * told["cells"]
+
+
+def test_the_resolution_is_that_of_the_photographs_if_nobody_says_one(run: Path, tmp_path: Path) -> None:
+    result = orthophoto.orthophoto_run(run, tmp_path / "map.tif")
+    pixel = SCALE * (3.0 - RADIUS) * 2 * np.tan(0.35) / 64  # of a camera on the place beneath it
+    assert pixel < result["resolution"] < 3 * pixel
+    assert result["resolution"] in (0.25, 0.5, 1.0)
+    assert [Path(file).name for file in result["files"]] == ["map.tif", "map_elevation.tif"]
+    assert not (run / "orthophoto.tif").exists()
+
+
+def test_cells_that_no_photograph_sees_have_the_mesh_s_colours(run: Path) -> None:
+    plate = np.array([[-4.0, -4, -0.9], [4, -4, -0.9], [4, 4, -0.9], [-4, 4, -0.9]])  # wider than all photographs
+    green = np.tile(np.array([[10, 200, 30]], dtype=np.uint8), (4, 1))
+    lid = plate + np.array([0, 0, 4.0])  # above all cameras, which see its lower side
+    vertices = np.concatenate([plate, lid])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.int32)
+    write_mesh(run / "mesh.ply", Mesh(vertices, faces, np.concatenate([green, green])))
+    with pytest.raises(Exception, match="photographs that see the mesh were expected"):
+        orthophoto.orthophoto_run(run)
+    write_mesh(run / "mesh.ply", Mesh(vertices[:4], faces[:2], green))
+    result = orthophoto.orthophoto_run(run)
+    image = np.asarray(Image.open(run / "orthophoto.tif"))
+    known = (image == (10, 200, 30, 255)).all(axis=-1)
+    assert result["cells_unseen"] == pytest.approx(known.sum(), abs=2)
+    assert 0 < result["cells_unseen"] < result["cells"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--resolution", "0"], "--resolution must be metres above 0, got 0"),
+        (["--resolution", "nan"], "--resolution must be metres above 0, got nan"),
+        (["--resolution", "0.0001"], "at most 36,000,000 are written; take 0.0027 m or more"),
+        (["--out", "map.png"], "--out must end in .tif or .tiff, got map.png"),
+        (["--out", "nowhere/map.tif"], "nowhere"),
+    ],
+)
+def test_bad_input_is_one_line(
+    run: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run)
+    assert gs2d(["orthophoto", str(run), "--quiet", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not list(run.glob("*.tif"))
+
+
+def test_a_run_that_is_nowhere_or_has_no_mesh_is_told_what_to_do(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "mesh.ply").unlink()
+    assert gs2d(["orthophoto", str(run), "--quiet"]) == 2
+    assert "write it with `gs2d mesh" in capsys.readouterr().err
+    (run / "georeference.json").unlink()
+    assert gs2d(["orthophoto", str(run), "--quiet"]) == 2
+    assert "gs2d georeference" in capsys.readouterr().err
