@@ -76,6 +76,7 @@ OPTIONAL = (
         _packages("markers", "opencv-python-headless"),
     ),
     Wanted("texture", "textured meshes (--texture)", _packages("texture", "xatlas")),
+    Wanted("spz4", "SPZ of version 4 (gs2d export --layout spz4)", _packages("spz4", "zstandard")),
     Wanted("usd", "OpenUSD files (gs2d export --out x.usd)", _packages("usd", "usd-core")),
     Wanted("view", "viewer in the browser (gs2d view, --viewer)", _packages("view", "viser")),
 )

@@ -13,6 +13,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "geo": ("pyproj>=3.6", "tifffile>=2024.1"),
         "markers": ("opencv-python-headless>=4.7",),
         "sfm": ("pycolmap>=4.2",),
+        "spz4": ("zstandard>=0.22",),
         "texture": ("xatlas>=0.0.9",),
         "usd": ("usd-core>=26.3",),
         "view": ("viser>=1.1,<2", "msgspec>=0.18", "websockets>=14"),

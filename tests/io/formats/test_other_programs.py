@@ -119,6 +119,20 @@ def test_the_field_s_converter_and_we_read_each_other_s_sog(tmp_path: Path) -> N
     assert turned_by(back.quats, ours.quats).max() < 0.05
 
 
+def test_the_field_s_converter_and_we_read_each_other_s_spz_of_version_4(tmp_path: Path) -> None:
+    pytest.importorskip("zstandard")
+    splats = a_scene(300, 2)
+    splats.opacity_logits.clamp_(-5, 5)  # of an opaque byte the converter makes an infinite logit
+    write_layout(tmp_path / "a.ply", splats, "3dgs")
+    splat_transform(tmp_path / "a.ply", tmp_path / "theirs.spz")
+    theirs = read_splat_file(tmp_path / "theirs.spz")
+    assert theirs.kind == "SPZ version 4"
+    write_layout(tmp_path / "ours.spz", splats, "spz4")
+    splat_transform(tmp_path / "ours.spz", tmp_path / "back.ply")
+    bits = {"means": 3e-4, "scales": 0.04, "quats": 0.3, "sh0": 0.015}
+    near(read_splat_file(tmp_path / "back.ply").gaussians, splats, **bits, shN=0.05)
+
+
 def test_the_finest_level_of_the_converter_s_stream_is_all_of_the_splats(tmp_path: Path) -> None:
     splats = a_scene(700, 1)
     write_layout(tmp_path / "a.ply", splats, "3dgs")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from gs2d.core.sh import sh_basis
-from gs2d.errors import DataError, DiskError
+from gs2d.errors import BackendError, DataError, DiskError
 from gs2d.io.formats import compressed_ply
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gs2d.io.formats.registry import LAYOUTS, layout_of, read_splat_file, read_surfels, write_layout
@@ -290,14 +291,14 @@ def test_spz_is_a_tenth_of_the_plain_ply(tmp_path: Path) -> None:
     assert size["a.compressed.ply"] < size["a.ply"] / 3.9
 
 
-@pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "usd", "gltf", "sog"])
+@pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "spz4", "usd", "gltf", "sog"])
 def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, layout: str) -> None:
     with pytest.raises(DiskError, match="the folder does not exist"):
         write_layout(tmp_path / "no" / f"a{LAYOUTS.get(layout).ending}", a_scene(5), layout)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "usd", "gltf", "sog"])
+@pytest.mark.parametrize("layout", ["compressed", "spz", "splat", "spz4", "usd", "gltf", "sog"])
 @pytest.mark.parametrize("kept", [0, 1, 10, 200, -1])
 def test_a_file_cut_anywhere_is_one_line_that_names_it(tmp_path: Path, layout: str, kept: int) -> None:
     path = tmp_path / f"cut{LAYOUTS.get(layout).ending}"
@@ -338,11 +339,72 @@ def test_a_header_of_spz_that_cannot_be_is_refused(tmp_path: Path, changes: dict
     assert len(read_splat_file(tmp_path / "a.spz").gaussians) == 1
 
 
-def test_spz_of_a_later_version_which_is_no_gzip_is_named(tmp_path: Path) -> None:
-    (tmp_path / "a.spz").write_bytes(b"NGSP\x04\0\0\0" + bytes(50))
-    with pytest.raises(DataError, match="SPZ of version 2 or 3 was expected, got a later one; convert it to a PLY"):
+@pytest.mark.parametrize("degree", [0, 2])
+def test_spz_of_version_4_has_the_streams_of_version_3_each_for_itself(tmp_path: Path, degree: int) -> None:
+    """By its documentation: a plain header, a table of sizes, streams of zstd."""
+    zstandard = pytest.importorskip("zstandard")
+    g = Gaussians.of(a_scene(300, degree))
+    write_spz(tmp_path / "3.spz", g)
+    assert write_spz(tmp_path / "4.spz", g, version=4) == ()
+    data, old = (tmp_path / "4.spz").read_bytes(), gzip.decompress((tmp_path / "3.spz").read_bytes())
+    magic, version, n, sh, bits, flags, streams, at = struct.unpack("<4sIIBBBBI", data[:20])
+    assert (magic, version, n, sh, flags, streams) == (b"NGSP", 4, 300, degree, 0, 6 if degree else 5)
+    assert (bits, at, data[20:32]) == (old[13], 32, bytes(12))
+    begin, inside = at + 16 * streams, b""
+    for i in range(streams):
+        packed, unpacked = struct.unpack_from("<QQ", data, at + 16 * i)
+        stream = zstandard.ZstdDecompressor().decompress(data[begin : begin + packed])
+        assert len(stream) == unpacked
+        begin, inside = begin + packed, inside + stream
+    assert begin == len(data)
+    assert inside == old[16:]
+    (third, three), (fourth, four) = read_spz(tmp_path / "3.spz"), read_spz(tmp_path / "4.spz")
+    assert (three, four) == (3, 4)
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(third, name), getattr(fourth, name))
+
+
+def spz4(path: Path, at: int, value: bytes) -> None:
+    """A file of version 4 with other bytes at a place."""
+    write_spz(path, Gaussians.of(a_scene(20, 0)), version=4)
+    data = bytearray(path.read_bytes())
+    data[at : at + len(value)] = value
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (4, b"\5", "SPZ of version 2, 3 or 4 .* got version 5"),
+        (12, b"\4", "degree 4"),
+        (15, b"\2", "2 streams"),
+        (8, struct.pack("<I", 4_000_000_000), "a cloud of splats .* got one that would take 80.0 GB"),
+        (8, struct.pack("<I", 21), "a stream of 189 bytes has 180"),
+        (8, struct.pack("<I", 19), "a stream of 171 bytes has 172"),  # no more is unpacked than was asked for, but one
+        (16, struct.pack("<I", 10**9), "a stream of 180 bytes has 0|its zstd is broken"),
+        (32, struct.pack("<Q", 5), "a stream of 180 bytes has 0|its zstd is broken"),
+        (112, bytes(4), "its zstd is broken"),
+    ],
+)
+def test_spz_of_version_4_that_cannot_be_is_one_line(tmp_path: Path, at: int, value: bytes, words: str) -> None:
+    pytest.importorskip("zstandard")
+    spz4(tmp_path / "a.spz", at, value)
+    with pytest.raises(DataError, match=words) as caught:
         read_splat_file(tmp_path / "a.spz")
-    with pytest.raises(DataError, match="cannot read .*b.spz: No such file"):
+    assert "\n" not in str(caught.value)
+
+
+def test_without_zstandard_version_4_says_what_brings_it_and_version_3_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    words = "SPZ of version 4 needs zstandard, which is not installed; pip install 'zstandard>=0.22'"
+    with pytest.raises(BackendError, match=words):
+        write_spz(tmp_path / "a.spz", Gaussians.of(a_scene(3)), version=4)
+    assert not (tmp_path / "a.spz").exists()
+    write_spz(tmp_path / "a.spz", Gaussians.of(a_scene(3)))
+    assert read_spz(tmp_path / "a.spz")[1] == 3
+    with pytest.raises(DataError, match=r"cannot read .*b.spz: No such file"):
         read_splat_file(tmp_path / "b.spz")
 
 

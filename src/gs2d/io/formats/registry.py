@@ -37,7 +37,7 @@ class Layout:
 LAYOUTS: Registry[Layout] = Registry(
     "layout",
     "gs2d.formats",
-    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "splat", "usd", "gltf", "sog"), __name__),
+    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "spz4", "splat", "usd", "gltf", "sog"), __name__),
     error=DataError,
 )
 """Names of formats that splats are written in."""
@@ -74,6 +74,11 @@ def _write_compressed(path: Path, splats: Splats) -> tuple[str, ...]:
 @register_format("spz", ending=".spz")
 def _write_spz(path: Path, splats: Splats) -> tuple[str, ...]:
     return write_spz(path, Gaussians.of(splats))
+
+
+@register_format("spz4", ending=".spz")
+def _write_spz4(path: Path, splats: Splats) -> tuple[str, ...]:
+    return write_spz(path, Gaussians.of(splats), version=4)
 
 
 @register_format("splat", ending=".splat")

@@ -1,28 +1,36 @@
-"""SPZ, Niantic's compressed splats (version 3; version 2 is read too): gzip over a header and one stream an attribute.
+"""SPZ, Niantic's compressed splats: version 3, gzip over a header and one stream an attribute; 2 is read too; 4, zstd.
 
 From the format's documentation (github.com/nianticlabs/spz, README). All little-endian: magic, version, count (u32
 each), SH degree, fractional bits, flags, reserved (u8 each); then positions (24-bit fixed point), opacities, colours,
-log scales in 16ths above -10, rotations, SH coefficients (coefficient by coefficient, r g b), 8 bits each.
+log scales in 16ths above -10, rotations, SH coefficients (coefficient by coefficient, r g b), 8 bits each. Version 4
+(extra ``spz4``) has the same streams, each packed for itself, behind a header that is not packed: the reserved byte is
+the number of streams, u32 where the table of their sizes is (u64 packed, u64 unpacked), 12 bytes of nothing.
 Its coordinates are right, up, back, where PLY's are taken to be right, down, front: y and z change sign on the way.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gs2d.core.extras import install
 from gs2d.core.growth import check_growth
 from gs2d.core.json_files import atomic_write
-from gs2d.errors import DataError
+from gs2d.errors import BackendError, DataError
 from gs2d.io.gaussians import Gaussians, logit_of_byte, sigmoid, to_byte, unit_quats
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")
+_HEADER_4 = struct.Struct("<IIIBBBBI12x")
+_SIZES = struct.Struct("<QQ")
+_WINDOW = 1 << 26  # bytes that a stream of zstd may look back
 _LARGEST = (1 << 23) - 1  # of 24 bits with a sign
 _EXTENDED = 0x2  # flag: vendors' records follow the header
 _FINEST = 20  # fractional bits
@@ -40,8 +48,24 @@ _FLIP = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float
 _TURN = np.array([1.0, -1.0, -1.0], np.float32)
 
 
-def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> tuple[str, ...]:
-    """Write SPZ version 3, atomically; the same bytes for the same splats.
+def required_zstd() -> Any:
+    """Return the package zstandard.
+
+    Raises
+    ------
+    BackendError
+        It is not installed.
+    """
+    try:
+        return importlib.import_module("zstandard")
+    except ModuleNotFoundError as error:
+        raise BackendError(
+            f"SPZ of version 4 needs {error.name}, which is not installed; {install('spz4')}, or use version 3"
+        ) from error
+
+
+def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, *, version: int = 3) -> tuple[str, ...]:
+    """Write SPZ of version 3 or 4, atomically; the same bytes for the same splats.
 
     The step of positions is at most a 64th of the size of the median splat, if the farthest leaves bits for it.
 
@@ -54,6 +78,8 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> tuple[str, 
     ------
     DataError
         A position beyond 2^23 units.
+    BackendError
+        Version 4 without zstandard.
     DiskError
         If the file could not be written.
     """
@@ -62,13 +88,27 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians) -> tuple[str, 
     bits = _fractional_bits(g, farthest)
     if farthest > _LARGEST:
         raise DataError(f"SPZ holds positions up to {_LARGEST} units, got {farthest:.4g}; use --layout 3dgs")
-    header = _HEADER.pack(_MAGIC, 3, len(g), g.sh_degree, bits, 0, 0)
-    packed = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS)  # gzip with no time of writing
+    streams = [array.tobytes() for array in _streams(g, bits)]
+    parts = _parts_4(g, bits, streams) if version == 4 else _parts_3(g, bits, streams)
     with atomic_write(path) as file:
-        for part in (header, *(array.tobytes() for array in _streams(g, bits))):
-            file.write(packed.compress(part))
-        file.write(packed.flush())
+        file.writelines(parts)
     return _losses(g)
+
+
+def _parts_3(g: Gaussians, bits: int, streams: list[bytes]) -> Iterator[bytes]:
+    packed = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS)  # gzip with no time of writing
+    for part in (_HEADER.pack(_MAGIC, 3, len(g), g.sh_degree, bits, 0, 0), *streams):
+        yield packed.compress(part)
+    yield packed.flush()
+
+
+def _parts_4(g: Gaussians, bits: int, streams: list[bytes]) -> list[bytes]:
+    streams = streams if g.shN.shape[1] else streams[:-1]  # no stream of nothing, as Niantic's library writes none
+    compressor = required_zstd().ZstdCompressor(level=12)
+    packed = [compressor.compress(stream) for stream in streams]
+    header = _HEADER_4.pack(_MAGIC, 4, len(g), g.sh_degree, bits, 0, len(streams), _HEADER_4.size)
+    table = [_SIZES.pack(len(a), len(b)) for a, b in zip(packed, streams, strict=True)]
+    return [header, *table, *packed]
 
 
 def _fractional_bits(g: Gaussians, farthest: float) -> int:
@@ -129,14 +169,31 @@ def _losses(g: Gaussians) -> tuple[str, ...]:
 
 
 def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
-    """Read SPZ of version 2 or 3: (Gaussians, version).
+    """Read SPZ of version 2, 3 or 4: (Gaussians, version).
 
     Raises
     ------
     DataError
         Missing, of another kind or version, or cut short.
+    BackendError
+        Version 4 without zstandard.
     """
-    unpack, tail = _opened(path)
+    try:
+        packed = Path(path).read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
+    version, degree, bits, parts = (_parts_of_4 if packed[:4] == b"NGSP" else _parts_of_3)(path, packed)
+    return _gaussians(version, degree, bits, parts), version
+
+
+def _sizes(version: int, degree: int) -> list[int]:
+    """Return bytes a splat of the streams."""
+    return [9, 1, 3, 3, 3 if version == 2 else 4, 3 * ((degree + 1) ** 2 - 1)]
+
+
+def _parts_of_3(path: str | os.PathLike[str], tail: bytes) -> tuple[int, int, int, list[np.ndarray]]:
+    """Return version, SH degree, fractional bits and streams [N, bytes] of a gzip file."""
+    unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     header = _unpacked(path, unpack, tail, _HEADER.size)
     magic, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
     if magic != _MAGIC or version not in (2, 3) or degree > 3 or bits > 23 or flags & _EXTENDED:
@@ -144,8 +201,7 @@ def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
             f"{os.fspath(path)}: SPZ of version 2 or 3 with SH degree 0 to 3 and no extensions was expected, got "
             f"version {version}, degree {degree}, flags {flags}; convert it to a PLY"
         )
-    wide, coefficients = 4 if version == 3 else 3, (degree + 1) ** 2 - 1
-    sizes = [9, 1, 3, 3, wide, 3 * coefficients]
+    sizes = _sizes(version, degree)
     check_growth(
         path, len(tail), count * sum(sizes), f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO
     )
@@ -155,31 +211,64 @@ def read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
     for size in sizes:
         parts.append(np.frombuffer(data, np.uint8, count * size, at).reshape(count, size))
         at += count * size
+    return int(version), degree, bits, parts
+
+
+def _parts_of_4(path: str | os.PathLike[str], data: bytes) -> tuple[int, int, int, list[np.ndarray]]:
+    """Return version, SH degree, fractional bits and streams [N, bytes] of a file of version 4."""
+    header = data[: _HEADER_4.size].ljust(_HEADER_4.size, b"\0")
+    _, version, count, degree, bits, _, streams, at = _HEADER_4.unpack(header)
+    sizes = _sizes(4, degree)[: 6 if degree else 5]
+    if version != 4 or degree > 3 or bits > 23 or streams not in (len(sizes), 6) or len(data) < _HEADER_4.size:
+        raise DataError(
+            f"{os.fspath(path)}: SPZ of version 2, 3 or 4 with SH degree 0 to 3 was expected, got version {version}, "
+            f"degree {degree}, {streams} streams in {len(data)} bytes; convert it to a PLY"
+        )
+    check_growth(
+        path, len(data), count * sum(sizes), f"a cloud of splats ({count:,} of them)", small=_SMALL, ratio=_RATIO
+    )
+    begin, parts = at + streams * _SIZES.size, []
+    for size in sizes:
+        told = data[at : at + _SIZES.size].ljust(_SIZES.size, b"\0")
+        length, unpacked = _SIZES.unpack(told)
+        stream = _unzstd(path, data[begin : begin + length], count * size)
+        if unpacked != count * size or len(stream) != unpacked:
+            raise DataError(
+                f"{os.fspath(path)}: SPZ was expected, a stream of {count * size} bytes has {len(stream)}, of "
+                f"{unpacked} that were announced; copy or export it again"
+            )
+        parts.append(np.frombuffer(stream, np.uint8).reshape(count, size))
+        at, begin = at + _SIZES.size, begin + length
+    if not degree:
+        parts.append(np.zeros((count, 0), np.uint8))
+    return 4, degree, bits, parts
+
+
+def _unzstd(path: str | os.PathLike[str], packed: bytes, size: int) -> bytes:
+    """Return at most ``size`` bytes and one more of what a stream becomes."""
+    zstandard = required_zstd()
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(packed) as reader:
+            return bytes(reader.read(size + 1))
+    except zstandard.ZstdError as error:
+        raise DataError(f"{os.fspath(path)}: SPZ was expected, its zstd is broken ({error}); copy it again") from error
+
+
+def _gaussians(version: int, degree: int, bits: int, parts: list[np.ndarray]) -> Gaussians:
+    count, coefficients = len(parts[0]), (degree + 1) ** 2 - 1
     positions, alphas, colors, scales, rotations, sh = parts
     low = positions.reshape(count, 3, 3).astype(np.int32)
     fixed = low[..., 0] | (low[..., 1] << 8) | (low[..., 2] << 16)
     fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
     shN = (sh.reshape(count, coefficients, 3).astype(np.float32) - 128.0) / 128.0 * _FLIP[:coefficients, None]
-    gaussians = Gaussians(
+    return Gaussians(
         (fixed / float(1 << bits) * _TURN).astype(np.float32),
-        _quats(rotations) if version == 3 else _old_quats(rotations),
+        _old_quats(rotations) if version == 2 else _quats(rotations),
         scales.astype(np.float32) / 16.0 - 10.0,
         logit_of_byte(alphas[:, 0]),
         ((colors.astype(np.float64) / 255.0 - 0.5) / _COLOR).astype(np.float32),
         shN,
     )
-    return gaussians, int(version)
-
-
-def _opened(path: str | os.PathLike[str]) -> tuple[Any, bytes]:
-    """Return a decompressor and what it is to read."""
-    try:
-        packed = Path(path).read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
-    if packed[:4] == struct.pack("<I", _MAGIC):
-        raise DataError(f"{os.fspath(path)}: SPZ of version 2 or 3 was expected, got a later one; convert it to a PLY")
-    return zlib.decompressobj(16 + zlib.MAX_WBITS), packed
 
 
 def _unpacked(path: str | os.PathLike[str], unpack: Any, packed: bytes, size: int, *, or_end: bool = False) -> bytes:

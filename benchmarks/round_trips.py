@@ -1,0 +1,106 @@
+"""What a format keeps of a run: bytes a splat, and pictures drawn from the file that was read back.
+
+::
+
+    python -m benchmarks.round_trips RUN [--layouts 3dgs spz] [--split test] [--every 1]
+
+Writes the splats of a finished run in every layout into a temporary folder, reads them back, draws the views of a
+split (the training views where it has none; every so many of them) and prints a row of Markdown for each: bytes a
+splat, PSNR against the run's own renderings and against the photographs (mean over views, colours in [0, 1] without
+rounding), seconds to write and to read. "the same" is a rendering that does not differ in any pixel by more than
+1e-4.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+from gs2d.core.splats import Splats
+from gs2d.data import View
+from gs2d.errors import BackendError
+from gs2d.io.formats.registry import LAYOUTS, read_disks, write_layout
+from gs2d.io.run_dir import open_run
+from gs2d.pipeline.finished import finished_splats
+from gs2d.pipeline.job import Job, reload_job
+from gs2d.render.api import rasterize
+
+Draw = Callable[[Splats], list[np.ndarray]]
+SAME = 1e-4  # of a colour in [0, 1]
+
+
+def pictures(splats: Splats, job: Job, views: Sequence[View]) -> list[np.ndarray]:
+    """Draw views, [H, W, 3] each, in [0, 1]."""
+    placed = splats.to(job.backend.device)
+    with torch.no_grad():
+        drawn = [rasterize(placed, view.camera, job.settings, backend=job.backend).color for view in views]
+    return [image.clamp(0, 1).cpu().numpy().astype(np.float64) for image in drawn]
+
+
+def photographs(job: Job, views: Sequence[View]) -> list[np.ndarray]:
+    """The photographs of views, over the run's background."""
+    found = []
+    for view in views:
+        image = view.image().astype(np.float64) / 255
+        if image.shape[2] == 4:
+            image = image[..., :3] * image[..., 3:] + np.array(job.settings.background) * (1 - image[..., 3:])
+        found.append(image)
+    return found
+
+
+def psnr(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
+    """Mean over the pictures, dB."""
+    errors = [max(float(np.square(x - y).mean()), 1e-20) for x, y in zip(a, b, strict=True)]
+    return float(np.mean([-10 * np.log10(error) for error in errors]))
+
+
+def row(layout: str, splats: Splats, draw: Draw, own: list[np.ndarray], real: list[np.ndarray], home: Path) -> str:
+    """Write, read, draw, and return a row of the table: ``own`` is what the splats themselves look like."""
+    path = home / f"a{LAYOUTS.get(layout).ending}"
+    start = time.perf_counter()
+    write_layout(path, splats, layout)
+    written = time.perf_counter() - start
+    start = time.perf_counter()
+    back = read_disks(path)
+    read = time.perf_counter() - start
+    drawn = draw(back)
+    furthest = max(float(np.abs(a - b).max()) for a, b in zip(drawn, own, strict=True))
+    against = "the same" if furthest <= SAME else f"{psnr(drawn, own):.1f}"
+    size = path.stat().st_size / max(len(splats), 1)
+    return f"| `{layout}` | {size:.1f} | {against} | {psnr(drawn, real):.2f} | {written:.1f} | {read:.1f} |"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table of a run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--layouts", nargs="+", default=list(LAYOUTS.builtin))
+    parser.add_argument("--split", choices=("train", "test"), default="test")
+    parser.add_argument("--every", type=int, default=1)
+    options = parser.parse_args(argv)
+    run = open_run(options.run)
+    splats, job = finished_splats(run), reload_job(run, lambda event: None)
+    views = job.scene.test if options.split == "test" and job.scene.test else job.scene.train
+    views = views[:: options.every]
+    own, real = pictures(splats, job, views), photographs(job, views)
+    print(f"{len(splats):,} splats, SH degree {splats.sh_degree}, {len(views)} views: {psnr(own, real):.2f} dB\n")
+    print("| layout | bytes a splat | renderings, dB | photographs, dB | written, s | read, s |")
+    print("|---|---|---|---|---|---|")
+    with TemporaryDirectory(prefix="gs2d-round-trips-") as home:
+        for layout in options.layouts:
+            try:
+                print(row(layout, splats, lambda s: pictures(s, job, views), own, real, Path(home)), flush=True)
+            except BackendError as error:
+                print(f"| `{layout}` | {error} | | | | |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
