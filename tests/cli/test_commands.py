@@ -7,11 +7,13 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cli_runs import TINY, one_line, spawn
 from gs2d.cli import run
 from gs2d.config.presets import RECIPES
+from gs2d.core.images import read_image
 from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.options import TrainOptions
 from tiny import write_ball_mesh, write_capture
@@ -160,6 +162,32 @@ def test_a_file_of_splats_is_exported_too(trained: Path, tmp_path: Path, capsys:
     assert "is the file that is read" in capsys.readouterr().err
     assert run(["info", str(trained / "run.json")]) == 2
     assert "got a file of a capture; give its folder" in capsys.readouterr().err
+
+
+def test_the_splats_of_a_file_are_drawn_and_meshed_with_the_cameras_of_a_run(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    glb, folders = tmp_path / "a.glb", [tmp_path / "own", tmp_path / "of_file"]
+    assert run(["export", str(trained), "--out", str(glb), "--quiet"]) == 0
+    words = ["--split", "train", "--threads", "1", "--quiet"]
+    assert run(["render", str(trained), "--out", str(folders[0]), *words]) == 0
+    assert run(["render", str(trained), "--out", str(folders[1]), "--splats", str(glb), *words]) == 0
+    own, of_file = ([read_image(path) for path in sorted(folder.iterdir())] for folder in folders)
+    assert len(own) == len(of_file) > 0
+    assert max(int(np.abs(a.astype(int) - b).max()) for a, b in zip(own, of_file, strict=True)) <= 1
+    mesh = ["mesh", str(trained), "--threads", "1", "--splats", str(glb)]
+    assert run([*mesh, "--out", str(tmp_path / "m.ply"), "--quiet"]) == 0
+    assert (tmp_path / "m.ply").stat().st_size > 100
+    for words, told in (
+        (mesh, "--splats needs --out: what is in the run is made of its own splats"),
+        ([*mesh, "--out", str(trained / "mesh.ply")], "is the mesh of the run, which is that of its own splats"),
+        ([*mesh, "--texture"], "--splats has no texture"),
+        (["render", str(trained), "--splats", str(glb)], "--splats needs --out"),
+        (["render", str(trained), "--splats", str(trained), "--out", str(tmp_path / "x")], "got the folder"),
+    ):
+        assert run(words) == 2
+        assert told in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_an_export_whose_layout_and_ending_contradict_each_other_is_refused(

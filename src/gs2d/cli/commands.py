@@ -67,6 +67,8 @@ class Mesh(TextureOptions, MeshOptions, Common):
     """Run folder."""
     out: Path | None = None
     """Mesh file (default: mesh.ply in the run; with --texture mesh.glb)."""
+    splats: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Take the splats of this file, of any format that is read, in the frame of the run; needs --out."""
     texture: bool = False
     """Write it with a texture from the photographs: mesh.glb, or what --out names, .glb or .obj. Without options that
     change the mesh it is the run's mesh.ply."""
@@ -97,6 +99,8 @@ class Render(Common):
     """Frames a second of the video."""
     exposure_of: Annotated[str | None, arg(metavar="PHOTOGRAPH")] = None
     """Of a run with --exposure: in the exposure of this training photograph (default: in the mean of all)."""
+    splats: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Take the splats of this file, of any format that is read, in the frame of the run; needs --out."""
     threads: int | None = None
     """CPU threads."""
 

@@ -76,6 +76,7 @@ def mesh(command: c.Mesh, console: Console) -> None:
         options,
         console.on_event,
         out=command.out,
+        splats_file=command.splats,
         threads=command.threads,
         georeferenced=command.georeferenced,
     )
@@ -90,6 +91,8 @@ def mesh(command: c.Mesh, console: Console) -> None:
 def _textured_mesh(command: c.Mesh, mesh_options: Any, console: Console) -> None:
     from gs2d.pipeline.texture import texture_run
 
+    if command.splats is not None:
+        raise ProtocolError("--splats has no texture, which is of the run's own mesh; leave --texture out")
     result = texture_run(
         command.run,
         command,
@@ -128,6 +131,7 @@ def render(command: c.Render, console: Console) -> None:
         video=command.video,
         fps=command.fps,
         exposure_of=command.exposure_of,
+        splats_file=command.splats,
         threads=command.threads,
     )
     console.close()

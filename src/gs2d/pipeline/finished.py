@@ -7,7 +7,9 @@ from pathlib import Path
 import torch
 
 from gs2d.core.splats import Splats
-from gs2d.errors import RunError
+from gs2d.errors import DataError, RunError
+from gs2d.io.formats.registry import read_disks
+from gs2d.io.georeference import georeference_of_file
 from gs2d.io.run_dir import (
     SPLATS,
     RunFolder,
@@ -41,8 +43,17 @@ def finished_splats(run: RunFolder) -> Splats:
     return splats
 
 
-def open_job(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFolder, Job, Splats]:
-    """Return a finished run, what defines it, and its splats on the device of its backend.
+def open_job(
+    path: Path, threads: int | None, on_event: OnEvent, *, splats_file: Path | None = None, out: Path | None = None
+) -> tuple[RunFolder, Job, Splats]:
+    """Return a run, what defines it, and its splats on the device of its backend.
+
+    Parameters
+    ----------
+    splats_file : Path or None
+        Take the splats of this file instead, of any format that is read, in the frame of the run.
+    out : Path or None
+        Where what is made of it goes, which must be said then: files of the run are of its own splats.
 
     Raises
     ------
@@ -50,9 +61,19 @@ def open_job(path: Path, threads: int | None, on_event: OnEvent) -> tuple[RunFol
     """
     use_threads(threads)
     run = open_run(path)
-    splats = finished_splats(run)
+    splats = finished_splats(run) if splats_file is None else _splats_of(Path(splats_file), out)
     job = reload_job(run, on_event)
     return run, job, splats.to(job.backend.device)
+
+
+def _splats_of(path: Path, out: Path | None) -> Splats:
+    if out is None:
+        raise RunError("--splats needs --out: what is in the run is made of its own splats; name another place")
+    if path.is_dir():
+        raise DataError(f"--splats must be a file of splats, got the folder {path}; give the splats.ply in it")
+    if georeference_of_file(path) is not None:
+        raise DataError(f"--splats must be in the frame of the run, {path} is in metres of the world; export it again")
+    return read_disks(path)
 
 
 def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") -> Path:

@@ -20,7 +20,7 @@ from gs2d.core.memory import trim
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.data.subject import LARGEST, Subject, checked_box
-from gs2d.errors import ProtocolError
+from gs2d.errors import ProtocolError, RunError
 from gs2d.evaluation.images import ImageMetrics
 from gs2d.io.meshes import read_mesh, write_mesh
 from gs2d.io.run_dir import (
@@ -311,6 +311,7 @@ def mesh_run(
     on_event: OnEvent = ignore,
     *,
     out: Path | None = None,
+    splats_file: Path | None = None,
     threads: int | None = None,
     georeferenced: bool = False,
 ) -> dict[str, Any]:
@@ -318,6 +319,8 @@ def mesh_run(
 
     Parameters
     ----------
+    splats_file : Path or None
+        Mesh the splats of this file instead of the run's, into ``out``.
     georeferenced : bool
         Write ``out`` in metres of the world; without options it is the run's mesh.ply, which is not made again.
 
@@ -327,11 +330,13 @@ def mesh_run(
     """
     path, out = Path(path), None if out is None else checked_output(path, out)
     place = placed_output(path, out, MESH) if georeferenced else None
-    if place is not None and out is not None and options == MeshOptions() and (path / MESH).exists():
+    if place is not None and out is not None and _is_own(options, splats_file) and (path / MESH).exists():
         mesh = read_mesh(path / MESH)
         write_mesh(out, placed_mesh(mesh, place))
         return {"file": str(out), "vertices": len(mesh.vertices), "faces": len(mesh.faces), **say_where(out, place)}
-    run, job, splats = open_job(path, threads, on_event)
+    run, job, splats = open_job(path, threads, on_event, splats_file=splats_file, out=out)
+    if splats_file is not None and out is not None and out.resolve() == run.file(MESH).resolve():
+        raise RunError(f"--out {out} is the mesh of the run, which is that of its own splats; choose another name")
     if out is not None and out.resolve() != run.file(MESH).resolve():
         subject = meshed_subject(run, job, splats, options, on_event)
         return extract_mesh(job, splats, options, out, on_event, subject=subject, place=place)
@@ -350,6 +355,11 @@ def mesh_run(
             page_run(run.path, on_event=on_event, job=job)
     report_again(run, on_event)
     return result
+
+
+def _is_own(options: MeshOptions, splats_file: Path | None) -> bool:
+    """Whether nothing but the mesh that the run has is asked for."""
+    return options == MeshOptions() and splats_file is None
 
 
 def keep_facts(run: RunFolder, result: Mapping[str, Any]) -> None:

@@ -208,12 +208,14 @@ def render_run(
     video: Path | None = None,
     fps: float = FPS,
     exposure_of: str | None = None,
+    splats_file: Path | None = None,
     threads: int | None = None,
 ) -> dict[str, Any]:
     """Render the views of a split, ``orbit`` frames of a circle or ``flight`` frames past the photographs, as PNGs.
 
     Frames of a circle or a flight can be made a video too: ``video`` names it, ``fps`` frames a second. All are in the
-    mean exposure of the photographs, or in that of the training photograph ``exposure_of``.
+    mean exposure of the photographs, or in that of the training photograph ``exposure_of``. ``splats_file`` is drawn
+    instead of the run's splats, into ``out``.
 
     Raises
     ------
@@ -225,7 +227,7 @@ def render_run(
     asked, (moving, video) = video, check_frames(orbit, flight, video, fps)
     if video is not None and video != asked and video.suffix == ".webp":
         on_event(Notice(f"the video is an animated WebP, {video}: MP4 needs ffmpeg with libx264 ({FFMPEG})"))
-    run, job, splats = open_job(path, threads, on_event)
+    run, job, splats = open_job(path, threads, on_event, splats_file=splats_file, out=out)
     transform = None if exposure_of is None else exposure_named(exposure_of, read_exposures(run, job.recipe))
     views: list[tuple[str, View]]
     if moving:
