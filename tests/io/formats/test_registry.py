@@ -266,6 +266,16 @@ def test_three_dimensional_gaussians_are_told_from_disks(tmp_path: Path, shared:
         file.gaussians.to_surfels(tmp_path / "a.spz")
 
 
+def test_infinite_logits_of_other_programs_are_opaque_and_empty(tmp_path: Path) -> None:
+    splats = a_scene(3, 0)
+    splats.opacity_logits[:2] = torch.tensor([math.inf, -math.inf])
+    write_splats(tmp_path / "a.ply", splats, layout="3dgs")
+    back, _ = read_surfels(tmp_path / "a.ply")
+    assert back.opacities[0] > 1 - 1e-7
+    assert back.opacities[1] < 1e-20
+    assert back.opacity_logits[2] == splats.opacity_logits[2]
+
+
 @pytest.mark.parametrize(
     ("name", "layout"),
     [

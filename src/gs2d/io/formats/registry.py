@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
 from gs2d.io.formats.usd import read_usd, write_usd
-from gs2d.io.gaussians import Gaussians
+from gs2d.io.gaussians import Gaussians, logit
 from gs2d.io.splat_ply import ply_kind, read_gaussians, read_splats, write_splats
 
 Writer = Callable[[Path, Splats], tuple[str, ...] | None]
@@ -228,6 +228,11 @@ def read_surfels(path: str | os.PathLike[str]) -> tuple[Splats, str]:
 
 
 def _told(kind: str, gaussians: Gaussians, path: str | os.PathLike[str]) -> SplatFile:
+    # Other programs write the logits of opaque and of empty splats as infinite (SplatTransform, of bytes of 255 and 0).
+    infinite = np.isinf(gaussians.opacity_logits)
+    if infinite.any():
+        ends = logit((gaussians.opacity_logits > 0).astype(np.float32))
+        gaussians = replace(gaussians, opacity_logits=np.where(infinite, ends, gaussians.opacity_logits))
     return SplatFile(kind, _finite(gaussians, path), gaussians.to_surfels(path) if gaussians.is_flat else None)
 
 
