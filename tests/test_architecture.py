@@ -47,7 +47,7 @@ INSIDE = {
         "checks growth locks extras memory memory_limit text": 0,
         "files georeference similarity": 1,
         "arrays json_files camera images mesh sh splats": 2,
-        "transforms": 3,
+        "exif transforms": 3,
     },
     "data": {
         "archive": 9,

@@ -16,15 +16,21 @@ from gs2d.core.images import image_size, read_image
 from gs2d.core.similarity import rotation_to_z
 from gs2d.errors import DataError
 from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.images import AVIF, HEIF, Photo, camera_groups, find_photos, read_photos, turn
-from gs2d.sfm.pairs import neighbour_pairs, similar_pairs
+from gs2d.sfm.images import AVIF, HEIF, Photo, camera_groups, find_photos, in_order_taken, read_photos, turn
+from gs2d.sfm.pairs import chosen, near_pairs, neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import up_direction
 
 DETAILS = ExifTags.IFD.Exif
 
 
 def image(
-    path: Path, *, size: tuple[int, int] = (24, 16), orientation: int = 1, model: str = "", focal: float = 0
+    path: Path,
+    *,
+    size: tuple[int, int] = (24, 16),
+    orientation: int = 1,
+    model: str = "",
+    focal: float = 0,
+    time: str = "",
 ) -> None:
     """A JPEG or PNG whose left half is red and whose top is bright, with EXIF."""
     width, height = size
@@ -37,6 +43,8 @@ def image(
         exif[ExifTags.Base.Model] = model
     if focal:
         exif.get_ifd(DETAILS)[ExifTags.Base.FocalLength] = focal
+    if time:
+        exif.get_ifd(DETAILS)[ExifTags.Base.DateTimeOriginal] = time
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, exif=exif, **({"quality": 95} if path.suffix in (".jpg", ".JPG") else {}))
 
@@ -173,8 +181,8 @@ def test_a_damaged_exif_block_is_no_exif_block(tmp_path: Path) -> None:
     at = raw.index(b"Exif\0\0") + 6
     path.write_bytes(raw[:at] + b"XX" + raw[at + 2 :])  # neither II nor MM
     first, second, _ = photos_of(tmp_path)
-    assert (first.orientation, first.size, first.made_by[1]) == (1, (24, 16), "")
-    assert (second.orientation, second.size, second.made_by[1]) == (6, (16, 24), "phone")
+    assert (first.orientation, first.size, first.taken.made_by[1]) == (1, (24, 16), "")
+    assert (second.orientation, second.size, second.taken.made_by[1]) == (6, (16, 24), "phone")
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -387,3 +395,60 @@ def test_similar_photographs_are_paired_and_strangers_are_not() -> None:
 
 def test_photographs_without_features_have_no_similar_ones() -> None:
     assert similar_pairs(lambda _: np.zeros((0, 128), np.uint8), 5, neighbours=3) == set()
+
+
+def flight(lines: int, shots: int) -> list[tuple[float, float, float]]:
+    """Places of a drone: lines 30 m apart, flown to and fro, a photograph every 12 m, at 80 m."""
+    along = [12.0 * k for k in range(shots)]
+    return [(x, 30.0 * line, 80.0) for line in range(lines) for x in (along if line % 2 == 0 else along[::-1])]
+
+
+def test_near_photographs_are_on_the_same_line_and_on_the_next_ones() -> None:
+    places = flight(9, 20)
+    pairs = near_pairs(places, 12)
+    middle = 4 * 20 + 10  # of the fifth line
+    others = {i if j == middle else j for i, j in pairs if middle in (i, j)}
+    assert {other // 20 for other in others} == {3, 4, 5}
+    assert max(np.linalg.norm(np.subtract(places[middle], places[other])) for other in others) < 45
+    assert all(i < j for i, j in pairs)
+
+
+def test_photographs_without_a_place_have_no_near_ones_and_all_at_one_place_are_no_error() -> None:
+    assert near_pairs([(0, 0, 0), None, (1, 0, 0), (9, 0, 0), None], 1) == {(0, 2), (2, 3)}
+    assert near_pairs([None, None, (0, 0, 0)], 5) == set()
+    same = near_pairs([(5, 5, 5)] * 6, 2)
+    assert all(i < j for i, j in same)
+    assert {number for pair in same for number in pair} == set(range(6))
+
+
+@pytest.mark.parametrize(("count", "most"), [(1000, 20_000), (5000, 99_000)])
+def test_pairs_of_many_photographs_grow_as_the_photographs_do(count: int, most: int) -> None:
+    places = flight(count // 50, 50)
+    picked = chosen({"next": neighbour_pairs(count, 10), "near": near_pairs(places, 20)})
+    assert 10 * count < len(picked) < most
+
+
+def test_pairs_say_how_many_they_are_and_why() -> None:
+    picked = chosen({"near": {(0, 1), (2, 3)}, "alike": {(0, 1), (0, 3)}, "none": set()})
+    assert picked.pairs == ((0, 1), (0, 3), (2, 3))
+    assert picked.line(4) == "3 of 6 pairs of photographs are compared: 2 near, 2 alike (some for two reasons)"
+    assert chosen({"near": {(0, 1)}}).line(3) == "1 of 3 pairs of photographs are compared: 1 near"
+
+
+def test_the_order_is_that_of_the_clocks_where_they_all_run(tmp_path: Path) -> None:
+    """A counter of names that began again at 0001, as cameras do after 9999."""
+    for name, second in (("DSC_9998", 1), ("DSC_9999", 2), ("DSC_0001", 3), ("DSC_0002", 4)):
+        image(tmp_path / f"{name}.jpg", time=f"2026:05:01 10:00:0{second}")
+    photos = photos_of(tmp_path)
+    order, by = in_order_taken(photos)
+    assert [photos[i].name for i in order] == ["DSC_9998.jpg", "DSC_9999.jpg", "DSC_0001.jpg", "DSC_0002.jpg"]
+    assert by == "time"
+    image(tmp_path / "DSC_0003.jpg")
+    assert in_order_taken(photos_of(tmp_path)) == ([0, 1, 2, 3, 4], "name")
+
+
+def test_times_that_are_all_the_same_tell_no_order(tmp_path: Path) -> None:
+    """A program that exported all of them in one minute."""
+    for i in range(4):
+        image(tmp_path / f"{i}.jpg", time="2026:05:01 10:00:00")
+    assert in_order_taken(photos_of(tmp_path)) == ([0, 1, 2, 3], "name")

@@ -1,4 +1,4 @@
-"""Where photographs were taken: from their EXIF, or from a file."""
+"""Where photographs were taken, by their files or by a list, in metres of a frame of the world."""
 
 from __future__ import annotations
 
@@ -6,17 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
-from PIL import ExifTags
 
-from gs2d.core.images import open_image
 from gs2d.errors import DataError
 from gs2d.geo.projection import WGS84, Projection, to_enu, utm_epsg
 from gs2d.geo.tables import read_table
-
-DAMAGED_EXIF = (OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, AttributeError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,34 +56,6 @@ class WorldFrame:
     origin: np.ndarray
     geodetic: np.ndarray | None
     grid_scale: float
-
-
-def exif_position(path: Path) -> np.ndarray | None:
-    """Return latitude, longitude and height that a photograph's EXIF has [3], or None. A damaged block is none.
-
-    A height that is missing is NaN.
-    """
-    gps = ExifTags.GPS
-    try:
-        with open_image(path) as file:
-            told: dict[int, Any] = file.getexif().get_ifd(ExifTags.IFD.GPSInfo)
-        latitude = _degrees(told[gps.GPSLatitude], told.get(gps.GPSLatitudeRef, "N"), "S")
-        longitude = _degrees(told[gps.GPSLongitude], told.get(gps.GPSLongitudeRef, "E"), "W")
-        height = float(told[gps.GPSAltitude]) if gps.GPSAltitude in told else math.nan
-        if told.get(gps.GPSAltitudeRef, b"\0") in (b"\1", 1):
-            height = -height
-    except DAMAGED_EXIF:
-        return None
-    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
-        return None  # receivers without a fix write zeros
-    return np.array([latitude, longitude, height])
-
-
-def _degrees(parts: Sequence[Any], side: Any, negative: str) -> float:
-    degrees, minutes, seconds = (float(part) for part in parts)
-    value = degrees + minutes / 60 + seconds / 3600
-    letter = side.decode("ascii", "replace") if isinstance(side, bytes) else str(side)
-    return -value if letter.strip("\0 ").upper() == negative else value
 
 
 def read_positions(path: Path) -> Positions:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gs2d.core.camera import Camera
+from gs2d.core.exif import read_place
 from gs2d.core.georeference import CHECK, FITTED, LEFT_OUT, Georeference, Residual
 from gs2d.core.similarity import rotation_to_z
 from gs2d.data import View
@@ -18,7 +19,7 @@ from gs2d.errors import DataError, RunError
 from gs2d.geo.control import Located, locate, read_control
 from gs2d.geo.fit import Fit, cameras_up, fit_places
 from gs2d.geo.markers import Marker, detected, detector, in_run
-from gs2d.geo.positions import Positions, WorldFrame, exif_position, in_frame, matched, read_positions
+from gs2d.geo.positions import Positions, WorldFrame, in_frame, matched, read_positions
 from gs2d.io.georeference import read_georeference, write_georeference
 from gs2d.io.run_dir import GEOREFERENCE, POSES, RunFolder, open_run
 from gs2d.pipeline.events import OnEvent, counted, ignore
@@ -198,7 +199,7 @@ def _positions(views: Sequence[View], options: GeoreferenceOptions, on_event: On
         return read_positions(options.positions)
     found = {}
     for view in counted(views, "reading EXIF", len(views), on_event):
-        place = None if view.path is None else exif_position(view.path)
+        place = None if view.path is None else read_place(view.path)
         if place is not None:
             found[view.name] = place
     if not found:

@@ -122,12 +122,16 @@ class Finding:
     """Which photographs share a camera: same folder, size, camera, lens and focal length; all; none."""
     camera_model: LensModel = "auto"
     """Lens (auto: with one focal length; the simplest that observations held out do not speak against)."""
-    matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
-    """Pairs to match: all; next ones by name (frames of a video); next and most similar ones. auto: all up to 150."""
+    matching: Literal["auto", "exhaustive", "sequential", "similar", "spatial"] = "auto"
+    """Pairs to match: all; next ones (frames of a video); next and most similar ones; next, nearest in space and most
+    similar ones. auto: all up to 150, else spatial where most photographs know where they were taken, else similar."""
     overlap: int = 10
-    """Next photographs that each is matched with, where not all pairs are."""
+    """Next photographs (by the time in EXIF, else by name) that each is matched with, where not all pairs are."""
     neighbours: int = 40
-    """Similar photographs that each is matched with, where not all pairs are."""
+    """Others that each is matched with, where not all pairs are: similar ones; spatial: half of them near ones."""
+    positions: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Where photographs were taken, to choose pairs by: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's
+    geo.txt (default: GPS in their EXIF or XMP)."""
     max_size: int | None = None
     """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
     feature_size: int = 1600
@@ -186,7 +190,7 @@ class PosesOptions(Finding):
     """Replace the capture in --out, if this command made it."""
 
     def __post_init__(self) -> None:
-        paths_of(self, "photos", "out")
+        paths_of(self, "photos", "out", "positions")
 
 
 @dataclass(frozen=True, kw_only=True)

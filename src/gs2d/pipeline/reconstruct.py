@@ -31,7 +31,7 @@ from gs2d.pipeline.options import (
 )
 from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
 from gs2d.pipeline.report import report_again
-from gs2d.pipeline.sfm import ASKED_FOR, check_poses_options, find_poses, placed_line
+from gs2d.pipeline.sfm import asked_for, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run
 from gs2d.pipeline.train import check_viewer, train
@@ -227,11 +227,11 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
     try:
         if poses["photos"] != str(options.photos.resolve()):
             raise RunError(f"{capture} was made of {poses['photos']}, not of {options.photos}; {again}")
-        asked = {"frames": PosesOptions.frames, **poses["asked"]}  # a capture of before there were videos
-        for name in ASKED_FOR:
-            if asked[name] != getattr(wanted, name):
+        for name, value in asked_for(wanted).items():
+            before = poses["asked"].get(name, getattr(PosesOptions, name))  # an option that there was not, then
+            if before != value:
                 option = f"--{name.replace('_', '-')}"
-                raise RunError(f"{capture} was made with {option} {asked[name]}, now {getattr(wanted, name)}; {again}")
+                raise RunError(f"{capture} was made with {option} {before}, now {value}; {again}")
         if options.photos.is_dir():  # their folder is not needed any more
             before = {row["source"] for row in poses["photographs"]}
             now = {path.relative_to(options.photos).as_posix() for path in find_photos(options.photos)[0]}

@@ -20,10 +20,11 @@ from gs2d.io.run_dir import make_folder, now, remove_made
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Plan, Step, counted, ignore
 from gs2d.pipeline.options import PosesOptions
+from gs2d.pipeline.photo_places import Places, places_of
 from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, read_facts, solve
 from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, read_photos
+from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, in_order_taken, read_photos
 from gs2d.sfm.lens import START, lens_line
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
 from gs2d.sfm.plot import write_image_of
@@ -31,11 +32,13 @@ from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into
 from gs2d.sfm.workspace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workspace
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
-MATCHINGS = ("auto", "exhaustive", "sequential", "similar")
+MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
-    "cameras", "camera_model", "matching", "overlap", "neighbours", "max_size", "feature_size", "frames", "seed"
-)  # fmt: skip
+    *("cameras", "camera_model", "matching", "overlap", "neighbours", "positions"),
+    *("max_size", "feature_size", "frames", "seed"),
+)
+_MOST = 0.5  # of the photographs: so many have a place where "auto" goes by places
 _GROWTH = {"placing cameras": 1.5}  # each is adjusted with those that have a place, but not with all of them every time
 FRAMES = "frames"  # of a video, in the workplace, until they are in the capture
 SMALLEST_SIDE, MAX_THREADS = 64, 1024
@@ -68,12 +71,15 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             paths = _frames_of(video, root, options.frames, on_event) if video else paths
             reading = read_photos(paths, root, threads=threads)
             photos = list(counted(reading, "reading photographs", len(paths), on_event))
+            places = places_of(photos, options.positions)
+            for note in places.notes:
+                on_event(Notice(note))
             sizes = [photo.size_within(options.max_size) for photo in photos]
             groups = camera_groups(photos, sizes, options.cameras)
             capture = work / "capture"
             staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
-            request = _request(options, work, photos, sizes, groups, threads)
-            solved = solve(request, _progress(on_event))
+            request = _request(options, work, photos, places, sizes, groups, threads)
+            solved = solve(request, _progress(on_event), lambda line: on_event(Notice(line)))
             pieces = [read_model(capture / SPARSE / str(i), done) for i, done in enumerate(solved.models)]
             facts = read_facts(Path(request.database))
             check_any(pieces, facts, options.photos)
@@ -173,13 +179,12 @@ def _request(
     options: PosesOptions,
     work: Path,
     photos: Sequence[Photo],
+    places: Places,
     sizes: Sequence[tuple[int, int]],
     groups: Sequence[Sequence[int]],
     threads: int,
 ) -> Request:
-    matching = options.matching
-    if matching == "auto":
-        matching = "exhaustive" if len(photos) <= ALL_PAIRS else "similar"
+    order, ordered_by = in_order_taken(photos)
     return Request(
         images=str(work / "capture" / IMAGES),
         database=str(work / "database.db"),
@@ -193,8 +198,10 @@ def _request(
             )
             for group in groups
         ),
-        in_order=tuple(photo.name for photo in photos),
-        matching=matching,
+        in_order=tuple(photos[i].name for i in order),
+        ordered_by=ordered_by,
+        places=tuple(places.metres[i] for i in order),
+        matching=_matching(options, len(photos), places),
         overlap=options.overlap,
         neighbours=options.neighbours,
         feature_size=options.feature_size,
@@ -202,6 +209,32 @@ def _request(
         seed=options.seed,
         asked_lens=None if options.camera_model == "auto" else options.camera_model,
     )
+
+
+def _matching(options: PosesOptions, count: int, places: Places) -> str:
+    """Which pairs are compared.
+
+    Raises
+    ------
+    DataError
+        By places, of which there are none.
+    """
+    if options.matching == "spatial" and not places.known:
+        raise DataError(
+            f"--matching spatial needs photographs that know where they were taken, none of {count} does; give a file "
+            "of --positions, or use --matching similar"
+        )
+    if options.matching != "auto":
+        return options.matching
+    if count <= ALL_PAIRS:
+        return "exhaustive"
+    return "spatial" if places.known >= _MOST * count else "similar"
+
+
+def asked_for(options: PosesOptions) -> dict[str, Any]:
+    """Return the options that decide what the capture is, as ``poses.json`` remembers them."""
+    asked = {name: getattr(options, name) for name in ASKED_FOR}
+    return {name: str(value.resolve()) if isinstance(value, Path) else value for name, value in asked.items()}
 
 
 def _progress(on_event: OnEvent) -> Any:
@@ -260,7 +293,7 @@ def _result(
             for i, piece in enumerate(pieces[1:], start=1)
         ],
         "photographs": rows,
-        "asked": {name: getattr(options, name) for name in ASKED_FOR},
+        "asked": asked_for(options),
         "options": {
             "matching": request.matching,
             "pairs_matched": len(facts.matches),
@@ -313,4 +346,4 @@ def _doubts(result: dict[str, Any]) -> list[str]:
     return doubts
 
 
-__all__ = ["ASKED_FOR", "PosesOptions", "check_poses_options", "find_poses", "placed_line"]
+__all__ = ["PosesOptions", "asked_for", "check_poses_options", "find_poses", "placed_line"]

@@ -22,6 +22,7 @@ from gs2d.core.files import atomic_write
 from gs2d.errors import BackendError, DataError
 
 OnProgress = Callable[[str, int, int], None]  # name of the phase, steps done, steps in all
+OnNote = Callable[[str], None]  # a line for people
 MISSING = f"structure from motion needs pycolmap, which is not installed: {install('sfm')}"
 POLL_SECONDS = 0.5
 _LITTLE_SPACE = 64 << 20  # bytes; what SQLite could not write is given back when it gives up
@@ -61,10 +62,14 @@ class Request:
         COLMAP's database, and the folder for the models ``0``, ``1`` ...; neither exists.
     groups : tuple of Group
     in_order : tuple of str
-        All names, in the order in which they were taken as far as names tell.
-    matching : "exhaustive", "sequential" or "similar"
+        All names, in the order in which they were taken.
+    ordered_by : "time" or "name"
+        What tells the order.
+    places : tuple of Place or None
+        Metres, of each name in ``in_order``; None: nobody knows.
+    matching : "exhaustive", "sequential", "similar" or "spatial"
     overlap, neighbours : int
-        Next photographs, and similar ones, that each is matched with where not all pairs are.
+        Next photographs, and others (similar or near), that each is matched with where not all pairs are.
     feature_size : int
         Longer side on which features are found, px.
     asked_lens : str or None
@@ -76,6 +81,8 @@ class Request:
     output: str
     groups: tuple[Group, ...]
     in_order: tuple[str, ...]
+    ordered_by: str
+    places: tuple[tuple[float, float, float] | None, ...]
     matching: str
     overlap: int
     neighbours: int
@@ -110,7 +117,9 @@ class Solved:
     refused: dict[str, str]
 
 
-def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] = ()) -> Solved:
+def solve(
+    request: Request, on_progress: OnProgress, on_note: OnNote = lambda _line: None, *, command: Sequence[str] = ()
+) -> Solved:
     """Find the cameras.
 
     Parameters
@@ -134,7 +143,7 @@ def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] =
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, env=environment, encoding="utf-8"
         )
         try:
-            solved, phase = _follow(process, Path(request.database), on_progress)
+            solved, phase = _follow(process, Path(request.database), on_progress, on_note)
         finally:
             process.kill()
             process.wait()
@@ -146,7 +155,9 @@ def solve(request: Request, on_progress: OnProgress, *, command: Sequence[str] =
     return solved
 
 
-def _follow(process: subprocess.Popen[str], database: Path, on_progress: OnProgress) -> tuple[Solved | None, str]:
+def _follow(
+    process: subprocess.Popen[str], database: Path, on_progress: OnProgress, on_note: OnNote
+) -> tuple[Solved | None, str]:
     """Pass progress on until the worker has finished or died."""
     lines: queue.Queue[str | None] = queue.Queue()
     assert process.stdout is not None
@@ -169,6 +180,8 @@ def _follow(process: subprocess.Popen[str], database: Path, on_progress: OnProgr
         message = json.loads(line)
         if "models" in message:
             solved = Solved(message["models"], message.get("lens", {}), message.get("refused", {}))
+        if "note" in message:
+            on_note(message["note"])
         if "phase" in message:
             phase, total = message["phase"], message["total"]
             before = _rows(database, _COUNTED[phase]) if phase == "again" else 0  # those of the first time

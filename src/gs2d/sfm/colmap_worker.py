@@ -22,7 +22,7 @@ import numpy as np
 from gs2d.core.similarity import rotation_to_z
 from gs2d.sfm import second_round as second
 from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
-from gs2d.sfm.pairs import neighbour_pairs, similar_pairs
+from gs2d.sfm.pairs import Chosen, chosen, near_pairs, neighbour_pairs, similar_pairs
 from gs2d.sfm.upright import up_direction
 
 Say = Callable[..., None]
@@ -97,19 +97,31 @@ def match(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
         pairing = pycolmap.ExhaustivePairingOptions()
         pycolmap.match_exhaustive(database, matching, pairing, verification, cpu)
         return
-    pairs = neighbour_pairs(len(names), request["overlap"])
-    if request["matching"] == "similar":
-        say(phase="comparing", total=2 * len(names))
-        pairs |= _similar(pycolmap, request, say)
-    say(phase="matching", total=len(pairs))
+    pairs = _pairs(pycolmap, request, say)
+    say(phase="matching", total=len(pairs), note=pairs.line(len(names)))
     listed = Path(database).with_name("pairs.txt")
-    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs)), encoding="utf-8")
-    chosen = pycolmap.ImportedPairingOptions()
-    chosen.match_list_path = str(listed)
-    pycolmap.match_image_pairs(database, matching, chosen, verification, cpu)
+    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.pairs), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(listed)
+    pycolmap.match_image_pairs(database, matching, pairing, verification, cpu)
 
 
-def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int, int]]:
+def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> Chosen:
+    """Which pairs to compare, where not all are: next ones, those near in space, and those that look alike."""
+    matching, count = request["matching"], len(request["in_order"])
+    next_to = f"next to each other by {request['ordered_by']}"
+    reasons = {next_to: neighbour_pairs(count, request["overlap"])}
+    others = request["neighbours"]
+    if matching == "spatial":
+        reasons["near in space"] = near_pairs(request["places"], others - others // 2)
+        others //= 2
+    if matching != "sequential" and others:
+        say(phase="comparing", total=2 * count)
+        reasons["that look alike"] = _similar(pycolmap, request, others, say)
+    return chosen(reasons)
+
+
+def _similar(pycolmap: Any, request: dict[str, Any], neighbours: int, say: Say) -> set[tuple[int, int]]:
     database = pycolmap.Database.open(request["database"])
     try:
         ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -119,7 +131,7 @@ def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int,
             say(done=next(done))
             return np.asarray(database.read_descriptors(ids[names[i]]).data).reshape(-1, 128)
 
-        return similar_pairs(read, len(names), neighbours=request["neighbours"], seed=request["seed"])
+        return similar_pairs(read, len(names), neighbours=neighbours, seed=request["seed"])
     finally:
         database.close()
 
@@ -246,7 +258,10 @@ def _second_round(
 def _likeness(pycolmap: Any, request: dict[str, Any], names: list[str]) -> Callable[[str, str], float]:
     """How much two photographs share: verified matches, and where they were not compared, how alike they look."""
     if request["matching"] != "exhaustive":
-        near = {frozenset((names[i], names[j])) for i, j in _similar(pycolmap, request, lambda **_: None)}
+        near = {
+            frozenset((names[i], names[j]))
+            for i, j in _similar(pycolmap, request, request["neighbours"], lambda **_: None)
+        }
     else:
         near = set()
     database = pycolmap.Database.open(request["database"])

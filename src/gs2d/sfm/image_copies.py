@@ -11,10 +11,11 @@ from pathlib import Path
 
 from PIL import ExifTags, Image
 
+from gs2d.core.exif import DAMAGED_EXIF
 from gs2d.core.files import atomic_write, disk_error
 from gs2d.core.images import open_image, read_image
 from gs2d.errors import DataError
-from gs2d.sfm.images import DAMAGED_EXIF, JPEG, Photo, turn
+from gs2d.sfm.images import JPEG, Photo, turn
 
 QUALITY = 95  # of JPEG files that had to be written again, without chroma subsampling
 

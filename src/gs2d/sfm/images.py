@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
-import struct
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from PIL import ExifTags, Image, features
+from PIL import Image, features
 
-from gs2d.core.images import natural_key, open_image, read_image
+from gs2d.core.exif import Taken, read_taken
+from gs2d.core.images import natural_key, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.video_frames import VIDEOS
 
@@ -41,7 +41,6 @@ _KINDS = {
 FEWEST = 3  # two photographs give no point that a third confirms
 _MASKS = "masks"
 _HIDDEN = (".", "__MACOSX")
-DAMAGED_EXIF = (OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, struct.error)  # in Pillow
 _ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -67,18 +66,20 @@ class Photo:
         Its path below ``images/`` of the capture: UTF-8 without white space, as COLMAP's lists; ``.png`` if converted.
     size : (int, int)
         Width and height as it is seen, px: after its EXIF orientation.
-    orientation : int
-        EXIF, 1 (upright) to 8.
-    made_by : tuple of str
-        Camera, lens and focal length as EXIF has them; empty strings where it has none.
+    taken : Taken
+        What the file says of how it was taken; its orientation is what is left to be turned.
     """
 
     source: Path
     label: str
     name: str
     size: tuple[int, int]
-    orientation: int
-    made_by: tuple[str, ...]
+    taken: Taken
+
+    @property
+    def orientation(self) -> int:
+        """EXIF, 1 (upright) to 8."""
+        return self.taken.orientation
 
     @property
     def is_converted(self) -> bool:
@@ -174,27 +175,10 @@ def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[
 
 def _read(path: Path, root: Path, name: str) -> Photo:
     height, width = read_image(path).shape[:2]
-    orientation, made_by = _exif(path)
-    if path.suffix.lower() in (".tif", ".tiff"):  # Pillow has turned it
-        orientation = 1
+    taken = read_taken(path)
+    orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else taken.orientation  # which Pillow has turned
     size = (height, width) if orientation >= 5 else (width, height)
-    return Photo(path, path.relative_to(root).as_posix(), name, size, orientation, made_by)
-
-
-def _exif(path: Path) -> tuple[int, tuple[str, ...]]:
-    """Orientation, and what made the picture. A damaged EXIF block is none."""
-    base = ExifTags.Base
-    try:
-        with open_image(path) as file:
-            exif = file.getexif()
-            details = exif.get_ifd(ExifTags.IFD.Exif)
-            orientation = exif.get(base.Orientation, 1)
-            tags = [exif.get(base.Make), exif.get(base.Model)]
-            tags += [details.get(tag) for tag in (base.LensModel, base.FocalLength, base.FocalLengthIn35mmFilm)]
-            made_by = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
-    except DAMAGED_EXIF:
-        return 1, ("",) * 5
-    return orientation if orientation in _ORIENTATIONS else 1, made_by
+    return Photo(path, path.relative_to(root).as_posix(), name, size, replace(taken, orientation=orientation))
 
 
 def _names(labels: Sequence[str]) -> list[str]:
@@ -239,8 +223,20 @@ def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cam
         return [list(range(len(photos)))]
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, (photo, size) in enumerate(zip(photos, sizes, strict=True)):
-        groups.setdefault((os.path.dirname(photo.name), size, photo.made_by), []).append(i)
+        groups.setdefault((os.path.dirname(photo.name), size, photo.taken.made_by), []).append(i)
     return list(groups.values())
+
+
+def in_order_taken(photos: Sequence[Photo]) -> tuple[list[int], str]:
+    """Return the numbers of the photographs in the order in which they were taken, and by what: "time" or "name".
+
+    By their clocks where each has one that runs: where most of the times differ.
+    """
+    times = [photo.taken.seconds for photo in photos]
+    known = [seconds for seconds in times if seconds is not None]
+    if len(known) < len(photos) or 2 * len(set(known)) < len(photos):
+        return list(range(len(photos))), "name"
+    return sorted(range(len(photos)), key=lambda i: (known[i], i)), "time"
 
 
 def _by(size: tuple[int, int]) -> str:

@@ -1,14 +1,47 @@
-"""Which photographs to compare with which, where all pairs would be too many. Numpy only."""
+"""Which photographs to compare with which, where all pairs would be too many. Numpy and scipy only."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 WORDS = 64
 _ROUNDS = 10  # of k-means
 _SAMPLES = 30_000  # descriptors that the words are learnt from
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Pairs to compare, and why.
+
+    Attributes
+    ----------
+    pairs : tuple of (int, int)
+        i < j, ascending.
+    reasons : mapping of str to int
+        How many there are for each reason; a pair may have several.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    reasons: Mapping[str, int]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def line(self, count: int) -> str:
+        """Return how many of all pairs of ``count`` photographs are compared, and why, for people."""
+        why = ", ".join(f"{number:,} {reason}" for reason, number in self.reasons.items())
+        both = " (some for two reasons)" if sum(self.reasons.values()) > len(self.pairs) else ""
+        return f"{len(self.pairs):,} of {count * (count - 1) // 2:,} pairs of photographs are compared: {why}{both}"
+
+
+def chosen(reasons: Mapping[str, set[tuple[int, int]]]) -> Chosen:
+    """Return all pairs of these sets."""
+    pairs = sorted(set().union(*reasons.values()))
+    return Chosen(tuple(pairs), {reason: len(some) for reason, some in reasons.items() if some})
 
 
 def neighbour_pairs(count: int, overlap: int) -> set[tuple[int, int]]:
@@ -18,6 +51,29 @@ def neighbour_pairs(count: int, overlap: int) -> set[tuple[int, int]]:
     """
     steps = {*range(1, overlap + 1), *(1 << k for k in range(overlap))}
     return {(i, i + step) for i in range(count) for step in steps if i + step < count}
+
+
+def near_pairs(places: Sequence[Sequence[float] | None], neighbours: int) -> set[tuple[int, int]]:
+    """Pairs (i < j) of each photograph with those that were taken nearest to it.
+
+    Parameters
+    ----------
+    places : sequence of [3] or None
+        Metres; None: nobody knows.
+    neighbours : int
+        Nearest photographs that each is paired with.
+    """
+    known = [i for i, place in enumerate(places) if place is not None]
+    if len(known) < 2:
+        return set()
+    at = np.array([places[i] for i in known], dtype=float)
+    count = min(neighbours, len(known) - 1)
+    _, found = cKDTree(at).query(at, k=count + 1)
+    pairs = set()
+    for row, others in enumerate(np.atleast_2d(found)):  # of those at the same place any may be the first
+        for other in [j for j in others if j != row][:count]:
+            pairs.add((known[min(row, other)], known[max(row, other)]))
+    return pairs
 
 
 def similar_pairs(

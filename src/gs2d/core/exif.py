@@ -1,0 +1,171 @@
+"""What a photograph's file says of how it was taken: place, time, orientation and camera, by EXIF and by XMP of drones.
+
+A damaged block is none: nothing here raises for what a file says of itself, but for a file that is no image.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from gs2d.core.images import open_image
+
+#: What Pillow raises for a damaged EXIF block.
+DAMAGED_EXIF = (
+    *(OSError, SyntaxError, ValueError, KeyError, TypeError, ZeroDivisionError, AttributeError, OverflowError),
+    struct.error,
+)
+_UPRIGHT = 1
+_ORIENTATIONS = range(1, 9)
+# Names in XMP, without their prefix: DJI (also in its own spelling), senseFly and others; the first that is there.
+_LATITUDES = ("GpsLatitude", "GPSLatitude", "Latitude")
+_LONGITUDES = ("GpsLongitude", "GpsLongtitude", "GPSLongitude", "Longitude")
+_HEIGHTS = ("AbsoluteAltitude", "AltitudeWGS84", "GPSAltitude", "AltitudeAMSL")
+
+
+@dataclass(frozen=True)
+class Taken:
+    """How a photograph was taken, as far as its file tells.
+
+    Attributes
+    ----------
+    orientation : int
+        EXIF, 1 (upright) to 8.
+    made_by : tuple of str
+        Camera, lens and focal length as EXIF has them; empty strings where it has none.
+    place : (float, float, float) or None
+        Latitude and longitude (degrees, WGS 84) and height (m); a height that is missing is NaN.
+    seconds : float or None
+        When, on the clock of the camera, which knows no time zone; comparable among photographs only.
+    """
+
+    orientation: int = _UPRIGHT
+    made_by: tuple[str, ...] = ("",) * 5
+    place: tuple[float, float, float] | None = None
+    seconds: float | None = None
+
+
+def read_taken(path: Path) -> Taken:
+    """Return what a photograph's file says of how it was taken."""
+    base = ExifTags.Base
+    try:
+        with open_image(path) as file:
+            exif, xmp = file.getexif(), _xmp(file)
+            details: dict[int, Any] = exif.get_ifd(ExifTags.IFD.Exif)
+            orientation = exif.get(base.Orientation, _UPRIGHT)
+            tags = [exif.get(base.Make), exif.get(base.Model)]
+            tags += [details.get(tag) for tag in (base.LensModel, base.FocalLength, base.FocalLengthIn35mmFilm)]
+            made_by = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
+            place, seconds = _place(exif, xmp), _seconds(exif, details)
+    except DAMAGED_EXIF:
+        return Taken()
+    return Taken(orientation if orientation in _ORIENTATIONS else _UPRIGHT, made_by, place, seconds)
+
+
+def read_place(path: Path) -> np.ndarray | None:
+    """Return latitude, longitude and height that a photograph's file has [3], or None; see :class:`Taken`."""
+    place = read_taken(path).place
+    return None if place is None else np.array(place)
+
+
+def _xmp(file: Image.Image) -> str:
+    """Return the XMP block as text: attributes and elements are looked for by name, so that no XML is parsed."""
+    block = file.info.get("xmp") or file.info.get("XML:com.adobe.xmp") or b""
+    return block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block)
+
+
+# -- where -------------------------------------------------------------------------------------------------------------
+def _place(exif: Image.Exif, xmp: str) -> tuple[float, float, float] | None:
+    """EXIF's place, else XMP's; a height that one lacks is the other's."""
+    told = _exif_place(exif)
+    more = _xmp_place(xmp) if told is None or math.isnan(told[2]) else None
+    if told is None or more is None:
+        return told or more
+    return told[0], told[1], more[2]
+
+
+def _exif_place(exif: Image.Exif) -> tuple[float, float, float] | None:
+    gps = ExifTags.GPS
+    try:
+        told: Mapping[int, Any] = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        latitude = _degrees(told[gps.GPSLatitude], told.get(gps.GPSLatitudeRef, "N"), "S")
+        longitude = _degrees(told[gps.GPSLongitude], told.get(gps.GPSLongitudeRef, "E"), "W")
+        height = float(told[gps.GPSAltitude]) if gps.GPSAltitude in told else math.nan
+        if told.get(gps.GPSAltitudeRef, b"\0") in (b"\1", 1):
+            height = -height
+    except DAMAGED_EXIF:
+        return None
+    return _believable(latitude, longitude, height)
+
+
+def _degrees(parts: Sequence[Any], side: Any, negative: str) -> float:
+    degrees, minutes, seconds = (float(part) for part in parts)
+    value = degrees + minutes / 60 + seconds / 3600
+    letter = side.decode("ascii", "replace") if isinstance(side, bytes) else str(side)
+    return -value if letter.strip("\0 ").upper() == negative else value
+
+
+def _xmp_place(xmp: str) -> tuple[float, float, float] | None:
+    try:
+        latitude, longitude = (_xmp_degrees(_named(xmp, names)) for names in (_LATITUDES, _LONGITUDES))
+    except DAMAGED_EXIF:
+        return None
+    try:
+        top, _, bottom = _named(xmp, _HEIGHTS).partition("/")
+        height = float(top) / float(bottom or 1)
+    except DAMAGED_EXIF:
+        height = math.nan
+    if _found(xmp, "GPSAltitudeRef") == "1" and not _found(xmp, "AbsoluteAltitude"):
+        height = -height
+    return _believable(latitude, longitude, height)
+
+
+def _named(xmp: str, names: Sequence[str]) -> str:
+    """Return what XMP has under the first of these names that it has; empty without any."""
+    return next(filter(None, (_found(xmp, name) for name in names)), "")
+
+
+def _found(xmp: str, name: str) -> str:
+    """Return what XMP has under a name of any prefix, as attribute or element; empty without it."""
+    found = re.search(rf"[\w-]+:{name}\s*(?:=\s*[\"']([^\"'<>]*)[\"']|>([^<]*)<)", xmp)
+    return (found[1] or found[2] or "").strip() if found else ""
+
+
+def _xmp_degrees(text: str) -> float:
+    """Return degrees of ``+46.84``, or of EXIF's form in XMP: ``46,50.55N`` or ``46,50,33N``."""
+    letter = text[-1:].upper()
+    if letter not in ("N", "S", "E", "W"):
+        return float(text)
+    parts = [float(part) for part in text[:-1].split(",")]
+    value = sum(part / 60**k for k, part in enumerate(parts[:3]))
+    return -value if letter in ("S", "W") else value
+
+
+def _believable(latitude: float, longitude: float, height: float) -> tuple[float, float, float] | None:
+    """Return the place, or None for one that cannot be: receivers without a fix write zeros."""
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or (latitude == 0 and longitude == 0):
+        return None
+    return latitude, longitude, height if math.isfinite(height) else math.nan
+
+
+# -- when --------------------------------------------------------------------------------------------------------------
+def _seconds(exif: Image.Exif, details: Mapping[int, Any]) -> float | None:
+    base = ExifTags.Base
+    text = details.get(base.DateTimeOriginal) or details.get(base.DateTimeDigitized) or exif.get(base.DateTime)
+    part = details.get(base.SubsecTimeOriginal) or details.get(base.SubsecTime) or ""
+    try:
+        told = datetime.datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        whole = told.replace(tzinfo=datetime.UTC).timestamp()
+    except DAMAGED_EXIF:
+        return None
+    digits = str(part).strip("\0 ")
+    return whole + (float(f"0.{digits}") if re.fullmatch("[0-9]{1,9}", digits) else 0.0)
