@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from gs2d.core.camera import look_at
 from gs2d.core.images import image_size, read_image
 from gs2d.core.similarity import rotation_to_z
 from gs2d.errors import DataError
+from gs2d.sfm import compare
 from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import AVIF, HEIF, Photo, camera_groups, find_photos, in_order_taken, read_photos, turn
 from gs2d.sfm.pairs import chosen, near_pairs, neighbour_pairs, similar_pairs
@@ -421,10 +423,10 @@ def test_photographs_without_a_place_have_no_near_ones_and_all_at_one_place_are_
     assert {number for pair in same for number in pair} == set(range(6))
 
 
-@pytest.mark.parametrize(("count", "most"), [(1000, 20_000), (5000, 99_000)])
+@pytest.mark.parametrize(("count", "most"), [(1000, 13_000), (5000, 70_000)])
 def test_pairs_of_many_photographs_grow_as_the_photographs_do(count: int, most: int) -> None:
     places = flight(count // 50, 50)
-    picked = chosen({"next": neighbour_pairs(count, 10), "near": near_pairs(places, 20)})
+    picked = chosen({"next": neighbour_pairs(count, 3), "near": near_pairs(places, 20)})
     assert 10 * count < len(picked) < most
 
 
@@ -452,3 +454,33 @@ def test_times_that_are_all_the_same_tell_no_order(tmp_path: Path) -> None:
     for i in range(4):
         image(tmp_path / f"{i}.jpg", time="2026:05:01 10:00:00")
     assert in_order_taken(photos_of(tmp_path)) == ([0, 1, 2, 3], "name")
+
+
+def test_where_places_are_known_fewer_are_compared_and_those_without_one_lose_nothing(tmp_path: Path) -> None:
+    """Of 60 photographs numbers 7 and 30 know no place: all that they would have without places they have with them."""
+    rng = np.random.default_rng(0)
+    features = [rng.integers(0, 255, (80, 128), dtype=np.uint8) for _ in range(60)]
+    database = SimpleNamespace(
+        read_all_images=lambda: [SimpleNamespace(name=f"{i}", image_id=i) for i in range(60)],
+        read_descriptors=lambda i: SimpleNamespace(data=features[i]),
+        close=lambda: None,
+    )
+    pycolmap = SimpleNamespace(Database=SimpleNamespace(open=lambda _path: database))
+    places = [None if i in (7, 30) else place for i, place in enumerate(flight(6, 10))]
+    request = {"in_order": [f"{i}" for i in range(60)], "overlap": 6, "neighbours": 16, "ordered_by": "time", "seed": 0}
+    picked = {}
+    for matching in ("similar", "spatial"):
+        (tmp_path / matching).mkdir()
+        request |= {"matching": matching, "places": places, "database": str(tmp_path / matching / "database.db")}
+        picked[matching] = compare._pairs(pycolmap, request, lambda **_: None)
+    assert len(picked["spatial"]) < 0.8 * len(picked["similar"])
+    assert list(picked["spatial"].reasons) == ["near in space", "next to each other by time", "that look alike"]
+
+    def chosen_by(number: int, matching: str) -> set[tuple[int, int]]:
+        following = {(i, j) for i, j in neighbour_pairs(60, 6) if number in (i, j)}
+        assert following <= set(picked[matching].pairs)
+        return {pair for pair in picked[matching].pairs if number in pair}
+
+    for number in (7, 30):
+        assert len(chosen_by(number, "spatial")) >= 16
+        assert len(chosen_by(number, "similar")) >= 16

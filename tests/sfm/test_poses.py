@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,10 @@ from gs2d.core.images import read_image
 from gs2d.data import load_scene
 from gs2d.data.readers.colmap import read_images
 from gs2d.errors import RunError
-from gs2d.pipeline.events import Event, Phase
+from gs2d.pipeline.events import Event, Notice, Phase
 from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm.lens import MODELS
-from gs2d.sfm.workspace import workspace
 from room_photos import FOCAL, SIZE, UP, Room, room_image, textures, write_room
 
 
@@ -152,6 +152,23 @@ def test_the_same_seed_gives_the_same_bytes(colmap: None, pieces: Path, tmp_path
     assert {path: path.read_bytes() for path in sorted(out.rglob("*.bin"))} == models
 
 
+class Kept:
+    """What a search says: the names of its phases, and its lines."""
+
+    def __init__(self, interrupt_at: str = "") -> None:
+        self.phases: list[str] = []
+        self.lines: list[str] = []
+        self.interrupt_at = interrupt_at
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, Phase):
+            self.phases.append(event.name)
+            if event.name == self.interrupt_at:
+                raise KeyboardInterrupt
+        if isinstance(event, Notice):
+            self.lines.append(event.text)
+
+
 def test_what_appears_in_the_folder_while_colmap_works_is_not_replaced(colmap: None, tmp_path: Path) -> None:
     write_room(tmp_path / "photos", 4)
     masks = tmp_path / "capture" / "masks"
@@ -163,6 +180,11 @@ def test_what_appears_in_the_folder_while_colmap_works_is_not_replaced(colmap: N
     with pytest.raises(RunError, match=r"holds other files \(masks\)"):
         find_poses(PosesOptions(photos=tmp_path / "photos", out=tmp_path / "capture", threads=1), put)
     assert masks.is_dir()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".capture.poses", "capture", "photos"]
+    masks.rmdir()
+    found = find_poses(PosesOptions(photos=tmp_path / "photos", out=tmp_path / "capture", threads=1), kept := Kept())
+    assert found["placed"] == 4
+    assert "finding features" not in kept.phases  # what was found is not found again
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "photos"]
 
 
@@ -205,21 +227,53 @@ def test_a_camera_that_only_turned_is_doubted(colmap: None, tmp_path: Path, caps
     assert "the photographs were taken from nearly one place" in capsys.readouterr().err
 
 
-def test_an_interrupt_in_the_middle_leaves_nothing(room: Room, tmp_path: Path) -> None:
-    def interrupt(event: Event) -> None:
-        if isinstance(event, Phase) and event.name == "matching pairs":
-            raise KeyboardInterrupt
-
+@pytest.mark.parametrize(
+    ("phase", "said"),
+    [
+        ("matching pairs", "features of 12 photographs, 0 pairs"),
+        ("placing cameras", "features of 12 photographs, 66 pairs"),
+        ("comparing lenses", "features of 12 photographs, 66 pairs, cameras that were placed"),
+    ],
+)
+def test_a_search_that_was_interrupted_goes_on_and_ends_in_the_same_bytes(
+    room: Room, tmp_path: Path, phase: str, said: str
+) -> None:
+    out = tmp_path / "new" / "capture"
+    options = PosesOptions(photos=room.photos, out=out, threads=2)
     with pytest.raises(KeyboardInterrupt):
-        find_poses(PosesOptions(photos=room.photos, out=tmp_path / "new" / "capture", threads=2), interrupt)
-    assert list(tmp_path.iterdir()) == []
+        find_poses(options, first := Kept(interrupt_at=phase))
+    work = tmp_path / "new" / ".capture.poses"
+    assert first.lines[-1] == f"what was found is kept in {work}: the same command goes on; remove it to begin anew"
+    assert [path.name for path in out.parent.iterdir()] == [".capture.poses"]
+    find_poses(options, second := Kept())
+    assert f"going on with the search that was interrupted: {said}" in second.lines
+    assert [path.name for path in out.parent.iterdir()] == ["capture"]
+    for name in ("cameras", "images", "points3D", "frames", "rigs"):
+        same = f"sparse/0/{name}.bin"
+        assert (out / same).read_bytes() == (room.capture / same).read_bytes()
+
+
+def test_a_search_with_other_options_keeps_what_they_do_not_change(room: Room, tmp_path: Path) -> None:
+    options = PosesOptions(photos=room.photos, out=tmp_path / "capture", threads=2)
+    with pytest.raises(KeyboardInterrupt):
+        find_poses(options, Kept(interrupt_at="comparing lenses"))
+    find_poses(replace(options, matching="sequential", overlap=3), second := Kept())
+    assert "going on with the search that was interrupted: features of 12 photographs" in second.lines
+    # 1, 2, 3 and 4 places on
+    assert "38 of 66 pairs of photographs are compared: 38 next to each other by name" in second.lines
+    with pytest.raises(KeyboardInterrupt):
+        find_poses(replace(options, overwrite=True), Kept(interrupt_at="placing cameras"))
+    find_poses(replace(options, overwrite=True, feature_size=190), third := Kept())
+    assert "going on with the search that was interrupted: copies of photographs" in third.lines
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=["term", "kill"])
-def test_an_interrupted_command_leaves_no_capture_and_no_process(room: Room, tmp_path: Path, number: int) -> None:
-    """SIGTERM cleans up. SIGKILL cannot: its hidden folder goes with the next command, its worker with its stdin."""
+def test_an_interrupted_command_leaves_no_process_and_what_the_next_one_goes_on_with(
+    room: Room, tmp_path: Path, number: int
+) -> None:
+    """Its worker ends with its stdin."""
     words = [sys.executable, "-m", "gs2d", "poses", str(room.photos), "--out", str(tmp_path / "capture")]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     work = tmp_path / ".capture.poses"
@@ -231,16 +285,12 @@ def test_an_interrupted_command_leaves_no_capture_and_no_process(room: Room, tmp
     if number == signal.SIGTERM:
         assert process.returncode == 130
         assert error.splitlines()[-1] == "interrupted"
-        assert list(tmp_path.iterdir()) == []
-    else:
-        assert [path.name for path in tmp_path.iterdir()] == [".capture.poses"]
+    assert [path.name for path in tmp_path.iterdir()] == [".capture.poses"]
     while workers_of(work) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not workers_of(work)
-    if number == signal.SIGKILL:
-        with workspace(tmp_path / "capture"):
-            assert [path.name for path in work.iterdir()] == [".lock"]
-        assert not work.exists()
+    assert poses(room.photos, tmp_path / "capture", "--quiet") == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["capture"]
 
 
 def workers_of(work: Path) -> list[int]:

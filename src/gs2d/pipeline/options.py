@@ -128,7 +128,8 @@ class Finding:
     overlap: int = 10
     """Next photographs (by the time in EXIF, else by name) that each is matched with, where not all pairs are."""
     neighbours: int = 40
-    """Others that each is matched with, where not all pairs are: similar ones; spatial: half of them near ones."""
+    """Similar photographs that each is matched with, where not all pairs are; spatial: half as many near ones, and a
+    quarter as many similar ones."""
     positions: Annotated[Path | None, arg(metavar="FILE")] = None
     """Where photographs were taken, to choose pairs by: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's
     geo.txt (default: GPS in their EXIF or XMP)."""

@@ -6,28 +6,32 @@ The finished capture is read back by the loader that training uses before it get
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import os
+import shutil
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from gs2d.core.images import natural_key
 from gs2d.core.json_files import write_json
 from gs2d.data import load_scene
 from gs2d.errors import DataError, RunError
-from gs2d.io.run_dir import make_folder, now, remove_made
+from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Plan, Step, counted, ignore
 from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.photo_places import Places, places_of
 from gs2d.pipeline.plan import PLACED
-from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, read_facts, solve
+from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, in_order_taken, read_photos
 from gs2d.sfm.lens import START, lens_line
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
 from gs2d.sfm.plot import write_image_of
+from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
 from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
 from gs2d.sfm.workspace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workspace
 
@@ -65,39 +69,94 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     threads = options.threads or _cores()
     made = make_folder(out.parent)
     try:
-        with workspace(out) as work:
+        with workspace(out) as work, _kept(work, on_event):
             check_out(options.out, options.photos, overwrite=options.overwrite)  # a killed command's capture is back
+            made_of = _made_of(options, paths)
             root = work / FRAMES if video else options.photos
-            paths = _frames_of(video, root, options.frames, on_event) if video else paths
+            paths = _frames_of(video, work, options.frames, made_of, on_event) if video else paths
             reading = read_photos(paths, root, threads=threads)
             photos = list(counted(reading, "reading photographs", len(paths), on_event))
-            places = places_of(photos, options.positions)
-            for note in places.notes:
-                on_event(Notice(note))
-            sizes = [photo.size_within(options.max_size) for photo in photos]
-            groups = camera_groups(photos, sizes, options.cameras)
-            capture = work / "capture"
-            staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
-            request = _request(options, work, photos, places, sizes, groups, threads)
+            request = _request(options, work, photos, threads, on_event)
+            if line := go_on(work, {"photographs": made_of, **layers(request)}, ours=("capture",)):
+                on_event(Notice(line))
+            staged = _stage(photos, work / "capture" / IMAGES, options, threads, on_event, ours=video is not None)
             solved = solve(request, _progress(on_event), lambda line: on_event(Notice(line)))
-            pieces = [read_model(capture / SPARSE / str(i), done) for i, done in enumerate(solved.models)]
-            facts = read_facts(Path(request.database))
-            check_any(pieces, facts, options.photos)
-            result = _result(options, request, photos, staged, pieces, facts, solved)
-            result["seconds"] = round(time.monotonic() - started, 1)
-            on_event(Phase("checking the capture", 0))
-            with attempted(POSES_PNG, "", on_event):
-                write_image_of(capture / POSES_PNG, pieces[0], _title(result))
-            write_json(capture / POSES_JSON, result)
-            load_scene(capture, format="colmap")
+            try:
+                result = _finish(options, request, photos, staged, solved, started, on_event)
+            except DataError:
+                forget(work)  # it would end so again
+                raise
             check_out(options.out, options.photos, overwrite=options.overwrite)  # hours later it may hold something
-            put_in_place(capture, out, work)
+            put_in_place(work / "capture", out, work)
+            forget(work)
     except BaseException:
         remove_made(made)
         raise
     for line in filter(None, (result["lens"]["about"], *_doubts(result))):
         on_event(Notice(line))
     return {"capture": str(options.out), **result}
+
+
+@contextlib.contextmanager
+def _kept(work: Path, on_event: OnEvent) -> Iterator[None]:
+    """Say that what was found is kept, where a search ends before it is done."""
+    try:
+        yield
+    except BaseException:
+        if (work / SEARCH).exists():
+            on_event(Notice(f"what was found is kept in {work}: the same command goes on; remove it to begin anew"))
+        raise
+
+
+def _made_of(options: PosesOptions, paths: Sequence[Path]) -> dict[str, Any]:
+    """Return what the copies of the photographs are made of: files, programs, and options."""
+    return {
+        "versions": {**versions(), "pycolmap": importlib.metadata.version("pycolmap")},
+        "photos": str(options.photos.resolve()),
+        "files": [_stamp(path) for path in paths or [options.photos]],
+        "max_size": options.max_size,
+        "link": options.link,
+        "frames": None if paths else options.frames,
+    }
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    """Return a file's name, bytes and time; one that is gone is told of when it is read."""
+    try:
+        told = path.stat()
+    except OSError:
+        return str(path), 0, 0
+    return str(path), told.st_size, told.st_mtime_ns
+
+
+def _finish(
+    options: PosesOptions,
+    request: Request,
+    photos: Sequence[Photo],
+    staged: Sequence[str],
+    solved: Solved,
+    started: float,
+    on_event: OnEvent,
+) -> dict[str, Any]:
+    """Write what the capture needs beside the models, and look at it as training does; what ``poses.json`` holds.
+
+    Raises
+    ------
+    DataError
+        No photograph found a place.
+    """
+    capture = Path(request.images).parent
+    pieces = [read_model(capture / SPARSE / str(i), done) for i, done in enumerate(solved.models)]
+    facts = read_facts(Path(request.database))
+    check_any(pieces, facts, options.photos)
+    result = _result(options, request, photos, staged, pieces, facts, solved)
+    result["seconds"] = round(time.monotonic() - started, 1)
+    on_event(Phase("checking the capture", 0))
+    with attempted(POSES_PNG, "", on_event):
+        write_image_of(capture / POSES_PNG, pieces[0], _title(result))
+    write_json(capture / POSES_JSON, result)
+    load_scene(capture, format="colmap")
+    return result
 
 
 def _folder_of(photos: Path, on_event: OnEvent) -> list[Path]:
@@ -108,14 +167,18 @@ def _folder_of(photos: Path, on_event: OnEvent) -> list[Path]:
     return paths
 
 
-def _frames_of(video: Video, folder: Path, count: int, on_event: OnEvent) -> list[Path]:
-    """Frames of a video as photographs in a folder of their own.
+def _frames_of(video: Video, work: Path, count: int, made_of: dict[str, Any], on_event: OnEvent) -> list[Path]:
+    """Frames of a video as photographs in a folder of their own; those of a search that was interrupted will do.
 
     Raises
     ------
     DataError
         It does not decode, or has too few frames.
     """
+    folder = work / FRAMES
+    if is_of(work, "photographs", made_of) and folder.is_dir():
+        return sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
+    shutil.rmtree(folder, ignore_errors=True)
     if video.hdr is not None:
         on_event(Notice(f"{video.path} is an HDR video ({video.hdr}): colours are taken as they are, a little flat"))
     looking = sharpness_of(video)
@@ -175,19 +238,22 @@ def _stage(
     return staged
 
 
-def _request(
-    options: PosesOptions,
-    work: Path,
-    photos: Sequence[Photo],
-    places: Places,
-    sizes: Sequence[tuple[int, int]],
-    groups: Sequence[Sequence[int]],
-    threads: int,
-) -> Request:
+def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads: int, on_event: OnEvent) -> Request:
+    """Return what COLMAP is asked to do.
+
+    Raises
+    ------
+    DataError
+    """
+    places = places_of(photos, options.positions)
+    for note in places.notes:
+        on_event(Notice(note))
+    sizes = [photo.size_within(options.max_size) for photo in photos]
+    groups = camera_groups(photos, sizes, options.cameras)
     order, ordered_by = in_order_taken(photos)
     return Request(
         images=str(work / "capture" / IMAGES),
-        database=str(work / "database.db"),
+        database=str(work / DATABASE),
         output=str(work / "capture" / SPARSE),
         groups=tuple(
             Group(

@@ -69,7 +69,7 @@ class Request:
         Metres, of each name in ``in_order``; None: nobody knows.
     matching : "exhaustive", "sequential", "similar" or "spatial"
     overlap, neighbours : int
-        Next photographs, and others (similar or near), that each is matched with where not all pairs are.
+        Next photographs, and similar ones, that each is matched with where not all pairs are; fewer near ones do.
     feature_size : int
         Longer side on which features are found, px.
     asked_lens : str or None
@@ -90,6 +90,17 @@ class Request:
     threads: int
     seed: int
     asked_lens: str | None = None
+
+
+def layers(request: Request) -> dict[str, Any]:
+    """Return what features, pairs and mapping are made of, for :func:`gs2d.sfm.search.go_on`."""
+    told = asdict(request)
+    pairs = ("in_order", "ordered_by", "places", "matching", "overlap", "neighbours")
+    return {
+        "features": {name: told[name] for name in ("groups", "feature_size", "seed")},
+        "pairs": {name: told[name] for name in pairs},
+        "mapping": {name: told[name] for name in ("asked_lens",)},
+    }
 
 
 def check_installed() -> None:
@@ -184,9 +195,11 @@ def _follow(
             on_note(message["note"])
         if "phase" in message:
             phase, total = message["phase"], message["total"]
-            before = _rows(database, _COUNTED[phase]) if phase == "again" else 0  # those of the first time
-            on_progress(_PHASES[phase], 0, total)
-        if "done" in message:
+            before = 0
+            if phase == "again":  # those of the first time do not count
+                before = _rows(database, _COUNTED[phase]) - message.get("done", 0)
+            on_progress(_PHASES[phase], message.get("done", 0), total)
+        elif "done" in message:
             on_progress(_PHASES[phase], message["done"], total)
 
 

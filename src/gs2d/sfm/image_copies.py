@@ -25,6 +25,8 @@ def copy_images(
 ) -> Generator[str, None, None]:
     """Put the photographs into ``folder``; yields for each what was done: "copied", "linked", "turned", "resized".
 
+    What is there already, of a search that was interrupted, is not written again.
+
     Parameters
     ----------
     max_size : int or None
@@ -50,23 +52,30 @@ def _stage(photo: Photo, target: Path, max_size: int | None, link: bool) -> str:
     if size == photo.size and photo.orientation == 1 and not photo.is_converted:
         if link:
             with contextlib.suppress(OSError):
-                os.link(photo.source.resolve(), target)
-                return "linked"
-        return _copy(photo.source, target)
-    return _rewrite(photo, target, size)
+                if not target.exists():
+                    os.link(photo.source.resolve(), target)
+                if os.path.samefile(photo.source, target):
+                    return "linked"
+        if not target.exists():
+            _copy(photo.source, target)
+        return "copied"
+    if not target.exists():
+        _rewrite(photo, target, size)
+    if size != photo.size:
+        return "resized"
+    return "turned" if photo.orientation != 1 else "converted"
 
 
-def _copy(source: Path, target: Path) -> str:
+def _copy(source: Path, target: Path) -> None:
     try:
         file = open(source, "rb")  # noqa: SIM115 - closed below; its errors are not the target's
     except OSError as error:
         raise DataError(f"cannot read {source}: {error.strerror or error}") from error
     with file, atomic_write(target) as copy:
         shutil.copyfileobj(file, copy, 1 << 20)
-    return "copied"
 
 
-def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> str:
+def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> None:
     """Write a picture again: upright, of ``size``, in its own format or as PNG; EXIF stays, but for the orientation."""
     image = turn(Image.fromarray(read_image(photo.source)), photo.orientation)
     if image.size != size:
@@ -78,9 +87,6 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> str:
             image.save(out, "JPEG", quality=QUALITY, subsampling=0, **kept)
         else:
             image.save(out, "PNG", **kept)
-    if size != photo.size:
-        return "resized"
-    return "turned" if photo.orientation != 1 else "converted"
 
 
 def _kept(source: Path) -> dict[str, bytes]:

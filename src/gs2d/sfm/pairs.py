@@ -77,7 +77,7 @@ def near_pairs(places: Sequence[Sequence[float] | None], neighbours: int) -> set
 
 
 def similar_pairs(
-    read: Callable[[int], np.ndarray], count: int, *, neighbours: int, seed: int = 0
+    read: Callable[[int], np.ndarray], count: int, *, neighbours: int | Sequence[int], seed: int = 0
 ) -> set[tuple[int, int]]:
     """Pairs (i < j) of each photograph with those that look most like it.
 
@@ -89,9 +89,10 @@ def similar_pairs(
     ----------
     read : function of a number
         The descriptors [M, 128] of a photograph; called twice for each.
-    neighbours : int
-        Most similar photographs that each is paired with.
+    neighbours : int, or a sequence of int
+        Most similar photographs that each is paired with, or that of each.
     """
+    each_of = [neighbours] * count if isinstance(neighbours, int) else neighbours
     rng = np.random.default_rng(seed)
     each = max(1, _SAMPLES // max(count, 1))
     chosen = [_sample(read(i), each, rng) for i in range(count)]
@@ -100,7 +101,7 @@ def similar_pairs(
         return set()
     words = _cluster(samples, rng)
     vectors = np.stack([_vlad(read(i).astype(np.float32), words) for i in range(count)])
-    return _nearest((vectors[i : i + 256] @ vectors.T for i in range(0, count, 256)), neighbours)
+    return _nearest((vectors[i : i + 256] @ vectors.T for i in range(0, count, 256)), each_of)
 
 
 def _sample(descriptors: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
@@ -135,13 +136,13 @@ def _vlad(descriptors: np.ndarray, words: np.ndarray) -> np.ndarray:
     return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-12))
 
 
-def _nearest(blocks: Iterable[np.ndarray], neighbours: int) -> set[tuple[int, int]]:
+def _nearest(blocks: Iterable[np.ndarray], neighbours: Sequence[int]) -> set[tuple[int, int]]:
     pairs = set()
     row = 0
     for block in blocks:
         for similarity in block:
             order = np.argsort(-similarity, kind="stable")
-            best = [int(j) for j in order if j != row][:neighbours]
+            best = [int(j) for j in order[: neighbours[row] + 1] if j != row][: neighbours[row]]
             pairs |= {(min(row, j), max(row, j)) for j in best}
             row += 1
     return pairs

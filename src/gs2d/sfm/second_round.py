@@ -47,27 +47,35 @@ def partners(
     return pairs
 
 
-def match_again(
-    pycolmap: Any, request: Mapping[str, Any], pairs: Sequence[tuple[str, str]], cameras: Any, begin: Callable[[], None]
-) -> None:
-    """Compare pairs once more: looser, guided by the motion that is found, with the cameras that are known now.
-
-    ``begin`` is called when what was known of the pairs is gone and the comparing begins.
-    """
-    path = request["database"]
-    database = pycolmap.Database.open(path)
+def forget(pycolmap: Any, request: Mapping[str, Any], pairs: Sequence[tuple[str, str]], cameras: Any) -> None:
+    """Remove what is known of pairs from the database, and tell it the cameras that are known now."""
+    database = pycolmap.Database.open(request["database"])
     try:
         for camera in cameras.values():
-            known = copy.copy(camera)
-            known.has_prior_focal_length = True
-            database.update_camera(known)
+            better = copy.copy(camera)
+            better.has_prior_focal_length = True
+            database.update_camera(better)
         ids = {image.name: image.image_id for image in database.read_all_images()}
         for first, second in pairs:
             database.delete_matches(ids[first], ids[second])
             database.delete_two_view_geometry(ids[first], ids[second])
     finally:
         database.close()
-    begin()
+
+
+def known(pycolmap: Any, request: Mapping[str, Any], pairs: Sequence[tuple[str, str]]) -> int:
+    """How many of the pairs have been compared again: by a search that was ended meanwhile."""
+    database = pycolmap.Database.open(request["database"])
+    try:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        return sum(database.exists_two_view_geometry(ids[first], ids[second]) for first, second in pairs)
+    finally:
+        database.close()
+
+
+def match_again(pycolmap: Any, request: Mapping[str, Any], pairs: Sequence[tuple[str, str]]) -> None:
+    """Compare pairs once more: looser, guided by the motion that is found, with the cameras that are known now."""
+    path = request["database"]
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = request["threads"]
     matching.guided_matching = True

@@ -1,7 +1,8 @@
 """Where a capture is made before it has its name: it appears as a whole or not at all.
 
-All work is done in the hidden folder ``.NAME.poses`` beside the capture: copies, COLMAP's database, models. A command
-that fails or is interrupted removes it; what a killed one leaves is removed by the next one with the same ``--out``.
+All work is done in the hidden folder ``.NAME.poses`` beside the capture: copies, COLMAP's database, models. What an
+interrupted or killed command leaves there is gone on with by the next one with the same ``--out`` (``search``), or
+removed where nothing says of what it was made.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from gs2d.core.files import disk_error
 from gs2d.errors import RunError
 from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_made
+from gs2d.sfm.search import SEARCH
 
 IMAGES, SPARSE, POSES_JSON, POSES_PNG = "images", "sparse", "poses.json", "poses.png"
 OLD = "old"  # an earlier capture, until the new one has its name
@@ -64,7 +66,9 @@ def hidden_workspace(out: Path) -> Path:
 
 @contextlib.contextmanager
 def workspace(out: Path) -> Iterator[Path]:
-    """Hold a hidden folder beside the capture, empty, against other processes; remove it at the end.
+    """Hold a hidden folder beside the capture against other processes; remove it at the end, but for a search.
+
+    It is empty, or has what a search that was interrupted left; ``search.forget`` ends one.
 
     Raises
     ------
@@ -81,13 +85,19 @@ def workspace(out: Path) -> Iterator[Path]:
         try:
             if (work / OLD).exists() and not out.exists():  # killed between two renames
                 os.rename(work / OLD, out)
-            for entry in work.iterdir():
-                if entry.name != LOCK:
-                    shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            if not (work / SEARCH).exists():
+                _empty(work)
             yield work
         finally:
-            shutil.rmtree(work, ignore_errors=True)
+            if not (work / SEARCH).exists():
+                shutil.rmtree(work, ignore_errors=True)
     remove_made(made)  # where an open lock cannot be deleted
+
+
+def _empty(work: Path) -> None:
+    for entry in work.iterdir():
+        if entry.name != LOCK:
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
 
 def put_in_place(capture: Path, out: Path, work: Path) -> None:

@@ -1,0 +1,166 @@
+"""Features of photographs, and what they match: the steps before cameras, each of which goes on where it was ended.
+
+COLMAP writes each photograph and each pair in a transaction of its own, and leaves out what is there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.core.files import atomic_write
+from gs2d.sfm.pairs import Chosen, chosen, near_pairs, neighbour_pairs, similar_pairs
+
+Say = Callable[..., None]
+ALIKE = "alike.json"  # beside the database: which photographs look alike
+LESS_NEXT, LESS_ALIKE = 3, 4  # times fewer next and similar ones where near ones are known (docs/decisions/sfm.md)
+
+
+def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
+    """SIFT features of all photographs into the database; each group of photographs shares a camera.
+
+    The photographs are listed before, so that their numbers do not depend on which thread is first.
+    """
+    say(phase="features", total=len(request["in_order"]))
+    database, images = request["database"], request["images"]
+    if _listed(database) != len(request["in_order"]):  # ended before all of them were: their cameras would be several
+        _list(pycolmap, request)
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = request["threads"]
+    options.max_image_size = request["feature_size"]
+    mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
+    names = [name for group in request["groups"] for name in group["names"]]
+    pycolmap.extract_features(database, images, names, mode, reader, options, pycolmap.Device.cpu)
+
+
+def _listed(database: str) -> int:
+    """How many photographs the database has."""
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(database, timeout=60.0)) as connection:
+        return int(connection.execute("SELECT COUNT(*) FROM images").fetchone()[0])
+    return 0
+
+
+def _list(pycolmap: Any, request: dict[str, Any]) -> None:
+    """Write photographs and cameras into a new database."""
+    for path in Path(request["database"]).parent.glob(f"{Path(request['database']).name}*"):
+        path.unlink()
+    pycolmap.Database.open(request["database"]).close()
+    for group in request["groups"]:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = group["camera_model"]
+        reader.camera_params = _prior(pycolmap, group)
+        mode = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(request["database"], request["images"], mode, group["names"], reader)
+
+
+def _prior(pycolmap: Any, group: dict[str, Any]) -> str:
+    """Camera parameters from the EXIF block of the group's first original; empty without a focal length in it.
+
+    Of the original, because COLMAP takes some of the tags as pixels, which a smaller copy has fewer of.
+    """
+    try:
+        original = pycolmap.infer_camera_from_image(group["original"])
+    except (RuntimeError, ValueError):  # a format that COLMAP does not read; the copy is one that it does
+        return ""
+    if not original.has_prior_focal_length:
+        return ""
+    width, height = group["size"]
+    f = original.mean_focal_length() * max(width, height) / max(original.width, original.height)
+    camera = pycolmap.Camera.create_from_model_name(1, group["camera_model"], f, width, height)
+    return ", ".join(repr(float(value)) for value in camera.params)
+
+
+def match(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
+    """Compare photographs and verify what matches by a fundamental or essential matrix."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = request["threads"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = request["seed"]
+    database, cpu = request["database"], pycolmap.Device.cpu
+    names = request["in_order"]
+    if request["matching"] == "exhaustive":
+        say(phase="matching", total=len(names) * (len(names) - 1) // 2)
+        pairing = pycolmap.ExhaustivePairingOptions()
+        pycolmap.match_exhaustive(database, matching, pairing, verification, cpu)
+        return
+    pairs = _pairs(pycolmap, request, say)
+    say(phase="matching", total=len(pairs), note=pairs.line(len(names)))
+    listed = Path(database).with_name("pairs.txt")
+    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.pairs), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(listed)
+    pycolmap.match_image_pairs(database, matching, pairing, verification, cpu)
+
+
+def _pairs(pycolmap: Any, request: dict[str, Any], say: Say) -> Chosen:
+    """Which pairs to compare, where not all are: next ones, those near in space, and those that look alike."""
+    matching, count = request["matching"], len(request["in_order"])
+    next_to = f"next to each other by {request['ordered_by']}"
+    following = neighbour_pairs(count, request["overlap"])
+    reasons = {next_to: following}
+    if matching == "spatial":
+        reasons = {"near in space": near_pairs(request["places"], request["neighbours"] // 2)}
+        lost = {i for i, place in enumerate(request["places"]) if place is None}
+        few = request["overlap"] // LESS_NEXT
+        reasons[next_to] = {(i, j) for i, j in following if j - i <= few or lost & {i, j}}
+    if matching != "sequential":
+        say(phase="comparing", total=2 * count)
+        reasons["that look alike"] = _similar(pycolmap, request, say)
+    return chosen(reasons)
+
+
+def _alike(request: dict[str, Any]) -> list[int]:
+    """How many that look alike each photograph is compared with: fewer where near ones are known."""
+    many = int(request["neighbours"])
+    if request["matching"] != "spatial":
+        return [many] * len(request["in_order"])
+    return [many if place is None else many // LESS_ALIKE for place in request["places"]]
+
+
+def _similar(pycolmap: Any, request: dict[str, Any], say: Say) -> set[tuple[int, int]]:
+    """Pairs that look alike; kept, because a second round asks again."""
+    kept = Path(request["database"]).with_name(ALIKE)
+    if kept.exists():
+        return {(i, j) for i, j in json.loads(kept.read_text(encoding="utf-8"))}
+    database = pycolmap.Database.open(request["database"])
+    try:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        names, done = request["in_order"], itertools.count(1)
+
+        def read(i: int) -> np.ndarray:
+            say(done=next(done))
+            return np.asarray(database.read_descriptors(ids[names[i]]).data).reshape(-1, 128)
+
+        pairs = similar_pairs(read, len(names), neighbours=_alike(request), seed=request["seed"])
+    finally:
+        database.close()
+    with atomic_write(kept, "w") as file:
+        json.dump(sorted(pairs), file)
+    return pairs
+
+
+def likeness(pycolmap: Any, request: dict[str, Any]) -> Callable[[str, str], float]:
+    """How much two photographs share: verified matches, and where they were not compared, how alike they look."""
+    names = request["in_order"]
+    near: set[frozenset[str]] = set()
+    if request["matching"] != "exhaustive":
+        alike = _similar(pycolmap, request, lambda **_: None)
+        near = {frozenset((names[i], names[j])) for i, j in alike}
+    database = pycolmap.Database.open(request["database"])
+    try:
+        name = {image.image_id: image.name for image in database.read_all_images()}
+        pairs, counts = database.read_two_view_geometry_num_inliers()
+        shared = {
+            frozenset(name[i] for i in pycolmap.pair_id_to_image_pair(pair)): float(count)
+            for pair, count in zip(pairs, counts, strict=True)
+        }
+    finally:
+        database.close()
+    return lambda a, b: shared.get(frozenset((a, b)), 0.0) + 0.5 * (frozenset((a, b)) in near)
