@@ -33,6 +33,7 @@ SAID_OTHERWISE = {
     "--cache": "the default differs",
     "--set": "of one recipe, or of all that have the stage",
     "--subject-box": "at first, or from now on",
+    "--positions": "to choose pairs by, or to place the run by",
     "--bbox": "of a mesh's volume, or of splats by their centres",
 }
 

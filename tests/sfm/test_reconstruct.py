@@ -239,13 +239,19 @@ def interrupt(words: list[str], until: str) -> str:
     return said
 
 
-def test_ctrl_c_among_the_cameras_leaves_nothing_and_names_the_command(room: Room, tmp_path: Path) -> None:
+def test_ctrl_c_among_the_cameras_keeps_what_was_found_and_names_the_command(room: Room, tmp_path: Path) -> None:
     out = tmp_path / "run"
     said = interrupt(words_for(room.photos, out), "finding features")
     line = said.splitlines()[-1]
-    assert line.startswith("interrupted; nothing was kept, as no camera was found; resume with: gs2d reconstruct ")
+    assert line.startswith("interrupted; what was found of the cameras is kept; resume with: gs2d reconstruct ")
     assert said.splitlines()[-1].endswith(" --resume")
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in out.iterdir()] == [".capture.poses"]
+    heard: list[Event] = []
+    options = ReconstructOptions(photos=room.photos, out=out, resume=True, training=TRAINING, **SMALL)  # type: ignore[arg-type]
+    reconstruct(options, heard.append)
+    lines = [event.text for event in heard if isinstance(event, Notice)]
+    assert any(line.startswith("going on with the search that was interrupted: features of ") for line in lines)
+    assert not (out / ".capture.poses").exists()
 
 
 def test_ctrl_c_in_training_keeps_the_cameras(room: Room, tmp_path: Path) -> None:

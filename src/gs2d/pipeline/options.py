@@ -133,6 +133,8 @@ class Finding:
     positions: Annotated[Path | None, arg(metavar="FILE")] = None
     """Where photographs were taken, to choose pairs by: CSV (name,lat,lon,height or name,x,y,z) or OpenDroneMap's
     geo.txt (default: GPS in their EXIF or XMP)."""
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    """How cameras are placed: one after the other, or all at once, which is faster for many (auto: from 500 on)."""
     max_size: int | None = None
     """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
     feature_size: int = 1600

@@ -37,10 +37,12 @@ from gs2d.sfm.workspace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out,
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
+MAPPERS = ("auto", "incremental", "global")
+MANY = 500  # photographs, from which on "auto" places all at once (docs/decisions/sfm.md)
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
     *("cameras", "camera_model", "matching", "overlap", "neighbours", "positions"),
-    *("max_size", "feature_size", "frames", "seed"),
+    *("mapper", "max_size", "feature_size", "frames", "seed"),
 )
 _MOST = 0.5  # of the photographs: so many have a place where "auto" goes by places
 _GROWTH = {"placing cameras": 1.5}  # each is adjusted with those that have a place, but not with all of them every time
@@ -199,6 +201,7 @@ def check_poses_options(options: PosesOptions) -> None:
         ("cameras", ("auto", "one", "each")),
         ("camera_model", ("auto", *CAMERA_MODELS)),
         ("matching", MATCHINGS),
+        ("mapper", MAPPERS),
     ):
         got = getattr(options, name)
         if got not in allowed:
@@ -268,6 +271,7 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
         ordered_by=ordered_by,
         places=tuple(places.metres[i] for i in order),
         matching=_matching(options, len(photos), places),
+        mapper=_mapper(options, len(photos)),
         overlap=options.overlap,
         neighbours=options.neighbours,
         feature_size=options.feature_size,
@@ -295,6 +299,12 @@ def _matching(options: PosesOptions, count: int, places: Places) -> str:
     if count <= ALL_PAIRS:
         return "exhaustive"
     return "spatial" if places.known >= _MOST * count else "similar"
+
+
+def _mapper(options: PosesOptions, count: int) -> str:
+    if options.mapper != "auto":
+        return options.mapper
+    return "global" if count >= MANY else "incremental"
 
 
 def asked_for(options: PosesOptions) -> dict[str, Any]:
@@ -362,6 +372,7 @@ def _result(
         "asked": asked_for(options),
         "options": {
             "matching": request.matching,
+            "mapper": request.mapper,
             "pairs_matched": len(facts.matches),
             "overlap": options.overlap,
             "neighbours": options.neighbours,

@@ -70,6 +70,7 @@ class Request:
     matching : "exhaustive", "sequential", "similar" or "spatial"
     overlap, neighbours : int
         Next photographs, and similar ones, that each is matched with where not all pairs are; fewer near ones do.
+    mapper : "incremental" or "global"
     feature_size : int
         Longer side on which features are found, px.
     asked_lens : str or None
@@ -86,6 +87,7 @@ class Request:
     matching: str
     overlap: int
     neighbours: int
+    mapper: str
     feature_size: int
     threads: int
     seed: int
@@ -99,7 +101,7 @@ def layers(request: Request) -> dict[str, Any]:
     return {
         "features": {name: told[name] for name in ("groups", "feature_size", "seed")},
         "pairs": {name: told[name] for name in pairs},
-        "mapping": {name: told[name] for name in ("asked_lens",)},
+        "mapping": {name: told[name] for name in ("asked_lens", "mapper")},
     }
 
 

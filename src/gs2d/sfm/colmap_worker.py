@@ -25,6 +25,7 @@ from gs2d.sfm import second_round as second
 from gs2d.sfm.compare import find_features, likeness, match
 from gs2d.sfm.grow import grow_all, grow_on
 from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
+from gs2d.sfm.place_all import place_all
 from gs2d.sfm.search import MAPPING
 from gs2d.sfm.steps import Steps
 from gs2d.sfm.upright import up_direction
@@ -111,7 +112,10 @@ def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say)
         say(done=min(placed, total))
 
     options, often = _options(pycolmap, request), total > REPEATABLE
-    grow_all(pycolmap, request["database"], options, steps, "grown", count, often=often)
+    if request["mapper"] == "global":
+        place_all(pycolmap, request, steps, "grown", threads=_threads(request))
+    else:
+        grow_all(pycolmap, request["database"], options, steps, "grown", count, often=often)
     grown = [f"grown-{i}" for i in itertools.takewhile(lambda i: steps.has(f"grown-{i}"), itertools.count())]
     sizes = {}
     for name in grown:
