@@ -225,7 +225,7 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
         trained = any((command.out / "checkpoints").glob("*.pt"))
         found = isinstance(command, Reconstruct) and (command.out / "capture").exists()
         if trained or isinstance(command, Reconstruct):  # which starts where there is nothing yet
-            kept = "the cameras are kept; " if found else _search(command.out / "capture")
+            kept = "the cameras are kept; " if found else _search(command)
             line += f"; {'' if trained else kept}resume with: {_resumed(argv)}"
         else:
             line += "; nothing was kept, because training had not begun"
@@ -235,11 +235,11 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
     return INTERRUPTED
 
 
-def _search(capture: Path) -> str:
+def _search(command: Reconstruct) -> str:
     """Return what a search for cameras that was interrupted leaves, in words."""
     from gs2d.sfm.search import SEARCH
     from gs2d.sfm.workspace import hidden_workspace
 
-    if (hidden_workspace(capture) / SEARCH).exists():
+    if (hidden_workspace(command.out / "capture") / SEARCH).exists():
         return "what was found of the cameras is kept; "
     return "nothing was kept, as no camera was found; "
