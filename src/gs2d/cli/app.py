@@ -235,7 +235,7 @@ def _interrupted(argv: Sequence[str], command: Common) -> int:
     return INTERRUPTED
 
 
-def _search(command: Reconstruct) -> str:
+def _search(command: Train | Demo | Reconstruct) -> str:
     """Return what a search for cameras that was interrupted leaves, in words."""
     from gs2d.sfm.search import SEARCH
     from gs2d.sfm.workspace import hidden_workspace
