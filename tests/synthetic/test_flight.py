@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from benchmarks.flown_capture import main
 
+from gs2d.core.exif import read_place
 from gs2d.core.images import read_image
 from gs2d.data import load_scene
 from gs2d.data.readers.colmap import read_images, read_points
 from gs2d.errors import DataError
-from gs2d.geo.positions import exif_position
 from gs2d.geo.projection import to_enu
 from gs2d.io.meshes import read_mesh
 from gs2d.meshing.raycast import cast_camera
@@ -66,7 +66,7 @@ def test_sparse_points_lie_where_the_true_surface_is_and_are_seen_where_they_pro
 def test_photographs_say_in_their_exif_where_they_were_taken(capture: Path) -> None:
     origin = np.array([FLIGHT.latitude, FLIGHT.longitude, FLIGHT.altitude])
     for k, camera in enumerate(flown_cameras(FLIGHT)):
-        position = exif_position(capture / "images" / f"{k:06d}.jpg")
+        position = read_place(capture / "images" / f"{k:06d}.jpg")
         assert position is not None
         np.testing.assert_allclose(to_enu(position[None], origin)[0], camera.center, atol=0.02)
 
