@@ -102,6 +102,14 @@ def test_the_bytes_of_a_flown_capture_do_not_depend_on_the_threads(capture: Path
     assert len(digests(capture)) == 10 + 3 + 1
 
 
+def test_the_same_land_may_be_flown_over_with_any_number_of_photographs() -> None:
+    for count in (60, 960):
+        places = np.array([camera.center for camera in flown_cameras(Flight(count, side=300.0))])
+        assert np.ptp(places[:, :2], axis=0) == pytest.approx([270, 270], rel=0.15)
+    grown = [np.ptp([c.center[0] for c in flown_cameras(Flight(count))]) for count in (60, 960)]
+    assert grown[1] / grown[0] == pytest.approx(4, rel=0.15)
+
+
 def test_too_few_photographs_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(DataError, match="at least 2 photographs of 16 px, got 1 of 64x48"):
         write_flight(tmp_path / "one", Flight(1, width=64, height=48))

@@ -17,6 +17,7 @@ from gs2d.pipeline.options import (
     MeshOptions,
     OrthophotoOptions,
     Overrides,
+    PlanOptions,
     PosesOptions,
     ReconstructOptions,
     TextureOptions,
@@ -24,6 +25,7 @@ from gs2d.pipeline.options import (
     ViewOptions,
 )
 
+MemoryOption = Annotated[float | None, arg(metavar="GIB")]
 RunPath = Annotated[Positional[Path], arg(metavar="RUN")]
 
 
@@ -55,6 +57,11 @@ class Poses(PosesOptions, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Plan(PlanOptions, Common):
+    """Say what training on a capture takes: splats, memory, disk and hours on this machine, by trying for seconds."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Train(TrainOptions, Common):
     """Posed photographs to splats, mesh and report."""
 
@@ -74,6 +81,8 @@ class Mesh(TextureOptions, MeshOptions, Common):
     change the mesh it is the run's mesh.ply."""
     georeferenced: bool = False
     """In metres of the world (`gs2d georeference`), less an offset that is said in the file and beside it."""
+    memory: MemoryOption = None
+    """GiB of memory to keep to (default: half of what this machine or container has)."""
     threads: int | None = None
     """CPU threads."""
 
@@ -101,6 +110,8 @@ class Render(Common):
     """Of a run with --exposure: in the exposure of this training photograph (default: in the mean of all)."""
     splats: Annotated[Path | None, arg(metavar="FILE")] = None
     """Take the splats of this file, of any format that is read, in the frame of the run; needs --out."""
+    memory: MemoryOption = None
+    """GiB of memory to keep to (default: half of what this machine or container has)."""
     threads: int | None = None
     """CPU threads."""
 
@@ -131,6 +142,8 @@ class Evaluate(EvaluateOptions, Common):
 
     run: RunPath
     """Run folder."""
+    memory: MemoryOption = None
+    """GiB of memory to keep to (default: half of what this machine or container has)."""
     threads: int | None = None
     """CPU threads."""
 
@@ -181,6 +194,8 @@ class Report(Common):
 
     run: RunPath
     """Run folder."""
+    memory: MemoryOption = None
+    """GiB of memory to keep to (default: half of what this machine or container has)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,13 +244,14 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Reconstruct, Poses, Train, Mesh, Render, View, Page, Evaluate, Export, Georeference, Orthophoto, Report,
-    Recipes, Paper, Sweep, Doctor, Info, Completion
+    Demo, Reconstruct, Poses, Plan, Train, Mesh, Render, View, Page, Evaluate, Export, Georeference, Orthophoto,
+    Report, Recipes, Paper, Sweep, Doctor, Info, Completion
 )  # fmt: skip
 Command = (
     Annotated[Demo, subcommand("demo")]
     | Annotated[Reconstruct, subcommand("reconstruct")]
     | Annotated[Poses, subcommand("poses")]
+    | Annotated[Plan, subcommand("plan")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Mesh, subcommand("mesh")]
     | Annotated[Render, subcommand("render")]

@@ -21,6 +21,7 @@ def execute(command: Common, console: Console) -> None:
         c.Demo: demo,
         c.Reconstruct: reconstruct,
         c.Poses: poses,
+        c.Plan: plan,
         c.Train: train,
         c.Mesh: mesh,
         c.Render: render,
@@ -39,9 +40,26 @@ def execute(command: Common, console: Console) -> None:
         c.Completion: completion,
     }
     try:
+        if isinstance(command, c.Mesh | c.Render | c.Evaluate | c.Report):  # who trains does so itself
+            from gs2d.pipeline.memory import use_memory
+
+            use_memory(command.memory)
         actions[type(command)](command, console)
     finally:
         console.close()
+
+
+def plan(command: c.Plan, console: Console) -> None:
+    """``gs2d plan``."""
+    from gs2d.pipeline.planned import command_of
+    from gs2d.pipeline.planned import plan as make_plan
+
+    found = make_plan(command, console.on_event)
+    console.close()
+    for line in found.lines():
+        console.say(line)
+    console.say(f"train so: {command_of(command, found)}")
+    console.result({**found.to_json(), "command": command_of(command, found)})
 
 
 def train(command: c.Train, console: Console) -> None:

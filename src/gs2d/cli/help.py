@@ -21,7 +21,7 @@ _FIRST_DAY = (
 )
 GROUPS: dict[str, tuple[str, ...]] = {
     "To begin with": ("doctor", "demo", "reconstruct", "view", "completion"),
-    "Step by step": ("poses", "train", "mesh"),
+    "Step by step": ("poses", "plan", "train", "mesh"),
     "Look, keep and share": ("info", "render", "page", "export", "report"),
     "Real-world coordinates": ("georeference", "orthophoto"),
     "Measure and compare": ("evaluate", "recipes", "sweep", "paper"),
@@ -35,6 +35,7 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
     "demo": ("out", "schedule_scale", "viewer", "resume", "overwrite"),
     "reconstruct": ("photos", "out", "quality", "texture", "viewer", "resume", "overwrite"),
     "poses": ("photos", "out", "frames", "camera_model", "max_size", "overwrite"),
+    "plan": ("scene", "recipe", "schedule_scale", "downscale", "memory", "disk"),
     "train": (
         "scene", "out", "recipe", "schedule_scale", "downscale", "exposure", "viewer", "resume", "overwrite"
     ),

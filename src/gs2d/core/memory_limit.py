@@ -11,9 +11,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["MemoryLimit", "cache_bytes", "memory_limit"]
+__all__ = ["MemoryLimit", "cache_bytes", "memory_budget", "memory_limit", "set_memory_budget"]
 
 CACHE_FRACTION = 0.2  # of what is left, that a cache may take: what the work itself needs must fit beside it
+BUDGET_FRACTION = 0.5  # of the limit in force, that a command takes if nobody says how much
 _UNLIMITED = 1 << 60  # cgroup v1 says 2^63 less a page where there is no limit
 
 
@@ -41,7 +42,9 @@ class MemoryLimit:
 
 
 def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
-    """Return the limit that leaves the least, of cgroup (v1 and v2), RLIMIT_AS and the machine; None: none is known.
+    """Return the limit that leaves the least, of cgroup (v1 and v2), RLIMIT_AS, the machine and the user.
+
+    None: none is known.
 
     Parameters
     ----------
@@ -53,7 +56,24 @@ def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
     address_space = _address_space()
     if address_space is not None:
         found.append(MemoryLimit(address_space, mapped, "the limit on address space, ulimit -v"))
+    found += [MemoryLimit(budget, resident, "--memory") for budget in _budget]
     return min(found, key=lambda limit: limit.room, default=None)
+
+
+_budget: list[int] = []  # of this process: what the user allows it, if anything
+
+
+def set_memory_budget(budget: int | None) -> None:
+    """Let this process have so many bytes, or (None) as many as the kernel, the container and the machine leave."""
+    _budget[:] = [] if budget is None else [budget]
+
+
+def memory_budget() -> int | None:
+    """Return the bytes that this process is to keep to: what was set, or half of the limit; None: none is known."""
+    if _budget:
+        return _budget[0]
+    limit = memory_limit()
+    return None if limit is None else int(BUDGET_FRACTION * limit.bytes)
 
 
 def cache_bytes(wanted: int) -> int:

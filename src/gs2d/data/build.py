@@ -253,7 +253,7 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
         skipped=capture.skipped,
         notes=capture.notes + _lens_notes(frames) + map_notes + place_notes + point_notes + bound_notes,
         root=root,
-        observe=capture.observe,
+        observe=None if capture.observe is None else functools.cache(capture.observe),  # asked for by view after view
     )
 
 

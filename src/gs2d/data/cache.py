@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,3 +114,32 @@ class ImageCache:
         if trims:
             trim()
         return image
+
+
+class ReadAhead:
+    """Fills caches with the pictures that will be asked for next, on threads of its own.
+
+    What goes wrong there is not told: whoever asks for the picture meets the same error.
+
+    Parameters
+    ----------
+    load : callable
+        Asks for the picture of an index.
+    threads : int
+    """
+
+    def __init__(self, load: Callable[[int], object], threads: int = 2) -> None:
+        self._load = load
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="read-ahead")
+        self._asked: set[int] = set()
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Ask for those of the indices that were not among the expected ones of the last time."""
+        for index in indices:
+            if index not in self._asked:
+                self._pool.submit(self._quietly, index)
+        self._asked = set(indices)
+
+    def _quietly(self, index: int) -> None:
+        with contextlib.suppress(Exception):
+            self._load(index)

@@ -224,6 +224,9 @@ class Scene:
         The folder it came from.
     observe : callable or None
         Reads which sparse points each photograph was found to show, where the capture says so.
+    ahead : int
+        Pictures that whoever goes through the views asks for before they are needed, because they come from the disk
+        each time (``gs2d.data.prepared``); 0: they are to stay in memory.
     """
 
     name: str
@@ -238,6 +241,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     root: Path | None = None
     observe: Callable[[], ObservedPoints] | None = None
+    ahead: int = 0
 
     def with_poses(self, poses: Mapping[str, np.ndarray]) -> Scene:
         """Return the scene with other training cameras: T_cam_world [4, 4] by the view's name. Images are shared."""

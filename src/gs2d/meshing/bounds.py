@@ -81,7 +81,7 @@ def sample_depths(item: DepthMap, count: int = 4096) -> DepthSample:
     """About ``count`` seen pixels of a depth map, evenly spread (no randomness)."""
     rows, columns = np.nonzero(item.depth > 0)
     pick = slice(None, None, max(1, len(rows) // count))
-    rows, columns = rows[pick], columns[pick]
+    rows, columns = rows[pick].copy(), columns[pick].copy()  # not a view that holds all of them
     depth = item.depth[rows, columns].astype(np.float64)
     camera = item.camera
     footprint = depth / np.sqrt(camera.fx * camera.fy)

@@ -18,6 +18,7 @@ from gs2d.meshing.sampling import UNSEEN, make_sampler
 
 NEIGHBOURS = 8  # views compared with each
 PERCENTILE = 75.0  # of the positive residuals
+_AT_ONCE = 64  # views whose distances from all others are in memory
 _ENOUGH = 100  # residuals, below which there is no estimate
 
 
@@ -40,10 +41,7 @@ def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits
     if not samples:
         return None
     edge = replace(limits, truncation=MAX_VOXELS_PER_TRUNCATION * limits.voxel)
-    centers = np.array([s.center for s in samples])
-    distance = np.linalg.norm(centers[:, None] - centers[None], axis=2)
-    np.fill_diagonal(distance, np.inf)
-    neighbours = np.argsort(distance, axis=1, kind="stable")[:, : min(NEIGHBOURS, len(samples) - 1)]
+    neighbours = _nearest(np.array([s.center for s in samples]))
     residuals: list[np.ndarray] = [np.zeros(0)]
     for j, item in enumerate(maps):
         view = make_sampler(item, edge)
@@ -56,3 +54,15 @@ def depth_noise(maps: Iterable[DepthMap], samples: Sequence[DepthSample], limits
     everything = np.concatenate(residuals)
     positive = everything[everything > 0]
     return float(np.percentile(positive, PERCENTILE)) if len(positive) >= _ENOUGH else None
+
+
+def _nearest(centers: np.ndarray) -> np.ndarray:
+    """Return the nearest others of each place [V, 3], some at a time: [V, NEIGHBOURS], fewer where there are fewer."""
+    count = min(NEIGHBOURS, len(centers) - 1)
+    found = np.empty((len(centers), count), np.int64)
+    for start in range(0, len(centers), _AT_ONCE):
+        rows = np.arange(start, min(start + _AT_ONCE, len(centers)))
+        distance = np.linalg.norm(centers[rows, None] - centers[None], axis=2)
+        distance[rows - start, rows] = np.inf
+        found[rows] = np.argsort(distance, axis=1, kind="stable")[:, :count]
+    return found

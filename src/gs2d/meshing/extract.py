@@ -9,15 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gs2d.core.mesh import Mesh
-from gs2d.meshing.bounds import FusionBounds, derive_limits, sample_depths, widen_truncation
+from gs2d.meshing.bounds import DepthSample, FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
 from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import Cleaned, clean
 from gs2d.meshing.marching_cubes import components, inside_box, keep_components
-from gs2d.meshing.slabs import fused_surface
+from gs2d.meshing.slabs import SLAB_BYTES, fused_surface
 from gs2d.meshing.tsdf import Volume, find_blocks, fusion_backend
 from gs2d.meshing.unbounded import FAR_VIEWS, cascade_marching_cubes, derive_cascade, fuse_cascade
 from gs2d.render.backends import Backend
+
+SAMPLES_A_MAP, FEWEST_SAMPLES = 4096, 16  # pixels of a depth map by which limits are derived
+SAMPLES = 1 << 19  # of all: 40 MB
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ def extract(
     folder: str | os.PathLike[str] | None = None,
     by_evidence: bool = False,
     with_bare: bool = True,
+    slab_bytes: int = SLAB_BYTES,
 ) -> Extraction:
     """Fuse frames into a mesh.
 
@@ -82,6 +86,8 @@ def extract(
         Leave only what enough views saw, in no more faces than their pixels carry (``evidence.clean``).
     with_bare : bool
         Take the depth of pixels that show nothing which could be matched (``Frame.bare``).
+    slab_bytes : int
+        Of the volume that are in memory at a time; the mesh does not depend on it.
 
     Raises
     ------
@@ -101,7 +107,7 @@ def extract(
         if not with_bare:
             spool.leave_out_bare()
         if limits is None:
-            samples = [sample_depths(item) for item in spool]
+            samples = sampled(spool)
             limits = derive_limits(
                 samples,
                 spool.cameras,
@@ -116,7 +122,15 @@ def extract(
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
         blocks = find_blocks(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
         fused = _Fused(blocks.frames, len(blocks.keys), blocks.nbytes, 1)
-        whole = fused_surface(spool, limits, blocks, min_weight=min_weight, threads=threads, backend=backend)
+        whole = fused_surface(
+            spool,
+            limits,
+            blocks,
+            min_weight=min_weight,
+            slab_bytes=slab_bytes,
+            threads=threads,
+            backend=backend,
+        )
         whole = whole if bbox is None else inside_box(whole, bbox)
         found = _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
         if not by_evidence:
@@ -171,7 +185,7 @@ def extract_unbounded(
     """
     backend = fusion_backend(backend)
     with Spool.of(frames, folder) as spool:
-        samples = [sample_depths(item) for item in spool]
+        samples = sampled(spool)
         cascade = derive_cascade(
             samples,
             spool.cameras,
@@ -193,6 +207,12 @@ def extract_unbounded(
     del volumes
     limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
     return _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
+
+
+def sampled(spool: Spool) -> list[DepthSample]:
+    """Return pixels of all depth maps: of each the fewer, the more there are, so that any number takes the same."""
+    count = min(SAMPLES_A_MAP, max(FEWEST_SAMPLES, SAMPLES // max(len(spool), 1)))
+    return [sample_depths(item, count) for item in spool]
 
 
 @dataclass(frozen=True)

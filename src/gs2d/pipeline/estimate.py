@@ -40,7 +40,7 @@ def estimate(job: Job) -> Estimate | None:
     try:
         trainer = Trainer(job.scene, full, job.protocol, backend=job.backend, init=job.init, progress_every=1)
         trainer.enter(0)
-        iteration = _seconds(trainer, first.iterations)
+        iteration = seconds_of(trainer, first.iterations)
     except Gs2dError:
         return None
     if iteration is None:
@@ -54,7 +54,7 @@ def full_iterations(recipe: Recipe) -> float:
     return sum(1 / stage.downscale_at(i) ** 2 for stage in recipe.stages for i in range(1, stage.iterations + 1))
 
 
-def _seconds(trainer: Trainer, iterations: int) -> float | None:
+def seconds_of(trainer: Trainer, iterations: int) -> float | None:
     """Return the median of some iterations without the first, which compile and decode; None if too few."""
     taken: list[float] = []
     begun = time.perf_counter()

@@ -37,6 +37,7 @@ from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.memory import check_memory
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.photographs import HOW, already_prepared, with_prepared
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined_poses import with_found_poses
 from gs2d.render.backends import Backend, backend_report, get_backend
@@ -221,6 +222,10 @@ def check_train_options(options: TrainOptions) -> Recipe:
         raise RecipeError(f"--checkpoint-seconds must be a positive number, got {options.checkpoint_seconds}")
     if options.stage2_cache_mb < 0:
         raise RecipeError(f"--stage2-cache-mb must be a whole number >= 0, got {options.stage2_cache_mb}")
+    if options.prepare not in HOW:
+        raise RecipeError(f"--prepare must be one of {', '.join(HOW)}, got {options.prepare}")
+    if options.disk is not None and not options.disk > 0:
+        raise RecipeError(f"--disk must be a positive number of GiB, got {options.disk}")
     if options.test_every is not None and options.test_every not in (0, *range(2, MAX_VIEWS)):
         raise ProtocolError(
             f"--test-every must be 0 (all views train) or a whole number >= 2 (every n-th is a test view), got "
@@ -317,6 +322,8 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     protocol = choose_protocol(options, scene_format, on_event)
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
     check_memory(scene, options.downscale, backend.device)
+    disk = None if options.disk is None else int(options.disk * 2**30)
+    scene = with_prepared(scene, options.out, options.prepare, on_event, disk=disk, threads=options.threads)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
     recipe = fit_recipe(options, scene, protocol, on_event)
@@ -477,7 +484,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
             f"the capture at {where} has {names[0]} + {names[1]} views, the run was made with "
             f"{data['scene']['train']} + {data['scene']['test']}; restore it or train again"
         )
-    scene = with_found_poses(run, recipe, scene)
+    scene = with_found_poses(run, recipe, already_prepared(scene, run.path))
     chosen = get_backend(named if backend == "auto" else backend)
     return Job(recipe, protocol, scene, chosen, settings, downscale, digest, cache_bytes)
 

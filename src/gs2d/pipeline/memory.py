@@ -5,14 +5,30 @@ from __future__ import annotations
 import gc
 
 from gs2d.core.memory import trim
-from gs2d.core.memory_limit import memory_limit
+from gs2d.core.memory_limit import memory_limit, set_memory_budget
 from gs2d.data import Scene
-from gs2d.errors import DataError
+from gs2d.errors import DataError, RecipeError
 from gs2d.kernels.library import available_variants, load
 
 ITERATION_BYTES = 160  # of a pixel, at least: images, their gradients, losses (docs/reliability.md)
 DECODING_BYTES = 12  # of a pixel of the file: what a JPEG is decoded through
 MAX_DOWNSCALE = 64
+
+
+LEAST_GIB = 0.5  # torch and the kernels by themselves take 0.4
+
+
+def use_memory(gib: float | None) -> None:
+    """Keep to so many GiB from now on; None: to half of what this machine or container has.
+
+    Raises
+    ------
+    RecipeError
+        Less than a command takes that does nothing.
+    """
+    if gib is not None and not LEAST_GIB <= gib < 1 << 20:
+        raise RecipeError(f"--memory must be {LEAST_GIB:g} GiB or more, got {gib:g}")
+    set_memory_budget(None if gib is None else int(gib * 2**30))
 
 
 def check_memory(scene: Scene, downscale: int, device: str) -> None:

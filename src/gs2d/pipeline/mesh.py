@@ -17,6 +17,7 @@ import torch
 from gs2d.core.files import disk_error
 from gs2d.core.georeference import Georeference
 from gs2d.core.memory import trim
+from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.data.subject import LARGEST, Subject, checked_box
@@ -33,6 +34,7 @@ from gs2d.io.run_dir import (
 from gs2d.meshing.bare import bare_pixels
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
+from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finished import checked_output, open_job
@@ -53,6 +55,7 @@ KEPT = (  # of what is said of a mesh, in metrics.json
     *("vertices", "faces", "voxel", "truncation", "depth_limit", "depth", "unbounded"),
     *("pixels", "faces_per_pixel", "area_unsupported", "area_apart"),
 )
+VOLUME_BYTES = 4 << 30  # of the fused volume, where it is not known how much memory there is
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
 
 
@@ -235,7 +238,8 @@ def _extract(
     own = bbox is not None or options.unbounded
     subject_only = fusion.subject and not options.unbounded
     bare = not subject_only or options.whole_scene or bbox is None  # in a room bare walls are most of what there is
-    fuse_frames = extract_unbounded if options.unbounded else partial(extract, by_evidence=subject_only, with_bare=bare)
+    bounded = partial(extract, by_evidence=subject_only, with_bare=bare, slab_bytes=_slab_bytes())
+    fuse_frames = extract_unbounded if options.unbounded else bounded
     if isinstance(frames, Spool):
         on_event(Phase("fusing", 0))
     result = fuse_frames(
@@ -245,13 +249,31 @@ def _extract(
         truncation=options.truncation or (None if own or options.voxel else fusion.truncation),
         depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,
         keep=keep or None,
-        max_bytes=int(options.max_gib * 2**30),
+        max_bytes=_volume_bytes(options),
         threads=torch.get_num_threads(),
         backend=job.backend,
     )
     if not len(result.mesh.faces):
         on_event(Notice("the mesh is empty: no surface was covered well enough"))
     return result
+
+
+def _volume_bytes(options: MeshOptions) -> int:
+    """Return how large the volume may be.
+
+    Bounded ones are fused a slab at a time, but their surface is in memory: while it is joined and cleaned it takes
+    about half of what the whole volume would. Unbounded ones are in memory whole.
+    """
+    if options.max_gib is not None:
+        return int(options.max_gib * 2**30)
+    budget = memory_budget()
+    return VOLUME_BYTES if budget is None else budget // 2 if options.unbounded else budget
+
+
+def _slab_bytes() -> int:
+    """Return how much of it may be in memory at a time."""
+    budget = memory_budget()
+    return SLAB_BYTES if budget is None else min(SLAB_BYTES, budget // 8)
 
 
 def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:

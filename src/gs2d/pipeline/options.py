@@ -56,6 +56,19 @@ class HowItRuns:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Resources:
+    """What a training may take of the machine."""
+
+    memory: Annotated[float | None, arg(metavar="GIB")] = None
+    """GiB of memory to keep to (default: half of what this machine or container has)."""
+    disk: Annotated[float | None, arg(metavar="GIB")] = None
+    """GiB of disk to keep to, for prepared photographs first of all (default: what is free)."""
+    prepare: Literal["auto", "always", "never"] = "auto"
+    """Keep photographs on the disk, in the run, undistorted and shrunk: any number in the same memory, with the same
+    result; auto: where they do not stay in memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Training:
     """What is trained and how: options of `gs2d train`, and of every command that trains on photographs."""
 
@@ -147,7 +160,7 @@ class Finding:
 
 # -- verbs that make a run ---------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions(Training, HowItRuns):
+class TrainOptions(Training, Resources, HowItRuns):
     """One training run. Overrides are applied after the schedule is scaled: a number means what it says."""
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
@@ -178,6 +191,29 @@ class TrainOptions(Training, HowItRuns):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanOptions(Resources):
+    """What is to be planned: a training as `gs2d train` would do it."""
+
+    scene: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """Folder of the capture."""
+    recipe: Annotated[str | Recipe, arg(constructor=str)] = DEFAULT_RECIPE
+    """As in `gs2d train`."""
+    downscale: int = 1
+    """As in `gs2d train`; the plan may need more."""
+    schedule_scale: float = 1.0
+    """As in `gs2d train`."""
+    overrides: Overrides = ()
+    """As in `gs2d train`."""
+    backend: str = "auto"
+    """As in `gs2d train`."""
+    threads: int | None = None
+    """CPU threads."""
+
+    def __post_init__(self) -> None:
+        paths_of(self, "scene")
+
+
+@dataclass(frozen=True, kw_only=True)
 class PosesOptions(Finding):
     """One run of structure from motion."""
 
@@ -197,7 +233,7 @@ class PosesOptions(Finding):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions(HowItRuns):
+class ReconstructOptions(Resources, HowItRuns):
     """From photographs to a mesh."""
 
     photos: Photos
@@ -274,8 +310,9 @@ class MeshOptions:
     """Mesh everything, not only the subject."""
     unbounded: bool = False
     """Mesh what lies far away too, in voxels that grow with the distance."""
-    max_gib: float = 4.0
-    """Memory for the fused volume; more is an error that names a voxel that fits."""
+    max_gib: float | None = None
+    """Size of the fused volume, of which a slab at a time is in memory (default: by --memory); more is an error that
+    names a voxel that fits."""
     depth: Literal["mean", "median", "transmittance"] | None = None
     """Depth that is fused (default: the run's protocol)."""
     keep_components: int | None = None

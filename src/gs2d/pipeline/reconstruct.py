@@ -25,6 +25,7 @@ from gs2d.pipeline.options import (
     HowItRuns,
     PosesOptions,
     ReconstructOptions,
+    Resources,
     Training,
     TrainOptions,
     values,
@@ -93,6 +94,7 @@ def train_options(options: ReconstructOptions) -> TrainOptions:
         estimate=True,
         **values(Training, options.training),
         **values(HowItRuns, options),
+        **values(Resources, options),
     )
 
 

@@ -31,12 +31,14 @@ from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, 
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
 from gs2d.pipeline.job import Job, as_begun, check_same_run, check_train_options, prepare_job
 from gs2d.pipeline.live import open_live
-from gs2d.pipeline.memory import release
+from gs2d.pipeline.memory import release, use_memory
 from gs2d.pipeline.mesh import MeshFrames, extract_mesh, keep_facts
 from gs2d.pipeline.observer import TrainingObserver
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
+from gs2d.pipeline.photographs import PREPARED
 from gs2d.pipeline.plan import TRAINED
+from gs2d.pipeline.planned import plan_notices
 from gs2d.pipeline.refined_poses import FoundPoses, found_poses, write_poses
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
@@ -49,6 +51,7 @@ from gs2d.pipeline.verdict.measures import Collector
 from gs2d.training import events
 from gs2d.viewer.server import free_port, required_viser
 
+MANY = 500  # photographs, from which a training is planned before it begins
 UNPACKED = "unpacked"  # in the run folder: what came as a ZIP file
 
 
@@ -77,9 +80,11 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     if is_archive(options.scene):
         return _train_archive(options, on_event)
     check_viewer(options)
-    claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": options.allowed}
+    allowed = (*options.allowed, PREPARED)
+    claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": allowed}
     check_claim(options.out, **claim)  # type: ignore[arg-type]
     use_threads(options.threads)
+    use_memory(options.memory)
     on_event(Plan(TRAINED))
     job = prepare_job(options, on_event)
     if options.overwrite:
@@ -101,6 +106,9 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
             extra = {"title": options.title} if options.title else {}
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         start = choose_start(run, job, options, on_event)
+        if start.state is None and (options.estimate or options.memory or options.disk or len(job.scene.views) >= MANY):
+            for line in plan_notices(job, options.prepare):
+                on_event(line)
         if options.estimate and start.state is None:
             for event in pretraining_notices(job):
                 on_event(event)

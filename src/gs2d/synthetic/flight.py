@@ -41,6 +41,9 @@ class Flight:
     width, height : int, px
     points : int or None
         Sparse points, before those that fewer than three photographs see are left out; None: 40 a photograph.
+    side : float or None, m
+        Of the land that is flown over, about; None: it grows with the photographs, which overlap by 80 % ahead and
+        70 % to the side.
     seed : int
     latitude, longitude, altitude : float
         Degrees and m, of the origin.
@@ -52,6 +55,7 @@ class Flight:
     width: int = 320
     height: int = 240
     points: int | None = None
+    side: float | None = None
     seed: int = 0
     latitude: float = 47.05
     longitude: float = 8.3
@@ -146,6 +150,8 @@ def flown_cameras(flight: Flight) -> list[Camera]:
     step, gap = along * (1 - FORWARD), across * (1 - SIDE)
     lines = max(1, round(np.sqrt(flight.photographs * step / gap)))
     each = -(-flight.photographs // lines)
+    if flight.side is not None:
+        step, gap = step * flight.side / (each * step), gap * flight.side / (lines * gap)
     rng = np.random.default_rng([flight.seed, 1])
     cameras = []
     for k in range(flight.photographs):

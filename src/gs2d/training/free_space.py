@@ -7,6 +7,7 @@ and the recipe, so a resume knows the same.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +16,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gs2d.config.robust import FreeSpace
+from gs2d.core.memory_limit import cache_bytes
+from gs2d.core.spill import Spilled
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import quats_to_matrices
-from gs2d.training.plane_sweep import Sweep
+from gs2d.training.plane_sweep import SWEEP_BYTES, Sweep
 
 _UNKNOWN = float("inf")
 
@@ -43,13 +46,18 @@ class FreeView:
 class FreeSpaceMaps:
     """The free space of all training views of a scene."""
 
-    def __init__(self, sweep: Sweep, settings: FreeSpace) -> None:
-        self._settings = settings
-        self._views = [_free_view(sweep, index, settings) for index in range(len(sweep.views))]
+    def __init__(self, sweep: Sweep, settings: FreeSpace, *, spilled: bool = False) -> None:
+        self._settings, self._device = settings, torch.device("cpu")
+        limit = 0 if spilled else cache_bytes(SWEEP_BYTES)
+        self._views: Sequence[FreeView] = Spilled(
+            (_free_view(sweep, index, settings) for index in range(len(sweep.views))), limit
+        )
 
     def move_to(self, device: torch.device | str) -> None:
-        """Move all tensors to a device."""
-        self._views = [view.to(device) for view in self._views]
+        """Give the tensors to a device; of many photographs, one by one."""
+        self._device = torch.device(device)
+        if isinstance(self._views, Spilled) and self._views.in_memory == len(self._views):
+            self._views = [view.to(device) for view in self._views]
 
     @torch.no_grad()
     def inside(self, splats: Splats) -> Tensor:
@@ -61,7 +69,8 @@ class FreeSpaceMaps:
         ends = self._ends(splats)
         against = torch.zeros(len(splats), dtype=torch.int32, device=splats.device)
         support = torch.zeros_like(against)
-        for view in self._views:
+        for kept in self._views:
+            view = kept.to(self._device)
             free = (ends[0] - _center(view)).norm(dim=1) < view.radius
             for places in ends:
                 free |= _is_free(view, places)

@@ -20,6 +20,7 @@ from gs2d.errors import DataError
 from gs2d.losses.multiview import PatchImage, prepare_image
 from gs2d.training.targets import Target
 
+PATCH_BYTES = 1 << 29  # of photographs as patches, that are kept
 SAMPLES = 2000  # points that say how far away is what a camera looks at
 
 
@@ -97,7 +98,7 @@ def draw_turn(
 class ImageFiles:
     """Photographs of the training views as patches; the first that fit in ``limit_bytes`` are kept."""
 
-    def __init__(self, views: tuple[View, ...], settings: MultiView, *, limit_bytes: int = 1 << 29) -> None:
+    def __init__(self, views: tuple[View, ...], settings: MultiView, *, limit_bytes: int = PATCH_BYTES) -> None:
         self._views, self._settings, self._room = views, settings, cache_bytes(limit_bytes)
         self._kept: dict[int, PatchImage] = {}
 

@@ -24,7 +24,7 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.exposure import expose, identity
 from gs2d.render.types import RasterSettings, RenderOutput
-from gs2d.training.multiview import ImageFiles, draw_turn, find_neighbours, is_compared
+from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours, is_compared
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
@@ -116,7 +116,8 @@ class FullRender:
         self._background = torch.tensor(protocol.background, device=backend.device)
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
-            self._images = ImageFiles(scene.train, recipe.multiview)
+            limit = 0 if scene.ahead else PATCH_BYTES
+            self._images = ImageFiles(scene.train, recipe.multiview, limit_bytes=limit)
         device, terms = torch.device(backend.device), {loss_of(term): term for s in recipe.stages for term in s.losses}
         self._functions = {known_by: prepared(term, scene, recipe, device) for known_by, term in terms.items()}
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +18,8 @@ from torch import Tensor
 
 from gs2d.config.robust import DenseStart
 from gs2d.core.memory import trim
+from gs2d.core.memory_limit import cache_bytes
+from gs2d.core.spill import Spilled
 from gs2d.core.transforms import nearest_distances
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import PointCloud, Scene, View
@@ -35,6 +37,7 @@ GREY = (0.3, 0.6, 0.1)
 BEST_ANGLE, NARROW, WIDE = 10.0, 4.0, 12.0  # degrees: neighbours' baselines, and how fast narrower and wider ones lose
 TRIM_EVERY = 8  # views; what is freed between results that stay was 2 GB of a capture of 292 photographs
 PLANES_AT_ONCE = 16  # 5 MB of each of what a comparison is made of, at 200 px; fewer would make threads wait more
+SWEEP_BYTES = 1 << 30  # of shrunk views, of depths, of free space: each; what is beyond goes to the disk
 REPEATED = 3.0  # cells: sparse points within that of a swept one start no splat of their own
 
 T = TypeVar("T")
@@ -83,20 +86,20 @@ class Sweep:
 
     Attributes
     ----------
-    views : tuple of SmallView
-        Of the training views, in their order.
+    views : sequence of SmallView
+        Of the training views, in their order. Of many, not all are in memory.
     neighbours : tuple of tuple of int
         Of each view, best first; empty for views that were not swept.
-    depths : tuple of ndarray [H, W] float64 world units
+    depths : sequence of ndarray [H, W] float64 world units
         Along the optical axis; 0 where unknown.
-    scores : tuple of ndarray [H, W] float32
+    scores : sequence of ndarray [H, W] float32
         NCC of those depths.
     """
 
-    views: tuple[SmallView, ...]
+    views: Sequence[SmallView]
     neighbours: tuple[tuple[int, ...], ...]
-    depths: tuple[np.ndarray, ...]
-    scores: tuple[np.ndarray, ...]
+    depths: Sequence[np.ndarray]
+    scores: Sequence[np.ndarray]
 
     def agreeing(self, index: int, fraction: float) -> np.ndarray:
         """Return how many neighbours have, where a pixel's place appears in them, the same depth: int [H, W]."""
@@ -126,10 +129,11 @@ def sweep_views(scene: Scene, settings: DenseStart) -> Sweep:
     known = sweep_range(scene)
     longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
     factor = max(1, round(longest / settings.side))
-    views = tuple(_trimming(_shrunk(view, known, factor) for view in scene.train))
+    limit = 0 if scene.ahead else cache_bytes(SWEEP_BYTES)
+    views = Spilled(_trimming(_shrunk(view, known, factor) for view in scene.train), limit)
     neighbours = _neighbours(scene, views, known.observed, settings)
-    found = list(_trimming(_depths(views, index, neighbours[index], settings) for index in range(len(views))))
-    return Sweep(views, neighbours, tuple(depth for depth, _ in found), tuple(score for _, score in found))
+    found = Spilled(_trimming(_depths(views, index, neighbours[index], settings) for index in range(len(views))), limit)
+    return Sweep(views, neighbours, found.column(0), found.column(1))
 
 
 def _trimming(results: Iterable[T]) -> Iterator[T]:
@@ -282,15 +286,15 @@ def _neighbours(
     shared_points = _shared([observed.seen.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train])
     swept = set(np.unique(np.linspace(0, count - 1, min(count, settings.max_views)).round().astype(int)).tolist())
     found: list[tuple[int, ...]] = []
-    for index, view in enumerate(scene.train):
-        if views[index].far == 0 or index not in swept:
+    for index, (view, small) in enumerate(zip(scene.train, views, strict=True)):
+        if small.far == 0 or index not in swept:
             found.append(())
             continue
-        target = view.camera.center + view.camera.forward * float(np.median(views[index].depth))
+        target = view.camera.center + view.camera.forward * float(np.median(small.depth))
         mine, theirs = view.camera.center - target, centers - target
         lengths = np.maximum(np.linalg.norm(theirs, axis=1) * np.linalg.norm(mine), 1e-12)
         angle = np.degrees(np.arccos(np.clip(theirs @ mine / lengths, -1, 1)))
-        shared = shared_points[index]
+        shared = shared_points[[index]].toarray()[0]
         fits = (angle >= settings.min_angle) & (angle <= settings.max_angle) & (shared >= MIN_SHARED)
         fits[index] = False
         width = np.where(angle < BEST_ANGLE, NARROW, WIDE)
@@ -300,8 +304,8 @@ def _neighbours(
     return tuple(found)
 
 
-def _shared(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """How many points each two views share, [V, V]; ``rows`` are the points of each view, each once."""
+def _shared(rows: Sequence[np.ndarray]) -> Any:
+    """How many points each two views share, sparse [V, V]; ``rows`` are the points of each view, each once."""
     from scipy.sparse import csr_matrix
 
     ends = np.cumsum([0, *(len(found) for found in rows)])
@@ -309,7 +313,7 @@ def _shared(rows: Sequence[np.ndarray]) -> np.ndarray:
     shows = csr_matrix(
         (np.ones(len(points), dtype=np.int64), points, ends), shape=(len(rows), points.max(initial=0) + 1)
     )
-    return np.asarray((shows @ shows.T).toarray())
+    return csr_matrix(shows @ shows.T)
 
 
 @torch.no_grad()

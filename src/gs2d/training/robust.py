@@ -75,7 +75,7 @@ class Robustness:
             return
         self._sweep = None if start is None or start.fit is None else sweep
         if recipe.free_space is not None:
-            self._free = FreeSpaceMaps(sweep, recipe.free_space)
+            self._free = FreeSpaceMaps(sweep, recipe.free_space, spilled=scene.ahead > 0)
 
     @property
     def starts_densely(self) -> bool:

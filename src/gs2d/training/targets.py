@@ -16,6 +16,7 @@ from gs2d.losses.api import TargetMaps
 # Of 292 photographs of 780x520 a fifth would stay in twice as much, for less than 1 % of an iteration's time: to make a
 # target anew from its bytes takes a few ms. Small captures stay whole.
 TARGET_BYTES = 1 << 28
+PINNED_BYTES = 1 << 33
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +148,7 @@ class DeviceTargets:
         device: torch.device,
         dtype: torch.dtype = torch.float32,
         limit_bytes: int = 1 << 31,
-        pinned_bytes: int = 1 << 33,
+        pinned_bytes: int = PINNED_BYTES,
         pin: Callable[[Tensor], Tensor] = torch.Tensor.pin_memory,
     ) -> None:
         self._views, self._use_masks = views, use_masks

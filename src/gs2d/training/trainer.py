@@ -16,7 +16,9 @@ from torch import Tensor
 from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import CloneInPlace, RankByError, Recipe, Stage, validate
 from gs2d.core.memory import trim
+from gs2d.core.memory_limit import cache_bytes
 from gs2d.core.splats import Splats
+from gs2d.data.cache import ReadAhead
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.losses.api import LossFunction, LossReport, target_maps
@@ -47,7 +49,7 @@ from gs2d.training.resumable import check_resumable
 from gs2d.training.robust import Robustness
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
-from gs2d.training.targets import TARGET_BYTES, DeviceTargets, Targets, TargetSource
+from gs2d.training.targets import PINNED_BYTES, TARGET_BYTES, DeviceTargets, Targets, TargetSource
 
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
 
@@ -127,6 +129,7 @@ class Trainer:
         self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
         self._target_bytes, self._stage2_cache_bytes = target_bytes, stage2_cache_bytes
         self._objective: Objective | None = None  # of the stage under way, from its first iteration here
+        self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
         self._downscale = 0  # nothing was looked at
         self._check_sizes()
         stage = self.recipe.stages[min(self.state.stage, len(self.recipe.stages) - 1)]
@@ -206,6 +209,8 @@ class Trainer:
         stage, iteration = self.recipe.stages[state.stage], state.step + 1
         index = state.next_view(len(self.scene.train))
         self._look_at(stage.downscale_at(iteration))
+        if self._ahead is not None:
+            self._ahead.expect(state.queue[-self.scene.ahead :][::-1])
         if self._objective is None:
             self._objective = choose_objective(self._whole, state, stage, self._stage2_cache_bytes)
         reports = iteration % self._progress_every == 0 or iteration == stage.iterations
@@ -284,7 +289,16 @@ class Trainer:
         use_masks, dtype, device = self.protocol.use_mask_in_training, splats.dtype, splats.device
         if is_async(device):
             limit = 1 << 31 if limit_bytes is None else limit_bytes
-            return DeviceTargets(views, background, use_masks=use_masks, device=device, dtype=dtype, limit_bytes=limit)
+            pinned = 0 if scene.ahead else cache_bytes(PINNED_BYTES)
+            return DeviceTargets(
+                views,
+                background,
+                use_masks=use_masks,
+                device=device,
+                dtype=dtype,
+                limit_bytes=limit,
+                pinned_bytes=pinned,
+            )
         operations = self.backend.loss_operations(device)
         keeps = operations is not None and operations.blur is not None
         return Targets(
@@ -296,7 +310,7 @@ class Trainer:
             or any(t.kind == "silhouette" or t.where == "object" for s in self.recipe.stages for t in s.losses),
             dtype=dtype,
             device=device,
-            limit_bytes=TARGET_BYTES if limit_bytes is None else limit_bytes,
+            limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
         )
 
     def _new_state(self, dtype: torch.dtype, init: Splats | None) -> TrainState:

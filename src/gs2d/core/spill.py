@@ -1,0 +1,115 @@
+"""A sequence of which only so much is in memory; the rest waits in a temporary file."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import tempfile
+import weakref
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from typing import IO, Any, Generic, TypeVar, overload
+
+from gs2d.errors import DiskError
+
+T = TypeVar("T")
+RECENT = 32  # of those in the file that stay at hand: neighbours of a view are asked for again soon
+
+
+class Spilled(Sequence[T], Generic[T]):
+    """Values in order; the first that fit in ``limit_bytes`` stay in memory, later ones are pickled into a file.
+
+    The file has no name, lies in the system's temporary folder (``TMPDIR``) and vanishes with the sequence. What comes
+    back from it is equal to what went in, bit for bit.
+
+    Parameters
+    ----------
+    values : iterable
+        Taken one by one: a generator makes each when the one before is put away.
+    limit_bytes : int
+
+    Raises
+    ------
+    DiskError
+        If the file cannot be written.
+    """
+
+    def __init__(self, values: Iterable[T], limit_bytes: int) -> None:
+        self._kept: list[T] = []
+        self._slots: list[tuple[int, int]] = []
+        self._recent: OrderedDict[int, T] = OrderedDict()
+        self._file: IO[bytes] | None = None
+        room = limit_bytes
+        for value in values:
+            packed = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
+            if self._file is None and len(packed) <= room:
+                room -= len(packed)
+                self._kept.append(value)
+            else:
+                self._put_away(packed)
+
+    def _put_away(self, packed: bytes) -> None:
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the sequence
+                weakref.finalize(self, self._file.close)
+            self._slots.append((self._file.seek(0, os.SEEK_END), len(packed)))
+            self._file.write(packed)
+        except OSError as error:
+            raise DiskError(
+                f"a temporary file for what does not fit in memory cannot be written ({error.strerror or error}); free "
+                "some space, set TMPDIR to a folder with room, or allow more --memory",
+                error.errno,
+            ) from error
+
+    def __len__(self) -> int:
+        return len(self._kept) + len(self._slots)
+
+    @property
+    def in_memory(self) -> int:
+        """How many of the values stay in memory."""
+        return len(self._kept)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[T]: ...
+    def __getitem__(self, index: int | slice) -> T | Sequence[T]:
+        if isinstance(index, slice):
+            return [self[at] for at in range(*index.indices(len(self)))]
+        at = range(len(self))[index]
+        if at < len(self._kept):
+            return self._kept[at]
+        if at in self._recent:
+            self._recent.move_to_end(at)
+            return self._recent[at]
+        assert self._file is not None
+        offset, size = self._slots[at - len(self._kept)]
+        self._file.seek(offset)
+        value: T = pickle.loads(self._file.read(size))  # our own file, which nobody else can open
+        self._recent[at] = value
+        if len(self._recent) > RECENT:
+            self._recent.popitem(last=False)
+        return value
+
+    def column(self, number: int) -> Sequence[Any]:
+        """Return the sequence of one entry of each value, where values are tuples."""
+        return _Column(self, number)
+
+    def __iter__(self) -> Iterator[T]:
+        return (self[at] for at in range(len(self)))
+
+
+class _Column(Sequence[Any]):
+    """One entry of each of the tuples of a sequence."""
+
+    def __init__(self, rows: Sequence[Any], number: int) -> None:
+        self._rows, self._number = rows, number
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [row[self._number] for row in self._rows[index]]
+        return self._rows[index][self._number]

@@ -1,0 +1,344 @@
+"""What a capture will take: splats, memory, disk and hours on this machine, before anything is trained.
+
+Some photographs from the middle of the capture are decoded, swept and trained on for seconds; the rest is arithmetic
+with what was met in finished runs (docs/scale.md). All of it is told with bounds.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import Recipe
+from gs2d.core.memory_limit import memory_budget
+from gs2d.core.splats import Splats
+from gs2d.data import Scene, View
+from gs2d.data.prepared import decoded_bytes
+from gs2d.errors import DataError, Gs2dError
+from gs2d.pipeline.estimate import full_iterations, seconds_of
+from gs2d.pipeline.events import duration
+from gs2d.pipeline.memory import DECODING_BYTES, ITERATION_BYTES, MAX_DOWNSCALE
+from gs2d.pipeline.photographs import fits
+from gs2d.render.backends import Backend
+from gs2d.training.plane_sweep import start_points, sweep_views
+from gs2d.training.trainer import Trainer
+
+PROBED_VIEWS, DECODED_VIEWS = 12, 4
+PROGRAM_BYTES = 400 << 20  # torch, the kernels, the scene
+SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
+FUSION_BYTES = 270 << 20  # a slab, the surface of a default mesh and what cleans it
+CHECKPOINT_BYTES = 59 * 3 * 4  # of a splat; two checkpoints are kept
+FILE_BYTES = 4 * 61 + 80 + 40  # of a splat: splats.ply, scene.html, the mesh
+GROWTH = (1.0, 4.0, 9.0)  # splats at the end over those at the start: least, expected, most of finished runs
+FIXED_SECONDS = 15  # to start, find the subject, write the page and the report
+DOUBT = 1.5  # by which hours are known where the splats are
+
+
+@dataclass(frozen=True)
+class Range:
+    """A figure: at least, expected, at most."""
+
+    least: float
+    expected: float
+    most: float
+
+    def scaled(self, factor: float) -> Range:
+        """Return all three times a factor."""
+        return Range(self.least * factor, self.expected * factor, self.most * factor)
+
+
+@dataclass(frozen=True)
+class CapturePlan:
+    """What training on a capture takes.
+
+    Attributes
+    ----------
+    photographs : int
+    pixels : int
+        Of all photographs, as files, and ``trained_pixels`` at the size of training.
+    trained_pixels : int
+    downscale : int
+        As asked for, or the next at which an iteration fits.
+    iterations : int
+    start : int
+        Splats that training starts from, about.
+    splats : Range
+        At the end.
+    max_splats : int or None
+        The budget of splats that fits in memory, where as many as may come would not.
+    memory : Range
+        Bytes.
+    allowed : int or None
+        Bytes of memory to keep to.
+    prepared : bool
+        Whether the photographs wait on the disk.
+    disk : float
+        Bytes in the run folder, and ``temporary`` in the temporary folder, for depth maps.
+    temporary : float
+    seconds : Range
+    """
+
+    photographs: int
+    pixels: int
+    trained_pixels: int
+    downscale: int
+    iterations: int
+    start: int
+    splats: Range
+    max_splats: int | None
+    memory: Range
+    allowed: int | None
+    prepared: bool
+    disk: float
+    temporary: float
+    seconds: Range
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the plan for people."""
+        side = f" (--downscale {self.downscale})" if self.downscale > 1 else ""
+        where = "prepared on the disk" if self.prepared else "in memory"
+        of = "" if self.allowed is None else f" of {self.allowed / 2**30:.3g} GiB allowed"
+        budget = "" if self.max_splats is None else f"; only with a budget: {budget_option(self.max_splats)}"
+        memory, splats, seconds = self.memory.scaled(2.0**-30), self.splats, self.seconds
+        return [
+            f"photographs: {self.photographs:,}, {self.pixels / 1e6:,.0f} megapixels, trained on at "
+            f"{self.trained_pixels / 1e6:,.0f}{side}, {where}",
+            f"splats: {rounded(splats.expected):,} ({rounded(splats.least):,} to {rounded(splats.most):,}), from "
+            f"{rounded(self.start):,}{budget}",
+            f"memory: {memory.expected:.2g} GiB ({memory.least:.2g} to {memory.most:.2g}){of}",
+            f"disk: {self.disk / 2**30:.2g} GiB in the run, {self.temporary / 2**30:.2g} GiB for a while in the "
+            "temporary folder",
+            f"time: {duration(seconds.expected)} ({duration(seconds.least)} to {duration(seconds.most)}), "
+            f"{self.iterations:,} iterations, mesh and report",
+        ]
+
+
+def budget_option(splats: int) -> str:
+    """Return how a budget of splats is asked for."""
+    return f"--set surface.densify.max_splats={splats}"
+
+
+def rounded(number: float) -> int:
+    """Return a number to two digits."""
+    return 0 if number < 1 else int(round(number, 1 - math.floor(math.log10(number))))
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What seconds of trying told.
+
+    Attributes
+    ----------
+    start_per_view : float or None
+        Splats that a swept photograph starts; None: training starts from the sparse points.
+    sweep, decode : float
+        Seconds of a photograph.
+    packed : float
+        Bytes of a prepared pixel.
+    base, slope : float
+        Seconds of an iteration without splats, and of each splat of the capture more.
+    """
+
+    start_per_view: float | None
+    sweep: float
+    decode: float
+    packed: float
+    base: float
+    slope: float
+
+
+def middle_views(scene: Scene, count: int) -> list[View]:
+    """Return so many training views that stand nearest to the one in the middle of all."""
+    centers = np.array([view.camera.center for view in scene.train])
+    middle = centers[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))]
+    return [
+        scene.train[i] for i in np.sort(np.argsort(np.linalg.norm(centers - middle, axis=1), kind="stable")[:count])
+    ]
+
+
+def probe(scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend) -> Probe:
+    """Try a few photographs from the middle of the capture: seconds.
+
+    Raises
+    ------
+    Gs2dError
+        The recipe cannot begin on them.
+    """
+    views = middle_views(scene, PROBED_VIEWS)
+    begun = time.perf_counter()
+    pictures = [view.image() for view in views[:DECODED_VIEWS]]
+    decode = (time.perf_counter() - begun) / len(pictures)
+    sizes = []
+    for picture in pictures:
+        packed = io.BytesIO()
+        Image.fromarray(picture).save(packed, format="PNG", compress_level=1)
+        sizes.append(packed.tell() / (picture.shape[0] * picture.shape[1]))
+    part = replace(scene, train=tuple(views), test=())
+    start, sweep = None, 0.0
+    if recipe.dense_start is not None:
+        begun = time.perf_counter()
+        try:
+            start = len(
+                start_points(replace(part, points=None), sweep_views(part, recipe.dense_start), recipe.dense_start)
+            )
+        except DataError:
+            start = None  # training itself says what is done then
+        sweep = (time.perf_counter() - begun) / len(views)
+    base, slope = _iteration(part, recipe, protocol, backend, len(scene.train))
+    per_view = None if start is None else start / len(views)
+    return Probe(per_view, sweep, decode, float(np.mean(sizes)), base, slope)
+
+
+def _iteration(part: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, views: int) -> tuple[float, float]:
+    """Seconds of an iteration by the splats of the whole capture, from two numbers of splats on a part of it."""
+    first, *rest = recipe.stages
+    bare = replace(
+        recipe,
+        stages=(replace(first, downscale=1, halve_at=()), *rest),
+        dense_start=None,
+        free_space=None,
+        seen_area=None,
+    )
+    trainer = Trainer(part, bare, protocol, backend=backend, progress_every=1)
+    start = trainer.splats.to("cpu")
+    found: list[tuple[int, float]] = []
+    for splats in (start, crowded(start)):
+        again = Trainer(part, bare, protocol, backend=backend, init=splats, progress_every=1)
+        again.enter(0)
+        seconds = seconds_of(again, first.iterations)
+        if seconds is None:
+            raise DataError("too few iterations to measure; plan a longer schedule")
+        found.append((len(splats), seconds))
+    (few, fast), (many, slow) = found
+    slope = max(slow - fast, 0.0) / max(many - few, 1)
+    return max(fast - slope * few, 0.2 * fast), slope
+
+
+def crowded(splats: Splats, times: int = 4) -> Splats:
+    """Return so many times the splats on the same surface: each has as much less area."""
+    generator = torch.Generator().manual_seed(0)
+    rows = splats.rows(torch.arange(len(splats)).repeat_interleave(times))
+    shift = torch.randn(rows.means.shape, generator=generator, dtype=rows.means.dtype)
+    return replace(
+        rows,
+        means=rows.means + shift * rows.scales.mean(dim=1, keepdim=True) / 2,
+        log_scales=rows.log_scales - math.log(times) / 2,
+    )
+
+
+def plan_capture(
+    scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, *, downscale: int = 1, prepare: str = "auto"
+) -> CapturePlan:
+    """Plan the training of a scene, whose photographs are ``downscale`` times smaller than their files.
+
+    Raises
+    ------
+    DataError
+        What training starts from does not fit in memory at any downscale.
+    Gs2dError
+        The recipe cannot begin.
+    """
+    tried = probe(scene, recipe, protocol, backend)
+    allowed, on_host = memory_budget(), backend.device == "cpu"
+    largest = max(view.camera.width * view.camera.height for view in scene.views) * downscale**2
+    chosen = fitting_downscale(largest, downscale, allowed, on_host=on_host)
+    shrink = (downscale / chosen) ** 2
+    trained = sum(view.camera.width * view.camera.height for view in scene.views) * shrink
+    sparse = 0 if scene.points is None else len(scene.points)
+    swept = 0 if recipe.dense_start is None else min(len(scene.train), recipe.dense_start.max_views)
+    start = max(2, sparse) if tried.start_per_view is None else int(swept * tried.start_per_view) + sparse // 4
+    splats, budget = expected_splats(recipe, start), None
+    prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
+    pictures = 0.0 if prepared else decoded_bytes(scene) * shrink
+    fixed = PROGRAM_BYTES + pictures + largest / chosen**2 * ITERATION_BYTES * on_host + largest * DECODING_BYTES
+    memory = _memory(fixed, splats)
+    if allowed is not None and memory.most > allowed:
+        budget = int((allowed - fixed - FUSION_BYTES) / SPLAT_BYTES)
+        if budget < start:
+            raise DataError(
+                f"{len(scene.views):,} photographs start from about {rounded(start):,} splats, which need "
+                f"{(fixed + FUSION_BYTES + start * SPLAT_BYTES) / 2**30:.2g} GiB, got "
+                f"{allowed / 2**30:.2g} GiB to keep to; allow more --memory, or train on a part of the capture"
+            )
+        splats = Range(min(splats.least, budget), min(splats.expected, budget), min(splats.most, budget))
+        memory = _memory(fixed, splats)
+        budget = None if splats.most < budget else rounded(0.95 * budget)
+    packed = trained * tried.packed if prepared else 0.0
+    return CapturePlan(
+        photographs=len(scene.views),
+        pixels=sum(k.width * k.height for k in (view.file_intrinsics() for view in scene.views)),
+        trained_pixels=int(trained),
+        downscale=chosen,
+        iterations=recipe.iterations,
+        start=start,
+        splats=splats,
+        max_splats=budget,
+        memory=memory,
+        allowed=allowed,
+        prepared=prepared,
+        disk=packed + splats.expected * (2 * CHECKPOINT_BYTES + FILE_BYTES),
+        temporary=trained * 8,
+        seconds=_seconds(tried, recipe, scene, start, splats, swept, shrink),
+    )
+
+
+def fitting_downscale(largest: int, downscale: int, allowed: int | None, *, on_host: bool) -> int:
+    """Return the smallest downscale, not below the given one, at which an iteration takes half of what is allowed.
+
+    Raises
+    ------
+    DataError
+        There is none.
+    """
+    if allowed is None or not on_host:
+        return downscale
+    for factor in range(downscale, MAX_DOWNSCALE + 1):
+        if PROGRAM_BYTES + largest * (ITERATION_BYTES / factor**2 + DECODING_BYTES) <= allowed:
+            return factor
+    raise DataError(
+        f"photographs of up to {largest / 1e6:.3g} megapixels need {largest * DECODING_BYTES / 2**30:.2g} GiB to be "
+        f"read, got {allowed / 2**30:.2g} GiB to keep to; allow more --memory, or shrink the files"
+    )
+
+
+def expected_splats(recipe: Recipe, start: int) -> Range:
+    """Return the splats at the end of a recipe that starts from so many."""
+    densifiers = [stage.densify for stage in recipe.stages if stage.densify is not None]
+    grown = [start * factor for factor in (GROWTH if densifiers else (1.0, 1.0, 1.0))]
+    budgets = [getattr(densify, "max_splats", None) for densify in densifiers]
+    most = max((budget for budget in budgets if budget is not None), default=None)
+    least, expected, largest = (value if most is None else min(value, max(most, start)) for value in grown)
+    return Range(least, expected, largest)
+
+
+def _memory(fixed: float, splats: Range) -> Range:
+    """Return bytes; what the mesh takes comes when training has given its gradients back, with as much again."""
+    of = [fixed + FUSION_BYTES + count * SPLAT_BYTES for count in asdict(splats).values()]
+    return Range(*of)
+
+
+def _seconds(tried: Probe, recipe: Recipe, scene: Scene, start: int, splats: Range, swept: int, shrink: float) -> Range:
+    """Return seconds of everything: each iteration by how many splats there are by then."""
+    threads = max(1, torch.get_num_threads())
+    fixed = FIXED_SECONDS + len(scene.views) * tried.decode * 2 / min(threads, 2) + swept * tried.sweep
+    found = []
+    for count in asdict(splats).values():
+        mean = (start + 3 * count) / 4  # most splats come in the first half
+        iteration = (tried.base + tried.slope * mean) * shrink
+        found.append(fixed + iteration * (full_iterations(recipe) + 1.2 * len(scene.views)))  # scored, fused
+    return Range(found[0] / DOUBT, found[1], found[2] * DOUBT)
+
+
+__all__ = ["CapturePlan", "Gs2dError", "Probe", "Range", "plan_capture", "probe"]

@@ -1,0 +1,52 @@
+"""A sequence that is partly on the disk: the same values, whatever is in memory."""
+
+from __future__ import annotations
+
+import gc
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs2d.core.spill import RECENT, Spilled
+from gs2d.errors import DiskError
+
+
+def values(count: int) -> list[tuple[int, np.ndarray]]:
+    return [(k, np.random.default_rng(k).random(100)) for k in range(count)]
+
+
+@pytest.mark.parametrize("limit", [0, 3000, 1 << 20])
+def test_values_come_back_bit_for_bit_in_any_order(limit: int) -> None:
+    given = values(2 * RECENT)
+    kept = Spilled(iter(given), limit)
+    assert len(kept) == len(given)
+    assert kept.in_memory == {0: 0, 3000: 3, 1 << 20: len(given)}[limit]  # about 920 bytes each
+    for index in [*range(len(given)), *range(len(given) - 1, -1, -3), -1]:
+        assert kept[index][0] == given[index][0]
+        np.testing.assert_array_equal(kept[index][1], given[index][1])
+    assert [number for number, _ in kept] == list(kept.column(0)) == list(range(len(given)))
+    assert [number for number, _ in kept[3:9:2]] == kept.column(0)[3:9:2] == [3, 5, 7]
+    with pytest.raises(IndexError):
+        kept[len(given)]
+
+
+def test_its_file_has_no_name_and_goes_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    kept = Spilled(values(3), 0)
+    file = kept._file
+    assert file is not None
+    assert list(tmp_path.iterdir()) == []
+    del kept
+    gc.collect()
+    assert file.closed
+
+
+def test_a_disk_that_is_full_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    with pytest.raises(DiskError, match=r"cannot be written \(No space left on device\); free some space, set TMPDIR"):
+        Spilled(values(2), 0)

@@ -1,0 +1,163 @@
+"""What a capture will take, before anything is trained: counted, bounded, and refused where it cannot fit."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from gs2d.cli.app import run as main
+from gs2d.config.presets import get_recipe
+from gs2d.config.serialize import apply_overrides
+from gs2d.core import memory_limit
+from gs2d.errors import DataError, RecipeError
+from gs2d.pipeline import capture_plan
+from gs2d.pipeline.capture_plan import PROGRAM_BYTES, crowded, expected_splats, fitting_downscale, rounded
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.options import PlanOptions, TrainOptions
+from gs2d.pipeline.planned import command_of, plan
+from gs2d.pipeline.train import train
+from gs2d.synthetic.flight import Flight, write_flight
+from train_toys import random_splats
+
+MEGA = 1_000_000
+
+
+@pytest.fixture(autouse=True)
+def no_budget() -> object:
+    yield
+    memory_limit.set_memory_budget(None)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flown") / "capture"
+    write_flight(folder, Flight(12, width=64, height=48, points=6000, seed=1))
+    return folder
+
+
+def planned(capture: Path, **more: object) -> PlanOptions:
+    given = {"schedule_scale": 0.01, "recipe": "2dgs", **more}
+    return PlanOptions(scene=capture, **given)  # type: ignore[arg-type]
+
+
+def test_a_plan_counts_photographs_and_pixels_and_bounds_the_rest_and_writes_nothing(capture: Path) -> None:
+    before = sorted(path.name for path in capture.rglob("*"))
+    found = plan(planned(capture))
+    assert (found.photographs, found.pixels, found.trained_pixels) == (12, 12 * 64 * 48, 12 * 64 * 48)
+    assert (found.downscale, found.prepared, found.max_splats, found.iterations) == (1, False, None, 300)
+    assert found.start < found.splats.expected < found.splats.most
+    assert 0 < found.seconds.least < found.seconds.expected < found.seconds.most
+    assert PROGRAM_BYTES < found.memory.least <= found.memory.expected <= found.memory.most
+    assert found.temporary == 8 * found.trained_pixels
+    lines = found.lines()
+    assert [line.partition(":")[0] for line in lines] == ["photographs", "splats", "memory", "disk", "time"]
+    assert lines[0] == "photographs: 12, 0 megapixels, trained on at 0, in memory"
+    assert sorted(path.name for path in capture.rglob("*")) == before
+
+
+def test_the_command_line_tells_it_as_json_with_the_command_that_trains(
+    capture: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["plan", str(capture), "--recipe", "2dgs", "--schedule-scale", "0.01", "--prepare", "always", "--json"]
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["prepared"] is True
+    assert told["disk"] > 12 * 64 * 48
+    assert told["command"] == f"gs2d train {capture} --out RUN --recipe 2dgs --schedule-scale 0.01"
+
+
+def test_splats_at_the_end_are_those_at_the_start_times_growth_but_for_a_budget() -> None:
+    recipe = get_recipe("2dgs")
+    found = expected_splats(recipe, 1000)
+    assert (found.least, found.expected, found.most) == (1000, 4000, 9000)
+    limited = expected_splats(apply_overrides(recipe, ("surface.densify.max_splats=2500",)), 1000)
+    assert (limited.least, limited.expected, limited.most) == (1000, 2500, 2500)
+    frozen = expected_splats(apply_overrides(recipe, ("surface.densify=null",)), 1000)
+    assert (frozen.least, frozen.most) == (1000, 1000)
+
+
+def test_the_downscale_is_the_first_at_which_an_iteration_fits() -> None:
+    allowed = PROGRAM_BYTES + 24 * MEGA * (160 // 4 + 12)  # of 24 megapixels at half their size
+    assert fitting_downscale(24 * MEGA, 1, allowed, on_host=True) == 2
+    assert fitting_downscale(24 * MEGA, 1, allowed - 1, on_host=True) == 3
+    assert fitting_downscale(24 * MEGA, 4, allowed, on_host=True) == 4
+    assert fitting_downscale(24 * MEGA, 1, allowed, on_host=False) == 1  # what a GPU has is its own
+    with pytest.raises(DataError, match="24 megapixels need 0.27 GiB to be read, got 0.4 GiB to keep to"):
+        fitting_downscale(24 * MEGA, 1, PROGRAM_BYTES + 10 * MEGA, on_host=True)
+
+
+def test_a_budget_of_splats_is_named_where_as_many_as_may_come_do_not_fit(
+    capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture_plan, "SPLAT_BYTES", 1 << 20)  # a thousand are a gigabyte
+    options = planned(capture, memory=2.0)
+    found = plan(options)
+    assert found.max_splats is not None
+    assert found.start < found.max_splats < 1700
+    assert found.memory.most <= 2 << 30
+    assert f"--set surface.densify.max_splats={found.max_splats} --memory 2" in command_of(options, found)
+    monkeypatch.setattr(capture_plan, "SPLAT_BYTES", 1 << 24)
+    with pytest.raises(DataError, match=r"12 photographs start from about .* splats, which need .* got 2 GiB to keep"):
+        plan(options)
+
+
+def test_what_cannot_fit_is_refused_in_one_line_and_leaves_nothing(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, said in (
+        (
+            ["--memory", "0.5"],
+            "12 photographs start from .* splats, which need 0.6[0-9] GiB, got 0.5 GiB",
+        ),
+        (["--disk", "1e-6"], "12 photographs take about"),
+        (["--downscale", "0"], "--downscale must be a whole number >= 1, got 0"),
+    ):
+        assert main(["plan", str(capture), "--recipe", "2dgs", "--quiet", *words]) == 2
+        error = capsys.readouterr().err
+        assert re.search(said, error)
+        assert error.count("\n") == 1
+    out = tmp_path / "run"
+    with pytest.raises(DataError, match="12 photographs start from about"):
+        train(TrainOptions(scene=capture, out=out, recipe="2dgs", schedule_scale=0.001, memory=0.5))
+    assert not out.exists()
+
+
+def test_a_training_with_limits_says_its_plan_before_it_begins(capture: Path, tmp_path: Path) -> None:
+    heard: list[str] = []
+
+    def stop(event: Event) -> None:
+        if isinstance(event, Notice):
+            heard.append(event.text)
+        if getattr(event, "name", "").startswith("training"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.01, memory=3.0), stop)
+    assert any(text.startswith("memory: ") and "of 3 GiB allowed" in text for text in heard)
+    assert any(text.startswith("time: ") for text in heard)
+
+
+def test_a_crowd_of_splats_covers_what_the_few_did() -> None:
+    few = random_splats(20, seed=1)
+    many = crowded(few)
+    assert len(many) == 80
+    area = few.scales.prod(dim=1).sum()
+    assert many.scales.prod(dim=1).sum() == pytest.approx(float(area), rel=1e-5)
+    shift = (many.means.reshape(20, 4, 3) - few.means[:, None]).norm(dim=2)
+    assert bool((shift < 3 * few.scales.max(dim=1).values[:, None]).all())
+    assert torch.equal(crowded(few).means, many.means)
+
+
+def test_figures_for_people_have_two_digits() -> None:
+    assert [rounded(value) for value in (0.3, 7, 1234, 98_765)] == [0, 7, 1200, 99_000]
+    assert math.isclose(capture_plan.Range(1, 2, 3).scaled(2).most, 6)
+
+
+def test_a_memory_that_is_none_is_refused(capture: Path) -> None:
+    with pytest.raises(RecipeError, match=r"--memory must be 0.5 GiB or more, got 0"):
+        plan(planned(capture, memory=0.0))
