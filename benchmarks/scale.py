@@ -36,7 +36,6 @@ from gs2d.synthetic.flight import Flight, write_flight
 from gs2d.training.initialize import initial_splats
 
 EVERY = 0.05  # s, between looks at memory
-SIDE = 400.0  # m, of the land: the same for any number of photographs, so that its surface is, too
 ITERATIONS_OF_ALL = 30_000  # of the recipe 2dgs
 
 
@@ -112,7 +111,7 @@ def run_one(folder: Path, photographs: int, args: argparse.Namespace) -> list[Me
     """Make a capture, train, mesh and report."""
     capture, run = folder / f"capture-{photographs}", folder / f"run-{photographs}"
     if not (capture / "sparse/0/cameras.bin").exists():
-        flight = Flight(photographs, args.size, args.size * 3 // 4, points=args.splats, side=SIDE)
+        flight = Flight(photographs, args.size, args.size * 3 // 4, points=args.splats, side=args.side)
         write_flight(capture, flight)
     if not (capture / "start.ply").exists():
         write_splats(capture / "start.ply", surface_splats(capture, args.splats))
@@ -152,6 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--photographs", type=int, nargs="+", default=[100, 400, 1600, 6400])
     parser.add_argument("--compare", type=int, nargs="*", default=[100])
     parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--side", type=float, default=200.0, help="m of land, the same for any number of photographs")
     parser.add_argument("--splats", type=int, default=20_000)
     parser.add_argument("--iterations", type=int, default=150)
     parser.add_argument("--memory", type=float, default=2.0, help="GiB, as of gs2d train")
