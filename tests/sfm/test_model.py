@@ -80,7 +80,7 @@ def test_a_camera_is_described_by_its_field_of_view() -> None:
 def request(work: Path) -> Request:
     group = Group(("a.jpg",), "OPENCV", (9, 9), "a.jpg")
     database, output = str(work / "database.db"), str(work / "out")
-    chosen = ("name", (None,), "exhaustive", 1, 1, "incremental")
+    chosen = ("name", (None,), "exhaustive", 1, 1, "incremental", ())
     return Request("images", database, output, (group,), ("a.jpg",), *chosen, 64, 1, 0)
 
 

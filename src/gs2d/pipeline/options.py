@@ -148,6 +148,8 @@ class Finding:
     geo.txt (default: GPS in their EXIF or XMP)."""
     mapper: Literal["auto", "incremental", "global"] = "auto"
     """How cameras are placed: one after the other, or all at once, which is faster for many (auto: from 500 on)."""
+    rig: bool = False
+    """Cameras mounted together: each sub-folder is one, and photographs of one name were taken at one moment."""
     max_size: int | None = None
     """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
     feature_size: int = 1600

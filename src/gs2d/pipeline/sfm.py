@@ -27,7 +27,7 @@ from gs2d.pipeline.photo_places import Places, places_of
 from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, in_order_taken, read_photos
+from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, in_order_taken, read_photos, rig_folders
 from gs2d.sfm.lens import START, lens_line
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
 from gs2d.sfm.plot import write_image_of
@@ -42,12 +42,13 @@ MANY = 500  # photographs, from which on "auto" places all at once (docs/decisio
 ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
     *("cameras", "camera_model", "matching", "overlap", "neighbours", "positions"),
-    *("mapper", "max_size", "feature_size", "frames", "seed"),
+    *("mapper", "rig", "max_size", "feature_size", "frames", "seed"),
 )
 _MOST = 0.5  # of the photographs: so many have a place where "auto" goes by places
 _GROWTH = {"placing cameras": 1.5}  # each is adjusted with those that have a place, but not with all of them every time
 FRAMES = "frames"  # of a video, in the workplace, until they are in the capture
 SMALLEST_SIDE, MAX_THREADS = 64, 1024
+_PIECES = 5  # that are counted one by one
 _DOUBTFUL_FRACTION, _DOUBTFUL_ERROR, _DOUBTFUL_ANGLE = 0.8, 1.5, 4.0  # of the photographs placed; px; degrees
 
 
@@ -94,7 +95,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     except BaseException:
         remove_made(made)
         raise
-    for line in filter(None, (result["lens"]["about"], *_doubts(result))):
+    for line in filter(None, (result["lens"]["about"], _pieces_line(result), *_doubts(result))):
         on_event(Notice(line))
     return {"capture": str(options.out), **result}
 
@@ -272,6 +273,7 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
         places=tuple(places.metres[i] for i in order),
         matching=_matching(options, len(photos), places),
         mapper=_mapper(options, len(photos)),
+        rig=rig_folders(photos, groups) if options.rig else (),
         overlap=options.overlap,
         neighbours=options.neighbours,
         feature_size=options.feature_size,
@@ -397,6 +399,18 @@ def _title(result: dict[str, Any]) -> str:
     return (
         f"{result['placed']} of {result['count']} photographs placed, {result['points']:,} points, "
         f"{result['mean_error_px']:.2f} px"
+    )
+
+
+def _pieces_line(result: dict[str, Any]) -> str:
+    """Say how many photographs each piece has, where there are several."""
+    others = [len(other["photos"]) for other in result["other_models"]]
+    if not others:
+        return ""
+    rest = ", ".join(str(count) for count in others[:_PIECES]) + (" ..." if len(others) > _PIECES else "")
+    return (
+        f"the photographs make {len(others) + 1} pieces that nothing joins, of {result['placed']}, {rest}: the largest "
+        f"is the capture ({SPARSE}/0); photographs between them would join them"
     )
 
 

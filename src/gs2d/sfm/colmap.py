@@ -71,6 +71,8 @@ class Request:
     overlap, neighbours : int
         Next photographs, and similar ones, that each is matched with where not all pairs are; fewer near ones do.
     mapper : "incremental" or "global"
+    rig : tuple of str
+        Folders of cameras that are mounted together, the reference first; none: there is no rig.
     feature_size : int
         Longer side on which features are found, px.
     asked_lens : str or None
@@ -88,6 +90,7 @@ class Request:
     overlap: int
     neighbours: int
     mapper: str
+    rig: tuple[str, ...]
     feature_size: int
     threads: int
     seed: int
@@ -101,7 +104,7 @@ def layers(request: Request) -> dict[str, Any]:
     return {
         "features": {name: told[name] for name in ("groups", "feature_size", "seed")},
         "pairs": {name: told[name] for name in pairs},
-        "mapping": {name: told[name] for name in ("asked_lens", "mapper")},
+        "mapping": {name: told[name] for name in ("asked_lens", "mapper", "rig")},
     }
 
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from gs2d.core.similarity import rotation_to_z
 from gs2d.sfm import second_round as second
+from gs2d.sfm.assemble import merged, mount
 from gs2d.sfm.compare import find_features, likeness, match
 from gs2d.sfm.grow import grow_all, grow_on
 from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
@@ -66,7 +67,9 @@ def map_(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> dict
     """
     if steps.facts("first") is None:
         _first_round(pycolmap, request, steps, say)
-    pieces = [steps.read(pycolmap, name) for name in steps.facts("first") or ()]
+    if steps.facts("joined") is None:
+        _join_pieces(pycolmap, request, steps, say)
+    pieces = [steps.read(pycolmap, name) for name in steps.facts("joined") or ()]
     lens: dict[str, Any] = {}
     refused: dict[str, str] = {}
     if pieces:
@@ -123,6 +126,30 @@ def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say)
         if piece.num_reg_images() >= SMALLEST_MODEL and piece.num_points3D():
             sizes[name] = (-piece.num_reg_images(), -piece.num_points3D())
     steps.finish("first", sorted(sizes, key=lambda name: sizes[name]))
+
+
+def _join_pieces(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
+    """Step "joined": names of the models, after those that share photographs became one, and cameras of a rig too."""
+    names = steps.facts("first") or []
+    options, threads = _options(pycolmap, request), _threads(request)
+    if len(names) > 1:
+        grown = [steps.read(pycolmap, name) for name in names]
+        pieces, joined = merged(pycolmap, request, options, grown, threads=threads)
+        for larger, smaller in joined:
+            say(note=f"two pieces that share photographs became one: {larger} and {smaller} photographs")
+        if joined:
+            names = _write_pieces(steps, "piece", pieces)
+    if request["rig"] and names:
+        pieces = [steps.read(pycolmap, name) for name in names]
+        mounted = mount(pycolmap, request, options, pieces[0], threads=threads)
+        names = _write_pieces(steps, "mounted", [mounted]) + names[1:]
+    steps.finish("joined", names)
+
+
+def _write_pieces(steps: Steps, name: str, pieces: list[Any]) -> list[str]:
+    for i, piece in enumerate(pieces):
+        steps.write(f"{name}-{i}", piece)
+    return [f"{name}-{i}" for i in range(len(pieces))]
 
 
 def _settle_lens(pycolmap: Any, request: dict[str, Any], piece: Any, steps: Steps, say: Say) -> None:

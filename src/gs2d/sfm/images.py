@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -225,6 +226,38 @@ def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cam
     for i, (photo, size) in enumerate(zip(photos, sizes, strict=True)):
         groups.setdefault((os.path.dirname(photo.name), size, photo.taken.made_by), []).append(i)
     return list(groups.values())
+
+
+def rig_folders(photos: Sequence[Photo], groups: Sequence[Sequence[int]]) -> tuple[str, ...]:
+    """Return the folders whose photographs of one name were taken at one moment by cameras that are mounted together.
+
+    Parameters
+    ----------
+    groups : sequence of sequences of int
+        Which photographs share a camera.
+
+    Raises
+    ------
+    DataError
+        Fewer than two folders, names that most photographs have alone, or a folder of several cameras.
+    """
+    names: dict[str, set[str]] = {}
+    for photo in photos:
+        names.setdefault(os.path.dirname(photo.name), set()).add(os.path.basename(photo.name))
+    expected = "--rig needs a sub-folder for each camera, with the same names for the same moments"
+    if len(names) < 2 or "" in names:
+        raise DataError(f"{expected}; got photographs in {', '.join(sorted(names)) or 'one folder'}")
+    often = Counter(name for those in names.values() for name in those)
+    alone = sorted((name for name, number in often.items() if number == 1), key=natural_key)
+    if 2 * len(alone) > len(often):
+        raise DataError(f"{expected}; got {len(alone)} of {len(often)} names in one folder alone, such as {alone[0]}")
+    folders = {frozenset(os.path.dirname(photos[i].name) for i in group) for group in groups}
+    if len(groups) != len(names) or len(folders) != len(names) or any(len(those) != 1 for those in folders):
+        raise DataError(
+            f"--rig needs one camera a folder, got {len(groups)} cameras for {len(names)} folders: photographs of one "
+            "size and lens in each, and --cameras auto"
+        )
+    return tuple(sorted(names, key=lambda folder: (-len(names[folder]), natural_key(folder))))
 
 
 def in_order_taken(photos: Sequence[Photo]) -> tuple[list[int], str]:

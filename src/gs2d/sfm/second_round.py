@@ -121,9 +121,12 @@ def refuse_unsupported(piece: Any, newcomers: Iterable[str]) -> dict[str, str]:
         passed = [name for name in waiting if not _objection(piece, placed[name], settled, float(usual))]
         settled |= {placed[name].image_id for name in passed}
         waiting = [name for name in waiting if name not in passed]
+    held = {image.frame_id for image in placed.values() if image.image_id in settled}  # of a rig one camera is enough
+    waiting = [name for name in waiting if placed[name].frame_id not in held]
     refused = {name: _objection(piece, placed[name], settled, float(usual)) for name in waiting}
     for name in refused:
-        piece.deregister_frame(placed[name].frame_id)
+        if placed[name].has_pose:  # else it went with another of its rig
+            piece.deregister_frame(placed[name].frame_id)
     return refused
 
 
