@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -372,3 +373,22 @@ def test_a_textured_mesh_says_where_it_is(tmp_path: Path) -> None:
         assert trimesh.load_mesh(tmp_path / name).faces.shape == (1, 3)  # still a mesh to others
     write_mesh(tmp_path / "a.ply", read_mesh(tmp_path / "a.obj"))
     assert georeference_of_file(tmp_path / "a.ply") is None
+
+
+@pytest.mark.parametrize("name", ["mesh.glb", "mesh.obj"])
+def test_the_textured_mesh_a_million_metres_away_comes_back_to_a_millimetre(
+    run: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("xatlas")
+    g, out = placed(run), tmp_path / name
+    words = ["--texture", "--texture-size", "256", "--faces", "100000", "--georeferenced"]
+    assert gs2d(["mesh", str(run), "--out", str(out), *words]) == 0
+    assert "less the offset 1000123 6000456 789" in capsys.readouterr().out
+    said = georeference_of_file(out)
+    assert said is not None
+    assert (said.epsg, said.origin.tolist()) == (32632, g.origin.tolist())
+    (geometry,) = trimesh.load_scene(out, process=False).geometry.values()  # in the file's own axes, z up
+    expected = np.unique(g.to_world(read_mesh(run / "mesh.ply").vertices) - g.origin, axis=0)
+    away = cKDTree(expected).query(said.to_world(np.asarray(geometry.vertices)) - g.origin)[0]
+    assert away.max() < 1e-3
+    assert len(np.unique(np.round(geometry.vertices, 3), axis=0)) == len(np.unique(np.round(expected, 3), axis=0))
