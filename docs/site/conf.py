@@ -15,7 +15,6 @@ sys.path.insert(0, str(SITE))
 
 import navigation  # noqa: E402
 import reference  # noqa: E402
-from pygments.lexers.special import TextLexer  # noqa: E402
 
 import gs2d  # noqa: E402
 
@@ -72,6 +71,5 @@ def _first_page(app: Any, error: Exception | None) -> None:
 
 def setup(app: Any) -> None:
     """Say what happens when."""
-    app.add_lexer("mermaid", TextLexer)  # a diagram where the repository is shown, its lines here
     app.connect("source-read", _complete)
     app.connect("build-finished", _first_page)
