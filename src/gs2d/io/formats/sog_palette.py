@@ -8,7 +8,7 @@ import torch
 _ROUNDS = 12  # of a codebook
 _PALETTE_ROUNDS = 5
 _LEARNT_FROM = 150_000  # splats, at random, that a palette is made of
-_DISTANCES = 1 << 24  # at once, 64 MB
+_DISTANCES = 1 << 22  # at once, 16 MB
 
 
 def codebook(values: np.ndarray, count: int = 256) -> np.ndarray:
@@ -60,6 +60,11 @@ def palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _nearest(rows: torch.Tensor, centers: torch.Tensor) -> torch.Tensor:
     half = 0.5 * centers.square().sum(dim=1)
+    at_once = max(_DISTANCES // len(centers), 1)
+    room = torch.empty(at_once, len(centers))  # taken once: fresh pages for every chunk cost as much as the products
     return torch.cat(
-        [(half - chunk @ centers.T).argmin(dim=1) for chunk in rows.split(max(_DISTANCES // len(centers), 1))]
+        [
+            torch.addmm(half, chunk, centers.T, alpha=-1, out=room[: len(chunk)]).argmin(dim=1)
+            for chunk in rows.split(at_once)
+        ]
     )
