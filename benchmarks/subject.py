@@ -26,7 +26,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.data import View
 from gs2d.data.build import Decoder
-from gs2d.data.readers.colmap import find_mask
+from gs2d.data.masks import find_mask
 from gs2d.errors import DataError, Gs2dError
 from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import MESH, open_run

@@ -59,7 +59,7 @@ INSIDE = {
         "bounds": 3,
         "scene": 2,
         "priors": 1,
-        "cache undistort": 0,
+        "cache masks undistort": 0,
     },
     "render": {
         "tensor_api": 7,

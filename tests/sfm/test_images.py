@@ -101,10 +101,9 @@ def test_files_that_are_no_photographs_are_named_with_what_to_do(tmp_path: Path)
         (tmp_path / name).write_bytes(b"?")
     found, notes = find_photos(tmp_path)
     assert len(found) == 3
-    heic, video, masks, other = notes
+    heic, video, other = notes
     assert heic.startswith("x.HEIC and 1 more were not read: pip install pi-heif (its wheel holds LGPL code)")
     assert video == "clip.MOV was not read: a video; give it alone, or put frames of it here"
-    assert masks.startswith("masks/0.jpg.png was not read: put masks/ beside images/ of the capture")
     assert other == "notes.txt was not read: no photographs"
 
 

@@ -17,6 +17,7 @@ from gs2d.core.images import image_size, read_image, read_mask
 from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
+from gs2d.data.masks import EMPTY, Masks, find_masks
 from gs2d.data.priors import (
     DEPTH_SUFFIXES,
     DEPTHS,
@@ -64,6 +65,8 @@ class PosedImage:
         becomes the object mask and the picture stays opaque.
     maps : MapFiles or None
         Depth and normal maps.
+    mask_is_alpha : bool
+        What the mask leaves out is empty: it becomes the alpha channel, which is 1 where there is no mask.
     """
 
     name: str
@@ -75,6 +78,7 @@ class PosedImage:
     object_mask: Path | None = None
     alpha_is_silhouette: bool = False
     maps: MapFiles | None = None
+    mask_is_alpha: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,8 @@ class Capture:
     """A data set as its reader understood it (fields as in Scene).
 
     ``downscaled_by`` is the factor by which the image files that were chosen are already smaller (``images_N``);
-    ``home`` the folder that may hold the folders of maps, where it is not the root.
+    ``home`` the folder that may hold the folders of maps and masks, where it is not the root, and ``mask_homes`` others
+    that may hold masks. ``finds_masks`` is False where files of these names are something else.
     """
 
     format: str
@@ -95,6 +100,8 @@ class Capture:
     notes: tuple[str, ...] = ()
     home: Path | None = None
     observe: Callable[[], ObservedPoints] | None = None
+    mask_homes: tuple[Path, ...] = ()
+    finds_masks: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +121,9 @@ class Decoder:
                 f"image {frame.path} must be {k.width}x{k.height}, got {image.shape[1]}x{image.shape[0]}; "
                 "did the file change since the scene was loaded?"
             )
-        mask = self._read_mask(frame.mask, need=1.0)
+        mask = self._read_mask(frame.mask, need=0.5 if frame.mask_is_alpha else 1.0)
+        if frame.mask_is_alpha:
+            image, mask = cut_out(image, mask), None
         object_mask = self._read_mask(frame.object_mask, need=0.5)
         if frame.alpha_is_silhouette and image.shape[2] == 4:
             object_mask = image[:, :, 3] >= 128 if object_mask is None else object_mask
@@ -213,7 +222,23 @@ def _check_aspect(what: str, got: tuple[int, int], expected: tuple[int, int], ow
         )
 
 
-def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int | None, cache_bytes: int) -> Scene:
+def cut_out(image: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    """Return a photograph [H, W, 3 or 4] with an alpha channel, 0 where a mask [H, W] bool is False."""
+    alpha = np.full(image.shape[:2], 255, np.uint8) if image.shape[2] == 3 else image[:, :, 3].copy()
+    if mask is not None:
+        alpha[~mask] = 0
+    return np.dstack([image[:, :, :3], alpha])
+
+
+def build_scene(
+    capture: Capture,
+    root: Path,
+    *,
+    downscale: int,
+    test_every: int | None,
+    cache_bytes: int,
+    masks: Masks = Masks(),  # noqa: B008 (frozen)
+) -> Scene:
     """Return a Scene of a Capture: sizes checked, cameras downscaled, views split, extent and bounds measured.
 
     Raises
@@ -229,7 +254,8 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
     factor = max(1, downscale // capture.downscaled_by)
     cache = ImageCache(cache_bytes)
     lens_maps = functools.lru_cache(maxsize=4)(source_positions)  # 12 bytes a pixel; cameras are mostly shared
-    frames = sorted((fit_to_file(frame) for frame in capture.frames), key=lambda frame: frame.name)
+    frames, mask_notes, masks = _with_masks(capture, root, masks)
+    frames = sorted((fit_to_file(frame) for frame in frames), key=lambda frame: frame.name)
     names = [frame.name for frame in frames]
     if len(set(names)) != len(names):
         twice = next(a for a, b in itertools.pairwise(names) if a == b)
@@ -251,8 +277,9 @@ def build_scene(capture: Capture, root: Path, *, downscale: int, test_every: int
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=capture.skipped,
-        notes=capture.notes + _lens_notes(frames) + map_notes + place_notes + point_notes + bound_notes,
+        notes=capture.notes + mask_notes + _lens_notes(frames) + map_notes + place_notes + point_notes + bound_notes,
         root=root,
+        masks=masks,
         observe=None if capture.observe is None else functools.cache(capture.observe),  # asked for by view after view
     )
 
@@ -302,6 +329,20 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
         raise DataError(f"view {frame.name}: {error}") from error
     maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera, lens_maps)
     return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps, k)
+
+
+def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedImage], tuple[str, ...], Masks]:
+    """Return the frames with their masks, a note about them, and how many there are."""
+    frames = list(capture.frames)
+    if not capture.finds_masks and masks.folder is None:
+        return frames, (), masks
+    homes = [home for home in (capture.home, *capture.mask_homes, root) if home is not None]
+    named, names, images = ([getattr(frame, what) for frame in frames] for what in ("mask", "name", "path"))
+    found, note = find_masks(names, images, named, homes, masks)
+    count = len(found) - found.count(None)
+    empty = masks.masked == EMPTY and count > 0
+    frames = [replace(frame, mask=mask, mask_is_alpha=empty) for frame, mask in zip(frames, found, strict=True)]
+    return frames, (note,) if note else (), replace(masks, found=count)
 
 
 def _with_maps(frames: list[PosedImage], home: Path) -> tuple[list[PosedImage], tuple[str, ...]]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from gs2d.core.memory_limit import cache_bytes as room_for_cache
 from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
+from gs2d.data.masks import Masks
 from gs2d.data.readers.colmap import MODEL_FOLDERS, model_folder, read_colmap
 from gs2d.data.readers.common import SUFFIXES
 from gs2d.data.readers.dtu import CAMERA_FILES, read_dtu
@@ -146,6 +147,8 @@ def load_scene(
     downscale: int = 1,
     test_every: int | None = None,
     cache_bytes: int | None = None,
+    masks: str | os.PathLike[str] | None = None,
+    masked: str | None = None,
 ) -> Scene:
     """Read a capture; nothing is decoded but image headers, and nothing is ever written.
 
@@ -163,6 +166,11 @@ def load_scene(
     cache_bytes : int
         Bound on decoded pictures held in memory. None: ``DEFAULT_CACHE_BYTES``, or a fifth of what the limits in force
         (control group, address space, the machine) leave this process.
+    masks : path, optional
+        Folder of masks (white = keep) of another place than tools put them; those are found without it.
+    masked : str, optional
+        What a black pixel of a mask is: "ignore", it takes part in nothing; "empty", nothing is there, as an alpha
+        channel says; "off", masks are not used. None: ignored, where the protocol uses masks.
 
     Raises
     ------
@@ -177,9 +185,12 @@ def load_scene(
         raise DataError(f"downscale must be a whole number >= 1, got {downscale}")
     if cache_bytes is None:
         cache_bytes = room_for_cache(DEFAULT_CACHE_BYTES)
+    chosen = Masks(None if masks is None else _folder(masks), masked)
     capture = reader.read(root, downscale=downscale)
     if isinstance(capture, Scene):
+        if masks is not None or masked is not None:
+            raise DataError(f"format {format} has masks of its own, got masks or masked; leave them out")
         if downscale > 1:
             raise DataError(f"format {format} cannot be shrunk when it is read, got downscale {downscale}; use 1")
         return capture
-    return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes)
+    return build_scene(capture, root, downscale=downscale, test_every=test_every, cache_bytes=cache_bytes, masks=chosen)

@@ -14,6 +14,7 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.images import composite
 from gs2d.core.memory import trim
 from gs2d.data.cache import DecodedImage, ImageCache
+from gs2d.data.masks import Masks
 from gs2d.data.priors import ObservedPoints, PriorMaps
 from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
@@ -227,6 +228,8 @@ class Scene:
     ahead : int
         Pictures that whoever goes through the views asks for before they are needed, because they come from the disk
         each time (``gs2d.data.prepared``); 0: they are to stay in memory.
+    masks : Masks
+        Which of the photographs have a mask, and what it means.
     """
 
     name: str
@@ -242,6 +245,7 @@ class Scene:
     root: Path | None = None
     observe: Callable[[], ObservedPoints] | None = None
     ahead: int = 0
+    masks: Masks = Masks()  # noqa: RUF009 (frozen)
 
     def with_poses(self, poses: Mapping[str, np.ndarray]) -> Scene:
         """Return the scene with other training cameras: T_cam_world [4, 4] by the view's name. Images are shared."""

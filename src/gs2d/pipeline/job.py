@@ -30,11 +30,13 @@ from gs2d.core.text import name_bytes
 from gs2d.data import FORMATS, Scene, View, detect_format, load_scene
 from gs2d.data.benchmarks import missing_lines, protocol_of
 from gs2d.data.load import reader_of
+from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.formats.registry import read_surfels
 from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.pipeline.masks import with_masks, without_masked_points
 from gs2d.pipeline.memory import check_memory
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.photographs import HOW, already_prepared, with_prepared
@@ -101,6 +103,7 @@ class Job:
                 "extent": self.scene.extent,
                 "skipped": list(self.scene.skipped),
                 "digest": self.images_digest,
+                **_masks_of(self.scene),
             },
             "raster": self.settings.facts(),
             "seed": self.recipe.seed,
@@ -320,12 +323,15 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
     reader_of(scene_format)  # a wrong name is told before anything is read
     protocol = choose_protocol(options, scene_format, on_event)
-    scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event)
+    masks = Masks(options.masks, options.masked)
+    scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event, masks)
+    protocol = with_masks(protocol, scene, on_event)
     check_memory(scene, options.downscale, backend.device)
     disk = None if options.disk is None else int(options.disk * 2**30)
     scene = with_prepared(scene, options.out, options.prepare, on_event, disk=disk, threads=options.threads)
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
+    scene = without_masked_points(scene, protocol, on_event)
     recipe = fit_recipe(options, scene, protocol, on_event)
     protocol = with_fused_depth(with_backdrop(protocol, recipe, scene, on_event), recipe)
     digest = with_priors(digest, scene, recipe, on_event)
@@ -394,10 +400,25 @@ def choose_backend(name: str, on_event: OnEvent) -> Backend:
     return backend
 
 
-def read_scene(path: Path, scene_format: str, downscale: int, protocol: Protocol, on_event: OnEvent) -> Scene:
+def _masks_of(scene: Scene) -> dict[str, Any]:
+    """Return what the user said about masks, for ``run.json``: nothing, mostly."""
+    folder, masked = scene.masks.folder, scene.masks.masked
+    if folder is None and masked is None:
+        return {}
+    return {"masks": {"folder": None if folder is None else str(folder.resolve()), "masked": masked}}
+
+
+def read_scene(
+    path: Path,
+    scene_format: str,
+    downscale: int,
+    protocol: Protocol,
+    on_event: OnEvent,
+    masks: Masks = Masks(),  # noqa: B008 (frozen)
+) -> Scene:
     """Load a capture and tell what was decided or skipped."""
     test_every = None if scene_format == "blender" else protocol.test_every  # Blender captures bring their split
-    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every)
+    scene = load_scene(path, format=scene_format, downscale=downscale, test_every=test_every, **masks.options())
     for text in scene.notes:
         on_event(Notice(text))
     _say_some(scene.skipped, "views skipped", on_event)
@@ -425,8 +446,8 @@ def scene_digest(scene: Scene, on_event: OnEvent, *, uses_masks: bool = False) -
     on_event(Phase("reading photographs", len(scene.views)))
     for done, view in enumerate(scene.preload(DECODE_THREADS), start=1):
         digest.update(name_bytes(f"{view.name} {'train' if id(view) in train else 'test'}"))
-        mask = view.mask()
-        empty += [view] if uses_masks and mask is not None and not mask.any() else []
+        mask = view.alpha() if scene.masks.masked == EMPTY else view.mask() if uses_masks else None
+        empty += [view] if mask is not None and not mask.any() else []
         for array in _arrays(view):
             digest.update(f"{array.shape} {array.dtype}".encode())
             digest.update(np.ascontiguousarray(array).data)
@@ -472,12 +493,14 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
         settings = settings.for_depths(protocol.depth, protocol.fused_depth)
         named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
         cache_bytes = int(data.get("stage2_cache_bytes", 0))  # runs of before there were cached views had none
+        said = data["scene"].get("masks", {})
+        masks = Masks(None if said.get("folder") is None else Path(said["folder"]), said.get("masked"))
     except (LookupError, TypeError, ValueError, AttributeError, RecipeError) as error:
         raise RunError(
             f"{run.file(RUN_JSON)} must hold recipe, protocol, raster, backend, downscale and scene as gs2d writes "
             f"them, got another entry ({error}); restore it, or train again with --overwrite"
         ) from error
-    scene = read_scene(where, data["scene"]["format"], downscale, protocol, on_event)
+    scene = read_scene(where, data["scene"]["format"], downscale, protocol, on_event, masks)
     names = (len(scene.train), len(scene.test))
     if names != (data["scene"]["train"], data["scene"]["test"]):
         raise RunError(

@@ -290,7 +290,8 @@ def fusion_frame(job: RenderedScene, view: View, output: RenderOutput, depth: st
     """Return what fusion takes of a view: depth of a kind and colour where it is covered well enough."""
     valid = (output.alpha >= OPAQUE).cpu().numpy()
     mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
-    for pixels in (mask, view.valid()):  # beyond the photograph nothing has said how far the surface is
+    # Beyond the photograph, and where it is ignored, nothing has said how far the surface is.
+    for pixels in (mask, view.usable(masks=job.protocol.use_mask_in_fusion)):
         if pixels is not None:
             valid = valid & pixels
     if job.protocol.fusion.subject:

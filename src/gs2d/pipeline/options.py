@@ -110,6 +110,9 @@ class Training:
     """What the photographs are of, as a box (default: what most cameras look at). The mesh is of it."""
     whole_scene: Annotated[bool, arg(name="scene")] = False
     """Mesh everything, not only the subject."""
+    masked: Literal["ignore", "empty", "off"] | None = None
+    """What a black pixel of a mask is: ignored, it takes part in nothing; empty, there is nothing, as an alpha channel
+    says; off: masks are not used (default: ignored, but under protocols of data sets)."""
     stage2_cache_mb: int = 1024
     """MiB for cached views in stage 2, about 5 MiB a view of 400x400 (0 = none; results differ by rounding)."""
 
@@ -154,6 +157,10 @@ class Finding:
     """Shrink the copies to this longer side, px (default: all pixels, the same bytes)."""
     feature_size: int = 1600
     """Longer side on which features are found, px: larger is slower and a little more accurate."""
+    masks: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
+    match_masked: bool = False
+    """Find features in masked pixels too: of a thing that was cut out, but stood still with its background."""
     frames: int = 100
     """Frames to take of a video, each the sharpest of its stretch (needs ffmpeg); photographs are all taken."""
     link: bool = False
@@ -174,6 +181,8 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
     downscale: int = 1
     """Shrink the photographs by this integer, area-filtered."""
+    masks: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
     schedule_scale: float = 1.0
     """Fraction of the full schedule: 0.1 trains a tenth of the iterations."""
     init: Annotated[Path | None, arg(metavar="FILE")] = None
@@ -189,7 +198,7 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Tell before training how long it will take and what is held out."""
 
     def __post_init__(self) -> None:
-        paths_of(self, "scene", "out", "init", "start_from", "cache")
+        paths_of(self, "scene", "out", "masks", "init", "start_from", "cache")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,7 +240,7 @@ class PosesOptions(Finding):
     """Replace the capture in --out, if this command made it."""
 
     def __post_init__(self) -> None:
-        paths_of(self, "photos", "out", "positions")
+        paths_of(self, "photos", "out", "positions", "masks")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from typing import Any
 from gs2d.config.recipe import Recipe
 from gs2d.core.json_files import read_json
 from gs2d.data import detect_format, load_scene
+from gs2d.data.masks import OFF
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
 from gs2d.meshing.texture import required
@@ -72,13 +73,16 @@ QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> de
 
 def poses_options(options: ReconstructOptions) -> PosesOptions:
     """Return those of ``gs2d poses``, which puts the capture into the run folder."""
+    finding = values(Finding, options.finding)
+    if options.training.masked == OFF:
+        finding["match_masked"] = True
     return PosesOptions(
         photos=options.photos,
         out=options.out / CAPTURE,
         threads=options.threads,
         seed=options.seed,
         overwrite=options.overwrite,
-        **values(Finding, options.finding),
+        **finding,
     )
 
 

@@ -12,12 +12,14 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gs2d.core.images import natural_key
 from gs2d.core.json_files import write_json
 from gs2d.data import load_scene
+from gs2d.data.masks import FOLDER
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import make_folder, now, remove_made, versions
 from gs2d.pipeline.attempts import attempted
@@ -29,6 +31,7 @@ from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, laye
 from gs2d.sfm.image_copies import copy_images
 from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, in_order_taken, read_photos, rig_folders
 from gs2d.sfm.lens import START, lens_line
+from gs2d.sfm.masks import copy_masks, masks_of
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
 from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
@@ -43,6 +46,7 @@ ALL_PAIRS = 150  # photographs, up to which "auto" matches every pair
 ASKED_FOR = (  # what poses.json remembers of the options: with another of these the capture is another one
     *("cameras", "camera_model", "matching", "overlap", "neighbours", "positions"),
     *("mapper", "rig", "max_size", "feature_size", "frames", "seed"),
+    *("masks", "match_masked"),
 )
 _MOST = 0.5  # of the photographs: so many have a place where "auto" goes by places
 _GROWTH = {"placing cameras": 1.5}  # each is adjusted with those that have a place, but not with all of them every time
@@ -79,13 +83,19 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             paths = _frames_of(video, work, options.frames, made_of, on_event) if video else paths
             reading = read_photos(paths, root, threads=threads)
             photos = list(counted(reading, "reading photographs", len(paths), on_event))
+            masks = _masks_of(options, photos, video is not None, on_event)
+            made_of |= {"masks": [_stamp(mask) for mask in masks if mask is not None]} if any(masks) else {}
             request = _request(options, work, photos, threads, on_event)
+            capture = work / "capture"
+            if any(masks) and not options.match_masked:
+                request = replace(request, masks=str(capture / FOLDER))
             if line := go_on(work, {"photographs": made_of, **layers(request)}, ours=("capture",)):
                 on_event(Notice(line))
-            staged = _stage(photos, work / "capture" / IMAGES, options, threads, on_event, ours=video is not None)
+            copy_masks(photos, masks, capture / FOLDER, options.max_size)
+            staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
             solved = solve(request, _progress(on_event), lambda line: on_event(Notice(line)))
             try:
-                result = _finish(options, request, photos, staged, solved, started, on_event)
+                result = _finish(options, request, photos, staged, solved, started, on_event, masks=masks)
             except DataError:
                 forget(work)  # it would end so again
                 raise
@@ -140,6 +150,8 @@ def _finish(
     solved: Solved,
     started: float,
     on_event: OnEvent,
+    *,
+    masks: Sequence[Path | None] = (),
 ) -> dict[str, Any]:
     """Write what the capture needs beside the models, and look at it as training does; what ``poses.json`` holds.
 
@@ -153,6 +165,7 @@ def _finish(
     facts = read_facts(Path(request.database))
     check_any(pieces, facts, options.photos)
     result = _result(options, request, photos, staged, pieces, facts, solved)
+    result |= {"masks": len(masks) - masks.count(None)} if any(masks) else {}
     result["seconds"] = round(time.monotonic() - started, 1)
     on_event(Phase("checking the capture", 0))
     with attempted(POSES_PNG, "", on_event):
@@ -160,6 +173,25 @@ def _finish(
     write_json(capture / POSES_JSON, result)
     load_scene(capture, format="colmap")
     return result
+
+
+def _masks_of(options: PosesOptions, photos: Sequence[Photo], is_video: bool, on_event: OnEvent) -> list[Path | None]:
+    """Return the mask of each photograph, and say how many have one.
+
+    Raises
+    ------
+    DataError
+    """
+    if is_video:
+        if options.masks is not None:
+            raise DataError(
+                "--masks are of photographs, got a video; take its frames with ffmpeg, and give their folder"
+            )
+        return [None] * len(photos)
+    masks, line = masks_of(photos, options.photos, options.masks)
+    if line:
+        on_event(Notice(line))
+    return masks
 
 
 def _folder_of(photos: Path, on_event: OnEvent) -> list[Path]:

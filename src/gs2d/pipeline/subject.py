@@ -6,10 +6,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
+from PIL import Image
 
 from gs2d.core.camera import Camera
 from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
+from gs2d.data import View
 from gs2d.data.subject import (
     OBJECT,
     Sight,
@@ -159,9 +161,17 @@ def sights(job: RenderedScene, splats: Splats) -> list[Sight]:
     """Return what some of the training cameras see: rendered depth, and the sparse points that it does not hide."""
     views = job.scene.train
     count = min(len(views), MAX_VIEWS)
-    cameras = [views[i].camera for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
+    chosen = [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
     points = np.zeros((0, 3)) if job.scene.points is None else np.asarray(job.scene.points.points, np.float64)
-    return [_sight(camera, _depth(job, splats, camera), points) for camera in map(_small, cameras)]
+    return [
+        _sight(camera := _small(view.camera), _depth(job, splats, camera), points, _kept(job, view)) for view in chosen
+    ]
+
+
+def _kept(job: RenderedScene, view: View) -> np.ndarray | None:
+    """Return where a photograph may say what it looks at, [H, W] bool: where its mask keeps it. None: anywhere."""
+    used = job.scene.masks.found and job.protocol.use_mask_in_training
+    return view.mask() if used else None
 
 
 def _small(camera: Camera) -> Camera:
@@ -176,8 +186,15 @@ def _depth(job: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
     return np.asarray(torch.where(output.alpha >= OPAQUE, output.depth_median, 0).cpu().numpy(), np.float64)
 
 
-def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray) -> Sight:
-    """Return the votes of one camera."""
+def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray, kept: np.ndarray | None) -> Sight:
+    """Return the votes of one camera; ``kept`` [H, W] bool, of any size: pixels that may vote."""
+    points = points[shown(camera, points)]
+    if kept is not None:
+        image = Image.fromarray(kept).resize((camera.width, camera.height), Image.Resampling.NEAREST)
+        small = np.asarray(image, dtype=bool)
+        pixels = camera.project(points)[0].astype(np.int64)
+        points = points[small[pixels[:, 1].clip(max=camera.height - 1), pixels[:, 0].clip(max=camera.width - 1)]]
+        depth = np.where(small, depth, 0)
     rows, columns = np.nonzero(depth > 0)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     z = depth[rows, columns]
@@ -196,8 +213,7 @@ def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray) -> Sight:
 
 
 def _visible(camera: Camera, depth: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the sparse points in a camera's picture that no rendered surface hides."""
-    points = points[shown(camera, points)]
+    """Return the points, in a camera's picture, that no rendered surface hides."""
     points = points[:: max(1, -(-len(points) // MAX_POINTS))]
     pixels, z = camera.project(points)
     column = np.minimum(pixels[:, 0].astype(np.int64), camera.width - 1)

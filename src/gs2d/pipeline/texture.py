@@ -162,7 +162,9 @@ def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[Vie
     """Return the training views, in another size if one is asked for, from where those of the job are."""
     if options.texture_downscale in (None, job.downscale) or job.scene.root is None:
         return job.scene.train
-    scene = read_scene(job.scene.root, job.scene.format, options.texture_downscale or 1, job.protocol, on_event)
+    scene = read_scene(
+        job.scene.root, job.scene.format, options.texture_downscale or 1, job.protocol, on_event, job.scene.masks
+    )
     return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}).train
 
 

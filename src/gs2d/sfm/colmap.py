@@ -77,6 +77,8 @@ class Request:
         Longer side on which features are found, px.
     asked_lens : str or None
         The model that the user wants; None: lenses are compared.
+    masks : str or None
+        Folder of masks (``NAME.png``): no features are looked for in their black pixels.
     """
 
     images: str
@@ -95,14 +97,16 @@ class Request:
     threads: int
     seed: int
     asked_lens: str | None = None
+    masks: str | None = None
 
 
 def layers(request: Request) -> dict[str, Any]:
     """Return what features, pairs and mapping are made of, for :func:`gs2d.sfm.search.go_on`."""
     told = asdict(request)
     pairs = ("in_order", "ordered_by", "places", "matching", "overlap", "neighbours")
+    features = ("groups", "feature_size", "seed", *(("masks",) if request.masks is not None else ()))
     return {
-        "features": {name: told[name] for name in ("groups", "feature_size", "seed")},
+        "features": {name: told[name] for name in features},
         "pairs": {name: told[name] for name in pairs},
         "mapping": {name: told[name] for name in ("asked_lens", "mapper", "rig")},
     }

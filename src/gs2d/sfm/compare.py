@@ -36,6 +36,8 @@ def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
     options.num_threads = request["threads"]
     options.max_image_size = request["feature_size"]
     mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
+    if request.get("masks"):
+        reader.mask_path = request["masks"]
     names = [name for group in request["groups"] for name in group["names"]]
     pycolmap.extract_features(database, images, names, mode, reader, options, pycolmap.Device.cpu)
 

@@ -15,6 +15,7 @@ from PIL import Image, features
 
 from gs2d.core.exif import Taken, read_taken
 from gs2d.core.images import natural_key, read_image
+from gs2d.data.masks import ENDING, FOLDER
 from gs2d.errors import DataError
 from gs2d.sfm.video_frames import VIDEOS
 
@@ -40,7 +41,6 @@ _KINDS = {
     for suffix in suffixes
 }
 FEWEST = 3  # two photographs give no point that a third confirms
-_MASKS = "masks"
 _HIDDEN = (".", "__MACOSX")
 _ORIENTATIONS = {  # EXIF 2.32, tag 0x0112: what makes the stored pixels upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -113,13 +113,12 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
         kind = _KINDS.get(path.suffix.lower(), "other")
         if path.exists() and not path.is_file():  # a pipe, which would be waited for
             kind = "other"
-        sorted_out["mask" if _MASKS in path.relative_to(root).parts[:-1] else kind].append(path)
-    photos, videos, raws, masks, others = sorted_out.values()
+        sorted_out["mask" if FOLDER in path.relative_to(root).parts[:-1] else kind].append(path)
+    photos, videos, raws, _, others = sorted_out.values()
+    photos = _without_masks(photos)
     notes = [f"{_some(raws, root)} not read: {_raw_remedy(raws[0])}"] if raws else []
     if videos:
         notes.append(f"{_some(videos, root)} not read: a video; give it alone, or put frames of it here")
-    if masks:
-        notes.append(f"{_some(masks, root)} not read: put {_MASKS}/ beside images/ of the capture, for training")
     if others:
         notes.append(f"{_some(others, root)} not read: no photographs")
     if len(photos) < FEWEST:
@@ -127,6 +126,13 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
         why = f"; {notes[0]}" if notes else ""
         raise DataError(f"{root} must hold {FEWEST} or more photographs, got {got}{why or '; ' + _SHOOTING}")
     return photos, tuple(notes)
+
+
+def _without_masks(photos: Sequence[Path]) -> list[Path]:
+    """Return the photographs but those that are the mask of another one: ``a_mask.png`` beside ``a.jpg``."""
+    stems = {path.with_suffix("") for path in photos}
+    masks = {path for path in photos if path.stem.endswith(ENDING)}
+    return [path for path in photos if path not in masks or path.with_name(path.stem[: -len(ENDING)]) not in stems]
 
 
 def _files(root: Path) -> Iterator[Path]:

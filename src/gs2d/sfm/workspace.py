@@ -14,7 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gs2d.core.files import disk_error
-from gs2d.errors import RunError
+from gs2d.core.json_files import read_json
+from gs2d.data.masks import FOLDER as MASKS
+from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_made
 from gs2d.sfm.search import SEARCH
 
@@ -46,7 +48,7 @@ def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
         raise disk_error(out, error) from error
     if out.is_mount():
         raise RunError(f"--out {given} is where a disk is mounted, and cannot be renamed; choose a folder in it")
-    others = sorted(entries - set(EXIT_BUG))
+    others = sorted(entries - set(EXIT_BUG) - ({MASKS} if _has_masks_of_ours(out) else set()))
     if POSES_JSON in entries and not others:
         if not overwrite:
             raise RunError(f"{given} already holds a capture; replace it with --overwrite")
@@ -57,6 +59,14 @@ def check_out(given: Path, images: Path, *, overwrite: bool) -> None:
         )
     if out == Path.cwd() or out in Path.cwd().parents:
         raise RunError(f"--out {given} is the folder that you are in, and is replaced as a whole; go elsewhere")
+
+
+def _has_masks_of_ours(out: Path) -> bool:
+    """Whether the masks of a capture were put there by this command: nobody else's are replaced."""
+    try:
+        return bool(read_json(out / POSES_JSON).get("masks"))
+    except (DataError, AttributeError):
+        return False
 
 
 def hidden_workspace(out: Path) -> Path:

@@ -147,7 +147,7 @@ def test_masks_of_opensfm_are_those_of_colmap(tmp_path: Path) -> None:
     mask[:10] = 255
     Image.fromarray(mask).save(tmp_path / "masks" / "a_1.jpg.png")
     scene = load_scene(tmp_path)
-    assert "masks: 1 of 9 views have one in masks (white = keep)" in scene.notes
+    assert "masks: 1 of 9 views have one in masks (white = keep); the other 8 are whole" in scene.notes
     np.testing.assert_array_equal(scene.train[0].mask(), mask > 0)
 
 

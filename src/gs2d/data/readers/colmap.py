@@ -353,8 +353,7 @@ def read_colmap(root: Path, downscale: int) -> Capture:
     """Read a COLMAP data set.
 
     Photographs are in ``images`` beside ``sparse`` (also in sub-folders of it), or in ``images_N`` when ``downscale``
-    is N and that folder exists. Masks are in ``masks``, one for an image ``a/b.jpg`` named ``a/b.jpg.png`` (as COLMAP
-    does) or ``a/b.png``; white = keep. EXIF orientation is ignored, as COLMAP ignores it.
+    is N and that folder exists. EXIF orientation is ignored, as COLMAP ignores it.
 
     Raises
     ------
@@ -392,11 +391,7 @@ def read_colmap(root: Path, downscale: int) -> Capture:
         k = intrinsics[image.camera_id]
         if factor > 1:
             _check_factor(path, k, factor)
-        mask = find_mask(home / "masks", name)
-        frames.append(PosedImage(name, path, k, image.T_cam_world, mask=mask))
-    masked = sum(frame.mask is not None for frame in frames)
-    if (home / "masks").is_dir():
-        notes.append(f"masks: {masked} of {len(frames)} views have one in {(home / 'masks').name} (white = keep)")
+        frames.append(PosedImage(name, path, k, image.T_cam_world))
     return Capture(
         "colmap",
         tuple(frames),
@@ -437,12 +432,6 @@ def model_points(folder: Path, kind: str) -> PointCloud | None:
     """Return the sparse points of a model as a PointCloud, or None."""
     points = read_points(folder, kind)
     return None if points is None or not len(points.xyz) else PointCloud(points.xyz, points.rgb)
-
-
-def find_mask(folder: Path, name: str) -> Path | None:
-    """Return the mask of the image ``name`` in ``folder``: ``name.png``, ``name`` with the suffix .png, or ``name``."""
-    candidates = (folder / f"{name}.png", (folder / name).with_suffix(".png"), folder / name)
-    return next((path for path in candidates if path.is_file()), None)
 
 
 def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage) -> Intrinsics:

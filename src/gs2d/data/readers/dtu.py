@@ -83,6 +83,7 @@ def read_dtu(root: Path) -> Capture:
         "dtu",
         tuple(frames),
         points,
+        finds_masks=False,
         T_metric_scene=scale[min(scale)],
         default_test_every=0,
         skipped=tuple(skipped),

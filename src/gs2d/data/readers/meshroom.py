@@ -18,7 +18,6 @@ import numpy as np
 
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
-from gs2d.data.readers.colmap import find_mask
 from gs2d.data.readers.common import ImageFiles, entries, head, points_beside, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
@@ -55,8 +54,8 @@ def _is_scene(path: Path) -> bool:
 def read_alicevision(root: Path) -> Capture:
     """Read the views that have a pose; the others, and views of rigs, are skipped and named.
 
-    Photographs are at the paths that the file names, else found by name in ``images`` or elsewhere below the folder;
-    masks in ``masks`` (white = keep). Points are those of the file (``structure``), else of a PLY file beside.
+    Photographs are at the paths that the file names, else found by name in ``images`` or elsewhere below the folder.
+    Points are those of the file (``structure``), else of a PLY file beside.
 
     Raises
     ------
@@ -77,7 +76,7 @@ def read_alicevision(root: Path) -> Capture:
             f"{path} must hold poses, got none; take the file of the node StructureFromMotion (cameras.sfm), or of "
             "ConvertSfMFormat with SfM File Format json"
         )
-    images, masks = ImageFiles([root / "images", root]), root / "masks"
+    images = ImageFiles([root / "images", root])
     frames: list[PosedImage] = []
     skipped: list[str] = []
     for index, view in enumerate(_list(data, "views", path)):
@@ -95,7 +94,7 @@ def read_alicevision(root: Path) -> Capture:
         if key not in cameras:
             raise DataError(f"{path}: intrinsics must hold {key} of view {label}, got {sorted(cameras)[:9]}")
         k = _intrinsics(cameras[key], version, f"{path}: intrinsic {key}")
-        frames.append(PosedImage(found[0], found[1], k, _pose(pose, where), mask=find_mask(masks, found[0])))
+        frames.append(PosedImage(found[0], found[1], k, _pose(pose, where)))
     points, notes = _points(data, path), list[str]()
     if points is None:
         points, notes = points_beside(root, frames)

@@ -21,7 +21,6 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
-from gs2d.data.readers.colmap import find_mask
 from gs2d.data.readers.common import ImageFiles, head, points_beside, real, reals, whole
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
@@ -52,8 +51,8 @@ def camera_file(root: Path) -> Path | None:
 def read_metashape(root: Path) -> Capture:
     """Read Metashape's cameras; those without a place, switched off or of another component are skipped and named.
 
-    Photographs are in ``images`` or elsewhere below the folder and found by their labels, with or without ending; masks
-    in ``masks`` (white = keep); sparse points in a PLY file beside (``foreign_points.points_beside``).
+    Photographs are in ``images`` or elsewhere below the folder and found by their labels, with or without ending;
+    sparse points in a PLY file beside (``common.points_beside``).
 
     Raises
     ------
@@ -65,7 +64,7 @@ def read_metashape(root: Path) -> Capture:
         raise DataError(f"{root} must hold cameras.xml of Metashape (File > Export > Export Cameras), got no such file")
     chunk, notes = _chunk(path)
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    images, masks = ImageFiles([root / "images", root]), root / "masks"
+    images = ImageFiles([root / "images", root])
     listed = [camera for group in chunk.iterfind("cameras") for camera in group.iter("camera")]
     placed, skipped = _placed(listed)
     component, more = _component(placed)
@@ -88,7 +87,7 @@ def read_metashape(root: Path) -> Capture:
             raise DataError(f"{path} must hold sensor {key!r} of camera {label}, got {sorted(sensors)[:9]}")
         k = _intrinsics(sensors[key], f"{path}: sensor {key}")
         T = pose_from_camera_to_world(M, f"{where}: transform", opengl=False)
-        frames.append(PosedImage(found[0], found[1], k, T, mask=find_mask(masks, found[0])))
+        frames.append(PosedImage(found[0], found[1], k, T))
     points, said = points_beside(root, frames)
     return Capture("metashape", tuple(frames), points, skipped=tuple(lost), notes=(*notes, *moved, *said))
 

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage
-from gs2d.data.readers.colmap import find_mask
 from gs2d.data.readers.common import ImageFiles, entries, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
@@ -45,8 +44,7 @@ def reconstruction_file(root: Path) -> Path | None:
 def read_opensfm(root: Path) -> Capture:
     """Read ``reconstruction.json``: of several reconstructions the one with most photographs.
 
-    Photographs are in ``images`` (of OpenDroneMap: beside the folder ``opensfm``), masks in ``masks``: ``a.jpg.png``
-    for ``a.jpg``, white = keep.
+    Photographs are in ``images`` (of OpenDroneMap: beside the folder ``opensfm``).
 
     Raises
     ------
@@ -59,7 +57,6 @@ def read_opensfm(root: Path) -> Capture:
     reconstruction, notes = _largest(path)
     homes = dict.fromkeys((path.parent, root, root.parent if root.name == "opensfm" else root))
     images = ImageFiles([*(home / "images" for home in homes), root])
-    masks = next((home / "masks" for home in homes if (home / "masks").is_dir()), None)
     cameras = entries(required(reconstruction, "cameras", str(path)), f"{path}: cameras")
     shots = entries(required(reconstruction, "shots", str(path)), f"{path}: shots")
     frames: list[PosedImage] = []
@@ -76,12 +73,11 @@ def read_opensfm(root: Path) -> Capture:
         if key not in cameras:
             raise DataError(f"{path}: cameras must hold {key!r} of shot {name}, got {sorted(cameras)[:9]}")
         k = _intrinsics(entries(cameras[key], f"{path}: camera {key}"), found[1], f"{path}: camera {key}")
-        frames.append(PosedImage(found[0], found[1], k, T, mask=None if masks is None else find_mask(masks, found[0])))
-    if masks is not None:
-        masked = sum(frame.mask is not None for frame in frames)
-        notes.append(f"masks: {masked} of {len(frames)} views have one in {masks.name} (white = keep)")
+        frames.append(PosedImage(found[0], found[1], k, T))
     points = _points(reconstruction.get("points"), path)
-    return Capture("opensfm", tuple(frames), points, skipped=tuple(skipped), notes=tuple(notes))
+    return Capture(
+        "opensfm", tuple(frames), points, skipped=tuple(skipped), notes=tuple(notes), mask_homes=tuple(homes)
+    )
 
 
 def _largest(path: Path) -> tuple[Mapping[str, Any], list[str]]:

@@ -1,0 +1,147 @@
+"""Masks of captures: where each tool puts them, and what a black pixel means."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
+from foreign_writers import small_alicevision, small_metashape, small_opensfm
+from gs2d.data import Scene, load_scene
+from gs2d.data.masks import find_mask
+from gs2d.errors import DataError
+
+HALF = np.where(np.arange(40) < 20, 255, 0).astype(np.uint8)[None].repeat(30, axis=0)  # the left half is kept
+
+
+def write(path: Path, pixels: np.ndarray = HALF) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+def masked_names(scene: Scene) -> list[str]:
+    return [view.name for view in scene.views if view.mask() is not None and not view.mask()[:, 25:].any()]
+
+
+@pytest.mark.parametrize(
+    ("make", "mask", "view"),
+    [
+        (small_colmap, "masks/3.png.png", "3.png"),
+        (small_colmap, "masks/3_mask.png", "3.png"),
+        (small_colmap, "images/3_mask.png", "3.png"),
+        (small_nerfstudio, "masks/f_03.png", "images/f_03.png"),
+        (small_nerfstudio, "masks/images/f_03.png.png", "images/f_03.png"),
+        (small_nerfstudio, "images/f_03_mask.png", "images/f_03.png"),
+        (small_blender, "masks/train/r_1.png", "train/r_1.png"),
+        (small_opensfm, "masks/a_1.jpg.png", "a_1.jpg"),
+        (small_metashape, "masks/IMG_1_mask.png", "IMG_1.jpg"),
+        (small_metashape, "masks/IMG_1.png", "IMG_1.jpg"),
+        (small_alicevision, "masks/IMG_1.png", "IMG_1.jpg"),
+    ],
+)
+def test_masks_are_found_where_tools_put_them(
+    tmp_path: Path, make: Callable[[Path], object], mask: str, view: str
+) -> None:
+    make(tmp_path)
+    names = [view.name for view in load_scene(tmp_path).views]
+    if view not in names:  # the writers name photographs as their tools do
+        view = sorted(names)[1]
+        mask = mask.replace(Path(mask).name.split("_mask")[0].split(".")[0], Path(view).stem)
+    write(tmp_path / mask)
+    scene = load_scene(tmp_path)
+    assert masked_names(scene) == [view]
+    assert scene.masks.found == 1
+    assert any(f"masks: 1 of {len(names)} views have one in" in note for note in scene.notes)
+    assert sorted(view.name for view in scene.views) == sorted(names)
+
+
+def test_nerfstudio_names_masks_itself_and_a_folder_of_the_user_wins(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path, frame={"mask_path": "other/m.png"})
+    write(tmp_path / "other" / "m.png")
+    scene = load_scene(tmp_path)
+    assert len(masked_names(scene)) == 9
+    assert any("masks: 9 of 9 views have one in the file of cameras (white = keep)" in note for note in scene.notes)
+    write(tmp_path / "mine" / "f_02.png")
+    scene = load_scene(tmp_path, masks=tmp_path / "mine")
+    assert masked_names(scene) == ["images/f_02.png"]
+    assert f"in {tmp_path / 'mine'} (white = keep, the rest is ignored); the other 8 are whole" in scene.notes[-1]
+
+
+def test_a_named_folder_serves_dtu_whose_own_masks_are_silhouettes(tmp_path: Path) -> None:
+    small_dtu(tmp_path / "scan")
+    assert load_scene(tmp_path / "scan").masks.found == 0
+    first = load_scene(tmp_path / "scan").views[0]
+    write(tmp_path / "mine" / f"{Path(first.name).stem}.png", HALF[: first.camera.height, : first.camera.width])
+    assert load_scene(tmp_path / "scan", masks=tmp_path / "mine").masks.found == 1
+
+
+def test_empty_makes_an_alpha_channel_of_the_mask_in_every_view(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    write(tmp_path / "masks" / "3.png")
+    scene = load_scene(tmp_path, masked="empty")
+    views = {view.name: view for view in scene.views}
+    alpha, whole = views["3.png"].alpha(), views["4.png"].alpha()
+    assert alpha is not None
+    assert whole is not None
+    assert (alpha[:, :20] == 1).all()
+    assert (alpha[:, 20:] == 0).all()
+    assert (whole == 1).all()
+    assert views["3.png"].mask() is None
+    assert (views["3.png"].target((0.25, 0.5, 0.75))[:, 20:] == (0.25, 0.5, 0.75)).all()
+    outside = views["3.png"].object_mask()
+    assert outside is not None
+    assert not outside[:, 20:].any()
+    assert any("(white = keep, the rest is empty)" in note for note in scene.notes)
+
+
+def test_off_uses_no_mask_and_says_so(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path, frame={"mask_path": "other/m.png"})
+    write(tmp_path / "other" / "m.png")
+    scene = load_scene(tmp_path, masked="off")
+    assert scene.masks.found == 0
+    assert all(view.mask() is None for view in scene.views)
+    assert "masks are not used (--masked off)" in scene.notes
+
+
+def test_masks_of_another_size_are_scaled_and_of_another_shape_refused(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    write(tmp_path / "masks" / "3.png", HALF.repeat(2, axis=0).repeat(2, axis=1))
+    assert masked_names(load_scene(tmp_path)) == ["3.png"]
+    write(tmp_path / "masks" / "3.png", HALF[:, :30])
+    with pytest.raises(DataError, match=r"mask .*3\.png must have the size \(or aspect\) of its image, 40x30, got 30"):
+        load_scene(tmp_path)
+
+
+def test_a_folder_without_masks_of_these_photographs_and_a_wrong_word_are_refused(tmp_path: Path) -> None:
+    small_colmap(tmp_path)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(DataError, match=r"none must hold masks of the photographs, got none of 9: 8\.png\.png"):
+        load_scene(tmp_path, masks=tmp_path / "none")
+    with pytest.raises(DataError, match="must be the folder"):
+        load_scene(tmp_path, masks=tmp_path / "missing")
+    with pytest.raises(DataError, match="masked must be one of ignore, empty, off, got black"):
+        load_scene(tmp_path, masked="black")
+
+
+def test_a_missing_mask_that_the_file_names_is_told(tmp_path: Path) -> None:
+    small_nerfstudio(tmp_path)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    data["frames"][0]["mask_path"] = "gone.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    assert "1 masks named in transforms.json do not exist" in load_scene(tmp_path).notes
+
+
+def test_the_longest_name_is_looked_for_first(tmp_path: Path) -> None:
+    for name in ("a/b.jpg.png", "a/b.png", "a/b_mask.png"):
+        write(tmp_path / name)
+    order = []
+    while (found := find_mask(tmp_path, "a/b.jpg")) is not None:
+        order.append(found.name)
+        found.unlink()
+    assert order == ["b.jpg.png", "b.png", "b_mask.png"]
