@@ -13,6 +13,7 @@ import torch
 
 from browser import Page, browser, require_browser
 from gs2d.core.camera import look_at
+from gs2d.core.georeference import Georeference
 from gs2d.core.splats import Splats
 from gs2d.data.subject import Subject
 from gs2d.render.api import rasterize
@@ -69,7 +70,7 @@ def as_at_first(request: pytest.FixtureRequest) -> None:
         tab = request.getfixturevalue("page")
         tab.size(640, 420)
         tab.ask("$('help').close(); limited = true; $('free').checked = false; document.body.classList.remove('bare');"
-                "boxed(false); show(0); home(); document.activeElement.blur()")  # fmt: skip
+                "boxed(false); measuring(false); show(0); home(); document.activeElement.blur()")  # fmt: skip
         still(tab)
 
 
@@ -248,3 +249,49 @@ def test_a_photographed_view_is_drawn_as_the_rasterizer_draws_it_after_turning_a
     finally:
         page.ask("document.body.classList.remove('bare')")
         page.size(640, 420)
+
+
+def test_two_clicks_measure_a_distance_on_the_surface(page: Page) -> None:
+    page.key("m")
+    place = "JSON.stringify([[0, 0.3, 0], [0, -0.3, 0]].map(onScreen).map((p) => [p.x, p.y]))"
+    red, green = json.loads(page.ask(place))
+    eye = values(page, "here.eye")[0]
+    for x, y in (red, green):
+        page.mouse("mousePressed", x, y)
+        page.mouse("mouseReleased", x, y)
+    assert values(page, "here.eye")[0] == eye
+    np.testing.assert_allclose(values(page, "ruler.ends")[0], [[0, 0.3, 0], [0, -0.3, 0]], atol=2e-3)
+    assert page.ask("$('distance').textContent") == "0.6 units"
+    assert page.ask("$('ruler').querySelector('text').textContent") == "0.6 units"
+    page.ask("$('truly').value = 1.25; $('truly').oninput()")
+    words = page.ask("$('knowncommand').value").split()
+    assert words[:4] == ["gs2d", "georeference", "RUN", "--known-distance"]
+    np.testing.assert_allclose([float(word) for word in words[4:]], [100, -199.7, 50, 100, -200.3, 50, 1.25], atol=3e-3)
+    page.key("Escape")
+    assert values(page, "ruler.on", "$('measurepanel').hidden") == [False, True]
+
+
+def test_a_drag_while_measuring_turns_and_a_click_beside_everything_says_so(page: Page) -> None:
+    page.key("m")
+    page.drag((320, 160), (360, 160))
+    assert values(page, "ruler.ends")[0] == []
+    page.mouse("mousePressed", 8, 200)
+    page.mouse("mouseReleased", 8, 200)
+    assert page.ask("$('aside').textContent") == "nothing solid there"
+    page.key("m")
+
+
+def test_a_georeferenced_page_measures_in_metres_with_the_height(page: Page, tmp_path: Path) -> None:
+    turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # the capture's y is up
+    world = Georeference(2.5, turn, np.zeros(3), np.zeros(3), "a test", grid_scale=0.5)
+    told = {"metres": world.metres_per_unit, "rotation": turn.flatten().tolist()}
+    page.ask(f"facts.world = {json.dumps(told)}")
+    try:
+        short, long = json.loads(page.ask("JSON.stringify(Object.values(distanceTold([0, 0, 0], [0, 0.6, 0.8])))"))
+    finally:
+        page.ask("facts.world = null")
+    assert (short, long) == ("5 m", "level 4 m, height +3 m")
+    np.testing.assert_allclose(world.ground_way(np.array([0, 0.6, 0.8])), [4, 0, 3])
+    path = tmp_path / "there.html"
+    write_page(path, two_balls(), ONE_SIDE, SETTINGS, title="x", focus=ORIGIN, unit=4.0, up=UP, world=world)
+    assert f'"world": {json.dumps(told)}' in path.read_text()

@@ -124,6 +124,10 @@ class Georeference:
         local = np.asarray(points, np.float64) - self.origin
         return np.asarray((local - self.translation) @ self.rotation / self.scale)
 
+    def ground_way(self, way: np.ndarray) -> np.ndarray:
+        """Return a way [3] between two places of the run in metres on the ground: east, north, up."""
+        return np.asarray(self.metres_per_unit * (self.rotation @ np.asarray(way, np.float64)))
+
     @property
     def is_local(self) -> bool:
         """Whether it changes nothing: what it is of is in local metres already."""

@@ -16,7 +16,7 @@ from gs2d.io.run_dir import PAGE, is_run, open_run
 from gs2d.pipeline.events import Notice, OnEvent, Phase, ignore
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import Job, reload_job
-from gs2d.pipeline.view import frame_around, from_aside, settings_without_run
+from gs2d.pipeline.view import frame_around, from_aside, settings_without_run, world_of
 from gs2d.viewer.web import Seen, write_page
 
 MAX_VIEWS = 100  # photographs that one can step through
@@ -91,6 +91,7 @@ def page_run(
         up=up,
         sh_degree=sh_degree,
         subject=subject,
+        world=world_of(path, on_event),
     )
     if written["bytes"] > LARGE:
         on_event(Notice(f"{written['bytes'] / 1e6:.0f} MB are much for a page: --sh-degree 1 or 0 makes it smaller"))

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gs2d.core.camera import Camera, look_at
+from gs2d.core.georeference import Georeference
 from gs2d.core.images import to_uint8
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
@@ -21,6 +22,7 @@ from gs2d.data import View
 from gs2d.data.subject import read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.formats.registry import read_disks
+from gs2d.io.georeference import georeference_of_file, read_georeference
 from gs2d.io.meshes import glb_bytes, glb_turn, read_mesh
 from gs2d.io.run_dir import MESH, TEXTURED, RunFolder, is_run, load_tensors, open_run
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
@@ -91,6 +93,7 @@ def open_viewer(
         first = content.cameras[0] if content.cameras else from_aside(frame, up)
         viewer.look_from(first, frame.origin)
         viewer.add_clip_box(_first_box(path, centers), str(path), of_run=is_run(path))
+        viewer.add_ruler(str(path), of_run=is_run(path), world=world_of(path, on_event))
     except BaseException:
         viewer.close()
         raise
@@ -104,6 +107,18 @@ def _first_box(path: Path, centers: np.ndarray) -> np.ndarray:
         return subject.box
     finite = centers[np.isfinite(centers).all(axis=1)]
     return np.percentile(finite, (2, 98), axis=0) if len(finite) else np.array([[-1.0] * 3, [1.0] * 3])
+
+
+def world_of(path: Path, on_event: OnEvent) -> Georeference | None:
+    """Return how the splats of a run or a file lie in the world, to measure in metres; None where that is not known."""
+    try:
+        if is_run(path):
+            return read_georeference(path)
+        told = georeference_of_file(path)
+        return None if told is None else told.of_local_files()
+    except DataError as error:
+        on_event(Notice(f"distances are in units of the capture: {error}"))
+        return None
 
 
 def serve(viewer: Viewer, on_event: OnEvent = ignore) -> None:

@@ -173,6 +173,8 @@ def problem_of(raw: Any, control: Callable[[str], Any]) -> str | None:
         return _problem_of_update(fields, control)
     if kind == "SceneNodeClickMessage":
         return None if _is_click(fields) else "not a click"
+    if kind == "ScenePointerMessage":
+        return None if _is_pointer(fields) else "not a click"
     # Others that viser has (uploads, tunnels, ...) are of no use to our page.
     return "" if kind.isidentifier() and hasattr(_messages, kind) else "not a message"
 
@@ -204,6 +206,19 @@ _CLICK: Mapping[str, Callable[[Any], bool]] = {
     "screen_pos": lambda v: _are_numbers(v, 2),
     "modifier": lambda v: v is None or (isinstance(v, str) and len(v) <= MAX_TEXT),
 }
+
+
+_POINTER: Mapping[str, Callable[[Any], bool]] = {
+    "event_type": lambda v: v == "click",
+    "ray_origin": _CLICK["ray_origin"],
+    "ray_direction": lambda v: _are_numbers(v, 3) and any(v),
+    "screen_pos": lambda v: isinstance(v, list) and len(v) == 1 and _are_numbers(v[0], 2),
+    "modifier": _CLICK["modifier"],
+}
+
+
+def _is_pointer(fields: Mapping[str, Any]) -> bool:
+    return set(fields) == set(_POINTER) and all(check(fields[name]) for name, check in _POINTER.items())
 
 
 def _is_camera(fields: Mapping[str, Any]) -> bool:

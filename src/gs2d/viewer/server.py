@@ -19,11 +19,13 @@ from PIL import Image
 
 from gs2d.core.camera import Camera
 from gs2d.core.extras import install
+from gs2d.core.georeference import Georeference
 from gs2d.core.transforms import focus_point
 from gs2d.errors import BackendError, Gs2dError
 from gs2d.viewer.clip import ClipBox
 from gs2d.viewer.exact import ExactImages, Render, ViewerFrame
 from gs2d.viewer.guard import Guard, guarded
+from gs2d.viewer.ruler import Ruler
 from gs2d.viewer.splats import Preview
 
 DEFAULT_PORT = 8080
@@ -145,6 +147,7 @@ class Viewer:
         self._stages: dict[str, ViewerStage] = {}
         self._preview: Preview | None = None
         self.clip: ClipBox | None = None
+        self.ruler: Ruler | None = None
         self._showing = (
             threading.Lock()
         )  # held by whoever changes the splats: browsers' threads, and that of a training
@@ -235,6 +238,14 @@ class Viewer:
                     self._show_splats(self._preview, visible=self._drawn.value == "preview")
 
         self.clip = ClipBox(self._server, self._frame, box, source, show, of_run=of_run)
+
+    def add_ruler(self, source: str, *, of_run: bool, world: Georeference | None) -> None:
+        """Add what measures distances on the splats that are shown, in metres where ``world`` is known."""
+
+        def shown() -> Render:
+            return self._stages[self._chosen.value].render()
+
+        self.ruler = Ruler(self._server, self._frame, shown, source, of_run=of_run, world=world)
 
     def add_status(self, text: str) -> Callable[[str], None]:
         """Return a line of text above all else, in Markdown; returns what changes it."""

@@ -25,6 +25,7 @@ import torch
 
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
+from gs2d.core.georeference import Georeference
 from gs2d.core.splats import Splats
 from gs2d.core.text import printable
 from gs2d.data.subject import OBJECT, SCENE, Subject
@@ -133,7 +134,7 @@ PARTS = {  # script elements: id -> file, type
     "final-frag": ("final.frag", "x-shader/x-fragment"),
     "sorter": ("sorter.js", "text/plain"),
 }
-SCRIPTS = ("camera.js", "viewer.js", "panel.js")  # one script, in this order
+SCRIPTS = ("camera.js", "viewer.js", "measure.js", "panel.js")  # one script, in this order
 HINT = (
     '<span class="mouse">Drag to turn, wheel to come closer, ? for more.</span>'
     '<span class="finger">One finger turns, two fingers come closer and shift.</span>'
@@ -280,6 +281,7 @@ def write_page(
     up: np.ndarray,
     sh_degree: int = 3,
     subject: Subject | None = None,
+    world: Georeference | None = None,
 ) -> dict[str, Any]:
     """Write the page.
 
@@ -302,6 +304,8 @@ def write_page(
         Of the stored coefficients at most: 45, 24, 9 or 0 bytes a splat.
     subject : Subject, optional
         What is shown first and turned about. Default: something around the focus.
+    world : Georeference, optional
+        Where the splats are in the world: the page measures in metres. Default: in units of the capture.
 
     Returns
     -------
@@ -317,7 +321,8 @@ def write_page(
         subject = guessed_subject([view.camera for view in views], focus, unit, up)
     shade = "#" + "".join(f"{round(255 * part):02x}" for part in settings.background)
     is_dark = sum(settings.background) < 1.5
-    told = json.dumps(_facts(packed, views, settings, unit, up, subject), allow_nan=False)
+    facts = {**_facts(packed, views, settings, unit, up, subject), "world": None if world is None else _world(world)}
+    told = json.dumps(facts, allow_nan=False)
     values = {
         "title": html.escape(printable(title)),
         "count": f"{packed.count:,}",
@@ -413,6 +418,11 @@ def _facts(
         "up": up.tolist(),
         "cameras": [_camera(view, packed.origin) for view in views],
     }
+
+
+def _world(world: Georeference) -> dict[str, Any]:
+    """Return what distances in metres need; a rotation by rows."""
+    return {"metres": world.metres_per_unit, "rotation": world.rotation.flatten().tolist()}
 
 
 def _camera(view: Seen, origin: np.ndarray) -> dict[str, Any]:

@@ -1,5 +1,4 @@
 // What the visitor presses: buttons, keys, fingers; the clip box with its numbers and handles; help.
-const KINDS = ["colours", "normals", "depth"];
 const digits = clamp(3 - Math.floor(Math.log10(Math.max(radius, 1e-9))), 0, 9); // a thousandth of the subject
 const box = { on: false, low: [...facts.subject.low], high: [...facts.subject.high] }; // relative to facts.origin
 const svg = $("lines");
@@ -28,15 +27,15 @@ function setFace(side, i, value) {
   boxed();
 }
 
-async function copyBox() {
+async function copied(field, told) {
   try {
-    await navigator.clipboard.writeText($("bbox").value);
+    await navigator.clipboard.writeText($(field).value);
   } catch {
-    $("bbox").select();
+    $(field).select();
     document.execCommand("copy"); // where the clipboard is only for pages of servers
   }
-  $("copied").textContent = "copied";
-  setTimeout(() => ($("copied").textContent = ""), 2000);
+  $(told).textContent = "copied";
+  setTimeout(() => ($(told).textContent = ""), 2000);
 }
 
 // ---- lines and handles over the picture ----
@@ -140,14 +139,14 @@ function listen() {
   };
   canvas.onwheel = (e) => { e.preventDefault(); $("hint").hidden = true; zoom(Math.exp(0.0015 * clamp(e.deltaY, -200, 200))); };
   canvas.oncontextmenu = (e) => e.preventDefault();
-  canvas.ondblclick = home;
+  canvas.ondblclick = () => ruler.on || home();
   const turn = (dx, dy) => () => { turnItself(false); orbit(dx, dy); };
   const keys = {
     ArrowLeft: () => goTo(shown - 1), ArrowRight: () => goTo(shown + 1),
     a: turn(0.1, 0), d: turn(-0.1, 0), w: turn(0, 0.1), s: turn(0, -0.1),
     h: home, Home: home, t: () => turnItself(!spinning),
     c: () => show(0), n: () => show(kind === 1 ? 0 : 1), z: () => show(kind === 2 ? 0 : 2),
-    b: () => boxed(!box.on), f: fullScreen, "?": () => $("help").showModal(),
+    b: () => boxed(!box.on), m: () => measuring(!ruler.on), Escape: () => measuring(false), f: fullScreen, "?": () => $("help").showModal(),
     "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1.1),
   };
   onkeydown = (e) => {
@@ -158,7 +157,7 @@ function listen() {
     }
   };
   onresize = touched;
-  const press = { before: keys.ArrowLeft, after: keys.ArrowRight, home, spin: keys.t, box: keys.b, full: fullScreen, more: keys["?"], copy: copyBox };
+  const press = { before: keys.ArrowLeft, after: keys.ArrowRight, home, spin: keys.t, box: keys.b, full: fullScreen, more: keys["?"], copy: () => copied("bbox", "copied") };
   for (const [id, act] of Object.entries(press)) $(id).onclick = act;
   for (const button of document.querySelectorAll("[data-kind]")) button.onclick = () => show(+button.dataset.kind);
   $("subjectbox").onclick = () => { Object.assign(box, { low: [...facts.subject.low], high: [...facts.subject.high] }); boxed(); };
@@ -171,6 +170,7 @@ function listen() {
   }
   if (!document.documentElement.requestFullscreen) $("full").hidden = true;
   makeHandles();
+  listenForTaps();
   boxed(false);
   turnItself(false);
   canvas.addEventListener("webglcontextlost", () => failed(Error("the graphics card gave up; reload the page")));

@@ -98,6 +98,7 @@ function frame() {
   sized(width, height);
   render(width, height);
   overlay();
+  drawRuler();
   if (!still) {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits: how long does a picture take here?
     const took = performance.now() - began;
@@ -165,6 +166,7 @@ async function begin() {
   [splatProgram, finalProgram] = [program(gl, "splat-vert", "splat-frag"), program(gl, "final-vert", "final-frag")];
   splatTable = table(gl, buffer, 0, 2 * n);
   shTable = table(gl, buffer, 32 * n, facts.stored * n);
+  keepRecords(buffer);
   const words = new Float32Array(buffer, 0, 8 * n), means = new Float32Array(3 * n);
   for (let i = 0; i < n; ++i) means.set(words.subarray(8 * i, 8 * i + 3), 3 * i);
   const every = Math.max(1, Math.floor(n / 4000));
