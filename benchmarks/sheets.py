@@ -44,7 +44,7 @@ def report(run: Path, longer: float) -> None:
     """The figures of one run."""
     job = reload_job(open_run(run), lambda event: None)
     splats = read_splats(run / "splats.ply")
-    seen = visible_mask(splats, job.scene, job.settings, job.backend)
+    seen = visible_mask(splats, job.scene.train, job.settings, job.backend)
     sizes = splats.scales.max(dim=1).values
     long = sizes > longer * job.scene.extent
     print(

@@ -16,6 +16,7 @@ import shlex
 import sys
 import traceback
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NoReturn
 
 import gs2d
@@ -35,6 +36,7 @@ from gs2d.cli.commands import (
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
+from gs2d.core.processes import here
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
 from gs2d.experiments.options import TableOptions
@@ -66,14 +68,14 @@ def run(argv: Sequence[str]) -> int:
         if (asked := _answer(argv)) is not None:
             show_help(asked)
             return OK
-        command = parse(argv)
+        command = _of_this_process(parse(argv))
     except SystemExit as exit_:
         return OK if exit_.code is None else exit_.code if isinstance(exit_.code, int) else EXIT_USAGE
     except BrokenPipeError:  # `gs2d train --help | head`
         _drop_stdout()
         return NOBODY_READS
     except (UsageError, Gs2dError) as error:
-        return _fail(str(error))
+        return _fail(str(error)) if os.environ.get("RANK", "0") == "0" else EXIT_USAGE
     interruptible = Interruptible()
     console = Console(quiet=command.quiet, as_json=command.json, before_each=interruptible.check)
     try:
@@ -86,12 +88,14 @@ def run(argv: Sequence[str]) -> int:
         return _what_is_missing(console, argv, command)
     except KeyboardInterrupt:
         console.close()
-        return _interrupted(argv, command)
+        return _interrupted(argv, command) if here().leads else INTERRUPTED
     except BrokenPipeError:  # `gs2d ... | head`
         _drop_stdout()
         return NOBODY_READS
     except Exception as error:
         console.close()
+        if getattr(error, "told", False) or (hasattr(error, "told") and not here().leads):
+            return EXIT_USAGE  # contact was lost to a process that says itself why
         return _report(error, command.debug)
 
 
@@ -162,6 +166,21 @@ def parse(argv: Sequence[str]) -> Common:
     if isinstance(command, HowItRuns) and command.resume and command.overwrite:
         raise UsageError("--resume and --overwrite exclude each other; give one")
     return command
+
+
+def _of_this_process(command: Common) -> Common:
+    """Return the command as this process of several does it: process 0 alone prints.
+
+    Raises
+    ------
+    UsageError
+        It is for one process.
+    """
+    place = here()
+    if place.size > 1 and not isinstance(command, Train):
+        name = type(command).__name__.lower()
+        raise UsageError(f"gs2d {name} runs in one process, got {place.size}; gs2d train is for torchrun")
+    return command if place.leads else replace(command, quiet=True, json=False)
 
 
 def _fail(message: str) -> int:

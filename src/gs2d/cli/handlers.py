@@ -11,6 +11,7 @@ from gs2d.cli import commands as c
 from gs2d.cli.commands import Common
 from gs2d.cli.console import Console
 from gs2d.cli.tables import say_where_it_is, score_rows, show_run, show_surface
+from gs2d.core.processes import here
 from gs2d.errors import DataError, ProtocolError, RecipeError
 from gs2d.pipeline.options import MeshOptions, TextureOptions, values
 
@@ -68,7 +69,8 @@ def train(command: c.Train, console: Console) -> None:
 
     run = run_training(command, console.on_event)
     console.close()
-    show_run(run.path, run.metrics(), console)
+    if here().leads:  # another process of the same training tells
+        show_run(run.path, run.metrics(), console)
 
 
 def demo(command: c.Demo, console: Console) -> None:

@@ -91,6 +91,10 @@ class LearningRates:
     stage, and both are multiplied by the scene's extent. ``stretch`` is of scaled schedules: one ``f`` times as long,
     f < 1, has all rates times ``f ** -stretch`` (2.1 times at a twentieth with 0.25). Adam's steps do not grow with
     gradients: in fewer of them a splat gets as far only if each is longer. 0 = rates as they are.
+
+    ``view_power`` is of steps that several views share (several processes): a step on the mean of B views has all rates
+    times ``B ** view_power``. 1/2 is what Grendel found (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training",
+    ICLR 2025); 0 = rates as they are.
     """
 
     means: float = 1.6e-4
@@ -105,6 +109,7 @@ class LearningRates:
     beta2: float = 0.999
     eps: float = 1e-15
     stretch: float = field(default=0.0, metadata={"omit_empty": True})
+    view_power: float = field(default=0.5, metadata={"omit_empty": True})
 
     def means_at(self, iteration: int) -> float:
         """Rate of ``means`` at an iteration (1-based), without the extent: log-linear, then constant."""
@@ -113,9 +118,21 @@ class LearningRates:
 
     def times(self, factor: float) -> LearningRates:
         """Return all rates times a factor."""
-        fixed = ("means_decay_steps", "beta1", "beta2", "eps", "stretch")
+        fixed = ("means_decay_steps", "beta1", "beta2", "eps", "stretch", "view_power")
         names = [entry.name for entry in fields(self) if entry.name not in fixed]
         return replace(self, **{name: getattr(self, name) * factor for name in names})
+
+    def for_views(self, views: int) -> LearningRates:
+        """Return what a step on the mean gradient of so many views takes, by Grendel's rule.
+
+        The gradients of views are nearly independent, so that one step should do what the steps of each would have
+        done. The mean of B of them has a second moment 1/B as large, by whose root Adam divides: rates times
+        ``B ** view_power``, eps / sqrt(B). Memory is of as many views as before: both betas to the power of B.
+        """
+        if views == 1:
+            return self
+        beta1, beta2, eps = self.beta1**views, self.beta2**views, self.eps / math.sqrt(views)
+        return replace(self.times(views**self.view_power), beta1=beta1, beta2=beta2, eps=eps)
 
     def at_end(self, iterations: int) -> LearningRates:
         """Constant rates, at the values that these reach after so many iterations."""

@@ -27,8 +27,8 @@ class AdamUpdate:
     gradient : Tensor
         Like the parameter; with ``compact``, of ``rows`` alone and in their order.
     rate : float
-    step : int
-        Of the bias correction, counted from 1 and with this one.
+    step : float
+        Of the bias correction, counted from 1 and with this one; not whole where steps were of different lengths.
     trained : Tensor [N] bool, optional
         Rows that are False are not written, and their gradients are not read.
     rows : Tensor [M] int64, optional
@@ -41,7 +41,7 @@ class AdamUpdate:
     square: Tensor
     gradient: Tensor
     rate: float
-    step: int
+    step: float
     trained: Tensor | None = None
     rows: Tensor | None = None
     compact: bool = False

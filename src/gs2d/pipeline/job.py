@@ -75,6 +75,8 @@ class Job:
         For cached views; see ``Trainer``.
     init, init_digest : Splats and str, or None
         What training starts from instead of points, and the hash of its file.
+    processes : int
+        That train together.
     """
 
     recipe: Recipe
@@ -87,6 +89,7 @@ class Job:
     stage2_cache_bytes: int
     init: Splats | None = None
     init_digest: str | None = None
+    processes: int = 1
 
     def definition(self) -> dict[str, Any]:
         """Return what ``run.json`` says and a resume compares."""
@@ -112,9 +115,15 @@ class Job:
             **({} if self.init_digest is None else {"init": self.init_digest}),
         }
 
-    def stage_key(self, index: int) -> str:
-        """Hash of all that decides the state at the end of stage ``index``: equal keys, equal bytes."""
+    def stage_key(self, index: int, processes: Sequence[tuple[int, int, int]] | None = None) -> str:
+        """Hash of all that decides the state at the end of stage ``index``: equal keys, equal bytes.
+
+        ``processes``: since which stage and iteration how many trained (``TrainState.processes``); by default those of
+        the job, all the time.
+        """
         recipe = to_json(self.recipe)
+        if processes is None:
+            processes = [(0, 0, self.processes)] if self.processes > 1 else []
         facts = {
             "scene": self.images_digest,
             "protocol": _training_facts(asdict(self.protocol)),
@@ -128,6 +137,7 @@ class Job:
             **({} if self.init_digest is None else {"init": self.init_digest}),
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
+            **({} if not processes else {"processes": list(map(list, processes))}),
             **{name: recipe[name] for name in LATER_FIELDS[2:] if recipe[name] is not None},
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()

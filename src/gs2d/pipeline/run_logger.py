@@ -70,7 +70,7 @@ class RunLogger:
     ) -> None:
         self._run, self._job, self._options, self._start, self._on_event = run, job, options, start, on_event
         self._visitors = visitors
-        self.progress_every = max(1, min(REPORTS[job.backend.device], options.checkpoint_every))
+        self.progress_every = progress_every(job, options)
         self._shown = choose_views(job.scene, options.shown_views)
         self._probes = (job.scene.test or job.scene.train)[
             :: max(1, len(job.scene.test or job.scene.train) // PROBE_VIEWS)
@@ -105,7 +105,8 @@ class RunLogger:
     def stop_if_asked(self) -> None:
         """Save a checkpoint and stop, where a signal asks for it and this iteration can be gone on from."""
         state = self._state
-        if not self._signals.asked or not state.entered:
+        assert self._trainer is not None
+        if not (self._signals.asked or self._trainer.processes.stop_asked) or not state.entered:
             return
         if self._before is not None and self._before.iteration != state.step:
             return  # the line of changes that is due would be lost: at most until the next progress
@@ -113,6 +114,8 @@ class RunLogger:
             return  # the checkpoint at the end of the stage is due
         self._keep_what_is_trained()
         self._signals.release()
+        if self._trainer.processes.stop_asked:  # another process heard it
+            raise KeyboardInterrupt
 
     def _keep_what_is_trained(self) -> None:
         """Save a checkpoint between two iterations; one that cannot be saved stops nothing."""
@@ -186,7 +189,7 @@ class RunLogger:
         if last or self._step_line_due(event.iteration, event.iterations):
             extra: dict[str, Any] = {"total_iteration": self._iterations_before(event.index) + event.iteration}
             extra["mean_area"] = event.mean_k_a
-            if last or _due(event.iteration, event.iterations, PROBES, self.progress_every):
+            if last or self._due(event.iteration, event.iterations, PROBES):
                 psnr = self._probe_psnr(state.splats)
                 if psnr is not None:
                     self.psnr = psnr
@@ -208,7 +211,13 @@ class RunLogger:
             self._start_clock()
 
     def _step_line_due(self, iteration: int, iterations: int) -> bool:
-        return _due(iteration, iterations, LOG_LINES, self.progress_every)
+        return self._due(iteration, iterations, LOG_LINES)
+
+    def _due(self, iteration: int, iterations: int, count: int) -> bool:
+        """Whether a multiple of the progress that is one of about ``count`` of a stage was in the last iteration."""
+        assert self._trainer is not None
+        every = max(1, math.ceil(iterations / count / self.progress_every)) * self.progress_every
+        return iteration // every > (iteration - self._trainer.views) // every
 
     def _log_changes(self, event: train_events.Progress) -> None:
         """Log what the iterations since the last step line changed, if that was one progress ago."""
@@ -232,7 +241,9 @@ class RunLogger:
     # -- checkpoints ---------------------------------------------------------------------------------------------------
     def _payload(self, index: int) -> dict[str, Any]:
         extra = {"seconds": self._seconds, "peak_memory": self._peak, "at_entry": self._at_entry}
-        return {"state": self._state.state_dict(), "extra": json.dumps(extra), "key": self._job.stage_key(index)}
+        state = self._state
+        key = self._job.stage_key(index, state.processes)
+        return {"state": state.state_dict(), "extra": json.dumps(extra), "key": key}
 
     def _save(self, index: int, iteration: int | None) -> None:
         self._peak = max(self._peak, self._memory.read())
@@ -399,10 +410,9 @@ _ROWS_OR_JUMPS = (
 )
 
 
-def _due(iteration: int, iterations: int, count: int, step: int) -> bool:
-    """Whether an iteration that is a multiple of ``step`` is one of about ``count`` of a stage."""
-    every = max(1, math.ceil(iterations / count / step)) * step
-    return iteration % every == 0
+def progress_every(job: Job, options: TrainOptions) -> int:
+    """Return the iterations between progress events."""
+    return max(1, min(REPORTS[job.backend.device], options.checkpoint_every))
 
 
 def _storable(value: Any) -> bool:

@@ -39,6 +39,7 @@ from gs2d.pipeline.page import page_run
 from gs2d.pipeline.photographs import PREPARED
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.planned import plan_notices
+from gs2d.pipeline.processes import connected, follow, lead, memory_of
 from gs2d.pipeline.refined_poses import FoundPoses, found_poses, write_poses
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
@@ -49,6 +50,7 @@ from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.verdict.file import write_verdict
 from gs2d.pipeline.verdict.measures import Collector
 from gs2d.training import events
+from gs2d.training.parallel import ONE_PROCESS, ManyProcesses, OneProcess
 from gs2d.viewer.server import free_port, required_viser
 
 MANY = 500  # photographs, from which a training is planned before it begins
@@ -77,14 +79,22 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     Gs2dError
         Anything that the user can mend.
     """
-    if is_archive(options.scene):
-        return _train_archive(options, on_event)
+    with connected(options.backend) as together:
+        if isinstance(together, ManyProcesses) and not together.leads:
+            use_threads(options.threads, together.place.local_size)
+            use_memory(memory_of(together.place, options.memory))
+            return follow(options, together)
+        return (_train_archive if is_archive(options.scene) else _train)(options, on_event, together)
+
+
+def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> RunFolder:
+    """Train a run that is the only one, or that others follow."""
     check_viewer(options)
     allowed = (*options.allowed, PREPARED)
     claim = {"resume": options.resume, "overwrite": options.overwrite, "allowed": allowed}
     check_claim(options.out, **claim)  # type: ignore[arg-type]
-    use_threads(options.threads)
-    use_memory(options.memory)
+    use_threads(options.threads, together.place.local_size)
+    use_memory(memory_of(together.place, options.memory))
     on_event(Plan(TRAINED))
     job = prepare_job(options, on_event)
     if options.overwrite:
@@ -105,6 +115,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         else:
             extra = {"title": options.title} if options.title else {}
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
+        job = lead(job, options, together, on_event)
         start = choose_start(run, job, options, on_event)
         if start.state is None and (options.estimate or options.memory or options.disk or len(job.scene.views) >= MANY):
             for line in plan_notices(job, options.prepare):
@@ -115,7 +126,8 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
         collected = Collector(job.scene, job.settings.background)
         hold()
         with MeshFrames(job) as frames:
-            splats, exposures, poses = train_stages(run, job, options, start, watch, [frames.visit, collected.visit])
+            visitors = [frames.visit, collected.visit]
+            splats, exposures, poses = train_stages(run, job, options, start, watch, visitors, together)
             release(job.scene)  # before the volume of the mesh
             write_exposures(run, exposures, on_event)
             write_poses(run, job.scene, poses, on_event)
@@ -125,7 +137,7 @@ def train(options: TrainOptions, on_event: OnEvent = ignore) -> RunFolder:
     return run
 
 
-def _train_archive(options: TrainOptions, on_event: OnEvent) -> RunFolder:
+def _train_archive(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> RunFolder:
     """Train on a capture in a ZIP file, which is unpacked into the run folder, where later commands find it."""
     options = replace(options, allowed=(*options.allowed, UNPACKED), title=options.title or options.scene.stem)
     check_train_options(options)
@@ -134,7 +146,7 @@ def _train_archive(options: TrainOptions, on_event: OnEvent) -> RunFolder:
     made = make_folder(home)
     try:
         on_event(Phase(f"unpacking {options.scene.name}", 0))
-        return train(replace(options, scene=unpack(options.scene, home)), on_event)
+        return _train(replace(options, scene=unpack(options.scene, home)), on_event, together)
     finally:  # what the run is not of goes: all of it where there is no run, the older one where a run was replaced
         used = RunFolder(options.out).definition()["scene"]["path"] if is_run(options.out) else ""
         for folder in home.iterdir():
@@ -191,6 +203,7 @@ def train_stages(
     start: ResumePoint,
     watch: TrainingObserver,
     visitors: Sequence[Visitor] = (),
+    together: OneProcess = ONE_PROCESS,
 ) -> tuple[Splats, Transforms, FoundPoses]:
     """Train from where ``start`` is to the end of the last stage; splats, exposures and poses of the photographs.
 
@@ -225,6 +238,7 @@ def train_stages(
         init=job.init if start.state is None else None,
         progress_every=recorder.progress_every,
         stage2_cache_bytes=job.stage2_cache_bytes,
+        processes=together,
     )
     recorder.begin(trainer)
     with recorder.ending_well():

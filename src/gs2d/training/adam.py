@@ -41,6 +41,7 @@ def adam_step(
     backend: Backend = PLAIN,
     skip: Collection[str] = (),
     rows: Tensor | None = None,
+    views: int = 1,
 ) -> None:
     """One Adam update, in place, of the rows and attributes that the stage trains.
 
@@ -56,13 +57,16 @@ def adam_step(
     skip : attributes that are left alone this time
     rows : Tensor [M] int64, optional
         The rows of the group that the stage trains, where the gradients are of those alone.
+    views : int
+        Of which the gradients are the mean, in one step: beta and eps are those of ``LearningRates.for_views``. Steps
+        are counted in views, so that the bias correction, 1 - (beta^views)^(steps / views), knows of no batches.
     """
-    updates = []
+    rates, updates = stage.lr.for_views(views), []
     for name, parameter in state.splats.items():
         if name not in stage.train or name in skip or parameter.numel() == 0:
             continue
         moments, group = state.moments[name], stage.train[name]
-        moments.steps += 1
+        moments.steps += views
         updates.append(
             AdamUpdate(
                 parameter,
@@ -70,10 +74,10 @@ def adam_step(
                 moments.square,
                 gradients[name],
                 lr[name],
-                moments.steps,
+                moments.steps if views == 1 else moments.steps / views,
                 trained=None if group == "all" or rows is not None else state.groups[group],
                 rows=None if group == "all" else rows,
                 compact=rows is not None and group != "all",
             )
         )
-    backend.adam_step(updates, beta1=stage.lr.beta1, beta2=stage.lr.beta2, eps=stage.lr.eps)
+    backend.adam_step(updates, beta1=rates.beta1, beta2=rates.beta2, eps=rates.eps)

@@ -22,10 +22,11 @@ MIN_FRACTION = 0.5  # of the views: a cache for fewer saves little of a stage, a
 WORTH = 2  # visits per view from which filling, about two forward passes, is repaid
 
 
-def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int) -> bool:
+def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int, processes: int = 1) -> bool:
     """Whether a stage can train from cached views, and is long enough to gain by it.
 
-    It trains the colours of one row group and nothing else, at one SH degree, by losses of the colour image.
+    It trains the colours of one row group and nothing else, at one SH degree, by losses of the colour image. Each of
+    several ``processes`` visits each view so many times less.
     """
     groups = set(stage.train.values())
     return (
@@ -37,14 +38,16 @@ def is_cacheable(recipe: Recipe, stage: Stage, *, backend: Backend, views: int) 
         and not stage.halve_at
         and OF_COLOR.issuperset(term.kind for term in stage.losses)
         and stage.active_sh_degree(1, recipe.sh_degree) == stage.active_sh_degree(stage.iterations, recipe.sh_degree)
-        and stage.iterations >= WORTH * views
+        and stage.iterations >= WORTH * views * processes
     )
 
 
-def choose_objective(whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int) -> Objective:
+def choose_objective(
+    whole: FullRender, state: TrainState, stage: Stage, limit_bytes: int, processes: int = 1
+) -> Objective:
     """Return cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
     backend, views = whole.backend, len(whole.scene.train)
-    if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend=backend, views=views):
+    if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend=backend, views=views, processes=processes):
         cached = CachedViews(whole, state, stage, limit_bytes, least=MIN_FRACTION * views)
         return cached if cached.views else whole
     return whole
@@ -78,7 +81,7 @@ class CachedViews:
     ) -> None:
         self._whole = whole
         (group,) = set(stage.train.values())
-        self.rows: Tensor = state.groups[group].nonzero().squeeze(1)
+        self.rows: Tensor | None = state.groups[group].nonzero().squeeze(1)
         self.views: list[CachedView] = []
         settings, room = whole.settings(stage, 1), limit_bytes
         for index in range(len(whole.scene.train)):

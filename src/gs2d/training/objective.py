@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol as Interface
 
@@ -15,7 +15,7 @@ from gs2d.config.protocols import Protocol
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.core.camera import Camera
 from gs2d.core.splats import Splats
-from gs2d.data.scene import Scene
+from gs2d.data.scene import Scene, View
 from gs2d.errors import DivergedError
 from gs2d.kernels.reference import finite
 from gs2d.losses.api import LossFunction, LossReport, LossView, compute_losses, loss_of, prepared
@@ -45,11 +45,11 @@ def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> Raster
 
 
 @torch.no_grad()
-def visible_mask(splats: Splats, scene: Scene, settings: RasterSettings, backend: Backend) -> Tensor:
-    """Splats [N] bool whose footprint reaches a pixel of some training view, hidden there or not."""
+def visible_mask(splats: Splats, views: Sequence[View], settings: RasterSettings, backend: Backend) -> Tensor:
+    """Splats [N] bool whose footprint reaches a pixel of some view, hidden there or not."""
     bare = replace(settings, sh_degree=0, with_distortion=False)
     seen = torch.zeros(len(splats), dtype=torch.bool, device=splats.device)
-    for view in scene.train:
+    for view in views:
         seen |= rasterize(splats, view.camera, bare, backend=backend).radii > 0
     return seen
 
@@ -97,7 +97,12 @@ class ViewResidual:
 
 
 class Objective(Interface):
-    """How a stage gets the loss and the gradients of a view."""
+    """How a stage gets the loss and the gradients of a view.
+
+    ``rows`` [M] int64 are those of which gradients may come alone; None: they come of all.
+    """
+
+    rows: Tensor | None
 
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
@@ -107,6 +112,8 @@ class Objective(Interface):
 
 class FullRender:
     """Every splat is rendered each time."""
+
+    rows: Tensor | None = None
 
     def __init__(
         self, scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, targets: TargetSource
@@ -268,6 +275,13 @@ class FullRender:
         if broken is not None:
             raise diverged(stage, iteration, f"the gradient of {broken}")
         return values, gradients
+
+
+def no_view(state: TrainState, stage: Stage, probe: Tensor | None) -> StepResult:
+    """Return the result of an iteration that shows nothing: zeros."""
+    gradients = {name: torch.zeros_like(tensor) for name, tensor in state.splats.items() if name in stage.train}
+    radii = state.splats.opacity_logits.new_zeros(len(state.splats))
+    return StepResult({}, gradients, None if probe is None else torch.zeros_like(probe).detach(), radii)
 
 
 def clipped_pixels(target: Target) -> Tensor:

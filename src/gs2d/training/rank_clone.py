@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -15,7 +15,12 @@ from gs2d.training.state import TrainState
 
 
 @torch.no_grad()
-def rank_by_error(state: TrainState, action: RankByError, errors_by_view: Iterable[Tensor]) -> Tensor:
+def rank_by_error(
+    state: TrainState,
+    action: RankByError,
+    errors_by_view: Iterable[Tensor],
+    combine: Callable[[Tensor], Tensor] = lambda total: total,
+) -> Tensor:
     """Write the row group of the splats with the largest E_i (paper Eq. 8), and return E [N] float64.
 
     Parameters
@@ -24,6 +29,8 @@ def rank_by_error(state: TrainState, action: RankByError, errors_by_view: Iterab
     action : RankByError
     errors_by_view : iterable of Tensor [N]
         The inner sum of E_i, one per training view.
+    combine : callable
+        The sum over several processes, of which each gives the errors of some views.
 
     Raises
     ------
@@ -33,6 +40,7 @@ def rank_by_error(state: TrainState, action: RankByError, errors_by_view: Iterab
     total = torch.zeros(len(state.splats), dtype=torch.float64, device=state.splats.device)
     for errors in errors_by_view:
         total += errors
+    total = combine(total)
     if not bool(torch.isfinite(total).all()):
         raise DivergedError("ranking by error met NaN or infinity: a splat or a photograph is not finite")
     group = torch.zeros(len(total), dtype=torch.bool, device=total.device)

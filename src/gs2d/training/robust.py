@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
-from gs2d.config.robust import DenseStart
+from gs2d.config.robust import DenseStart, SeenArea
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
@@ -18,6 +20,7 @@ from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.initialize import Initial
+from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.plane_sweep import Sweep, start_points, sweep_views
 from gs2d.training.rows import keep_rows
 from gs2d.training.seen_area import mostly_unseen
@@ -35,6 +38,8 @@ class Robustness:
     raster : RasterSettings
         Of training, and ``backend`` that renders: to see how much of a splat is photographed.
     backend : Backend
+    processes : OneProcess
+        Those that train together. Process 0 makes the start, and looks at free space and seen area for all.
 
     Attributes
     ----------
@@ -50,13 +55,21 @@ class Robustness:
         show; or a plane sweep finds nothing to start from, and the recipe requires that.
     """
 
-    def __init__(self, scene: Scene, recipe: Recipe, raster: RasterSettings, backend: Backend) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        raster: RasterSettings,
+        backend: Backend,
+        processes: OneProcess = ONE_PROCESS,
+    ) -> None:
+        self._processes = processes
         self.scene, self._given, self._recipe = scene, scene, recipe
         self._raster, self._backend = raster, backend
         self._free: FreeSpaceMaps | None = None
         self._sweep: Sweep | None = None  # until the first splats are fitted
         self.lacks = ""
-        if recipe.dense_start is None and recipe.free_space is None:
+        if (recipe.dense_start is None and recipe.free_space is None) or not processes.leads:
             return
         if scene.observe is None and recipe.free_space is not None:
             raise DataError(
@@ -101,17 +114,33 @@ class Robustness:
     def prune(self, state: TrainState, stage: Stage, iteration: int) -> list[events.Event]:
         """Prune the splats in free space, and those of which little is photographed, where that is due."""
         happened: list[events.Event] = []
-        if self._free is not None and self._looks_at_free_space(stage, iteration):
-            pruned = _drop(state, self._free.inside(state.splats))
+        if self._looks_at_free_space(stage, iteration):
+            pruned = self._drop(state, partial(self._in_free_space, state))
             if pruned:
                 happened.append(events.FreeSpacePruned(stage.name, iteration, pruned, len(state.splats)))
         settings = self._recipe.seen_area
         if settings is not None and self._looks_at_seen_area(stage, iteration):
-            cameras = [view.camera for view in per_image.scene_now(state, self._given).train]
-            pruned = _drop(state, mostly_unseen(state.splats, cameras, settings, self._raster, self._backend))
+            pruned = self._drop(state, partial(self._unseen, state, settings))
             if pruned:
                 happened.append(events.UnseenPruned(stage.name, iteration, pruned, len(state.splats)))
         return happened
+
+    def _in_free_space(self, state: TrainState) -> Tensor:
+        assert self._free is not None
+        return self._free.inside(state.splats)
+
+    def _unseen(self, state: TrainState, settings: SeenArea) -> Tensor:
+        cameras = [view.camera for view in per_image.scene_now(state, self._given).train]
+        return mostly_unseen(state.splats, cameras, settings, self._raster, self._backend)
+
+    def _drop(self, state: TrainState, mask: Callable[[], Tensor]) -> int:
+        """Drop the splats of a mask [N] and return how many: none where nothing would be left."""
+        found = self._processes.decide(mask, state.splats.means)
+        dropped = int(found.sum())
+        if dropped == 0 or dropped == len(found):  # all: the photographs contradict each other
+            return 0
+        keep_rows(state, ~found)
+        return dropped
 
     def _looks_at_free_space(self, stage: Stage, iteration: int) -> bool:
         settings = self._recipe.free_space
@@ -133,12 +162,3 @@ class Robustness:
         least = math.log(settings.least / (1 - settings.least))
         faded = torch.logit(torch.sigmoid(logits) * (1 - settings.rate)).clamp_min(least)
         backend.assign(logits, torch.where(logits > least, faded, logits))
-
-
-def _drop(state: TrainState, mask: Tensor) -> int:
-    """Drop the splats of a mask [N] and return how many: none where nothing would be left."""
-    dropped = int(mask.sum())
-    if dropped == 0 or dropped == len(mask):  # all: the photographs contradict each other
-        return 0
-    keep_rows(state, ~mask)
-    return dropped

@@ -68,6 +68,8 @@ class TrainState:
         Colour transforms of the training views, where the recipe learns them.
     poses : Poses or None
         Motions of the training cameras, where the recipe learns them.
+    processes : list of (stage, step, count)
+        From where on so many processes trained; empty: one, all the time.
     """
 
     splats: Splats
@@ -81,6 +83,12 @@ class TrainState:
     queue: list[int] = field(default_factory=list)
     exposures: Exposures | None = None
     poses: Poses | None = None
+    processes: list[tuple[int, int, int]] = field(default_factory=list)
+
+    def trained_by(self, count: int) -> None:
+        """Note that so many processes train from here on: the result depends on it."""
+        if count != (self.processes[-1][2] if self.processes else 1):
+            self.processes.append((self.stage, self.step, count))
 
     def next_view(self, count: int) -> int:
         """Index of the next training view: shuffled epochs, without replacement."""
@@ -108,6 +116,7 @@ class TrainState:
             "generator": self.generator.get_state(),
             **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
             **({} if self.poses is None else {"poses": self.poses.state_dict()}),
+            **({} if not self.processes else {"processes": [list(since) for since in self.processes]}),
         }
 
     @classmethod
@@ -142,6 +151,7 @@ class TrainState:
                 [int(index) for index in data["queue"]],
                 Exposures.from_state_dict(data["exposures"]) if "exposures" in data else None,
                 Poses.from_state_dict(data["poses"]) if "poses" in data else None,
+                [(int(stage), int(step), int(count)) for stage, step, count in data.get("processes", ())],
             )
             state.check()
             learned = {"exposures": state.exposures, "poses": state.poses}

@@ -6,7 +6,7 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -28,7 +28,7 @@ from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
 from gs2d.training.adam import adam_step, begin_stage, lr_at
 from gs2d.training.cached_objective import choose_objective
-from gs2d.training.densify.densifier import Surroundings, densifier_of
+from gs2d.training.densify.densifier import Densifier, Surroundings, densifier_of
 from gs2d.training.exposure import apply_exposure
 from gs2d.training.initialize import initial_splats, splats_as_start
 from gs2d.training.objective import (
@@ -40,9 +40,11 @@ from gs2d.training.objective import (
     diverged,
     first_not_finite,
     is_async,
+    no_view,
     raster_settings,
     visible_mask,
 )
+from gs2d.training.parallel import ONE_PROCESS, OneProcess, Turn
 from gs2d.training.priors import with_known_points
 from gs2d.training.rank_clone import clone_in_place, rank_by_error
 from gs2d.training.resumable import check_resumable
@@ -85,6 +87,10 @@ class Trainer:
         views that fit are cached. The result depends on it, by rounding.
     dtype : torch.dtype
         Of a new start.
+    processes : OneProcess
+        Those that train together (``training.parallel.ManyProcesses``), each with an own Trainer of the same scene and
+        recipe. An iteration of W processes takes W views and counts as W of the schedule: ``state.step`` counts views.
+        Process 0 has the ``state`` or ``init``, or makes the start, for all.
 
     Raises
     ------
@@ -107,26 +113,31 @@ class Trainer:
         target_bytes: int | None = None,
         stage2_cache_bytes: int = 1 << 30,
         dtype: torch.dtype = torch.float32,
+        processes: OneProcess = ONE_PROCESS,
     ) -> None:
         if not scene.train:
             raise DataError(f"scene {scene.name} has no training views")
         self.scene, self.recipe, self.protocol = scene, validate(recipe), protocol
         self.backend = backend if isinstance(backend, Backend) else get_backend(backend)
         self._on_event, self._between, self._progress_every = on_event, between, progress_every
+        self.processes = processes
+        self.views = processes.size  # of the last iteration
         self._pending: list[events.Event] = []
         if state is not None and init is not None:
             raise RunError("training goes on from a state or starts from init, got both; leave one out")
         # What goes on has begun; free space is found by the settings of the dense start, so that sweep is made again.
         goes_on = init is not None or (state is not None and self.recipe.free_space is None)
         begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe
-        self._robust = Robustness(scene, begins, self.settings, self.backend)
+        self._robust = Robustness(scene, begins, self.settings, self.backend, processes)
         if state is not None:
             check_resumable(state, self.recipe, len(scene.train))
-        self.state = self._new_state(dtype, init) if state is None else state
+        self.state = processes.share(lambda: self._new_state(dtype, init) if state is None else state)
+        self.state.trained_by(processes.size)
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
         self._densifiers = [densifier_of(stage.densify, self._surroundings(stage)) for stage in self.recipe.stages]
+        self._check_shared()
         self._target_bytes, self._stage2_cache_bytes = target_bytes, stage2_cache_bytes
         self._objective: Objective | None = None  # of the stage under way, from its first iteration here
         self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
@@ -189,12 +200,13 @@ class Trainer:
         self._check_parameters(stage, tuple(name for name, _ in state.splats.items()))
         trim()  # what finding the first splats, ranking and cloning left
         state.entered = True
+        self.processes.check(state)
         for event in happened:
             self._on_event(event)
         self._on_event(events.StageStarted(stage.name, index, stage.iterations, len(state.splats)))
 
     def step(self) -> None:
-        """One iteration of the stage that was entered.
+        """One iteration of the stage that was entered; several processes do as many of the schedule in one.
 
         A backend that does not wait for its device may find that it changed nothing, and do it again at the start of
         the next one (:meth:`gs2d.render.backends.Backend.iterate`). After a Progress event everything is settled.
@@ -206,55 +218,109 @@ class Trainer:
             a GPU, whose host does not wait for it, at the next Progress event, before anything could be saved.
         """
         state = self.state
-        stage, iteration = self.recipe.stages[state.stage], state.step + 1
-        index = state.next_view(len(self.scene.train))
+        stage, together = self.recipe.stages[state.stage], self.processes
+        together.meet(state)
+        iterations = self._iterations(stage)
+        turns = [Turn(number, state.next_view(len(self.scene.train))) for number in iterations]
+        iteration, self.views = iterations[-1], len(iterations)
         self._look_at(stage.downscale_at(iteration))
         if self._ahead is not None:
-            self._ahead.expect(state.queue[-self.scene.ahead :][::-1])
+            self._ahead.expect(together.part(state.queue[-self.scene.ahead * together.size :][::-1]))
         if self._objective is None:
-            self._objective = choose_objective(self._whole, state, stage, self._stage2_cache_bytes)
-        reports = iteration % self._progress_every == 0 or iteration == stage.iterations
-        densifier = self._densifiers[state.stage]
-        densifies = densifier is not None and densifier.changes(iteration)
-        changes_rows = densifies or self._robust.prunes(stage, iteration)
+            limit = self._stage2_cache_bytes // together.place.local_size
+            self._objective = choose_objective(self._whole, state, stage, limit, together.size)
+        reports = any(i % self._progress_every == 0 for i in iterations) or iteration == stage.iterations
+        changes_rows = any(self._changes(i) or self._robust.prunes(stage, i) for i in iterations)
         sharpens = stage.downscale_at(iteration + 1) != stage.downscale_at(iteration)  # then nothing may be done again
         result, happened = self._learner.iterate(
-            partial(self._learn, stage, iteration, index),
-            rollback=partial(self._rollback, stage, iteration, index),
-            exact=reports or changes_rows or sharpens,
+            partial(self._learn, stage, turns),
+            rollback=partial(self._rollback, stage, turns),
+            exact=reports or changes_rows or sharpens or together.size > 1,  # what is summed up cannot be taken back
         )
-        happened += self._robust.prune(self.state, stage, iteration)
+        for number in iterations:
+            happened += self._robust.prune(self.state, stage, number)
         state.step = iteration
+        if changes_rows:
+            together.check(state)
         for event in happened:
             self._on_event(event)
         if reports:
-            losses = check_losses(stage, iteration, result.losses)
+            losses = check_losses(stage, iteration, together.mean_losses(result.losses, self.views))
             self._check_parameters(stage, tuple(stage.train))  # on a CPU gradients are checked each time
-            lr = lr_at(stage.lr, iteration, self.scene.extent)
+            lr = lr_at(stage.lr.for_views(self.views), iteration, self.scene.extent)
             self._on_event(self._progress(stage, iteration, losses, lr))
 
-    def _learn(self, stage: Stage, iteration: int, index: int) -> tuple[StepResult, list[events.Event]]:
-        """Gradients of a view, statistics and densification, Adam."""
-        assert self._objective is not None
+    def _changes(self, iteration: int) -> bool:
+        """Whether the densifier of the stage under way may change splats in an iteration."""
         densifier = self._densifiers[self.state.stage]
-        probe = None if densifier is None else densifier.before_backward(self.state, iteration)
-        result = self._objective.evaluate(self.state, stage, iteration, index, probe)
-        happened = [] if densifier is None else list(densifier.after_backward(self.state, result, iteration))
+        return densifier is not None and densifier.changes(iteration)
+
+    def _iterations(self, stage: Stage) -> range:
+        """Return the iterations of the schedule that are done in one: all at one size, one of them with densification.
+
+        One process does one.
+        """
+        first = self.state.step + 1
+        stop, changed = min(first + self.processes.size, stage.iterations + 1), False
+        for number in range(first, stop) if stop > first + 1 else ():
+            changes = self._changes(number)
+            if (changes and changed) or stage.downscale_at(number) != stage.downscale_at(first):
+                return range(first, number)
+            changed |= changes
+        return range(first, stop)
+
+    def _learn(self, stage: Stage, turns: Sequence[Turn]) -> tuple[StepResult, list[events.Event]]:
+        """Gradients of a view, statistics and densification, Adam."""
+        state, objective, densifier = self.state, self._objective, self._densifiers[self.state.stage]
+        assert objective is not None
+        iteration = turns[-1].iteration
+        # What densification is told: of the iterations that are done in one, that in which something is due.
+        due = next((turn.iteration for turn in turns[:-1] if self._changes(turn.iteration)), iteration)
+        probe = None if densifier is None else densifier.before_backward(state, due)
+        result, of_views = self.processes.evaluate(
+            turns,
+            lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
+            lambda: no_view(state, stage, probe),
+            rows=objective.rows,
+            of_views=state.exposures is not None or state.poses is not None,
+        )
+        happened = [] if densifier is None else list(densifier.after_backward(state, result, due))
         if not any(isinstance(event, events.Densified) for event in happened):
             limited = any(isinstance(event, events.OpacityLimited) for event in happened)
-            skip, lr = ("opacity_logits",) if limited else (), lr_at(stage.lr, iteration, self.scene.extent)
-            options = {"backend": self._learner, "skip": skip, "rows": result.rows}
-            adam_step(self.state, stage, result.gradients, lr, **options)  # type: ignore[arg-type]
-        self._robust.decay(self.state, stage, iteration, self._learner)
-        per_image.update(self.state, self.recipe, iteration, index, result.gradients, self._learner)
+            rates = stage.lr.for_views(len(turns))
+            skip, lr = ("opacity_logits",) if limited else (), lr_at(rates, iteration, self.scene.extent)
+            options = {"backend": self._learner, "skip": skip, "rows": result.rows, "views": len(turns)}
+            adam_step(state, stage, result.gradients, lr, **options)  # type: ignore[arg-type]
+        for turn, gradients in zip(turns, of_views, strict=True):
+            self._robust.decay(state, stage, turn.iteration, self._learner)
+            per_image.update(state, self.recipe, turn.iteration, turn.index, gradients, self._learner)
         return result, happened
 
-    def _rollback(self, stage: Stage, iteration: int, index: int) -> None:
+    def _rollback(self, stage: Stage, turns: Sequence[Turn]) -> None:
         """Take back what the host has counted of an iteration that changed nothing."""
         for name, parameter in self.state.splats.items():
             if name in stage.train and parameter.numel() > 0:
-                self.state.moments[name].steps -= 1
-        per_image.rollback(self.state, self.recipe, iteration, index)
+                self.state.moments[name].steps -= len(turns)
+        for turn in turns:
+            per_image.rollback(self.state, self.recipe, turn.iteration, turn.index)
+
+    def _check_shared(self) -> None:
+        """Raise RecipeError for a stage that several processes cannot train."""
+        many = self.processes.size
+        for stage, densifier in zip(self.recipe.stages, self._densifiers, strict=True):
+            if many == 1 or densifier is None:
+                continue
+            kind = type(densifier).__name__
+            if not densifier.shares_views:
+                raise RecipeError(
+                    f"stage {stage.name!r}: its densifier must know several views in an iteration to train in {many} "
+                    f"processes, got {kind}, which knows one (Densifier.shares_views); train in one process"
+                )
+            if type(densifier).changes is Densifier.changes:
+                raise RecipeError(
+                    f"stage {stage.name!r}: {kind} must say in which iterations it leaves splats alone to train in "
+                    f"{many} processes, got one that may change them in each (Densifier.changes); train in one process"
+                )
 
     def _surroundings(self, stage: Stage) -> Surroundings:
         """Where the densifier of a stage works."""
@@ -262,7 +328,8 @@ class Trainer:
         def compare(state: TrainState, iteration: int, index: int) -> ViewResidual:
             return self._whole.residual(state, stage, iteration, index)
 
-        return Surroundings(stage.name, self.scene, self.settings, self.protocol.white, self._learner, compare)
+        around = (stage.name, self.scene, self.settings, self.protocol.white, self._learner, compare)
+        return Surroundings(*around, processes=self.processes)
 
     def _check_sizes(self) -> None:
         """Raise RecipeError for a stage whose photographs would be too small to learn from."""
@@ -339,14 +406,14 @@ class Trainer:
         if isinstance(action, CloneInPlace):
             count = clone_in_place(self.state, action)
             return events.Cloned(stage.name, action.writes, count, action.opacity, len(self.state.splats))
-        errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion))
+        errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion), self.processes.sum)
         group = self.state.groups[action.writes]
         fraction = float(errors[group].sum() / errors.sum().clamp(min=1e-300))
         return events.Ranked(stage.name, action.writes, int(group.sum()), float(errors[group].min()), fraction)
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
-        """Yield the inner sum of E_i [N] for each training view."""
-        for index in range(len(self.scene.train)):
+        """Yield the inner sum of E_i [N] for each training view that this process looks at."""
+        for index in self.processes.part(range(len(self.scene.train))):
             target, splats, settings = self._targets[index], self.state.splats, self.settings
             camera = self._whole.camera(self.state, index)
             if self.state.exposures is not None:
@@ -379,8 +446,8 @@ class Trainer:
         frozen = {"means", "quats", "log_scales", "opacity_logits"}.isdisjoint(stage.train)
         if frozen or self.protocol.near_plane_policy == "draw":
             return 0
-        scene = per_image.scene_now(self.state, self.scene)
-        seen = visible_mask(self.state.splats, scene, self.settings, self.backend)
+        views = self.processes.part(per_image.scene_now(self.state, self.scene).train)
+        seen = self.processes.any(visible_mask(self.state.splats, views, self.settings, self.backend))
         unseen = int((~seen).sum())
         if unseen == len(seen):
             return 0  # nothing is left to say what the scene is; evaluation will show it

@@ -51,10 +51,11 @@ class MultiViewErrorDensifier(GradientDensifier):
         around, options = self.surroundings, self._options
         views = torch.randperm(len(around.scene.train), generator=state.generator)[: options.error_views].tolist()
         error, seen = torch.zeros(2, len(state.splats), dtype=state.splats.dtype, device=state.splats.device)
-        for index in views:
+        for index in around.processes.part(views):
             found = around.compare(state, iteration, index)
             weighted, weights = blended_sums(state.splats, found, around.backend)
             error, seen = error + weighted, seen + (weights > 0)
+        error, seen = around.processes.sum(error), around.processes.sum(seen)
         error = error / seen.clamp(min=1)
         positive = error[error > 0]
         return (error / positive.median()) ** options.error_power if len(positive) else torch.ones_like(error)

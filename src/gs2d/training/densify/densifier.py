@@ -15,6 +15,7 @@ from gs2d.errors import RecipeError
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
+from gs2d.training.parallel import ONE_PROCESS, OneProcess
 from gs2d.training.state import TrainState
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ class Surroundings:
     compare : callable
         ``compare(state, iteration, index)`` renders training view ``index`` as the stage trains on it now, and returns
         how it differs from its photograph.
+    processes : OneProcess
+        Those that train together: what a densifier gathers of views goes through ``gather``, or ``part`` and ``sum``.
     """
 
     stage: str
@@ -50,6 +53,7 @@ class Surroundings:
     white: bool
     backend: Backend
     compare: Callable[[TrainState, int, int], ViewResidual]
+    processes: OneProcess = ONE_PROCESS
 
 
 class Densifier:
@@ -64,7 +68,15 @@ class Densifier:
     surroundings : Surroundings
     **options
         Of the recipe (``Densify.options``); a wrong one is a TypeError.
+
+    Attributes
+    ----------
+    shares_views : bool
+        Whether it may train in several processes, where an iteration has a view in each: it takes what ``output`` says
+        of the view (``losses``, ``signal``, ``radii``) through ``surroundings.processes`` alone, or not at all.
     """
+
+    shares_views = False
 
     def __init__(self, surroundings: Surroundings) -> None:
         self.surroundings = surroundings

@@ -41,6 +41,7 @@ class GradientDensifier(Densifier):
     """
 
     absolute: bool | None = False  # None: as the options say
+    shares_views = True
 
     def __init__(self, surroundings: Surroundings, densify: GradDensify | None = None, **options: Any) -> None:
         super().__init__(surroundings)
@@ -77,9 +78,7 @@ class GradientDensifier(Densifier):
         if iteration >= options.stop:
             return self._prune_large(state, iteration)
         assert state.statistics is not None
-        assert output.signal is not None
-        assert output.radii is not None
-        accumulate(state.statistics, output.signal, output.radii, around.backend)
+        around.processes.gather(state.statistics, output, self._add)
         white = around.white
         if options.densifies(iteration):
             extent = around.scene.extent
@@ -97,6 +96,12 @@ class GradientDensifier(Densifier):
             limit_opacity(state, ceiling)
             happened.append(events.OpacityLimited(around.stage, iteration, ceiling, reset))
         return happened
+
+    def _add(self, statistics: Mapping[str, Tensor], output: StepResult) -> None:
+        """Add what the view of this process says."""
+        assert output.signal is not None
+        assert output.radii is not None
+        accumulate(statistics, output.signal, output.radii, self.surroundings.backend)
 
     def urgency(self, state: TrainState, iteration: int) -> Tensor | None:
         """Return by how much the gradients of splats count more [N], at a densification; None: all as they are."""

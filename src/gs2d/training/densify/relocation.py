@@ -111,6 +111,8 @@ class RelocationDensifier(Densifier):
         Fields of :class:`Relocation`.
     """
 
+    shares_views = True  # it asks nothing of a view
+
     def __init__(self, surroundings: Surroundings, **options: Any) -> None:
         super().__init__(surroundings)
         self._options = Relocation(**options)

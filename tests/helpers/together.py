@@ -1,0 +1,212 @@
+"""A batch of several views in one process, to compare with; and a program that trains toys in several processes.
+
+As a program (``python together.py CASE,CASE FOLDER``), each process does the cases in order and writes what came out to
+``FOLDER/CASE.RANK.pt``; the environment says which process it is, as torchrun does.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gs2d.config.densify import Densify
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
+from gs2d.core.processes import Place
+from gs2d.errors import Gs2dError
+from gs2d.training import events
+from gs2d.training.objective import StepResult
+from gs2d.training.parallel import OF_A_VIEW, OneProcess, Turn
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from train_toys import backends, compared, make_scene, short
+
+
+class Batch(OneProcess):
+    """One process that does what several do: renders the views of an iteration one by one, and takes the mean."""
+
+    def __init__(self, views: int) -> None:
+        self.place = Place(0, views, 0, 1)
+        self.results: list[StepResult] = []
+
+    def evaluate(
+        self,
+        turns: Sequence[Turn],
+        one: Callable[[Turn], StepResult],
+        idle: Callable[[], StepResult],
+        *,
+        rows: Tensor | None,
+        of_views: bool,
+    ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
+        self.results = [_own_signal(one(turn)) for turn in turns]
+        total: dict[str, Tensor] = {}
+        for result in self.results:
+            for name in result.gradients.keys() - OF_A_VIEW.keys():
+                own = result.gradients[name]
+                own = own if rows is None or result.rows is not None else own[rows]
+                total[name] = total[name] + own if name in total else own.clone()
+        mean = {name: tensor / len(turns) for name, tensor in total.items()}
+        each = [{k: v for k, v in result.gradients.items() if k in OF_A_VIEW} for result in self.results]
+        return replace(self.results[0], gradients=mean, rows=rows), each
+
+    def gather(self, statistics: Any, result: StepResult, add: Callable[[Any, StepResult], Any]) -> None:
+        each = [{name: torch.zeros_like(tensor) for name, tensor in statistics.items()} for _ in self.results]
+        for own, one in zip(each, self.results, strict=True):
+            add(own, one)
+        for name, tensor in statistics.items():
+            tensor.add_(sum(own[name] for own in each))
+
+    def mean_losses(self, losses: Any, views: int) -> Mapping[str, float]:
+        kinds = dict.fromkeys(kind for result in self.results for kind in result.losses)
+        return {kind: sum(float(result.losses.get(kind, 0)) for result in self.results) / views for kind in kinds}
+
+
+def _own_signal(result: StepResult) -> StepResult:
+    """Return a result whose signal no later view adds to: they have one probe."""
+    if result.signal is None:
+        return result
+    signal = result.signal.clone()
+    result.signal.zero_()
+    return replace(result, signal=signal)
+
+
+def learning() -> Recipe:
+    """``short`` with exposures and poses learned from the third iteration on."""
+    exposure, poses = Exposure(start=2, decay_steps=20), PoseRefinement(start=2, decay_steps=20)
+    return replace(short(), exposure=exposure, poses=poses)
+
+
+def relocating() -> Recipe:
+    """Splats that are relocated in the fourth and the eighth iteration, and wander in the sixth."""
+    first = short().stages[0]
+    options = {"max_splats": 80, "start": 0, "stop": 8, "rounds": 2, "noise_every": 6}
+    return Recipe("relocating", (replace(first, densify=Densify("relocation", options)),))
+
+
+def by_error() -> Recipe:
+    """Densification by the error of four views."""
+    first = short(absgs=True).stages[0]
+    return Recipe("by-error", (replace(first, densify=replace(first.densify, error_views=4)),))
+
+
+RECIPES: dict[str, Callable[[], Recipe]] = {
+    "short": short,
+    "absgs": lambda: short(absgs=True),
+    "compared": compared,
+    "learning": learning,
+    "relocating": relocating,
+    "by_error": by_error,
+}
+
+
+def trained(
+    recipe: Recipe, together: OneProcess, state: dict[str, Any] | None = None, **options: Any
+) -> tuple[TrainState, dict[str, Any]]:
+    """Train to the end; the state, and what was heard: losses, and the states that could be gone on from."""
+    heard: dict[str, Any] = {"losses": [], "states": []}
+
+    def on_event(event: events.Event) -> None:
+        if isinstance(event, events.Progress):
+            heard["losses"].append((event.stage, event.iteration, dict(event.losses), dict(event.lr)))
+            heard["states"].append(trainer.state.state_dict())
+
+    begun = None if state is None else TrainState.from_state_dict(state)
+    given = {"backend": backends()[-1], "progress_every": 1} | options
+    trainer = Trainer(make_scene(), recipe, GENERIC, on_event=on_event, processes=together, state=begun, **given)
+    trainer.run()
+    return trainer.state, heard
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+def environment(rank: int, size: int, port: int) -> dict[str, str]:
+    """What torchrun says to a process."""
+    said = {"RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size, "MASTER_PORT": port}
+    own = {"MASTER_ADDR": "127.0.0.1", "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    return {**os.environ, **own, **{name: str(value) for name, value in said.items()}}
+
+
+def launch(size: int, words: Sequence[str]) -> list[subprocess.Popen[str]]:
+    """Start a program of Python in so many processes that find each other."""
+    port = free_port()
+    return [
+        subprocess.Popen(
+            [sys.executable, *words],
+            env=environment(rank, size, port),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(size)
+    ]
+
+
+def ended(processes: Sequence[subprocess.Popen[str]], seconds: float = 120) -> list[tuple[int, str]]:
+    """Wait for processes; exit code and stderr of each."""
+    said = [process.communicate(timeout=seconds)[1] for process in processes]
+    return [(process.returncode, text) for process, text in zip(processes, said, strict=True)]
+
+
+def together_in(size: int, cases: Sequence[str], folder: Path) -> dict[str, list[Any]]:
+    """Do cases in so many processes; what each found, by case."""
+    for code, text in ended(launch(size, [__file__, ",".join(cases), str(folder)])):
+        assert code == 0, text
+    found = {case: [folder / f"{case}.{rank}.pt" for rank in range(size)] for case in cases}
+    return {case: [torch.load(path, weights_only=False) for path in paths] for case, paths in found.items()}
+
+
+def do(case: str, many: Any) -> Any:
+    """Do one case in this process of several."""
+    if case in RECIPES:
+        state, heard = trained(RECIPES[case](), many)
+        return {"state": state.state_dict(), "losses": heard["losses"]}
+    if case == "resumed":  # in the middle of a stage: the state of process 0 counts, the others have none
+        whole, heard = trained(short(), many)
+        kept = many.tell(heard["states"][3]) if many.leads else many.tell(None)
+        state, _ = trained(short(), many, kept if many.leads else None)
+        return {"state": state.state_dict(), "whole": whole.state_dict(), "at": (kept["stage"], kept["step"])}
+    if case == "differing":  # a bit of one splat flips in the last process
+
+        def flip(self: Trainer) -> None:
+            if self.state.step == 2 and many.place.rank == many.size - 1:
+                self.state.splats.means.view(torch.int32)[0, 0] ^= 1
+            step(self)
+
+        step, Trainer.step = Trainer.step, flip  # type: ignore[method-assign]
+        try:
+            trained(short(), many)
+        except Gs2dError as error:
+            return str(error)
+        finally:
+            Trainer.step = step  # type: ignore[method-assign]
+        return ""
+    raise ValueError(case)
+
+
+def main() -> None:
+    """Do the cases of the command line."""
+    from gs2d.pipeline.processes import connected
+
+    torch.set_num_threads(1)
+    cases, folder = sys.argv[1].split(","), Path(sys.argv[2])
+    with connected("cpu") as many:
+        for case in cases:
+            torch.save(do(case, many), folder / f"{case}.{many.place.rank}.pt")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""Several processes train one scene: gradients of the batch, the same state everywhere, resuming, what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from gs2d.config.densify import Densify
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import LearningRates, Recipe, Stage
+from gs2d.data.scene import Scene
+from gs2d.errors import RecipeError
+from gs2d.render.backends import PLAIN
+from gs2d.training.adam import adam_step
+from gs2d.training.cached_objective import is_cacheable
+from gs2d.training.densify.densifier import Densifier
+from gs2d.training.parallel import ONE_PROCESS
+from gs2d.training.state import Moments, TrainState
+from gs2d.training.trainer import Trainer
+from together import RECIPES, Batch, together_in, trained
+from train_toys import random_splats, short
+
+CASES = [*RECIPES, "resumed", "differing"]
+
+
+def flat(value: Any, at: str = "") -> dict[str, torch.Tensor]:
+    """Every tensor and number of a state, by where it is."""
+    if isinstance(value, dict):
+        return {k: v for name, inner in value.items() for k, v in flat(inner, f"{at}/{name}").items()}
+    return {at: value if isinstance(value, torch.Tensor) else torch.as_tensor(value)} if value is not None else {}
+
+
+def differing(a: Any, b: Any) -> list[str]:
+    """Where two states are not the same, to the bit."""
+    first, second = flat(a), flat(b)
+    assert first.keys() == second.keys()
+    return [name for name in first if not torch.equal(first[name], second[name])]
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
+    """All cases, done by two processes."""
+    return together_in(2, CASES, tmp_path_factory.mktemp("two"))
+
+
+@pytest.mark.parametrize("case", RECIPES)
+def test_two_processes_have_the_same_state_to_the_bit(case: str, two: dict[str, list[Any]]) -> None:
+    first, second = two[case]
+    assert differing(first["state"], second["state"]) == []
+
+
+@pytest.mark.parametrize("case", RECIPES)
+def test_two_processes_train_what_one_does_with_batches_of_two(case: str, two: dict[str, list[Any]]) -> None:
+    """To the bit: the sum of two numbers has no order. What sums up all views (E_i, errors) does, to rounding."""
+    state, heard = trained(RECIPES[case](), Batch(2))
+    found = two[case][0]
+    assert differing(state.state_dict(), found["state"]) == []
+    assert [at[:2] for at in heard["losses"]] == [at[:2] for at in found["losses"]]
+    for (*_, losses, lr), (*_, others, other_lr) in zip(heard["losses"], found["losses"], strict=True):
+        assert others == pytest.approx(losses)
+        assert other_lr == lr
+
+
+def test_a_run_of_two_processes_goes_on_to_the_same_bytes(two: dict[str, list[Any]]) -> None:
+    for found in two["resumed"]:
+        assert found["at"] == (0, 7)
+        assert differing(found["state"], found["whole"]) == []
+
+
+def test_processes_whose_states_differ_stop_with_one_line(two: dict[str, list[Any]]) -> None:
+    for line in two["differing"]:
+        assert line.startswith("the processes must have the same state at iteration 4 of stage 1, got another one in")
+        assert "--resume" in line
+        assert "\n" not in line
+
+
+def test_views_that_learn_are_moved_once_a_turn(two: dict[str, list[Any]]) -> None:
+    """19 iterations of six views, in pairs and alone: none is left out, none counted twice."""
+    state = two["learning"][0]["state"]
+    assert state["processes"] == [[0, 0, 2]]
+    assert sum(state["exposures"]["steps"]) == 17  # from the third on
+    assert sum(state["poses"]["steps"]) >= 8
+    assert state["moments"]["means"]["steps"] <= 5  # views of the last stage: of five that count as five
+
+
+def test_rates_of_a_step_of_several_views_are_grendels() -> None:
+    rates = LearningRates().for_views(4)
+    assert rates.means == pytest.approx(2 * 1.6e-4)
+    assert rates.shN == pytest.approx(2 * 2.5e-3 / 20)
+    assert (rates.beta1, rates.beta2, rates.eps) == pytest.approx((0.9**4, 0.999**4, 0.5e-15))
+    assert rates.means_decay_steps == LearningRates().means_decay_steps
+    assert LearningRates(view_power=0).for_views(4).sh0 == LearningRates().sh0
+    assert LearningRates().for_views(1) == LearningRates()
+
+
+def test_a_step_of_four_views_is_a_step_of_adam_with_the_memory_of_four() -> None:
+    """By the formulas, in float64, after steps of one view and of four: the bias correction counts views."""
+    stage = Stage("s", 9, train={"opacity_logits": "all"})
+    state = TrainState(random_splats(5, dtype=torch.float64), torch.Generator())
+    state.moments["opacity_logits"] = Moments.zeros_like(state.splats.opacity_logits)
+    expected, seen = state.splats.opacity_logits.clone(), 0
+    mean, square = torch.zeros(2, 5, dtype=torch.float64)
+    for views in (1, 4, 3):
+        gradient = torch.linspace(-1, 2, 5, dtype=torch.float64) / views
+        adam_step(state, stage, {"opacity_logits": gradient}, {"opacity_logits": 0.05}, backend=PLAIN, views=views)
+        seen += views
+        mean = 0.9**views * mean + (1 - 0.9**views) * gradient
+        square = 0.999**views * square + (1 - 0.999**views) * gradient**2
+        root = (square / (1 - 0.999**seen)).sqrt() + 1e-15 / math.sqrt(views)
+        expected = expected - 0.05 / (1 - 0.9**seen) * mean / root
+    assert state.moments["opacity_logits"].steps == seen == 8
+    torch.testing.assert_close(
+        state.splats.opacity_logits, expected, rtol=1e-8, atol=1e-8
+    )  # torch counts steps in float32
+
+
+def test_one_process_notes_nothing_and_others_do_when_their_number_changes() -> None:
+    state = TrainState(random_splats(3), torch.Generator())
+    state.trained_by(1)
+    assert "processes" not in state.state_dict()
+    state.trained_by(2)
+    state.stage, state.step = 1, 30
+    state.trained_by(2)
+    state.trained_by(1)
+    again = TrainState.from_state_dict(state.state_dict())
+    assert again.processes == [(0, 0, 2), (1, 30, 1)]
+
+
+def test_a_run_goes_on_with_another_number_of_processes(scene: Scene) -> None:
+    """2, then 1, then 2: the schedule is one of views, and each of them is in it once."""
+    _, heard = trained(short(), Batch(2))
+    state, heard = trained(short(), ONE_PROCESS, heard["states"][1])
+    assert heard["losses"][0][:2] == ("surface", 5)
+    state, heard = trained(short(), Batch(2), heard["states"][2])
+    assert state.processes == [(0, 0, 2), (0, 4, 1), (0, 7, 2)]
+    assert [at[:2] for at in heard["losses"]][:3] == [("surface", 9), ("surface", 10), ("appearance", 2)]
+    assert state.stage == 3
+
+
+def test_iterations_that_are_done_in_one_have_one_size_and_one_densification(scene: Scene) -> None:
+    """``short`` densifies in 3, 6 and 9 and limits opacity in 5."""
+    trainer = Trainer(scene, short(), GENERIC, backend="reference", processes=Batch(4))
+    stage, found = trainer.recipe.stages[0], []
+    while trainer.state.step < stage.iterations:
+        found.append(list(trainer._iterations(stage)))
+        trainer.state.step = found[-1][-1]
+    assert found == [[1, 2, 3, 4], [5], [6, 7, 8], [9, 10]]
+
+
+class Guest(Densifier):
+    """Of a package that knows of one view an iteration."""
+
+    def changes(self, iteration: int) -> bool:
+        return False
+
+
+class Restless(Densifier):
+    """May change splats in each iteration."""
+
+    shares_views = True
+
+
+@pytest.mark.parametrize(("guest", "says"), [(Guest, "shares_views"), (Restless, "Densifier.changes")])
+def test_densifiers_that_cannot_share_an_iteration_are_refused(
+    guest: type[Densifier], says: str, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gs2d.training.trainer.densifier_of", lambda densify, around: densify and guest(around))
+    recipe = Recipe("guest", (replace(short().stages[0], densify=Densify("relocation")),))
+    with pytest.raises(RecipeError, match=says):
+        Trainer(scene, recipe, GENERIC, backend="reference", processes=Batch(2))
+    Trainer(scene, recipe, GENERIC, backend="reference")
+
+
+def test_a_cache_of_views_must_be_worth_it_in_each_process() -> None:
+    class Caches:
+        caches_views = True
+
+    stage = short().stages[1]
+    long = Stage(stage.name, 24, stage.train, stage.losses)
+    given: dict[str, Any] = {"backend": Caches(), "views": 6}
+    assert is_cacheable(short(), long, **given, processes=2)
+    assert not is_cacheable(short(), long, **given, processes=3)
