@@ -23,6 +23,13 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
             f"poses: a motion for each training camera after iteration {p.start:,}, rate {p.rate:g} to "
             f"{p.rate_final:g} (rad, shares of the extent) over {p.decay_steps:,} iterations, while all splats move"
         )
+    if recipe.intrinsics is not None:
+        i = recipe.intrinsics
+        what = "focal length and principal point" if i.principal_point else "focal length"
+        yield (
+            f"intrinsics: the {what} of each camera after iteration {i.start:,}, rate {i.rate:g} to {i.rate_final:g} "
+            f"over {i.decay_steps:,} iterations, with the poses"
+        )
     if recipe.multiview is not None:
         m = recipe.multiview
         where = f"one of {m.neighbours} nearby views within {m.max_angle:g} degrees"

@@ -23,6 +23,7 @@ from gs2d.config.recipe import (
     CloneInPlace,
     Exposure,
     GradDensify,
+    IntrinsicsRefinement,
     LearningRates,
     LossTerm,
     PoseRefinement,
@@ -331,6 +332,17 @@ def with_poses(recipe: Recipe, *, name: str | None = None) -> Recipe:
     if recipe.poses is not None:
         return recipe
     return replace(recipe, name=name or f"{recipe.name}-poses", poses=PoseRefinement())
+
+
+def with_intrinsics(recipe: Recipe, *, name: str | None = None) -> Recipe:
+    """Return the recipe with refined poses and focal lengths (``NAME-cameras``); itself if it has them.
+
+    Not in the paper. For cameras whose focal length is off by a few per mille to per cent (docs/guides/poses.md).
+    """
+    if recipe.intrinsics is not None:
+        return recipe
+    refined = replace(with_poses(recipe), intrinsics=IntrinsicsRefinement())
+    return replace(refined, name=name or f"{recipe.name.removesuffix('-poses')}-cameras")
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
 from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
 from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
+from gs2d.config.views import IntrinsicsRefinement as IntrinsicsRefinement
 from gs2d.config.views import PoseRefinement as PoseRefinement
-from gs2d.config.views import check_exposure, check_poses
+from gs2d.config.views import check_exposure, check_intrinsics, check_poses
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
@@ -335,7 +336,8 @@ class Recipe:
     """Stages in order, the seed of every random choice, and the start.
 
     ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
-    photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says. ``multiview``,
+    photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says; ``intrinsics`` None:
+    their focal lengths are the capture's. ``multiview``,
     ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses that do.
     ``dense_start``, ``free_space``, ``opacity_decay``, ``seen_area``: what keeps fog out where photographs are few.
     ``fused_depth``: the depth that becomes the mesh ("mean", "median" or "transmittance"); None: the protocol says.
@@ -356,6 +358,7 @@ class Recipe:
     opacity_decay: OpacityDecay | None = None
     seen_area: SeenArea | None = None
     fused_depth: str | None = field(default=None, metadata={"omit_empty": True})
+    intrinsics: IntrinsicsRefinement | None = field(default=None, metadata={"omit_empty": True})
 
     @property
     def iterations(self) -> int:
@@ -385,6 +388,11 @@ def validate(recipe: Recipe, *, to_train: bool = True) -> Recipe:
         check_poses(f"{where}: poses", recipe.poses)
         learns = any(stage.moves_all for stage in recipe.stages)
         require(learns, f"{where}: poses learn while the means of all splats do, and no stage trains those")
+    if recipe.intrinsics is not None:
+        check_intrinsics(f"{where}: intrinsics", recipe.intrinsics)
+        require(recipe.poses is not None, f"{where}: intrinsics learn with poses, got poses=null; set both or neither")
+        fixed = "views are compared by the intrinsics that the capture says"
+        require(recipe.multiview is None, f"{where}: intrinsics cannot learn with multiview: {fixed}; leave one out")
     kinds = [term.kind for stage in recipe.stages for term in stage.losses]
     check_multiview(f"{where}: multiview", recipe.multiview, kinds)
     check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)

@@ -17,7 +17,15 @@ from typing import TypeVar
 
 from gs2d.config.densify import Densify
 from gs2d.config.priors import DepthPrior, NormalPrior
-from gs2d.config.recipe import Exposure, GradDensify, LearningRates, PoseRefinement, Recipe, Stage
+from gs2d.config.recipe import (
+    Exposure,
+    GradDensify,
+    IntrinsicsRefinement,
+    LearningRates,
+    PoseRefinement,
+    Recipe,
+    Stage,
+)
 from gs2d.errors import RecipeError
 
 MIN_DENSIFICATIONS = 10
@@ -26,7 +34,8 @@ RESET_MARGIN = 200  # iterations of densification that a reset must leave
 MIN_INIT_POINTS = 10_000
 LONGER = 0.25  # power of 1 / factor by which steps are longer: docs/decisions/fog.md
 VIEWS_WAIT = 200  # iterations before exposures and poses are learned, where the schedule has them
-OfViews = TypeVar("OfViews", Exposure, PoseRefinement)
+OfViews = TypeVar("OfViews", Exposure, PoseRefinement, IntrinsicsRefinement)
+OfCameras = TypeVar("OfCameras", PoseRefinement, IntrinsicsRefinement)
 Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the keyboard
 
@@ -57,6 +66,7 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
         init_points=min(recipe.init_points, points),
         exposure=None if recipe.exposure is None else _scale_views(recipe.exposure, factor),
         poses=None if recipe.poses is None else _scale_poses(recipe.poses, factor),
+        intrinsics=None if recipe.intrinsics is None else _scale_poses(recipe.intrinsics, factor),
         depth_prior=None if recipe.depth_prior is None else _scale_prior(recipe.depth_prior, factor),
         normal_prior=None if recipe.normal_prior is None else _scale_prior(recipe.normal_prior, factor),
     )
@@ -90,8 +100,8 @@ def _scale_views(learned: OfViews, factor: float) -> OfViews:
     return replace(learned, decay_steps=decay_steps, start=max(least, round(learned.start * factor)))
 
 
-def _scale_poses(poses: PoseRefinement, factor: float) -> PoseRefinement:
-    """Scale the steps of poses: a camera moves when its image has its turn, and takes longer steps with fewer."""
+def _scale_poses(poses: OfCameras, factor: float) -> OfCameras:
+    """Scale the steps of cameras: one moves when its image has its turn, and takes longer steps with fewer."""
     longer = 1 / math.sqrt(factor)
     return replace(_scale_views(poses, factor), rate=poses.rate * longer, rate_final=poses.rate_final * longer)
 

@@ -1,4 +1,4 @@
-"""What a recipe may learn of each training photograph: an exposure, a pose. Pure Python; never imports torch."""
+"""What a recipe may learn of photographs: an exposure, a pose, a focal length. Pure Python; never imports torch."""
 
 from __future__ import annotations
 
@@ -74,6 +74,39 @@ class PoseRefinement:
         return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
 
 
+@dataclass(frozen=True)
+class IntrinsicsRefinement:
+    """The focal length of each camera, learned with the splats and the poses (``training/zooms.py``).
+
+    It learns in the stages in which poses do. Photographs whose files have the same intrinsics share a camera.
+
+    Attributes
+    ----------
+    rate, rate_final, decay_steps : float, float, int
+        Adam's rate, of the logarithm of the focal length, decays log-linearly over ``decay_steps`` iterations of the
+        run. A camera that all photographs share moves in every iteration. Grows with shorter schedules, as poses' do.
+    start : int
+        Learned when iteration of the run > start, as poses.
+    principal_point : bool
+        Whether the principal point moves, too. A turn of the camera looks nearly the same.
+    beta1, beta2, eps : float
+        Adam's.
+    """
+
+    rate: float = 1e-4
+    rate_final: float = 1e-6
+    decay_steps: int = 30_000
+    start: int = 500
+    principal_point: bool = False
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+
+    def rate_at(self, iteration: int) -> float:
+        """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
+        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
+
+
 def _decayed(first: float, last: float, fraction: float) -> float:
     """Log-linear between the ends of [0, 1]."""
     t = min(max(fraction, 0.0), 1.0)
@@ -93,14 +126,25 @@ def check_exposure(where: str, exposure: Exposure) -> None:
     one_of(f"{where}.initial", exposure.initial, ("identity", "points"))
 
 
+def check_intrinsics(where: str, intrinsics: IntrinsicsRefinement) -> None:
+    """Raise RecipeError for numbers that make no focal lengths."""
+    boolean = isinstance(intrinsics.principal_point, bool)
+    require(boolean, f"{where}.principal_point must be true or false, got {intrinsics.principal_point!r}")
+    _check_rates(where, intrinsics, "intrinsics=null leaves focal lengths alone", "shares of the focal length")
+
+
 def check_poses(where: str, poses: PoseRefinement) -> None:
     """Raise RecipeError for numbers that make no poses."""
+    _check_rates(where, poses, "poses=null leaves cameras alone", "rad, extents")
+
+
+def _check_rates(where: str, poses: PoseRefinement | IntrinsicsRefinement, without: str, units: str) -> None:
     for name in ("rate", "rate_final", "eps"):
         value = number(f"{where}.{name}", getattr(poses, name), low=0.0)
-        require(value > 0, f"{where}.{name} must be positive, got {value} (poses=null leaves cameras alone)")
+        require(value > 0, f"{where}.{name} must be positive, got {value} ({without})")
     for name in ("rate", "rate_final"):
         value = getattr(poses, name)
-        require(value <= 1, f"{where}.{name} must be at most 1 (rad, extents), got {value}")
+        require(value <= 1, f"{where}.{name} must be at most 1 ({units}), got {value}")
     for name in ("beta1", "beta2"):
         number(f"{where}.{name}", getattr(poses, name), low=0.0)
     require(max(poses.beta1, poses.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,17 @@ from gs2d.errors import ShapeError
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+class Zoom(NamedTuple):
+    """What intrinsics become: focal lengths ``scale`` times as long, the principal point moved by focal lengths.
+
+    Free of the image's size, so that it holds for a photograph at any downscale.
+    """
+
+    scale: float = 1.0
+    right: float = 0.0
+    down: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +142,12 @@ class Camera:
             raise ShapeError(f"downscale must leave at least one pixel of {self.width}x{self.height}, got {factor}")
         f = float(factor)
         return self._with(width, height, (self.fx / f, self.fy / f, self.cx / f, self.cy / f), (1 / f,) * 4)
+
+    def zoomed(self, zoom: Zoom) -> Camera:
+        """Return the same camera with other intrinsics; those that learn are let go."""
+        scale, right, down = zoom
+        cx, cy = self.cx + self.fx * right, self.cy + self.fy * down
+        return replace(self, fx=self.fx * scale, fy=self.fy * scale, cx=cx, cy=cy, intrinsics=None)
 
     def _with(self, width: int, height: int, numbers: tuple[float, ...], factors: tuple[float, ...]) -> Camera:
         """Another size, and these fx, fy, cx and cy; those that learn are a function of what they were."""

@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
-from gs2d.core.camera import Camera
+from gs2d.core.camera import Camera, Zoom
 from gs2d.core.checks import check_shapes
 from gs2d.core.images import composite
 from gs2d.core.memory import trim
@@ -40,6 +41,8 @@ class View:
         Its depth and normal maps, where the capture has such.
     intrinsics : Intrinsics or None
         Of the photograph's file, before its lens was taken out and before it was shrunk; None: as ``camera``.
+    zoom : Zoom or None
+        What training has made of the intrinsics of ``camera`` since they were read; None: nothing.
     """
 
     name: str
@@ -49,6 +52,7 @@ class View:
     path: Path | None = None
     maps: PriorMaps | None = None
     intrinsics: Intrinsics | None = None
+    zoom: Zoom | None = None
 
     @classmethod
     def from_arrays(
@@ -66,10 +70,17 @@ class View:
         picture = DecodedImage(image, mask, object_mask, valid)
         return cls(name, camera, lambda: picture)
 
-    def at(self, T_cam_world: np.ndarray) -> View:
-        """Return the same photograph, taken from elsewhere; its picture stays in the cache of this one."""
+    def at(self, T_cam_world: np.ndarray, zoom: Zoom | None = None) -> View:
+        """Return the same photograph, taken from elsewhere; its picture stays in the cache of this one.
+
+        With ``zoom`` its camera gets other intrinsics, too.
+        """
         camera = replace(self.camera, T_cam_world=T_cam_world)
-        return View(self.name, camera, self._image, path=self.path, maps=self.maps, intrinsics=self.intrinsics)
+        camera = camera if zoom is None else camera.zoomed(zoom)
+        zoom = self.zoom if zoom is None else zoom
+        return View(
+            self.name, camera, self._image, path=self.path, maps=self.maps, intrinsics=self.intrinsics, zoom=zoom
+        )
 
     def downscaled(self, factor: int) -> View:
         """Return the same photograph at 1 / ``factor`` of its size, with its camera, masks and maps.
@@ -87,6 +98,7 @@ class View:
             path=self.path,
             maps=maps,
             intrinsics=self.intrinsics,
+            zoom=self.zoom,
         )
 
     def file_intrinsics(self) -> Intrinsics:
@@ -162,6 +174,10 @@ class View:
                     f"got {array.shape[1]}x{array.shape[0]}; did the file change since the scene was loaded?"
                 )
         return image
+
+
+def _or(value: np.ndarray | None, otherwise: np.ndarray) -> np.ndarray:
+    return otherwise if value is None else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,11 +263,23 @@ class Scene:
     ahead: int = 0
     masks: Masks = Masks()  # noqa: RUF009 (frozen)
 
-    def with_poses(self, poses: Mapping[str, np.ndarray]) -> Scene:
-        """Return the scene with other training cameras: T_cam_world [4, 4] by the view's name. Images are shared."""
-        return replace(
-            self, train=tuple(view.at(poses[view.name]) if view.name in poses else view for view in self.train)
-        )
+    def with_poses(self, poses: Mapping[str, np.ndarray], zooms: Mapping[str, Zoom] = MappingProxyType({})) -> Scene:
+        """Return the scene with other cameras. Images are shared.
+
+        Parameters
+        ----------
+        poses : mapping
+            T_cam_world [4, 4] by the name of a training view.
+        zooms : mapping
+            What becomes of the intrinsics of a view, training or test, by its name.
+        """
+
+        def moved(view: View, pose: np.ndarray | None) -> View:
+            zoom = zooms.get(view.name)
+            return view if pose is None and zoom is None else view.at(_or(pose, view.camera.T_cam_world), zoom)
+
+        train = tuple(moved(view, poses.get(view.name)) for view in self.train)
+        return replace(self, train=train, test=tuple(moved(view, None) for view in self.test))
 
     def downscaled(self, factor: int) -> Scene:
         """Return the scene with training photographs of 1 / ``factor`` of their size; test views stay as they are."""

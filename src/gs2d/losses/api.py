@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -304,8 +304,16 @@ def _multiview_geometric(output: RenderOutput, view: LossView) -> Tensor:
 
 def _fused_normals(output: RenderOutput, view: LossView, operations: LossOperations, kind: str) -> Tensor:
     per_splat, weight = kind == "normal_consistency_per_splat", view.weights.get(kind, 1.0)
-    choices = {"edges": view.edges, "weights": view.pixel_weights}
-    return operations.normal_consistency(*_normals(output, view), **choices, per_splat=per_splat, expected=weight)
+    choices: dict[str, Any] = {"edges": view.edges, "weights": view.pixel_weights}
+    images = _normals(output, view)
+    value = operations.normal_consistency(*images, **choices, per_splat=per_splat, expected=weight)
+    if view.camera.intrinsics is None or not torch.is_grad_enabled():
+        return value
+    # The fused one takes the intrinsics for constants; what the normals of the depth image owe to them is added.
+    normal, depth, alpha, camera, mask = images
+    plain = reference.normal_consistency_per_splat if per_splat else reference.normal_consistency
+    by_camera = plain(normal.detach(), depth.detach(), alpha.detach(), camera, mask, **choices)
+    return value + (by_camera - by_camera.detach())
 
 
 FUSED: Mapping[str, Callable[[RenderOutput, LossView, LossOperations], Tensor]] = MappingProxyType(

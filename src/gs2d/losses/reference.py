@@ -99,7 +99,7 @@ def normals_from_depth(
     -------
     Tensor [H, W, 3]
         Unit normals in the world frame; 0 where undefined, and on the one-pixel border.
-        Differentiable in ``depth``; the camera is a constant.
+        Differentiable in ``depth``, and in the camera's ``intrinsics`` where they learn; its pose is a constant.
     """
     height, width = depth.shape
     if min(height, width) < 3:
@@ -109,8 +109,11 @@ def normals_from_depth(
     z = torch.where(hit, depth, torch.zeros_like(depth))  # 0 is the camera's centre
     i = torch.arange(width, dtype=depth.dtype, device=depth.device)
     j = torch.arange(height, dtype=depth.dtype, device=depth.device)
-    x = ((i + 0.5 - camera.cx) / camera.fx).expand(height, width)
-    y = ((j + 0.5 - camera.cy) / camera.fy)[:, None].expand(height, width)
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    if camera.intrinsics is not None:
+        fx, fy, cx, cy = camera.intrinsics.to(depth)
+    x = ((i + 0.5 - cx) / fx).expand(height, width)
+    y = ((j + 0.5 - cy) / fy)[:, None].expand(height, width)
     points = torch.stack([x * z, y * z, z], dim=-1)  # camera frame; the rotation to the world is applied last
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     right = points[1:-1, 2:] - points[1:-1, :-2]

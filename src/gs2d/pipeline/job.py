@@ -17,6 +17,7 @@ from gs2d.config.presets import (
     get_recipe,
     with_depth_prior,
     with_exposure,
+    with_intrinsics,
     with_normal_prior,
     with_poses,
     with_robustness,
@@ -138,6 +139,7 @@ class Job:
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
             **({} if not processes else {"processes": list(map(list, processes))}),
+            **({} if self.recipe.intrinsics is None else {"intrinsics": recipe["intrinsics"]}),
             **{name: recipe[name] for name in LATER_FIELDS[2:] if recipe[name] is not None},
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -182,6 +184,7 @@ def build_recipe(
     overrides: tuple[str, ...],
     exposure: bool = False,
     poses: bool = False,
+    intrinsics: bool = False,
     depth_prior: str | None = None,
     normal_prior: bool = False,
     robust: bool = False,
@@ -196,6 +199,7 @@ def build_recipe(
     value = recipe_of(recipe)
     value = with_exposure(value) if exposure else value
     value = with_poses(value) if poses else value
+    value = with_intrinsics(value) if intrinsics else value
     value = with_depth_prior(value, depth_prior) if depth_prior is not None else value
     value = with_normal_prior(value) if normal_prior else value
     value = with_robustness(value) if robust else value
@@ -207,6 +211,7 @@ def build_recipe(
     for option, wanted, field in (
         ("--exposure", exposure, "exposure"),
         ("--refine-poses", poses, "poses"),
+        ("--refine-cameras", intrinsics, "intrinsics"),
         ("--depth-prior", depth_prior is not None, "depth_prior"),
         ("--normal-prior", normal_prior, "normal_prior"),
     ):
@@ -259,6 +264,7 @@ def _recipe_of(options: TrainOptions, *, robust: bool, exposure: bool) -> Recipe
         overrides=options.overrides,
         exposure=exposure,
         poses=options.refine_poses,
+        intrinsics=options.refine_cameras,
         depth_prior=options.depth_prior,
         normal_prior=options.normal_prior,
         robust=robust,

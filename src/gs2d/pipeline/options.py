@@ -86,6 +86,8 @@ class Training:
     """Every so many-th view, by name, is a test view; 0: all train (default: what the protocol says, mostly 8)."""
     refine_poses: bool = False
     """Learn where each photograph was taken from, beginning where the capture says: for poses that are a little off."""
+    refine_cameras: bool = False
+    """Learn focal lengths, too: --refine-poses, and one focal length for all photographs of a camera."""
     depth_prior: Literal["auto", "sparse", "sensor", "relative"] | None = None
     """Train with known depths: of sparse points, or of maps in depths/, a sensor's or relative; auto: what is there."""
     normal_prior: bool = False

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
 
 from gs2d.config.recipe import LossTerm, Recipe
-from gs2d.core.camera import Camera
+from gs2d.core.camera import Camera, Zoom
 from gs2d.core.json_files import read_json, write_json
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import focus_point, perturb_pose
@@ -24,14 +24,36 @@ from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 
-FoundPoses = Mapping[str, np.ndarray]
-"""T_cam_world [4, 4] by the name of the training view; empty where a run learns none."""
 
-NONE: FoundPoses = MappingProxyType({})
+@dataclass(frozen=True, eq=False)
+class FoundPoses:
+    """The cameras that a run found.
+
+    Attributes
+    ----------
+    poses : mapping
+        T_cam_world [4, 4] by the name of the training view; empty where a run learns none.
+    zooms : mapping
+        What became of the intrinsics of a view, training or test, by its name; empty where a run learns none.
+    """
+
+    poses: Mapping[str, np.ndarray] = field(default_factory=dict)
+    zooms: Mapping[str, Zoom] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.poses)
+
+    def of(self, scene: Scene) -> Scene:
+        """Return a scene with these cameras."""
+        return scene.with_poses(self.poses, self.zooms)
+
+
+NONE = FoundPoses()
 ABOUT = (
     "cameras of the training photographs as refined, then those of the test photographs as given, in the layout of "
     "nerfstudio's transforms.json (OpenGL camera to world), for pictures of size w x h without distortion; "
-    "T_cam_world: the same for OpenCV, world to camera; moved: from the given pose, shift as a share of the extent"
+    "T_cam_world: the same for OpenCV, world to camera; moved: from the given pose, shift as a share of the extent; "
+    "zoom: what became of the given focal lengths (a factor) and principal point (moved right and down, focal lengths)"
 )
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GRID = 5  # points along each side of a picture, whose motion is measured
@@ -42,7 +64,10 @@ PHOTOMETRIC = (LossTerm("l1", 0.8), LossTerm("ssim", 0.2))
 
 def found_poses(given: Scene, now: Scene) -> FoundPoses:
     """Return the poses of the training views of a scene whose cameras have moved; none if it is the same."""
-    return NONE if now is given else {view.name: view.camera.T_cam_world for view in now.train}
+    if now is given:
+        return NONE
+    zooms = {view.name: view.zoom for view in now.views if view.zoom is not None}
+    return FoundPoses({view.name: view.camera.T_cam_world for view in now.train}, zooms)
 
 
 def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEvent) -> None:
@@ -54,13 +79,13 @@ def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEve
     """
     if not poses:
         return
-    refined = scene.with_poses(poses)
+    refined = poses.of(scene)
     middle = focus_point([view.camera for view in scene.train])
     frames, far = [], []
     for given, view in zip(scene.train, refined.train, strict=True):
         far.append(how_far(given.camera, view.camera, middle, scene.extent))
         frames.append({**_frame(view, scene.root), "split": "train", "moved": far[-1]})
-    frames += [{**_frame(view, scene.root), "split": "test"} for view in scene.test]
+    frames += [{**_frame(view, scene.root), "split": "test"} for view in refined.test]
     write_json(run.file(POSES), {"format": 1, "about": ABOUT, "frames": frames})
     mean = {name: float(np.mean([entry[name] for entry in far])) for name in far[0]}
     on_event(
@@ -69,6 +94,17 @@ def write_poses(run: RunFolder, scene: Scene, poses: FoundPoses, on_event: OnEve
             f"{100 * mean['shift']:.3f} % of the extent): {POSES}"
         )
     )
+    if poses.zooms:
+        on_event(Notice(zoom_line([poses.zooms[name] for name in poses.poses])))
+
+
+def zoom_line(zooms: Sequence[Zoom]) -> str:
+    """Return a line on what became of the focal lengths of training views."""
+    scales = sorted({zoom.scale for zoom in zooms})
+    factor = f"{scales[0]:.4f}" if len(scales) == 1 else f"{scales[0]:.4f} to {scales[-1]:.4f} ({len(scales)} cameras)"
+    moved = max(max(abs(zoom.right), abs(zoom.down)) for zoom in zooms)
+    also = f", principal points moved by up to {moved:.4f} focal lengths" if moved else ""
+    return f"focal lengths became {factor} times those of the capture{also}"
 
 
 def _frame(view: View, root: Path | None) -> dict[str, Any]:
@@ -83,6 +119,7 @@ def _frame(view: View, root: Path | None) -> dict[str, Any]:
         "T_cam_world": camera.T_cam_world.tolist(),
         **{"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy},
         **{"cx": camera.cx, "cy": camera.cy},
+        **({} if view.zoom is None else {"zoom": list(view.zoom)}),
     }
 
 
@@ -117,14 +154,21 @@ def read_poses(run: RunFolder, recipe: Recipe) -> FoundPoses:
         return NONE
     remedy = f"continue with `gs2d train ... --out {run.path} --resume`, which writes it again"
     try:
-        frames = [entry for entry in read_json(run.file(POSES))["frames"] if entry["split"] == "train"]
+        every = read_json(run.file(POSES))["frames"]
+        frames = [entry for entry in every if entry["split"] == "train"]
         poses = {entry["name"]: np.array(entry["T_cam_world"], dtype=np.float64) for entry in frames}
+        zooms = {entry["name"]: Zoom(*map(float, entry["zoom"])) for entry in every if "zoom" in entry}
     except (DataError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{run.file(POSES)} must hold the poses that this run found, got: {error}; {remedy}") from error
     for name, pose in poses.items():
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise RunError(f"{run.file(POSES)} must hold 4x4 numbers for {name}, got others; {remedy}")
-    return poses
+    if recipe.intrinsics is not None and not zooms.keys() >= poses.keys():
+        raise RunError(f"{run.file(POSES)} must hold the zoom of each training photograph, got none of some; {remedy}")
+    for name, zoom in zooms.items():
+        if not (np.isfinite(zoom).all() and zoom.scale > 0):
+            raise RunError(f"{run.file(POSES)} must hold a zoom of finite numbers for {name}, got others; {remedy}")
+    return FoundPoses(poses, zooms)
 
 
 def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
@@ -138,14 +182,14 @@ def with_found_poses(run: RunFolder, recipe: Recipe, scene: Scene) -> Scene:
     poses = read_poses(run, recipe)
     if not poses:
         return scene
-    missing = [view.name for view in scene.train if view.name not in poses]
+    missing = [view.name for view in scene.train if view.name not in poses.poses]
     if missing:
         raise RunError(
             f"{run.file(POSES)} must hold a pose for each training photograph, got none for {missing[0]}; continue "
             f"with `gs2d train ... --out {run.path} --resume`, which writes it again"
         )
     try:
-        return scene.with_poses(poses)
+        return poses.of(scene)
     except ShapeError as error:
         raise RunError(
             f"{run.file(POSES)} must hold rigid motions, got another: {error}; continue with `gs2d train ... --out "

@@ -355,9 +355,9 @@ class RunLogger:
 
     def _now(self, views: Sequence[View]) -> list[View]:
         """Return views of the capture from where their cameras are now."""
-        now = {view.name: view for view in scene_now(self._state, self._job.scene).train}
-        learned = set(map(id, self._job.scene.train))
-        return [now[view.name] if id(view) in learned else view for view in views]
+        scene = self._job.scene
+        now = dict(zip(map(id, scene.views), scene_now(self._state, scene).views, strict=True))
+        return [now.get(id(view), view) for view in views]
 
     @property
     def _state(self) -> TrainState:

@@ -165,7 +165,8 @@ def _views(job: Job, options: TextureOptions, on_event: OnEvent) -> Sequence[Vie
     scene = read_scene(
         job.scene.root, job.scene.format, options.texture_downscale or 1, job.protocol, on_event, job.scene.masks
     )
-    return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}).train
+    zooms = {view.name: view.zoom for view in job.scene.train if view.zoom is not None}
+    return scene.with_poses({view.name: view.camera.T_cam_world for view in job.scene.train}, zooms).train
 
 
 def _images(

@@ -131,7 +131,7 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
             release(job.scene)  # before the volume of the mesh
             write_exposures(run, exposures, on_event)
             write_poses(run, job.scene, poses, on_event)
-            job = replace(job, scene=job.scene.with_poses(poses)) if poses else job
+            job = replace(job, scene=poses.of(job.scene)) if poses else job
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
             finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
     return run

@@ -28,6 +28,7 @@ from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_nei
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
+from gs2d.training.zooms import zoom_rate
 
 
 def raster_settings(protocol: Protocol, extent: float, sh_degree: int) -> RasterSettings:
@@ -64,7 +65,8 @@ class StepResult:
         Weighted. Tensors on a GPU: to read them is to wait for it.
     gradients : mapping of attribute to Tensor
         Like the attributes; only of ``rows``, in their order, where those are given. Where exposures are learned also
-        "exposure" [3, 4], of the photograph's transform; where poses are, "pose" [6], of the camera's motion.
+        "exposure" [3, 4], of the photograph's transform; where poses are, "pose" [6], of the camera's motion; where
+        focal lengths are, "zoom" [3].
     signal : Tensor [N, 2] or [N, 4], or None
     radii : Tensor [N] px or None
         None where nothing was projected.
@@ -141,9 +143,11 @@ class FullRender:
         return settings.for_depths(*asked)
 
     def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
-        """Return the camera of training view ``index`` where it is now; with ``learns`` its pose gets a gradient."""
-        given = self.scene.train[index].camera
-        return given if state.poses is None else state.poses.camera(index, given, learns=learns)
+        """Return the camera of training view ``index`` where it is now; with ``learns`` it gets a gradient."""
+        camera = self.scene.train[index].camera
+        if state.zooms is not None:
+            camera = state.zooms.camera(index, camera, learns=learns)
+        return camera if state.poses is None else state.poses.camera(index, camera, learns=learns)
 
     def evaluate(
         self, state: TrainState, stage: Stage, iteration: int, index: int, probe: Tensor | None = None
@@ -151,7 +155,8 @@ class FullRender:
         """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
         splats = state.splats
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
-        camera = self.camera(state, index, learns=pose_rate(self.recipe, state.stage, iteration) > 0)
+        learns = any(rate(self.recipe, state.stage, iteration) > 0 for rate in (pose_rate, zoom_rate))
+        camera = self.camera(state, index, learns=learns)
         settings = self.settings(stage, iteration)
         rows = _learning_rows(state, stage) if probe is None else None  # the signal is of every splat
         output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
@@ -272,6 +277,9 @@ class FullRender:
         if state.poses is not None and camera.pose is not None:
             gradients["pose"] = state.poses.gradient(camera)  # in the host's memory, on a GPU too
             broken = broken if finite(gradients["pose"]) else "pose"
+        if state.zooms is not None and camera.intrinsics is not None:
+            gradients["zoom"] = state.zooms.gradient(camera, self.scene.train[index].camera)
+            broken = broken if finite(gradients["zoom"]) else "focal length"
         if broken is not None:
             raise diverged(stage, iteration, f"the gradient of {broken}")
         return values, gradients

@@ -29,7 +29,7 @@ from gs2d.training.state import TrainState
 
 T = TypeVar("T")
 Statistics = Mapping[str, Tensor]
-OF_A_VIEW = {"exposure": (3, 4), "pose": (6,)}  # gradients that are of one view, and are not averaged
+OF_A_VIEW = {"exposure": (3, 4), "pose": (6,), "zoom": (3,)}  # gradients that are of one view, and are not averaged
 FAILED = "gs2d/failed"  # key of the store: a process has said why it ended
 
 
@@ -111,7 +111,7 @@ class OneProcess:
         StepResult
             ``losses``, ``signal`` and ``radii`` are of this process's own view (:meth:`mean_losses`, :meth:`gather`).
         sequence of mapping
-            "exposure" and "pose" of each view, where there are any.
+            "exposure", "pose" and "zoom" of each view, where there are any.
         """
         result = one(turns[0])
         return result, (result.gradients,)
@@ -344,7 +344,7 @@ def _tensors(state: TrainState) -> Iterator[Tensor]:
             yield state.moments[name].square
     for named in (state.groups, state.statistics or {}):
         yield from (named[name] for name in sorted(named))
-    for learned in (state.exposures, state.poses):
+    for learned in (state.exposures, state.poses, state.zooms):
         if learned is not None:
             yield learned.offsets
             yield learned.square

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe
+from gs2d.core.camera import Zoom
 from gs2d.data.scene import Scene
 from gs2d.kernels.reference import finite
 from gs2d.render.backends import Backend
@@ -14,6 +15,7 @@ from gs2d.training.exposure import Exposures, check_views, exposure_step, uncoun
 from gs2d.training.point_gains import point_gains
 from gs2d.training.poses import Poses, check_poses, pose_rate, pose_step
 from gs2d.training.state import TrainState
+from gs2d.training.zooms import Zooms, check_zooms, zoom_rate, zoom_step
 
 
 def start(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:
@@ -25,6 +27,8 @@ def start(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:
             state.exposures.begin_with(known.gains)
     if recipe.poses is not None:
         state.poses = Poses.start([view.camera for view in scene.train], scene.extent)
+    if recipe.intrinsics is not None:
+        state.zooms = Zooms.start(scene.train)
     return state
 
 
@@ -32,6 +36,7 @@ def check(state: TrainState, recipe: Recipe, views: int) -> None:
     """Raise RunError unless a state has what the recipe learns of so many views, and nothing else."""
     check_views(state.exposures, views if recipe.exposure else 0)
     check_poses(state.poses, views if recipe.poses else 0)
+    check_zooms(state.zooms, views if recipe.intrinsics else 0)
 
 
 def update(
@@ -48,6 +53,8 @@ def update(
     if state.poses is not None and "pose" in gradients and backend.is_whole():
         # The host has waited for the gradient, so it may ask.
         pose_step(state.poses, index, gradients["pose"], recipe, pose_rate(recipe, state.stage, iteration))
+    if state.zooms is not None and "zoom" in gradients and backend.is_whole():
+        zoom_step(state.zooms, index, gradients["zoom"], recipe, zoom_rate(recipe, state.stage, iteration))
 
 
 def rollback(state: TrainState, recipe: Recipe, iteration: int, index: int) -> None:
@@ -60,12 +67,28 @@ def find_nonfinite(state: TrainState) -> str:
     """Return what is not finite, in words; "" if all is."""
     if state.exposures is not None and not finite(state.exposures.offsets):
         return "an exposure"
+    if state.zooms is not None and not finite(state.zooms.offsets):
+        return "a focal length"
     return "a pose" if state.poses is not None and not finite(state.poses.offsets) else ""
 
 
 def scene_now(state: TrainState, scene: Scene) -> Scene:
-    """Return the scene with its training cameras where they are now."""
+    """Return the scene with its training cameras where they are now.
+
+    Focal lengths are those of a camera: test photographs that share one with training photographs have its new one.
+    """
     poses = state.poses
     if poses is None:
         return scene
-    return scene.with_poses({view.name: poses.pose(index).numpy() for index, view in enumerate(scene.train)})
+    return scene.with_poses(
+        {view.name: poses.pose(index).numpy() for index, view in enumerate(scene.train)}, zooms_now(state, scene)
+    )
+
+
+def zooms_now(state: TrainState, scene: Scene) -> dict[str, Zoom]:
+    """Return what the intrinsics of views have become, by their names; empty where none are learned."""
+    zooms = state.zooms
+    if zooms is None:
+        return {}
+    of_camera = {view.file_intrinsics(): zooms.zoom(index) for index, view in enumerate(scene.train)}
+    return {view.name: of_camera[view.file_intrinsics()] for view in scene.views if view.file_intrinsics() in of_camera}

@@ -14,6 +14,7 @@ from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import RunError, ShapeError
 from gs2d.training.exposure import Exposures
 from gs2d.training.poses import Poses
+from gs2d.training.zooms import Zooms
 
 FORMAT = 1  # of the state dict
 # What a mapping that is no state, or one with other values in it, makes of the steps of reading it.
@@ -70,6 +71,8 @@ class TrainState:
         Motions of the training cameras, where the recipe learns them.
     processes : list of (stage, step, count)
         From where on so many processes trained; empty: one, all the time.
+    zooms : Zooms or None
+        Their focal lengths, where the recipe learns them.
     """
 
     splats: Splats
@@ -84,6 +87,7 @@ class TrainState:
     exposures: Exposures | None = None
     poses: Poses | None = None
     processes: list[tuple[int, int, int]] = field(default_factory=list)
+    zooms: Zooms | None = None
 
     def trained_by(self, count: int) -> None:
         """Note that so many processes train from here on: the result depends on it."""
@@ -117,6 +121,7 @@ class TrainState:
             **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
             **({} if self.poses is None else {"poses": self.poses.state_dict()}),
             **({} if not self.processes else {"processes": [list(since) for since in self.processes]}),
+            **({} if self.zooms is None else {"zooms": self.zooms.state_dict()}),
         }
 
     @classmethod
@@ -152,9 +157,10 @@ class TrainState:
                 Exposures.from_state_dict(data["exposures"]) if "exposures" in data else None,
                 Poses.from_state_dict(data["poses"]) if "poses" in data else None,
                 [(int(stage), int(step), int(count)) for stage, step, count in data.get("processes", ())],
+                Zooms.from_state_dict(data["zooms"]) if "zooms" in data else None,
             )
             state.check()
-            learned = {"exposures": state.exposures, "poses": state.poses}
+            learned = {"exposures": state.exposures, "poses": state.poses, "zooms": state.zooms}
             numbers = dict(state.splats.items()) | {name: it.offsets for name, it in learned.items() if it is not None}
             for name, tensor in numbers.items():
                 if not bool(tensor.isfinite().all()):
@@ -205,7 +211,7 @@ class TrainState:
             expected = torch.bool if name in groups else tensor.dtype if name in statistics else dtype
             if tensor.dtype != expected or not dtype.is_floating_point:
                 raise ShapeError(f"{name} must be {expected}, got {tensor.dtype}")
-        for learned in (self.exposures, self.poses):
+        for learned in (self.exposures, self.poses, self.zooms):
             if learned is not None:
                 learned.check()
         self._check_counts()
@@ -213,7 +219,7 @@ class TrainState:
     def _check_counts(self) -> None:
         """Raise RunError for a count below zero."""
         steps = [moments.steps for moments in self.moments.values()]
-        learned = [learned.steps for learned in (self.exposures, self.poses) if learned is not None]
+        learned = [learned.steps for learned in (self.exposures, self.poses, self.zooms) if learned is not None]
         least = min([self.stage, self.step, *steps, *self.queue, *(count for counts in learned for count in counts)])
         if least < 0:
             raise RunError(f"counts of iterations and views must be 0 or more, got {least}; train again")

@@ -29,7 +29,7 @@ def poses_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
     """
     if not path.exists():
         return missing(f"{path.name} is missing: it is written when training is finished.")
-    names, far = _moved(path)
+    names, far, zooms = _moved(path)
     most, mean = int(far[:, 0].argmax()), far.mean(axis=0)
     return render(
         "poses.html",
@@ -40,6 +40,7 @@ def poses_section(path: Path, last_stage: Mapping[str, Any]) -> Markup:
         has_test=bool(last_stage.get("test")),
         aligned=_aligned(last_stage),
         plot=_plot(far[:, 0]),
+        zooms=[] if zooms is None else [f"{scale:.4f}" for scale in sorted({zooms.min(), zooms.max()})],
     )
 
 
@@ -51,17 +52,22 @@ def _aligned(stage: Mapping[str, Any]) -> dict[str, float] | None:
     return {"plain": plain["psnr"], "aligned": aligned["psnr"]}
 
 
-def _moved(path: Path) -> tuple[list[str], np.ndarray]:
-    """Names of the training views, and what each has moved by [V, 3]: pixels, degrees, share of the extent."""
+def _moved(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
+    """Names of the training views, and what each has moved by [V, 3]: pixels, degrees, share of the extent.
+
+    And what became of their focal lengths [V], as factors, where those were refined.
+    """
     try:
         frames = [entry for entry in read_json(path)["frames"] if entry["split"] == "train"]
         names = [str(entry["name"]) for entry in frames]
         far = np.array([[entry["moved"][name] for name in MEASURES] for entry in frames], dtype=np.float64)
+        refined = bool(frames) and "zoom" in frames[0]
+        zooms = np.array([float(entry["zoom"][0]) for entry in frames]) if refined else None
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path} must hold name and motion of each photograph, got another entry ({error})") from error
     if not names or not np.isfinite(far).all():
         raise DataError(f"{path} must hold finite numbers of one photograph or more, got others")
-    return names, far
+    return names, far, zooms
 
 
 def _plot(pixels: np.ndarray) -> str:
