@@ -19,8 +19,11 @@ import torch
 from torch import Tensor
 
 from gs2d.config.densify import Densify
+from gs2d.config.presets import two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea
+from gs2d.config.schedule import scale_schedule
 from gs2d.core.processes import Place
 from gs2d.errors import Gs2dError
 from gs2d.training import events
@@ -29,6 +32,7 @@ from gs2d.training.parallel import OF_A_VIEW, OneProcess, Turn
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 from train_toys import backends, compared, make_scene, short
+from wall_scene import wall
 
 
 class Batch(OneProcess):
@@ -98,7 +102,25 @@ def by_error() -> Recipe:
     return Recipe("by-error", (replace(first, densify=replace(first.densify, error_views=4)),))
 
 
+def cached() -> Recipe:
+    """Stage 2 is long enough for cached views; ``ROOM`` is for four of the six."""
+    first, second, _ = short().stages
+    return Recipe("cached", (replace(first, iterations=3), replace(second, iterations=25)))
+
+
+def robust() -> Recipe:
+    """15 iterations on a wall: a dense start, free space looked at in the tenth, seen area and decay in each fifth."""
+    made = scale_schedule(with_robustness(two_dgs()), 0.0005)
+    start = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
+    decay, area = OpacityDecay(rate=0.1, every=5, least=0.02), SeenArea(times=3)
+    made = replace(made, dense_start=start, free_space=FreeSpace(every=10), opacity_decay=decay, seen_area=area)
+    return replace(made, stages=(replace(made.stages[0], densify=None),), sh_degree=1)
+
+
+ROOM = 90_000  # bytes of each process for cached views
 RECIPES: dict[str, Callable[[], Recipe]] = {
+    "cached": cached,
+    "robust": robust,
     "short": short,
     "absgs": lambda: short(absgs=True),
     "compared": compared,
@@ -120,8 +142,10 @@ def trained(
             heard["states"].append(trainer.state.state_dict())
 
     begun = None if state is None else TrainState.from_state_dict(state)
-    given = {"backend": backends()[-1], "progress_every": 1} | options
-    trainer = Trainer(make_scene(), recipe, GENERIC, on_event=on_event, processes=together, state=begun, **given)
+    room = ROOM * together.place.local_size
+    given = {"backend": backends()[-1], "progress_every": 1, "stage2_cache_bytes": room} | options
+    scene = wall() if recipe.dense_start else make_scene()
+    trainer = Trainer(scene, recipe, GENERIC, on_event=on_event, processes=together, state=begun, **given)
     trainer.run()
     return trainer.state, heard
 

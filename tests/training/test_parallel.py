@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -76,6 +77,23 @@ def test_processes_whose_states_differ_stop_with_one_line(two: dict[str, list[An
         assert line.startswith("the processes must have the same state at iteration 4 of stage 1, got another one in")
         assert "--resume" in line
         assert "\n" not in line
+
+
+@pytest.mark.slow
+def test_four_processes_train_what_one_does_with_batches_of_four(tmp_path: Path) -> None:
+    """To rounding: sums of four numbers have an order. Iterations of fewer views leave processes idle."""
+    cases = ["short", "learning", "relocating", "cached"]
+    for case, found in together_in(4, cases, tmp_path).items():
+        state, _ = trained(RECIPES[case](), Batch(4))
+        for other in found:
+            assert differing(found[0]["state"], other["state"]) == []
+        mine, theirs = flat(state.state_dict()), flat(found[0]["state"])
+        assert mine.keys() == theirs.keys()
+        for name, tensor in mine.items():
+            if name.startswith("/splats"):
+                torch.testing.assert_close(theirs[name], tensor, rtol=1e-3, atol=1e-4)
+            elif not tensor.is_floating_point():
+                assert torch.equal(theirs[name], tensor), name
 
 
 def test_views_that_learn_are_moved_once_a_turn(two: dict[str, list[Any]]) -> None:

@@ -94,8 +94,8 @@ def run(argv: Sequence[str]) -> int:
         return NOBODY_READS
     except Exception as error:
         console.close()
-        if getattr(error, "told", False) or (hasattr(error, "told") and not here().leads):
-            return EXIT_USAGE  # contact was lost to a process that says itself why
+        if getattr(error, "told", False):  # contact was lost to another process, and another one says why
+            return EXIT_USAGE
         return _report(error, command.debug)
 
 
@@ -107,6 +107,8 @@ def leave(code: int) -> NoReturn:
     except OSError as error:
         _drop_stdout()
         code = NOBODY_READS if isinstance(error, BrokenPipeError) else code or _report(error, debug=False)
+    if code and os.environ.get("WORLD_SIZE", "1") != "1":  # threads that still talk to processes that are gone
+        os._exit(code)
     sys.exit(code)
 
 

@@ -97,6 +97,10 @@ class RunLogger:
         elif state.step and self._step_line_due(state.step, self._stage(state.stage).iterations):
             self._before = take_snapshot(state.splats, state.step)  # as the run that was broken off had it
         self._saved_iteration = state.step
+        if state.processes and state.processes[-1][:2] == (state.stage, state.step):
+            stage, count = min(state.stage, len(self._job.recipe.stages) - 1), trainer.processes.size
+            fact = {"stage": self._stage(stage).name, "iteration": state.step, "count": count}
+            self._run.events.append({"kind": "processes", **fact})
         self._phase()
         self._start_clock()
         if state.entered:

@@ -42,7 +42,7 @@ class Turn:
 
 
 class LostContactError(RunError):
-    """Another process of the training is gone. ``told``: it has said why itself."""
+    """Another process of the training is gone. ``told``: another one says so, or why."""
 
     def __init__(self, message: str, *, told: bool) -> None:
         super().__init__(message)
@@ -199,11 +199,13 @@ class ManyProcesses(OneProcess):
             return None
 
     def _was_told(self) -> bool:
+        if not self.leads:  # process 0 says it; and the store may be gone with it
+            return True
         try:
             store = self._store()
             return store is not None and bool(store.check([FAILED]))
-        except RuntimeError:  # it was process 0's, and went with it
-            return not self.leads
+        except RuntimeError:
+            return False
 
     # -- the state -----------------------------------------------------------------------------------------------------
     def share(self, make: Callable[[], TrainState]) -> TrainState:

@@ -1,0 +1,47 @@
+"""The command ``gs2d`` in a process that torchrun, or a test, says is one of several; without mesh and report.
+
+``python together_run.py [signal=RANK:STEP:NUMBER] [seed=RANK:SEED] WORDS...``: a signal that the process of this rank
+sends itself at the beginning of a step, counted over all stages, but not after a restart; another seed in one of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+
+import gs2d.cli
+import gs2d.pipeline.train as pipeline
+from gs2d.io.splat_ply import write_splats
+from gs2d.training.trainer import Trainer
+
+
+def main() -> None:
+    """Run the command, with its exit code."""
+    rank, words = int(os.environ.get("RANK", "0")), sys.argv[1:]
+    while "=" in words[0]:
+        name, _, value = words.pop(0).partition("=")
+        where, *numbers = map(int, value.split(":"))
+        if where != rank or os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0":
+            continue
+        if name == "seed":
+            words += ["--seed", str(numbers[0])]
+        else:
+            _signalled(*numbers)
+    pipeline.finish = lambda run, job, splats, *_, **__: write_splats(run.file("splats.ply"), splats)
+    gs2d.cli.main(words)
+
+
+def _signalled(at: int, number: int) -> None:
+    step, count = Trainer.step, itertools.count(1)
+
+    def signalled(self: Trainer) -> None:
+        if next(count) == at:
+            os.kill(os.getpid(), number)
+        step(self)
+
+    Trainer.step = signalled  # type: ignore[method-assign]
+
+
+if __name__ == "__main__":
+    main()

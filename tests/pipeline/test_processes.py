@@ -1,0 +1,208 @@
+"""``gs2d train`` in several processes: who writes, what a kill and Ctrl-C leave, resuming, and what is refused."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import ball_runs
+import gs2d.cli
+import together_run
+from gs2d.core.processes import Place
+from gs2d.io.run_dir import RunFolder, load_tensors
+from gs2d.pipeline.events import ignore
+from gs2d.pipeline.job import prepare_job
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.processes import memory_of
+from tiny import write_capture
+from together import ended, launch
+
+ITERATIONS = 12  # of the only stage: densified, in views of two
+SMALL = (
+    *("--recipe", "2dgs", "--quiet", "--threads", "1", "--checkpoint-every", "4", "--set", "init_points=80"),
+    *(
+        "--set",
+        f"surface.iterations={ITERATIONS}",
+        "--set",
+        "surface.densify.start=2",
+        "--set",
+        "surface.densify.every=5",
+    ),
+    *("--set", "surface.densify.stop=11", "--set", "surface.densify.max_splats=120"),
+    *("--set", "surface.densify.opacity_cull=0.001", "--set", "surface.densify.scale_cull=9"),
+)
+
+
+def words(capture: Path, out: Path, *more: str) -> list[str]:
+    """The command that is run."""
+    return ["train", str(capture), "--out", str(out), *SMALL, *more]
+
+
+def in_processes(size: int, command: Sequence[str], *before: str) -> list[tuple[int, str]]:
+    """Run a command in so many processes; exit code and stderr of each."""
+    return ended(launch(size, [together_run.__file__, *before, *command]))
+
+
+def torchrun(*command: str) -> subprocess.CompletedProcess[str]:
+    """Run a command by the real launcher."""
+    program = [sys.executable, "-m", "torch.distributed.run", "--standalone", *command]
+    own = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.run(program, env={**os.environ, **own}, capture_output=True, text=True, timeout=280, check=False)
+
+
+def splats(run: Path) -> bytes:
+    """The bytes of the result."""
+    return (run / "splats.ply").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_capture(tmp_path_factory.mktemp("captures") / "ball", train=4, test=1, size=16)
+
+
+@pytest.fixture(scope="module")
+def whole(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of two processes that nothing disturbs."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert in_processes(2, words(capture, out)) == [(0, ""), (0, "")]
+    return out
+
+
+def test_a_run_of_two_processes_is_written_by_one(whole: Path) -> None:
+    run = RunFolder(whole)
+    kinds = [entry["kind"] for entry in run.events.read()]
+    assert kinds.count("initialised") == kinds.count("processes") == kinds.count("stage_end") == 1
+    assert "densify" in kinds
+    end = load_tensors(run.checkpoints()[-1].path)
+    assert end["state"]["processes"] == [[0, 0, 2]]
+    assert run.metrics()["stages"][0]["iterations"] == ITERATIONS
+    assert [path.name for path in whole.iterdir() if path.name.startswith(".")] == [".lock"]
+
+
+@pytest.mark.slow
+def test_a_killed_process_ends_the_run_which_goes_on_from_its_checkpoint(
+    capture: Path, whole: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    (code, line), (killed, silent) = in_processes(2, words(capture, out), f"signal=1:5:{int(signal.SIGKILL)}")
+    assert (code, killed, silent) == (2, -signal.SIGKILL, "")
+    assert line.startswith("error: process 0 of 2 lost contact with another one")
+    assert line.count("\n") == 1
+    assert [checkpoint.iteration for checkpoint in RunFolder(out).checkpoints()] == [4, 8]
+    assert in_processes(2, words(capture, out, "--resume")) == [(0, ""), (0, "")]
+    assert splats(out) == splats(whole)
+
+
+@pytest.mark.slow
+def test_a_signal_to_any_process_keeps_a_checkpoint(capture: Path, whole: Path, tmp_path: Path) -> None:
+    """At the fourth iteration, of views 6 and 7 of the schedule."""
+    out = tmp_path / "run"
+    (code, line), (_, silent) = in_processes(2, words(capture, out), f"signal=1:4:{int(signal.SIGTERM)}")
+    assert code == 130
+    assert line.startswith("interrupted; resume with: gs2d train")
+    assert silent == ""
+    assert RunFolder(out).checkpoints()[-1].iteration == 8
+    assert in_processes(2, words(capture, out, "--resume")) == [(0, ""), (0, "")]
+    assert splats(out) == splats(whole)
+
+
+@pytest.mark.slow
+def test_two_processes_then_one_then_two(capture: Path, whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    in_processes(2, words(capture, out), f"signal=0:3:{int(signal.SIGINT)}")
+    ((code, _),) = in_processes(1, words(capture, out, "--resume"), f"signal=0:3:{int(signal.SIGINT)}")
+    assert code == 130
+    assert in_processes(2, words(capture, out, "--resume")) == [(0, ""), (0, "")]
+    state = load_tensors(RunFolder(out).checkpoints()[-1].path)["state"]
+    assert [count for *_, count in state["processes"]] == [2, 1, 2]
+    assert splats(out) != splats(whole)
+    assert RunFolder(out).metrics()["stages"][0]["iterations"] == ITERATIONS
+
+
+def test_another_command_in_one_of_them_is_one_line(capture: Path, tmp_path: Path) -> None:
+    found = in_processes(2, words(capture, tmp_path / "run"), "seed=1:5")
+    assert [code for code, _ in found] == [2, 2]
+    (line,) = "".join(text for _, text in found).splitlines()
+    assert line.startswith(
+        "error: process 1 of 2: all processes must train the same, got another recipe than in process 0"
+    )
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("rank", ["0", "1"])
+def test_other_commands_are_refused_by_process_0(
+    rank: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = {"RANK": rank, "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "1"}
+    for name, value in said.items():
+        monkeypatch.setenv(name, value)
+    assert gs2d.cli.run(["mesh", "runs/x"]) == 2
+    line = "error: gs2d mesh runs in one process, got 2; gs2d train is for torchrun\n"
+    assert capsys.readouterr().err == (line if rank == "0" else "")
+
+
+def test_the_key_of_a_stage_knows_how_many_trained_it(capture: Path, tmp_path: Path) -> None:
+    job = prepare_job(TrainOptions(scene=capture, out=tmp_path, recipe="2dgs"), ignore)
+    two = replace(job, processes=2)
+    assert job.stage_key(0) == job.stage_key(0, []) != two.stage_key(0)
+    assert two.stage_key(0) == job.stage_key(0, [(0, 0, 2)]) != job.stage_key(0, [(0, 0, 2), (0, 4, 1)])
+
+
+def test_processes_of_a_machine_share_its_memory() -> None:
+    assert memory_of(Place(), None) is None
+    assert memory_of(Place(), 8.0) == 8.0
+    assert memory_of(Place(5, 8, 1, 4), 8.0) == 2.0
+    part, half = memory_of(Place(1, 4, 1, 4), None), memory_of(Place(1, 2, 1, 2), None)
+    assert part is None or half == pytest.approx(2 * part)
+
+
+@pytest.mark.slow
+def test_prepared_photographs_of_an_archive_give_the_same_bytes(capture: Path, whole: Path, tmp_path: Path) -> None:
+    """Process 0 unpacks and prepares; the other one reads what is there."""
+    archive = Path(shutil.make_archive(str(tmp_path / "ball"), "zip", capture))
+    command = words(archive, tmp_path / "run", "--prepare", "always")
+    assert in_processes(2, command) == [(0, ""), (0, "")]
+    assert splats(tmp_path / "run") == splats(whole)
+
+
+@pytest.mark.slow
+def test_torchrun_starts_again_what_was_killed(capture: Path, whole: Path, tmp_path: Path) -> None:
+    program = [
+        together_run.__file__,
+        f"signal=1:5:{int(signal.SIGKILL)}",
+        *words(capture, tmp_path / "run", "--resume"),
+    ]
+    done = torchrun("--nproc-per-node", "2", "--max-restarts", "1", *program)
+    assert done.returncode == 0, done.stderr
+    assert splats(tmp_path / "run") == splats(whole)
+
+
+@pytest.mark.slow
+def test_torchrun_starts_four_and_their_states_agree(tmp_path: Path) -> None:
+    """The real launcher, the whole command with mesh and report, all stages of 2DGS-R."""
+    out = tmp_path / "run"
+    given = [
+        "train",
+        str(write_capture(tmp_path / "ball")),
+        "--out",
+        str(out),
+        "--schedule-scale",
+        str(ball_runs.SCALE),
+        "--json",
+    ]
+    for override in ball_runs.SMALL:
+        given += ["--set", override]
+    done = torchrun("--nproc-per-node", "4", "-m", "gs2d", *given, "--recipe", "2dgs-r", "--threads", "1", "--quiet")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("{")
+    assert done.stdout.count('"stages"') == 1
+    assert {path.name for path in out.iterdir()} >= {"splats.ply", "mesh.ply", "report.html", "scene.html"}
+    assert load_tensors(RunFolder(out).checkpoints()[-1].path)["state"]["processes"] == [[0, 0, 4]]
