@@ -66,9 +66,9 @@ INSIDE = {
         "api": 6,
         "backends": 5,
         "cpu_cached pose_gradient exposure": 4,
-        "cpu cuda reference_errors": 3,
+        "cpu cuda cuda_step reference_errors": 3,
         "cuda_passes reference": 2,
-        "pair_budget reference_projection reference_transmittance pose_gradient_native exposure_native": 1,
+        "pair_budget whole_step reference_projection reference_transmittance pose_gradient_native exposure_native": 1,
         "types": 0,
     },
 }

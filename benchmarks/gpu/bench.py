@@ -21,7 +21,7 @@ import torch
 
 from benchmarks.timing import machine
 from gs2d.kernels.cuda import diagnose, launch
-from gs2d.kernels.cuda.launch import Launcher
+from gs2d.kernels.cuda.launch import Launcher, OneByOne
 from gs2d.render.backends import BACKENDS, Backend, CudaBackend, get_backend
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -151,7 +151,7 @@ class _Clock:
 
 
 @dataclass(eq=False)
-class RecordingLauncher:
+class RecordingLauncher(OneByOne):
     """Notes the names of what another launcher launches."""
 
     inner: Launcher
@@ -163,7 +163,7 @@ class RecordingLauncher:
 
 
 @dataclass(eq=False)
-class TimingLauncher:
+class TimingLauncher(OneByOne):
     """Times every launch of another launcher, by kernel."""
 
     inner: Launcher

@@ -48,9 +48,34 @@ class NullDriver:
     CUresult = SimpleNamespace(CUDA_SUCCESS=0)
     CUfunction_attribute = SimpleNamespace(CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES=8)
     CUstream = CUfunction = CUkernel = staticmethod(int)
+    CUDA_KERNEL_NODE_PARAMS = SimpleNamespace
 
     def __init__(self) -> None:
         self.launches = 0
+        self.nodes = 0  # of graphs, changed before they were started
+        self.kernels: dict[int, int] = {}  # of a graph
+
+    def cuDriverGetVersion(self) -> tuple[int, int]:
+        return 0, 13000
+
+    def cuGraphCreate(self, flags: int) -> tuple[int, int]:
+        self.kernels[len(self.kernels) + 1] = 0
+        return 0, len(self.kernels)
+
+    def cuGraphAddKernelNode(self, graph: int, *_: Any) -> tuple[int, int]:
+        self.kernels[graph] += 1
+        return 0, self.kernels[graph]
+
+    def cuGraphInstantiate(self, graph: int, flags: int) -> tuple[int, int]:
+        return 0, graph
+
+    def cuGraphExecKernelNodeSetParams(self, *_: Any) -> tuple[int]:
+        self.nodes += 1
+        return (0,)
+
+    def cuGraphLaunch(self, executable: int, stream: int) -> tuple[int]:
+        self.launches += self.kernels[executable]
+        return (0,)
 
     def __getattr__(self, name: str) -> Callable[..., tuple[int, int]]:
         return lambda *_: (0, 1)
@@ -73,9 +98,15 @@ class OperationCount(TorchDispatchMode):
         self.names[name] += 1
         if name in ("sort", "argsort"):
             self.launches += 5 + args[0].element_size()
-        elif name not in LOOKED_AT and name not in MADE:
+        elif name not in LOOKED_AT and name not in MADE and name != "randperm":  # that is the host's
             self.launches += 1
         return func(*args, **(kwargs or {}))
+
+
+def _nothing_overflowed(budget: pair_budget.PairBudget) -> bool:
+    budget._asked.clear()
+    budget.overflow = None
+    return False
 
 
 @contextmanager
@@ -96,7 +127,7 @@ def nothing_runs() -> Iterator[NullDriver]:
         (objective, "is_async", lambda device: True),
         (trainer, "validate", lambda recipe: recipe),  # the row group that stage 2 learns is made, not ranked
         (budget, "room", lambda self, rendering: 1 << 10),
-        (budget, "overflowed", lambda self: self._asked.clear()),
+        (budget, "overflowed", _nothing_overflowed),
     ]
     before = [(where, name, getattr(where, name)) for where, name, _ in changed]
     for where, name, value in changed:
@@ -158,7 +189,7 @@ def _time(made: Trainer, repeats: int) -> dict[str, float]:
 
 def _count(made: Trainer, driver: NullDriver) -> dict[str, int]:
     """Of one iteration."""
-    driver.launches = 0
+    driver.launches = driver.nodes = 0
     with OperationCount() as count:
         made.step()
     allocations = sum(count.names[name] for name in MADE)
@@ -167,6 +198,7 @@ def _count(made: Trainer, driver: NullDriver) -> dict[str, int]:
         "torch_operations": sum(count.names.values()) - allocations,
         "allocations": allocations,
         "device_launches": driver.launches + count.launches,
+        "changed_nodes": driver.nodes,
     }
 
 

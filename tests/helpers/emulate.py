@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import gs2d.kernels
+from gs2d.kernels.cuda.launch import OneByOne
 
 HERE = Path(__file__).parent
 KERNELS = Path(gs2d.kernels.__file__).parent
@@ -95,7 +96,7 @@ def build(
 
 
 @dataclass(frozen=True)
-class Emulator:
+class Emulator(OneByOne):
     """A launcher (``gs2d.kernels.cuda.launch``) that runs the package's kernels on tensors in host memory.
 
     A source file is compiled, into ``folder``, when one of its kernels is first wanted; with ``reuse`` what is there

@@ -20,8 +20,12 @@ class Result(IntEnum):
     CUDA_ERROR_INVALID_CONTEXT = 201
     CUDA_ERROR_NO_BINARY_FOR_GPU = 209
     CUDA_ERROR_NOT_FOUND = 500
+    CUDA_ERROR_NOT_SUPPORTED = 801
     CUDA_ERROR_ILLEGAL_ADDRESS = 700
     CUDA_ERROR_SOMETHING_NEW = 9999
+
+
+ARGUMENT_BYTES = 1024  # more than any structure has
 
 
 class Attribute(IntEnum):
@@ -41,6 +45,32 @@ class Launch:
     argument: bytes
 
 
+class NodeParameters:
+    """``CUDA_KERNEL_NODE_PARAMS``."""
+
+    kern: int
+    gridDimX: int
+    blockDimX: int
+    kernelParams: int
+
+
+@dataclass
+class Node:
+    """A kernel of a graph, with a copy of its argument."""
+
+    kernel: int
+    after: list[int]
+    blocks: int = 0
+    threads: int = 0
+    argument: ctypes.Array[ctypes.c_char] | None = None
+
+    def take(self, given: NodeParameters) -> None:
+        address = ctypes.cast(given.kernelParams, ctypes.POINTER(ctypes.c_void_p))[0]
+        assert address is not None
+        self.blocks, self.threads = given.gridDimX, given.blockDimX
+        self.argument = ctypes.create_string_buffer(ctypes.string_at(address, ARGUMENT_BYTES), ARGUMENT_BYTES)
+
+
 @dataclass
 class FakeDriver:
     """The functions of ``cuda.bindings.driver`` that the launcher calls."""
@@ -53,10 +83,15 @@ class FakeDriver:
     launches: list[Launch] = field(default_factory=list)
     attributes: list[tuple[int, int, int, int]] = field(default_factory=list)
     names: list[str] = field(default_factory=list)  # by handle - 1
+    version: int = 12080
+    graphs: list[list[Node]] = field(default_factory=list)  # by handle - 1
+    replays: list[int] = field(default_factory=list)  # graphs that were started
+    changes: int = 0  # of nodes
 
     CUresult = Result
     CUfunction_attribute = Attribute
     CUstream = CUfunction = CUkernel = staticmethod(int)
+    CUDA_KERNEL_NODE_PARAMS = NodeParameters
 
     def _done(self, name: str, *values: Any) -> tuple[Any, ...]:
         return (self.failing.get(name, Result.CUDA_SUCCESS), *values)
@@ -65,7 +100,7 @@ class FakeDriver:
         return self._done("cuInit")
 
     def cuDriverGetVersion(self) -> tuple[Any, ...]:
-        return self._done("cuDriverGetVersion", 12080)
+        return self._done("cuDriverGetVersion", self.version)
 
     def cuDeviceGet(self, ordinal: int) -> tuple[Any, ...]:
         return self._done("cuDeviceGet", ordinal)
@@ -89,7 +124,7 @@ class FakeDriver:
         return self._done("cuLibraryLoadData", len(self.loaded))
 
     def cuLibraryGetKernel(self, library: int, name: bytes) -> tuple[Any, ...]:
-        assert library == len(self.loaded)
+        assert 0 < library <= len(self.loaded)
         self.names.append(name.decode())
         return self._done("cuLibraryGetKernel", len(self.names))
 
@@ -108,6 +143,35 @@ class FakeDriver:
         if self.emulator is not None:
             self.emulator.launch(name, gx, bx, ctypes.c_char.from_address(address))  # type: ignore[arg-type]
         return self._done("cuLaunchKernel")
+
+    def cuGraphCreate(self, flags: int) -> tuple[Any, ...]:
+        self.graphs.append([])
+        return self._done("cuGraphCreate", len(self.graphs))
+
+    def cuGraphAddKernelNode(self, graph: int, after: list[int], count: int, given: NodeParameters) -> tuple[Any, ...]:
+        nodes = self.graphs[graph - 1]
+        assert count == len(after) == min(len(nodes), 1)
+        nodes.append(Node(given.kern, after))
+        nodes[-1].take(given)
+        return self._done("cuGraphAddKernelNode", len(nodes))
+
+    def cuGraphInstantiate(self, graph: int, flags: int) -> tuple[Any, ...]:
+        return self._done("cuGraphInstantiate", graph)
+
+    def cuGraphExecKernelNodeSetParams(self, graph: int, node: int, given: NodeParameters) -> tuple[Any, ...]:
+        self.changes += 1
+        if "cuGraphExecKernelNodeSetParams" not in self.failing:
+            self.graphs[graph - 1][node - 1].take(given)
+        return self._done("cuGraphExecKernelNodeSetParams")
+
+    def cuGraphLaunch(self, graph: int, stream: int) -> tuple[Any, ...]:
+        self.replays.append(graph)
+        for number, node in enumerate(self.graphs[graph - 1]):
+            assert node.after == [number][:number]  # a chain
+            assert node.argument is not None
+            if self.emulator is not None:
+                self.emulator.launch(self.names[node.kernel - 1], node.blocks, node.threads, node.argument)  # type: ignore[arg-type]
+        return self._done("cuGraphLaunch")
 
 
 def launcher(driver: FakeDriver, index: int = 0, stream: int = 0, code: bytes = b"\x7fELF") -> GpuLauncher:

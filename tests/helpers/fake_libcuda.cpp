@@ -73,6 +73,43 @@ int cuLaunchKernel(void* f, unsigned gx, unsigned gy, unsigned gz, unsigned bx, 
     return fails("cuLaunchKernel");
 }
 
+// Graphs: a line for each node as it is made or changed, and one for each start.
+struct NodeParameters {  // CUDA_KERNEL_NODE_PARAMS_v2
+    void* func;
+    unsigned gx, gy, gz, bx, by, bz, shared;
+    void **parameters, **extra;
+    void *kern, *context;
+};
+void say_node(const char* call, unsigned long long number, const NodeParameters* p) {
+    unsigned long long first;
+    memcpy(&first, p->parameters[0], 8);
+    char line[256];
+    snprintf(line, sizeof line, "{\"call\": \"%s\", \"node\": %llu, \"kernel\": \"%s\", \"grid\": [%u, %u, %u], \"block\": [%u, %u, %u], \"first\": %llu}",
+             call, number, static_cast<char*>(p->kern), p->gx, p->gy, p->gz, p->bx, p->by, p->bz, first);
+    say(line);
+}
+unsigned long long nodes;
+int cuGraphCreate(void** graph, unsigned) { return *graph = &nodes, fails("cuGraphCreate"); }
+int cuGraphAddKernelNode_v2(void** node, void*, void* const* after, size_t count, const NodeParameters* p) {
+    if (p->func || p->extra || p->context || p->shared) return 1;
+    if (count != (nodes ? 1u : 0u) || (nodes && reinterpret_cast<uintptr_t>(after[0]) != nodes)) return 1;
+    *node = reinterpret_cast<void*>(uintptr_t(++nodes));
+    say_node("node", nodes, p);
+    return fails("cuGraphAddKernelNode");
+}
+int cuGraphInstantiateWithFlags(void** executable, void* graph, unsigned long long) {
+    return *executable = graph, fails("cuGraphInstantiate");
+}
+int cuGraphExecKernelNodeSetParams_v2(void*, void* node, const NodeParameters* p) {
+    say_node("change", reinterpret_cast<uintptr_t>(node), p);
+    return fails("cuGraphExecKernelNodeSetParams");
+}
+int cuGraphLaunch(void*, void* stream) {
+    if (!current) return 201;
+    say("{\"call\": \"replay\", \"stream\": " + std::to_string(reinterpret_cast<uintptr_t>(stream)) + "}");
+    return fails("cuGraphLaunch");
+}
+
 // How cuda.bindings finds the functions.
 #define NAME(shown, real) \
     if (!strcmp(name, #shown)) return *out = reinterpret_cast<void*>(&real), 0
@@ -89,6 +126,12 @@ int cuGetProcAddress_v2(const char* name, void** out, int, uint64_t, void* statu
     NAME(cuLibraryGetKernel, cuLibraryGetKernel);
     NAME(cuKernelSetAttribute, cuKernelSetAttribute);
     NAME(cuLaunchKernel, cuLaunchKernel);
+    NAME(cuGraphCreate, cuGraphCreate);
+    NAME(cuGraphAddKernelNode, cuGraphAddKernelNode_v2);
+    NAME(cuGraphInstantiate, cuGraphInstantiateWithFlags);
+    NAME(cuGraphInstantiateWithFlags, cuGraphInstantiateWithFlags);
+    NAME(cuGraphExecKernelNodeSetParams, cuGraphExecKernelNodeSetParams_v2);
+    NAME(cuGraphLaunch, cuGraphLaunch);
     *out = nullptr;
     return 500;
 }

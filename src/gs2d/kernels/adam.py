@@ -13,7 +13,7 @@ from torch import Tensor
 from gs2d.errors import ShapeError
 from gs2d.kernels.library import Library, ready_library
 
-__all__ = ["AdamUpdate", "adam_step", "bias_corrections", "check_update", "first_not_finite"]
+__all__ = ["AdamUpdate", "adam_step", "bias_corrections", "bias_corrections_of", "check_update", "first_not_finite"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,12 @@ def check_update(update: AdamUpdate) -> None:
 
 def bias_corrections(update: AdamUpdate, beta1: float, beta2: float) -> tuple[float, float]:
     """Return rate / (1 - beta1^t) and sqrt(1 - beta2^t)."""
-    return update.rate / (1 - beta1**update.step), math.sqrt(1 - beta2**update.step)
+    return bias_corrections_of(update.rate, update.step, beta1, beta2)
+
+
+def bias_corrections_of(rate: float, step: float, beta1: float, beta2: float) -> tuple[float, float]:
+    """Return rate / (1 - beta1^t) and sqrt(1 - beta2^t) at step t."""
+    return rate / (1 - beta1**step), math.sqrt(1 - beta2**step)
 
 
 class _Attribute(ctypes.Structure):

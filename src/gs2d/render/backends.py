@@ -28,8 +28,10 @@ from gs2d.kernels.tsdf import FusionOnDevice, FusionOnHost
 from gs2d.render import cpu, cpu_cached, cuda, reference_errors
 from gs2d.render import reference as reference_rasterizer
 from gs2d.render.cpu_cached import CachedView
+from gs2d.render.cuda_step import Stepper
 from gs2d.render.pair_budget import PairBudget
 from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.render.whole_step import WholeStep
 
 __all__ = [
     "BACKENDS",
@@ -165,6 +167,17 @@ class Backend:
             The caller looks at the device after this iteration anyway: it must be whole when this returns.
         """
         return update()
+
+    def takes_whole_steps(self) -> bool:
+        """Whether :meth:`step` may do an iteration at all: else nobody needs to describe one."""
+        return False
+
+    def step(self, step: WholeStep) -> bool:
+        """Do an iteration with the usual losses in one piece; False: not this one, and nothing was done.
+
+        Its images, losses and gradients are not to be had afterwards: who wants to look does the parts.
+        """
+        return False
 
     def adam_step(self, updates: Sequence[adam.AdamUpdate], *, beta1: float, beta2: float, eps: float) -> None:
         """One Adam step of some attributes, in place."""
@@ -351,6 +364,7 @@ class CudaBackend(Backend):
     def __init__(self, budget: PairBudget | None = None) -> None:
         self._budget = budget
         self._last: tuple[Callable[[], Any], Callable[[], None]] | None = None  # what may have to be done again
+        self._stepper: Stepper | None = None
 
     def rasterize(
         self,
@@ -408,6 +422,25 @@ class CudaBackend(Backend):
         budget.exact = exact
         self._last = update, rollback
         return update()
+
+    def takes_whole_steps(self) -> bool:
+        """In a training, in an iteration after which nobody looks at the device."""
+        budget = self._budget
+        if budget is None:
+            return False
+        takes = not budget.exact and launch.steps() != launch.AUTOGRAD
+        if not takes and self._stepper is not None:
+            self._stepper.release()
+        return takes and not torch.are_deterministic_algorithms_enabled()
+
+    def step(self, step: WholeStep) -> bool:
+        """Do an iteration by kernels alone (:mod:`gs2d.render.cuda_step`)."""
+        if self._budget is None or not self.takes_whole_steps():
+            return False
+        if self._stepper is None:
+            device = step.splats.device
+            self._stepper = Stepper(launch.launcher_for(device), device)
+        return self._stepper.run(step, self._budget)
 
     def _overflow(self) -> Tensor | None:
         """[] int32 on the device: whether a rendering of this iteration lacks pairs; None: none can."""

@@ -211,7 +211,7 @@ def forward(
     projected = _project(launcher, view, parameters, errors=False, exact=exact)
     lists = _bin(launcher, view, projected, exact, budget)
     words = (len(lists.entries) >> 5) + len(lists.tiles) + 1
-    seen = torch.zeros(words, 8, dtype=torch.int32, device=device)
+    seen = torch.empty(words, 8, dtype=torch.int32, device=device)
     H, W = int(view.height), int(view.width)
     images = {name: floats(H, W, 3) if name in ("color", "normal") else floats(H, W) for name in IMAGES}
     images |= {"final_T": floats(H, W), "moments": floats(H, W, 3) if distortion else floats(0)}

@@ -80,13 +80,24 @@ class PairBudget:
         """Keep the number of pairs [] int64 of a rendering with ``room``, to be looked at later."""
         lacks = (pairs > room).to(torch.int32)
         self.overflow = lacks if self.overflow is None else self.overflow | lacks
+        self.expect(rendering, room, pairs.device).copy_(pairs, non_blocking=True)
+        self.asked(pairs.device)
+
+    def expect(self, rendering: Rendering, room: int, device: torch.device) -> Tensor:
+        """Return where the number of pairs of a rendering with ``room`` is to be written, [] int64: the host's memory.
+
+        What writes it sets ``overflow`` too, and says when it is on its way (:meth:`asked`).
+        """
         if len(self._host) == len(self._asked):
-            self._host.append(torch.empty((), dtype=torch.int64, pin_memory=pairs.is_cuda))
-        self._host[len(self._asked)].copy_(pairs, non_blocking=True)
+            self._host.append(torch.empty((), dtype=torch.int64, pin_memory=device.type == "cuda"))
         self._asked.append((rendering, room))
-        if pairs.is_cuda:
+        return self._host[len(self._asked) - 1]
+
+    def asked(self, device: torch.device) -> None:
+        """Remember the moment, on the current stream, from which the numbers are there."""
+        if device.type == "cuda":
             self._event = self._event or torch.cuda.Event()
-            self._event.record(torch.cuda.current_stream(pairs.device))
+            self._event.record(torch.cuda.current_stream(device))
 
     def overflowed(self) -> bool:
         """Whether a rendering lacked pairs; waits until their numbers are known, not until they are done.

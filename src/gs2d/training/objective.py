@@ -121,7 +121,7 @@ class FullRender:
         self, scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, targets: TargetSource
     ) -> None:
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
-        self._targets = targets
+        self.targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
         if recipe.multiview is not None:
             self._neighbours = find_neighbours(scene, recipe.multiview)
@@ -158,7 +158,7 @@ class FullRender:
         learns = any(rate(self.recipe, state.stage, iteration) > 0 for rate in (pose_rate, zoom_rate))
         camera = self.camera(state, index, learns=learns)
         settings = self.settings(stage, iteration)
-        rows = _learning_rows(state, stage) if probe is None else None  # the signal is of every splat
+        rows = learning_rows(state, stage) if probe is None else None  # the signal is of every splat
         output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
         neighbour = self._neighbour_of(state, stage, iteration, index)
         given = (index, camera, output, dict(leaves.items()), neighbour)
@@ -168,7 +168,7 @@ class FullRender:
     @torch.no_grad()
     def residual(self, state: TrainState, stage: Stage, iteration: int, index: int) -> ViewResidual:
         """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph."""
-        camera, target = self.camera(state, index), self._targets[index]
+        camera, target = self.camera(state, index), self.targets[index]
         settings = replace(self.settings(stage, iteration), with_distortion=False)
         color = rasterize(state.splats, camera, settings, backend=self.backend).color
         if state.exposures is not None:
@@ -192,7 +192,7 @@ class FullRender:
         bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False).for_depths(kind)
         small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
         depth = rasterize(state.splats, small, bare, backend=self.backend).depth(kind)
-        here, there = (self._images.of(i, self._targets[i]) for i in (index, other))
+        here, there = (self._images.of(i, self.targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 
     @property
@@ -207,7 +207,7 @@ class FullRender:
         self, state: TrainState, index: int, settings: RasterSettings, backend: Backend
     ) -> dict[str, LossReport]:
         """Return what the losses say of training view ``index`` as it is now."""
-        camera, target = self.camera(state, index), self._targets[index]
+        camera, target = self.camera(state, index), self.targets[index]
         output = rasterize(state.splats, camera, settings, backend=backend)
         view = LossView(target.image, target.mask, camera, depth_kind=self.protocol.depth, index=index)
         view.silhouette = target.silhouette
@@ -236,7 +236,7 @@ class FullRender:
             If one of them is not finite. On a GPU nothing is looked at here, because a look waits for the device; the
             trainer looks at losses and parameters together, before anything is reported or saved.
         """
-        target = self._targets[index]
+        target = self.targets[index]
         transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
         if transform is not None:
             clipped, background = clipped_pixels(target), self._background
@@ -317,7 +317,7 @@ def check_losses(stage: Stage, iteration: int, losses: Mapping[str, float | Tens
     return values
 
 
-def _learning_rows(state: TrainState, stage: Stage) -> Tensor | None:
+def learning_rows(state: TrainState, stage: Stage) -> Tensor | None:
     """Return the splats [N] of which the stage trains anything; None where it trains an attribute of all."""
     groups = set(stage.train.values())
     if not groups or "all" in groups:

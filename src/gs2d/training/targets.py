@@ -47,10 +47,31 @@ class Target:
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors if tensor is not None)
 
 
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A training view as it was decoded, on the device.
+
+    Attributes
+    ----------
+    image : Tensor [H, W, 3 or 4] uint8
+    mask : Tensor [H, W] bool or None
+        False = ignore this pixel.
+    valid : int
+        Pixels that count.
+    """
+
+    image: Tensor
+    mask: Tensor | None
+    valid: int
+
+
 class TargetSource(Protocol):
     """Targets by the index of their training view."""
 
     def __getitem__(self, index: int) -> Target: ...
+
+    def photograph(self, index: int) -> Photograph | None:
+        """Return the bytes of a view, where they wait on the device of training; None: targets are floats."""
 
 
 class Targets:
@@ -81,6 +102,10 @@ class Targets:
         self._room = cache_bytes(limit_bytes)
         self._kept: dict[int, Target] = {}
 
+    def photograph(self, index: int) -> Photograph | None:
+        """Return None: targets are kept as floats."""
+        return None
+
     def __getitem__(self, index: int) -> Target:
         kept = self._kept.get(index)
         if kept is not None:
@@ -110,6 +135,7 @@ class _DecodedImage:
 
     image: Tensor  # [H, W, 3 or 4] uint8
     mask: Tensor | None  # [H, W] bool
+    valid: int
 
     def nbytes(self, place: str) -> int:
         """Return the bytes it takes on the device or (torch rounds up to powers of two) in pinned memory."""
@@ -117,7 +143,7 @@ class _DecodedImage:
         return sum(1 << (size - 1).bit_length() if place == "pinned" and size else size for size in sizes)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> _DecodedImage:
-        return _DecodedImage(change(self.image), None if self.mask is None else change(self.mask))
+        return _DecodedImage(change(self.image), None if self.mask is None else change(self.mask), self.valid)
 
 
 class DeviceTargets:
@@ -156,6 +182,24 @@ class DeviceTargets:
         self._dtype, self._device, self._pin = dtype, device, pin
         self._room = {"device": limit_bytes, "pinned": pinned_bytes}
         self._kept: dict[int, _DecodedImage] = {}
+        self._places: dict[tuple[torch.Size, torch.dtype], Tensor] = {}  # for what comes from the host's memory
+
+    def photograph(self, index: int) -> Photograph | None:
+        """Return a view's bytes; those of views that wait elsewhere are good until the next one is asked for."""
+        image = self._kept.get(index)
+        if image is None:
+            image = self._take_in(index)
+        there = image.map(self._brought)
+        return Photograph(there.image, there.mask, there.valid)
+
+    def _brought(self, tensor: Tensor) -> Tensor:
+        """Return a tensor on the device; a copy goes to the same place each time."""
+        if tensor.device == self._device:
+            return tensor
+        key = tensor.shape, tensor.dtype
+        if key not in self._places:
+            self._places[key] = torch.empty(tensor.shape, dtype=tensor.dtype, device=self._device)
+        return self._places[key].copy_(tensor, non_blocking=True)
 
     def __getitem__(self, index: int) -> Target:
         image = self._kept.get(index)
@@ -173,7 +217,9 @@ class DeviceTargets:
         """Decode a photograph, and keep it where there is room."""
         view = self._views[index]
         mask = view.usable(masks=self._use_masks)
-        image = _DecodedImage(torch.tensor(view.image()), None if mask is None else torch.tensor(mask))
+        pixels = torch.tensor(view.image())
+        valid = pixels.shape[0] * pixels.shape[1] if mask is None else int(mask.sum())
+        image = _DecodedImage(pixels, None if mask is None else torch.tensor(mask), valid)
         for place in ("device", "pinned"):
             if image.nbytes(place) > self._room[place]:
                 continue

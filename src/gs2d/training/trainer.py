@@ -52,6 +52,7 @@ from gs2d.training.robust import Robustness
 from gs2d.training.rows import keep_rows
 from gs2d.training.state import TrainState
 from gs2d.training.targets import PINNED_BYTES, TARGET_BYTES, DeviceTargets, Targets, TargetSource
+from gs2d.training.whole_steps import WholeSteps
 
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
 
@@ -140,6 +141,7 @@ class Trainer:
         self._check_shared()
         self._target_bytes, self._stage2_cache_bytes = target_bytes, stage2_cache_bytes
         self._objective: Objective | None = None  # of the stage under way, from its first iteration here
+        self._whole_steps: WholeSteps | None = None  # likewise
         self._ahead = ReadAhead(lambda index: scene.train[index].image()) if scene.ahead else None
         self._downscale = 0  # nothing was looked at
         self._check_sizes()
@@ -187,7 +189,7 @@ class Trainer:
         """Run the entry actions of a stage and prepare its first iteration."""
         state, stage = self.state, self.recipe.stages[index]
         state.stage, state.step, state.entered = index, 0, False
-        self._objective = None
+        self._objective = self._whole_steps = None
         self._look_at(stage.downscale_at(1))
         while self._pending:
             self._on_event(self._pending.pop(0))
@@ -245,6 +247,7 @@ class Trainer:
         for event in happened:
             self._on_event(event)
         if reports:
+            assert result is not None  # of an iteration that was looked at
             losses = check_losses(stage, iteration, together.mean_losses(result.losses, self.views))
             self._check_parameters(stage, tuple(stage.train))  # on a CPU gradients are checked each time
             lr = lr_at(stage.lr.for_views(self.views), iteration, self.scene.extent)
@@ -269,11 +272,14 @@ class Trainer:
             changed |= changes
         return range(first, stop)
 
-    def _learn(self, stage: Stage, turns: Sequence[Turn]) -> tuple[StepResult, list[events.Event]]:
+    def _learn(self, stage: Stage, turns: Sequence[Turn]) -> tuple[StepResult | None, list[events.Event]]:
         """Gradients of a view, statistics and densification, Adam."""
         state, objective, densifier = self.state, self._objective, self._densifiers[self.state.stage]
         assert objective is not None
         iteration = turns[-1].iteration
+        if self._learner.takes_whole_steps() and self._learn_at_once(stage, turns, densifier):
+            self._robust.decay(state, stage, iteration, self._learner)
+            return None, []
         # What densification is told: of the iterations that are done in one, that in which something is due.
         due = next((turn.iteration for turn in turns[:-1] if self._changes(turn.iteration)), iteration)
         probe = None if densifier is None else densifier.before_backward(state, due)
@@ -295,6 +301,14 @@ class Trainer:
             self._robust.decay(state, stage, turn.iteration, self._learner)
             per_image.update(state, self.recipe, turn.iteration, turn.index, gradients, self._learner)
         return result, happened
+
+    def _learn_at_once(self, stage: Stage, turns: Sequence[Turn], densifier: Densifier | None) -> bool:
+        """Let the backend do an iteration of one process in one piece, if it is of a kind that it does."""
+        if self.processes.size > 1:
+            return False
+        if self._whole_steps is None:
+            self._whole_steps = WholeSteps(self._whole, self._objective, stage)
+        return self._whole_steps.learn(self.state, turns[-1].iteration, turns[-1].index, densifier)
 
     def _rollback(self, stage: Stage, turns: Sequence[Turn]) -> None:
         """Take back what the host has counted of an iteration that changed nothing."""
@@ -345,7 +359,7 @@ class Trainer:
         """Train on photographs of 1 / ``downscale`` of their size from now on; those of before are let go."""
         if downscale == self._downscale:
             return
-        self._downscale, self._objective = downscale, None
+        self._downscale, self._objective, self._whole_steps = downscale, None, None
         scene = self.scene.downscaled(downscale)
         self._targets: TargetSource = self._make_targets(scene, self._target_bytes)
         self._whole = FullRender(scene, self.recipe, self.protocol, self._learner, self._targets)
@@ -434,7 +448,7 @@ class Trainer:
         state, index = self.state, self.state.stage
         unseen = self._drop_unseen(stage)
         state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
-        self._objective = None
+        self._objective = self._whole_steps = None
         self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats), unseen))
 
     def _drop_unseen(self, stage: Stage) -> int:

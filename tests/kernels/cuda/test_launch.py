@@ -194,7 +194,31 @@ except BackendError as error:
 """
 
 
-def with_fake_libcuda(folder: Path, **environment: str) -> tuple[str, list[dict[str, object]]]:
+REPLAY = """
+import ctypes
+import torch
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda.launch import GpuLauncher, Work
+
+class Numbers(ctypes.Structure):
+    _fields_ = (("a", ctypes.c_int64), ("b", ctypes.c_float))
+
+launcher = GpuLauncher(
+    torch.device("cuda", 1), stream_of=lambda d: 0x1234, architecture_of=lambda d: "sm_90",
+    code_of=lambda name, arch: b"\\x7fELF" + bytes(100),
+)
+first, second = Numbers(77, 0.5), Numbers(78, 0.5)
+works = [Work("project_splats", 5, 128, first), Work("project_splats_vjp", 6, 256, second)]
+try:
+    for number in range(5):
+        second.a = 100 + number
+        launcher.run(works)
+except BackendError as error:
+    print(error)
+"""
+
+
+def with_fake_libcuda(folder: Path, script: str = SCRIPT, **environment: str) -> tuple[str, list[dict[str, object]]]:
     """What the script prints, and what the fake library saw."""
     pytest.importorskip("cuda.bindings", reason="cuda-bindings is not here")
     if shutil.which("g++") is None or sys.platform != "linux":
@@ -205,7 +229,7 @@ def with_fake_libcuda(folder: Path, **environment: str) -> tuple[str, list[dict[
     subprocess.run([*command, "-o", str(library), str(source)], check=True, timeout=60)
     settings = {**os.environ, "LD_LIBRARY_PATH": str(folder), "FAKE_CUDA_LOG": str(log), **environment}
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], env=settings, check=True, timeout=60, capture_output=True, text=True
+        [sys.executable, "-c", script], env=settings, check=True, timeout=60, capture_output=True, text=True
     )
     lines = log.read_text().splitlines() if log.exists() else []
     return done.stdout, [json.loads(line) for line in lines]
@@ -222,6 +246,43 @@ def test_the_real_bindings_hand_a_launch_on_as_it_was_meant(tmp_path: Path) -> N
         {"call": "attribute", "attribute": 8, "value": 60000, "kernel": "project_splats", "device": 1},
         {**launched, "grid": [6, 1, 1], "shared": 60000, "first": 78},
     ]
+
+
+def test_the_real_bindings_make_launches_that_come_again_a_graph_and_change_what_differs(tmp_path: Path) -> None:
+    said, seen = with_fake_libcuda(tmp_path, REPLAY)
+    assert said == ""
+    first = {"kernel": "project_splats", "grid": [5, 1, 1], "block": [128, 1, 1], "first": 77}
+    second = {"kernel": "project_splats_vjp", "grid": [6, 1, 1], "block": [256, 1, 1]}
+    of_launch = {"call": "launch", "shared": 0, "stream": 0x1234, "device": 1}
+    launched = [line for line in seen if line["call"] != "load"]
+    replay = {"call": "replay", "stream": 0x1234}
+    assert launched == [
+        {**of_launch, **first},
+        {**of_launch, **second, "first": 100},
+        {**of_launch, **first},
+        {**of_launch, **second, "first": 101},
+        {"call": "node", "node": 1, **first},
+        {"call": "node", "node": 2, **second, "first": 102},
+        replay,
+        {"call": "change", "node": 2, **second, "first": 103},
+        replay,
+        {"call": "change", "node": 2, **second, "first": 104},
+        replay,
+    ]
+
+
+@pytest.mark.parametrize("function", ["cuGraphCreate", "cuGraphAddKernelNode", "cuGraphInstantiate"])
+def test_a_driver_that_makes_no_graph_launches_one_by_one(tmp_path: Path, function: str) -> None:
+    said, seen = with_fake_libcuda(tmp_path, REPLAY, FAKE_CUDA_FAIL=f"{function}:801")
+    assert said == ""
+    assert [line["first"] for line in seen if line["call"] == "launch"][1::2] == [100, 101, 102, 103, 104]
+    assert "replay" not in {line["call"] for line in seen}
+
+
+def test_an_error_in_a_graph_is_one_line_too(tmp_path: Path) -> None:
+    said, _ = with_fake_libcuda(tmp_path, REPLAY, FAKE_CUDA_FAIL="cuGraphLaunch:700")
+    assert "launch of 2 kernels from project_splats on (CUDA_ERROR_ILLEGAL_ADDRESS)" in said
+    assert said.count("\n") == 1
 
 
 def test_the_real_bindings_errors_are_one_line_too(tmp_path: Path) -> None:

@@ -13,21 +13,27 @@ __all__ = [
     "BlendColorsArguments",
     "BlendVjpArguments",
     "BlurArguments",
+    "ClearArguments",
     "DepthArguments",
+    "DigitArguments",
     "EmitArguments",
     "ErrorArguments",
     "FinishArguments",
+    "Gathered",
     "MeanArguments",
     "NormalArguments",
     "OccludedArguments",
     "OrderArguments",
+    "Photograph",
     "PhotometricArguments",
     "PhotometricVjpArguments",
     "ProjectArguments",
     "ProjectColorsArguments",
     "ProjectVjpArguments",
     "RangeArguments",
+    "RunningArguments",
     "SlotArguments",
+    "SortArguments",
     "View",
     "fill",
 ]
@@ -156,6 +162,7 @@ class ProjectColorsArguments(ctypes.Structure):
         ("view", View),
         *_all(ctypes.c_int64, "count", "sh_rest"),
         *_pointers("means", "sh0", "shN", "tile_counts", "learns", "gradients", "g_sh0", "g_shN"),
+        ("clears", ctypes.c_int32),
     )
 
 
@@ -163,6 +170,12 @@ class OccludedArguments(ctypes.Structure):
     """Of occluded.cu."""
 
     _fields_ = (("view", View), *_pointers("records", "entries", "ranges", "tiles", "image", "mask", "errors"))
+
+
+class Gathered(ctypes.Structure):
+    """Of project_vjp.cu: the densification signal where it is added up at once."""
+
+    _fields_ = _pointers("signed_norms", "absolute_norms", "counts", "radii", "skip")
 
 
 class ProjectVjpArguments(ctypes.Structure):
@@ -175,6 +188,8 @@ class ProjectVjpArguments(ctypes.Structure):
         *_pointers(*(f"g_{name}" for name in PARAMETERS), "g_probe"),
         ("probe_columns", ctypes.c_int64),
         *_pointers("g_intrinsics"),
+        ("gathered", Gathered),
+        ("clears", ctypes.c_int32),
     )
 
 
@@ -188,12 +203,19 @@ class ErrorArguments(ctypes.Structure):
     )
 
 
+class Photograph(ctypes.Structure):
+    """Of photometric.cu: a target as it was decoded."""
+
+    _fields_ = (*_pointers("bytes"), ("background", ctypes.c_float * 3))
+
+
 class PhotometricArguments(ctypes.Structure):
     """Of photometric.cu."""
 
     _fields_ = (
         *_all(ctypes.c_int64, "height", "width"),
         *_pointers("rendered", "target", "mask", "target_mean", "maps", "partials"),
+        ("photograph", Photograph),
     )
 
 
@@ -203,6 +225,8 @@ class PhotometricVjpArguments(ctypes.Structure):
     _fields_ = (
         *_all(ctypes.c_int64, "height", "width"),
         *_pointers("rendered", "target", "mask", "maps", "means", "g_l1", "g_ssim", "gradient"),
+        ("photograph", Photograph),
+        *_all(ctypes.c_float, "l1_scale", "ssim_scale"),
     )
 
 
@@ -222,6 +246,40 @@ class NormalArguments(ctypes.Structure):
         *_all(ctypes.c_int32, "per_splat", "at_camera"),
         *_pointers("normal", "depth", "alpha", "mask", "weights", "partials", "means", "cotangent"),
         *_pointers("g_normal", "g_depth", "g_alpha"),
+        ("scale", ctypes.c_float),
+    )
+
+
+class ClearArguments(ctypes.Structure):
+    """Of sort.cu."""
+
+    _fields_ = (*_pointers("words"), ("count", ctypes.c_int64))
+
+
+class DigitArguments(ctypes.Structure):
+    """Of sort.cu."""
+
+    _fields_ = (*_pointers("keys"), ("count", ctypes.c_int64), ("passes", ctypes.c_int32), *_pointers("digits"))
+
+
+class SortArguments(ctypes.Structure):
+    """Of sort.cu."""
+
+    _fields_ = (
+        *_pointers("keys", "payloads", "sorted_keys", "sorted_payloads"),
+        ("count", ctypes.c_int64),
+        *_all(ctypes.c_int32, "shift", "bits"),
+        *_pointers("digits", "ticket", "words"),
+    )
+
+
+class RunningArguments(ctypes.Structure):
+    """Of sort.cu."""
+
+    _fields_ = (
+        *_pointers("order", "tile_counts"),
+        *_all(ctypes.c_int64, "count", "room"),
+        *_pointers("ends", "ticket", "words", "pairs", "overflow"),
     )
 
 

@@ -48,7 +48,8 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
     const int64 begin = a.ranges[2 * int64(at.tile)];
     const int count = int(a.ranges[2 * int64(at.tile) + 1] - begin);
 
-    for (int chunk = 0; 32 * chunk < count; ++chunk) {
+    int chunk = 0;
+    for (; 32 * chunk < count; ++chunk) {
         const int i = 32 * chunk + at.lane;
         const uint entry = i < count ? a.entries[begin + i] : 0u;
         uint hits[HALVES];  // of this warp: all its lanes agree
@@ -91,6 +92,10 @@ template <bool DIST> __device__ __forceinline__ void blend(const BlendArguments&
             }
         }
     }
+    if (a.seen)  // nobody saw what comes behind the last live pixel
+        for (chunk += at.lane; 32 * chunk < count; chunk += 32)
+#pragma unroll
+            for (int h = 0; h < HALVES; ++h) a.seen[word_of(begin, at.tile, chunk) + at.sub_block[h]] = 0u;
 #pragma unroll
     for (int h = 0; h < HALVES; ++h)
         if (at.inside[h]) write_pixel<DIST>(a, at.x, at.y + 4 * h, p[h]);

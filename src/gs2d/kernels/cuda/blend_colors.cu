@@ -26,8 +26,9 @@ struct ProjectColorsArguments {
     const float *means, *sh0, *shN;
     const int* tile_counts;  // [N]; 0: not drawn
     const uchar* learns;     // or null
-    const float* gradients;  // [N, 4]
+    float* gradients;        // [N, 4]
     float *g_sh0, *g_shN;    // null where not wanted
+    int clears;              // 1: rows of gradients that were read are zeros afterwards
 };
 
 extern "C" __global__ void __launch_bounds__(128, 8) blend_vjp_learning(BlendColorsArguments a) {
@@ -103,12 +104,15 @@ extern "C" __global__ void __launch_bounds__(128) project_colors_vjp(ProjectColo
         for (int k = 0; to.rest && k < 3 * rest; ++k) to.rest[k] = 0.f;
         return;
     }
-    const float *m = a.means + 3 * i, *g = a.gradients + 4 * i;
+    const float* m = a.means + 3 * i;
+    float4* row = reinterpret_cast<float4*>(a.gradients) + i;
+    const float4 g = *row;
+    if (a.clears) *row = {0.f, 0.f, 0.f, 0.f};
     float inverse_distance;
     const Vec3<float> direction =
         direction_of(Vec3<float>{m[0], m[1], m[2]} - center_of<float>(a.view.camera), inverse_distance);
     const Coefficients sh = {a.sh0 + 3 * i, a.shN + 3 * a.sh_rest * i};
-    color_vjp(a.view.sh_degree, sh, rest, to, direction, {g[0], g[1], g[2]});
+    color_vjp(a.view.sh_degree, sh, rest, to, direction, {g.x, g.y, g.z});
 }
 
 }  // namespace gs2d

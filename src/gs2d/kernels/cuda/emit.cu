@@ -12,8 +12,8 @@ struct EmitArguments {
     float near;
     int64 candidates;  // ends[visible - 1], or the room for them: then what has none is left out
     int64 visible;
-    const int64* order;  // [visible]: splats by depth
-    const int64* ends;   // [visible]: running sum of tile_counts in that order
+    const void* order;  // [visible] int64, or uint32 (`emit_sorted`): splats by depth
+    const void* ends;   // [visible], the same: running sum of tile_counts in that order
     const float *cull, *records;
     const ushort* rects;
     void* keys;      // [candidates] int16 or int32: tile, or the sentinel
@@ -24,18 +24,19 @@ struct EmitArguments {
 struct RangeArguments {
     int64 candidates;
     const void* keys;          // sorted
-    const int64* permutation;  // of the sort
+    const int64* permutation;  // of the sort; null where it has moved the entries too
     const uint* payloads;
     uint* entries;  // [candidates]: payloads in sorted order
     int64* ranges;  // [tiles + 1, 2]: begin and end of each tile's entries; zeros on entry
 };
 
 // First splat in depth order whose candidates end behind `candidate`.
-__device__ __forceinline__ int64 owner_of(const int64* ends, int64 visible, int64 candidate) {
+template <class Place>
+__device__ __forceinline__ int64 owner_of(const Place* ends, int64 visible, int64 candidate) {
     int64 low = 0, high = visible - 1;
     while (low < high) {
         const int64 middle = (low + high) >> 1;
-        if (ends[middle] > candidate)
+        if (int64(ends[middle]) > candidate)
             high = middle;
         else
             low = middle + 1;
@@ -43,15 +44,16 @@ __device__ __forceinline__ int64 owner_of(const int64* ends, int64 visible, int6
     return low;
 }
 
-template <class Key> __device__ __forceinline__ void emit(const EmitArguments& a) {
+template <class Key, class Place> __device__ __forceinline__ void emit(const EmitArguments& a) {
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.candidates) return;
-    if (i >= a.ends[a.visible - 1]) {  // room that is not needed
+    const Place *order = static_cast<const Place*>(a.order), *ends = static_cast<const Place*>(a.ends);
+    if (i >= int64(ends[a.visible - 1])) {  // room that is not needed
         static_cast<Key*>(a.keys)[i] = Key(a.tiles_x * a.tiles_y), a.payloads[i] = 0u;
         return;
     }
-    const int64 place = owner_of(a.ends, a.visible, i), splat = a.order[place];
-    const int from_last = int(a.ends[place] - 1 - i);
+    const int64 place = owner_of(ends, a.visible, i), splat = int64(order[place]);
+    const int from_last = int(int64(ends[place]) - 1 - i);
     const ushort* rect = a.rects + 4 * splat;
     const int x0 = rect[0], y0 = rect[1], columns = rect[2] - x0, rows = rect[3] - y0;
     const int j = columns * rows - 1 - from_last;
@@ -81,7 +83,7 @@ template <class Key> __device__ __forceinline__ void find_ranges(const RangeArgu
     const int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i >= a.candidates) return;
     const Key* keys = static_cast<const Key*>(a.keys);
-    a.entries[i] = a.payloads[a.permutation[i]];
+    if (a.permutation) a.entries[i] = a.payloads[a.permutation[i]];
     const int key = keys[i];
     if (i == 0 || keys[i - 1] != key) {
         a.ranges[2 * int64(key)] = i;
@@ -90,8 +92,10 @@ template <class Key> __device__ __forceinline__ void find_ranges(const RangeArgu
     if (i == a.candidates - 1) a.ranges[2 * int64(key) + 1] = a.candidates;
 }
 
-extern "C" __global__ void __launch_bounds__(128) emit_entries_16(EmitArguments a) { emit<short>(a); }
-extern "C" __global__ void __launch_bounds__(128) emit_entries_32(EmitArguments a) { emit<int>(a); }
+extern "C" __global__ void __launch_bounds__(128) emit_entries_16(EmitArguments a) { emit<short, int64>(a); }
+extern "C" __global__ void __launch_bounds__(128) emit_entries_32(EmitArguments a) { emit<int, int64>(a); }
+extern "C" __global__ void __launch_bounds__(128) emit_sorted_16(EmitArguments a) { emit<short, uint>(a); }
+extern "C" __global__ void __launch_bounds__(128) emit_sorted_32(EmitArguments a) { emit<int, uint>(a); }
 extern "C" __global__ void __launch_bounds__(128) find_ranges_16(RangeArguments a) { find_ranges<short>(a); }
 extern "C" __global__ void __launch_bounds__(128) find_ranges_32(RangeArguments a) { find_ranges<int>(a); }
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, Protocol
@@ -20,11 +20,15 @@ import torch
 from gs2d.errors import BackendError, ShapeError
 from gs2d.kernels.cuda import compile as nvrtc
 from gs2d.kernels.cuda.driver import PER_THREAD, call, failure, load_driver, own_default_stream
+from gs2d.kernels.cuda.graph import Graph, Work, can_replay
 
-__all__ = ["GpuLauncher", "Launcher", "grow_in_place", "launcher_for"]
+__all__ = ["GpuLauncher", "Launcher", "OneByOne", "Work", "grow_in_place", "launcher_for", "steps"]
 
 ALLOCATOR_VARIABLES = ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF")
+STEP_VARIABLE, GRAPH, LAUNCHES, AUTOGRAD = "GS2D_CUDA_STEP", "graph", "launches", "autograd"
 STATIC_SHARED_BYTES = 48 << 10  # what a block may have without asking
+GRAPHS_FROM = 3  # times that the same launches come, from which they are worth a graph
+MAX_GRAPHS = 64
 MAX_STREAMS = 64  # that are known by their objects
 MAX_BLOCKS = (1 << 31) - 1
 
@@ -37,6 +41,18 @@ class Launcher(Protocol):
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
         """Queue the kernel ``name`` on the current stream."""
+
+    def run(self, works: Sequence[Work]) -> None:
+        """Queue kernels one after another; the same ones may be started as a graph."""
+
+
+class OneByOne:
+    """Of a launcher that has nothing better for many launches."""
+
+    def run(self, works: Sequence[Work]) -> None:
+        """Launch each."""
+        for work in works:
+            self.launch(work.name, work.blocks, work.threads, work.arguments)  # type: ignore[attr-defined]
 
 
 def _stream_of(device: torch.device) -> int:
@@ -62,6 +78,8 @@ class GpuLauncher:
         Machine code of a source file for an architecture.
     source_of : mapping of str to str, optional
         The file of each kernel; by default the package's.
+    graphs : bool
+        Whether launches that come again and again are made a graph, where the driver can.
 
     Raises
     ------
@@ -78,6 +96,7 @@ class GpuLauncher:
         architecture_of: Callable[[torch.device], str] = _architecture_of,
         code_of: Callable[[str, str], bytes] = lambda name, arch: nvrtc.cubin(name, arch).code,
         source_of: Mapping[str, str] | None = None,
+        graphs: bool = True,
     ) -> None:
         if own_default_stream():
             raise BackendError(f"{PER_THREAD} is set: kernels would run beside torch's work, not after it; unset it")
@@ -95,6 +114,8 @@ class GpuLauncher:
         self._functions: dict[str, Any] = {}  # by kernel
         self._allowed: dict[str, int] = {}  # dynamic shared memory asked for so far, by kernel
         self._lock = threading.Lock()  # the backward pass runs in a thread of its own
+        self._replays = graphs and can_replay(self._driver)
+        self._graphs: dict[tuple[str, ...], Graph | int] = {}  # by their kernels; how often these came before
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
         """Start a kernel on the current stream, and return at once.
@@ -118,6 +139,61 @@ class GpuLauncher:
                 status = self._start(*given)
         if status != driver.CUresult.CUDA_SUCCESS:
             raise failure(f"the launch of {name} ({blocks} blocks of {threads})", status)
+
+    def run(self, works: Sequence[Work]) -> None:
+        """Start kernels one after another on the current stream, and return at once.
+
+        From the third time on the same kernels are a graph, where the driver knows graphs and makes it: what the
+        launches cost the host, and the pauses between kernels, are then a fraction. Else each is launched.
+
+        Raises
+        ------
+        BackendError
+            As of :meth:`launch`.
+        """
+        if int(call(self._driver, "cuCtxGetCurrent")) == self._context_number:
+            self._run(works)
+        else:
+            with self._in_context():
+                self._run(works)
+
+    def _run(self, works: Sequence[Work]) -> None:
+        driver, stream = self._driver, self._stream(self._stream_of(self.device))
+        success = driver.CUresult.CUDA_SUCCESS
+        graph = self._graph_of(works) if self._replays and steps() == GRAPH else None
+        if graph is not None:
+            status = graph.launch(stream)
+            if status != success:
+                raise failure(f"the launch of {len(works)} kernels from {works[0].name} on", status)
+            return
+        for work in works:
+            function = self._functions.get(work.name) or self._load(work.name)
+            status = driver.cuLaunchKernel(
+                function, work.blocks, 1, 1, work.threads, 1, 1, 0, stream, work.parameters, 0
+            )[0]
+            if status != success:
+                raise failure(f"the launch of {work.name} ({work.blocks} blocks of {work.threads})", status)
+
+    def _graph_of(self, works: Sequence[Work]) -> Graph | None:
+        """Return the graph of these launches, as they are now; None: they have not come often enough, or cannot be."""
+        names = tuple([work.name for work in works])
+        known = self._graphs.get(names, 0)
+        if isinstance(known, int) and known + 1 < GRAPHS_FROM:
+            self._graphs[names] = known + 1
+            return None
+        try:
+            if isinstance(known, int):
+                if len(self._graphs) > MAX_GRAPHS:
+                    self._graphs.clear()
+                kernels = [self._functions.get(name) or self._load(name) for name in names]
+                known = self._graphs[names] = Graph(self._driver, kernels, works)
+            else:
+                known.change(works)
+        except BackendError:  # an old driver, or no room: slower, no worse
+            self._replays = False
+            self._graphs.clear()
+            return None
+        return known
 
     def _start(self, name: str, blocks: int, threads: int, argument: ctypes.c_void_p, shared_bytes: int) -> Any:
         """Launch in the context that is current; the driver copies what the argument points to."""
@@ -172,6 +248,22 @@ class GpuLauncher:
         kernel = self._driver.CUkernel(int(self._functions[name]))
         call(self._driver, "cuKernelSetAttribute", attribute, shared_bytes, kernel, self._handle)
         self._allowed[name] = shared_bytes
+
+
+def steps() -> str:
+    """Return how iterations of a training are done: ``GS2D_CUDA_STEP``, "graph" where it is not set.
+
+    "launches" starts each kernel of an iteration by itself, "autograd" goes through torch for every part.
+
+    Raises
+    ------
+    BackendError
+        It is none of these.
+    """
+    chosen = os.environ.get(STEP_VARIABLE) or GRAPH
+    if chosen not in (GRAPH, LAUNCHES, AUTOGRAD):
+        raise BackendError(f"{STEP_VARIABLE} must be {GRAPH}, {LAUNCHES} or {AUTOGRAD}, got {chosen!r}; unset it")
+    return chosen
 
 
 def grow_in_place() -> bool:

@@ -21,8 +21,9 @@ struct NormalArguments {
     const uchar* mask;                    // or null
     const float* weights;                 // of the pixels, or null
     float* partials;                      // [2, blocks]: valid pixels; sum of alpha <n, N>, of alpha - <n, N>, or of weighted terms
-    const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels
+    const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels; null where `scale` says it
     float *g_normal, *g_depth, *g_alpha;  // null where not wanted
+    float scale;                          // cotangent / valid pixels
 };
 
 struct MeanArguments {
@@ -93,7 +94,7 @@ extern "C" __global__ void __launch_bounds__(128) normal_consistency_vjp(NormalA
     __shared__ float depth[DH][DW], pull_x[CH][CW], pull_y[CH][CW];  // pulls: see depth_normal_vjp
     const int64 across = (a.width + NORMAL_W - 1) / NORMAL_W;
     const int64 left = blockIdx.x % across * NORMAL_W, top = blockIdx.x / across * NORMAL_H;
-    const float of_all = *a.cotangent * a.means[0];
+    const float of_all = a.means ? *a.cotangent * a.means[0] : a.scale;
     for (int i = threadIdx.x; i < DH * DW; i += MEAN_THREADS)
         depth[i / DW][i % DW] = depth_at(a, left + i % DW - HALO, top + i / DW - HALO);
     __syncthreads();

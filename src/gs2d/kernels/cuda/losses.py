@@ -31,7 +31,7 @@ from gs2d.kernels.cuda.arguments import (
 if TYPE_CHECKING:
     from gs2d.kernels.cuda.launch import Launcher
 
-__all__ = ["blur", "masked_mean", "normal_consistency", "photometric"]
+__all__ = ["blur", "masked_mean", "normal_consistency", "photometric", "strips"]
 
 THREADS = 128
 STRIP, STRIP_ROWS = 128, 32  # photometric.cu: reals and rows of a block
@@ -68,8 +68,8 @@ def _cotangent(given: Tensor | None) -> Tensor | None:
     return None if given is None else given.detach().to(torch.float32).contiguous()
 
 
-def _strips(height: int, width: int) -> int:
-    """Blocks of photometric.cu."""
+def strips(height: int, width: int) -> int:
+    """Return the blocks of photometric.cu."""
     return -(-3 * width // STRIP) * -(-height // STRIP_ROWS)
 
 
@@ -98,7 +98,7 @@ def blur(image: Tensor, *, launcher: Launcher) -> Tensor:
     if source.numel() > 0:
         arguments = BlurArguments(sizes["H"], sizes["W"])
         fill(arguments, image=source, out=out)
-        launcher.launch("blur_image", _strips(sizes["H"], sizes["W"]), THREADS, arguments)
+        launcher.launch("blur_image", strips(sizes["H"], sizes["W"]), THREADS, arguments)
     return out
 
 
@@ -114,7 +114,7 @@ class _Photometric(torch.autograd.Function):
         launcher: Launcher,
     ) -> tuple[Tensor, Tensor]:
         height, width = rendered.shape[:2]
-        blocks = _strips(height, width)
+        blocks = strips(height, width)
         partials = rendered.new_empty(3, blocks)
         maps = rendered.new_empty(3, height, width, 3) if wanted else None
         if blocks > 0:
@@ -140,7 +140,7 @@ class _Photometric(torch.autograd.Function):
             fill(arguments, rendered=rendered, target=target, mask=mask, maps=maps, means=means, gradient=gradient)
             cotangents = {"g_l1": _cotangent(g_l1), "g_ssim": _cotangent(g_ssim)}
             fill(arguments, **cotangents)
-            ctx.launcher.launch("photometric_vjp", _strips(height, width), THREADS, arguments)
+            ctx.launcher.launch("photometric_vjp", strips(height, width), THREADS, arguments)
         return gradient, None, None, None, None, None
 
 

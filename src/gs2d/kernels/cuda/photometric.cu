@@ -11,22 +11,31 @@ namespace gs2d {
 constexpr int STRIP = MEAN_THREADS, STRIP_ROWS = 32;              // reals and rows of a block; losses.py has the same
 constexpr int SIDE = 3 * SSIM_RADIUS, STAGED = STRIP + 2 * SIDE;  // reals of a row that a block reads
 
+// A photograph as it was decoded, instead of `target`, in the variants `rgb` and `rgba`: [H, W, 3 or 4].
+struct Photograph {
+    const uchar* bytes;
+    float background[3];  // behind alpha
+};
+
 struct PhotometricArguments {
     int64 height, width;
     const float *rendered, *target;  // [H, W, 3]
     const uchar* mask;               // [H, W], 0 = ignore; or null
     const float* target_mean;        // [H, W, 3]: blur_image of the target; of the variant `known`
     float* maps;                     // [3, H, W, 3]: derivatives of SSIM by the blurred moments; or null
-    float* partials;                 // [3, blocks]: valid reals, L1, SSIM
+    float* partials;                 // [3, blocks]: valid reals, L1, SSIM; or null
+    Photograph photograph;
 };
 
 struct PhotometricVjpArguments {
     int64 height, width;
     const float *rendered, *target;
     const uchar* mask;
-    const float *maps, *means;   // means[0] = 1 / valid reals
+    const float *maps, *means;   // means[0] = 1 / valid reals; null where the scales below are given
     const float *g_l1, *g_ssim;  // cotangents of both values, or null
     float* gradient;             // [H, W, 3]
+    Photograph photograph;
+    float l1_scale, ssim_scale;  // cotangents / valid reals
 };
 
 struct BlurArguments {
@@ -100,12 +109,32 @@ __device__ __forceinline__ bool is_valid(const uchar* mask, int64 y, int64 width
     return !mask || mask[y * width + column / 3];
 }
 
-template <bool KNOWN> __device__ __forceinline__ void photometric(const PhotometricArguments& a) {
+// byte / 255, rounded as by a division: a product, and what it lacks.
+__device__ __forceinline__ float part_of_255(uchar byte) {
+    constexpr float PART = 1.f / 255.f;
+    const float x = float(byte), q = x * PART;
+    return fma(fma(-q, 255.f, x), PART, q);
+}
+
+// A real of the target: a float, or made of CHANNELS bytes a pixel.
+template <int CHANNELS, class Arguments>
+__device__ __forceinline__ float target_of(const Arguments& a, int64 y, int64 column) {
+    if constexpr (CHANNELS == 0) return a.target[y * 3 * a.width + column];
+    const Photograph& from = a.photograph;
+    if constexpr (CHANNELS == 3) return part_of_255(from.bytes[y * 3 * a.width + column]);
+    const int64 x = column / 3;
+    const int channel = int(column - 3 * x);
+    const uchar* pixel = from.bytes + 4 * (y * a.width + x);
+    const float behind = from.background[channel];
+    return (part_of_255(pixel[channel]) - behind) * part_of_255(pixel[3]) + behind;
+}
+
+template <bool KNOWN, int CHANNELS = 0> __device__ __forceinline__ void photometric(const PhotometricArguments& a) {
     __shared__ float rows[2][2][STAGED];
     const Strip s(a.height, a.width);
     const auto read = [&](int64 y) {
         return [&a, &s, y](int64 column, float* value) {
-            value[1] = a.target[y * s.n + column];
+            value[1] = target_of<CHANNELS>(a, y, column);
             value[0] = is_valid(a.mask, y, a.width, column) ? a.rendered[y * s.n + column] : value[1];
         };
     };
@@ -141,20 +170,27 @@ template <bool KNOWN> __device__ __forceinline__ void photometric(const Photomet
         a.maps[plane + at] = keep(valid, point.d_squares);
         a.maps[2 * plane + at] = keep(valid, point.d_product);
     }
-    leave_sums(sums, a.partials);
+    if (a.partials) leave_sums(sums, a.partials);  // the same for all
 }
 
 extern "C" __global__ void __launch_bounds__(128) photometric_forward(PhotometricArguments a) { photometric<false>(a); }
 extern "C" __global__ void __launch_bounds__(128) photometric_forward_known(PhotometricArguments a) {
     photometric<true>(a);
 }
+extern "C" __global__ void __launch_bounds__(128) photometric_forward_rgb(PhotometricArguments a) {
+    photometric<false, 3>(a);
+}
+extern "C" __global__ void __launch_bounds__(128) photometric_forward_rgba(PhotometricArguments a) {
+    photometric<false, 4>(a);
+}
 
 // dL/dx = B(d_mean) + 2 x B(d_squares) + y B(d_product) for SSIM, the sign of x - y for L1.
-extern "C" __global__ void __launch_bounds__(128) photometric_vjp(PhotometricVjpArguments a) {
+template <int CHANNELS> __device__ __forceinline__ void gradient_of(const PhotometricVjpArguments& a) {
     __shared__ float rows[2][3][STAGED];
     const Strip s(a.height, a.width);
     const int64 plane = s.height * s.n;
-    const float l1_scale = a.g_l1 ? *a.g_l1 * a.means[0] : 0.f, ssim_scale = a.g_ssim ? *a.g_ssim * a.means[0] : 0.f;
+    float l1_scale = a.l1_scale, ssim_scale = a.ssim_scale;
+    if (a.means) l1_scale = a.g_l1 ? *a.g_l1 * a.means[0] : 0.f, ssim_scale = a.g_ssim ? *a.g_ssim * a.means[0] : 0.f;
     const auto read = [&](int64 y) {
         return [&a, &s, plane, y](int64 column, float* value) {
             for (int m = 0; m < 3; ++m) value[m] = a.maps[m * plane + y * s.n + column];
@@ -174,13 +210,17 @@ extern "C" __global__ void __launch_bounds__(128) photometric_vjp(PhotometricVjp
         if (out < s.begin || !s.mine()) continue;
         float g = 0.f;
         if (is_valid(a.mask, out, a.width, s.column)) {
-            const float u = a.rendered[at], v = a.target[at];
+            const float u = a.rendered[at], v = target_of<CHANNELS>(a, out, s.column);
             const float ssim = fma(2.f * u, blurred[1].done(), fma(v, blurred[2].done(), blurred[0].done()));
             g = fma(ssim_scale, ssim, l1_scale * l1_sign(u, v));
         }
         a.gradient[at] = g;
     }
 }
+
+extern "C" __global__ void __launch_bounds__(128) photometric_vjp(PhotometricVjpArguments a) { gradient_of<0>(a); }
+extern "C" __global__ void __launch_bounds__(128) photometric_vjp_rgb(PhotometricVjpArguments a) { gradient_of<3>(a); }
+extern "C" __global__ void __launch_bounds__(128) photometric_vjp_rgba(PhotometricVjpArguments a) { gradient_of<4>(a); }
 
 // The window over an image, zero outside: bit for bit what photometric_forward computes for its target.
 extern "C" __global__ void __launch_bounds__(128) blur_image(BlurArguments a) {

@@ -7,17 +7,26 @@
 
 namespace gs2d {
 
+// The densification signal added to what was gathered; splats of radius 0 are left alone. All null: not here.
+struct Gathered {
+    float *signed_norms, *absolute_norms, *counts;  // [N]; absolute_norms may be null alone
+    const float* radii;                             // [N] px
+    const int* skip;                                // not 0 there: nothing is added; or null
+};
+
 struct ProjectVjpArguments {
     View view;
     int64 count, sh_rest;
     const float *means, *quats, *log_scales, *opacity_logits, *sh0, *shN;
     const int* tile_counts;  // 0: not drawn, all gradients are 0
     const uchar* learns;     // [N], 0: all gradients are 0; or null
-    const float* gradients;  // [N, 16]
-    const float* extras;     // [N, 4]
+    float* gradients;        // [N, 16]
+    float* extras;           // [N, 4]
     float *g_means, *g_quats, *g_log_scales, *g_opacity_logits, *g_sh0, *g_shN, *g_probe;  // null where not wanted
     int64 probe_columns;                                                                   // 2 or 4
     float* g_intrinsics;  // [N, 4]: what each splat says of fx, fy, cx, cy; or null
+    Gathered gathered;
+    int clears;  // 1: rows of gradients and extras that were read are zeros afterwards
 };
 
 // Rows of tensors that were made for this kernel alone: they begin on a boundary.
@@ -27,6 +36,8 @@ __device__ __forceinline__ void write_2(float* to, int64 i, float a, float b) {
 __device__ __forceinline__ void write_4(float* to, int64 i, float a, float b, float c, float d) {
     reinterpret_cast<float4*>(to)[i] = {a, b, c, d};
 }
+
+__device__ __forceinline__ float norm_of(float x, float y) { return sqrt(x * x + y * y); }
 
 // A row of three floats of each lane.
 __device__ __forceinline__ void write_3(float* to, int64 begin, int count, int lane, float a, float b, float c,
@@ -98,6 +109,11 @@ extern "C" __global__ void __launch_bounds__(128, PROJECT_VJP_BLOCKS) project_sp
         d = project_vjp(p, frame, r, gr, g_direction, a.view.camera);
         if (a.g_intrinsics) intrinsics = intrinsics_vjp(frame, r, gr, a.view.camera);
         abs_x = gr.abs_x, abs_y = gr.abs_y;
+        if (a.clears) {
+            const float4 none = {0.f, 0.f, 0.f, 0.f};
+            float4 *row = reinterpret_cast<float4*>(a.gradients) + 4 * i, *extra = reinterpret_cast<float4*>(a.extras) + i;
+            row[0] = none, row[1] = none, row[2] = none, row[3] = none, *extra = none;
+        }
     }
     if (a.g_means) write_3(a.g_means, begin, count, lane, d.mean.x, d.mean.y, d.mean.z, rows);
     if (lane >= count) return;
@@ -108,6 +124,12 @@ extern "C" __global__ void __launch_bounds__(128, PROJECT_VJP_BLOCKS) project_sp
     if (a.g_probe && a.probe_columns == 2) write_2(a.g_probe, i, d.probe_x * half_w, d.probe_y * half_h);
     if (a.g_probe && a.probe_columns == 4)
         write_4(a.g_probe, i, d.probe_x * half_w, d.probe_y * half_h, abs_x * half_w, abs_y * half_h);
+    const Gathered& to = a.gathered;
+    if (to.counts && to.radii[i] > 0.f && !(to.skip && *to.skip)) {
+        to.signed_norms[i] = to.signed_norms[i] + norm_of(d.probe_x * half_w, d.probe_y * half_h);
+        if (to.absolute_norms) to.absolute_norms[i] = to.absolute_norms[i] + norm_of(abs_x * half_w, abs_y * half_h);
+        to.counts[i] = to.counts[i] + 1.f;
+    }
     if (a.g_intrinsics) write_4(a.g_intrinsics, i, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy);
 }
 

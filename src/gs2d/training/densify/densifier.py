@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -88,6 +88,15 @@ class Densifier:
     def changes(self, iteration: int) -> bool:
         """Whether :meth:`after_backward` may change splats in this iteration, or look at a device."""
         return True
+
+    def gathers(self, state: TrainState, iteration: int) -> Mapping[str, Tensor] | None:
+        """Return the statistics that a backend may gather by itself in an iteration that changes nothing.
+
+        Tensors [N], to which the norms of the screen gradients of the splats with a radius are added: "signed" and
+        "count", and "absolute" where that is wanted; empty where nothing is gathered. :meth:`before_backward` and
+        :meth:`after_backward` are then not called. None: they must be.
+        """
+        return None
 
     def before_backward(self, state: TrainState, iteration: int) -> Tensor | None:
         """Return the screen probe (rule 13 of ``render/api.py``) whose gradient is wanted, zeros [N, 2 or 4], or None.

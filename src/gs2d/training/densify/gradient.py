@@ -64,6 +64,17 @@ class GradientDensifier(Densifier):
     def _caps(self, iteration: int) -> bool:
         return self._options.cap_every > 0 and iteration % self._options.cap_every == 0
 
+    def gathers(self, state: TrainState, iteration: int) -> Mapping[str, Tensor] | None:
+        """Return the statistics, until densification stops; a class with steps of its own is asked for them."""
+        steps = (type(self).before_backward, type(self).after_backward)
+        if steps != (GradientDensifier.before_backward, GradientDensifier.after_backward):
+            return None
+        if iteration >= self._options.stop:
+            return {}
+        assert state.statistics is not None
+        names = ("signed", "absolute", "count") if self._options.absolute else ("signed", "count")
+        return {name: state.statistics[name] for name in names}
+
     def before_backward(self, state: TrainState, iteration: int) -> Tensor | None:
         """Return the screen probe, until densification stops."""
         if iteration >= self._options.stop:

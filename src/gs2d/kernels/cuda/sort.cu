@@ -1,0 +1,263 @@
+// A stable sort by radix of keys with what belongs to them, and running sums: what a training iteration needs between its
+// own kernels, so that it asks torch for nothing.
+//
+// Eight bits a pass; a pass reads each key once ("onesweep": Adinets and Merrill, 2022). One launch counts the digits of all
+// passes. A block then takes the next piece of the keys by a ticket, ranks them, says how many of each digit it has, and
+// adds up what the pieces before it say, walking back until one says the sum of all before it ("decoupled look-back":
+// Merrill and Garland, 2016). A number and what it means are one word, so no order of memory is asked for; a piece only
+// waits for those with earlier tickets, whose blocks are running.
+#include "cuda/common.h"
+
+namespace gs2d {
+
+constexpr int SORT_THREADS = 256, SORT_ITEMS = 8, DIGITS = 256, MOST_PASSES = 4;  // sort.py has the same
+constexpr int PIECE = SORT_THREADS * SORT_ITEMS, SORT_WARPS = SORT_THREADS / 32, WARP_ITEMS = 32 * SORT_ITEMS;
+// A word of a piece: nothing yet; its own number; the sum of it and all pieces before.
+constexpr uint OWN = 1u << 30, SUM = 2u << 30, NUMBER = OWN - 1u;
+
+struct ClearArguments {
+    float4* words;  // on a boundary of 16 bytes
+    int64 count;    // of float4
+};
+
+struct DigitArguments {
+    const void* keys;  // [count] uint16 or uint32
+    int64 count;
+    int passes;
+    uint* digits;  // [MOST_PASSES, DIGITS]; zeros on entry
+};
+
+struct SortArguments {
+    const void* keys;
+    const uint* payloads;  // or null: the place of the key
+    void* sorted_keys;     // or null where nobody wants them
+    uint* sorted_payloads;
+    int64 count;
+    int shift, bits;       // of the digit
+    const uint* digits;    // [DIGITS]: how many keys have each
+    uint *ticket, *words;  // [pieces, DIGITS]; zeros on entry, both
+};
+
+struct RunningArguments {
+    const uint* order;        // [count]: splats by depth
+    const int* tile_counts;   // by splat
+    int64 count, room;        // room: for pairs
+    uint* ends;               // [count]: running sum, in that order
+    uint *ticket, *words;     // [pieces]; zeros on entry, both
+    int64* pairs;             // [1]: the last sum; the host's memory
+    int* overflow;            // [1]: whether it is more than there is room for
+};
+
+extern "C" __global__ void __launch_bounds__(256) clear_words(ClearArguments a) {
+    const int64 step = int64(gridDim.x) * blockDim.x;
+    for (int64 i = int64(blockIdx.x) * blockDim.x + threadIdx.x; i < a.count; i += step)
+        a.words[i] = {0.f, 0.f, 0.f, 0.f};
+}
+
+__device__ __forceinline__ void publish(uint* word, uint value) { *static_cast<volatile uint*>(word) = value; }
+
+// What a piece says, once it says something.
+__device__ __forceinline__ uint said(const uint* word) {
+    uint value;
+    do value = *static_cast<const volatile uint*>(word);
+    while (value < OWN);
+    return value;
+}
+
+// Sums stay at the largest number: more than there can be room for is all the same.
+__device__ __forceinline__ uint saturated(uint a, uint b) {
+    const uint sum = a + b;  // of two numbers below 2^30
+    return sum < NUMBER ? sum : NUMBER;
+}
+
+// The next piece, the same for all threads.
+__device__ __forceinline__ int64 next_piece(uint* ticket) {
+    __shared__ uint piece;
+    if (threadIdx.x == 0) piece = atomicAdd(ticket, 1u);
+    __syncthreads();
+    return int64(piece);
+}
+
+// Running sums of a number below 2^30 of each thread; without its own. All threads call it.
+template <int N> __device__ __forceinline__ void sums_before(uint (&numbers)[N], uint (*shared)[SORT_THREADS]) {
+    const int own = threadIdx.x;
+    for (int n = 0; n < N; ++n) shared[n][own] = numbers[n];
+    __syncthreads();
+    for (int step = 1; step < SORT_THREADS; step <<= 1) {
+        uint before[N];
+        for (int n = 0; n < N; ++n) before[n] = own >= step ? shared[n][own - step] : 0u;
+        __syncthreads();
+        for (int n = 0; n < N; ++n) shared[n][own] = saturated(shared[n][own], before[n]);
+        __syncthreads();
+    }
+    for (int n = 0; n < N; ++n) numbers[n] = own > 0 ? shared[n][own - 1] : 0u;
+}
+
+template <class Key> __device__ __forceinline__ void count_digits(const DigitArguments& a) {
+    __shared__ uint counts[MOST_PASSES][DIGITS];
+    for (int p = 0; p < MOST_PASSES; ++p) counts[p][threadIdx.x] = 0u;
+    __syncthreads();
+    const Key* keys = static_cast<const Key*>(a.keys);
+    const int64 step = int64(gridDim.x) * SORT_THREADS;
+    for (int64 i = int64(blockIdx.x) * SORT_THREADS + threadIdx.x; i < a.count; i += step) {
+        const uint key = keys[i];
+        for (int p = 0; p < a.passes; ++p) atomicAdd(&counts[p][key >> 8 * p & 255u], 1u);
+    }
+    __syncthreads();
+    for (int p = 0; p < a.passes; ++p) {
+        const uint count = counts[p][threadIdx.x];
+        if (count) atomicAdd(&a.digits[DIGITS * p + threadIdx.x], count);
+    }
+}
+
+// The lanes whose digit is this lane's.
+__device__ __forceinline__ uint peers_of(uint digit, int bits) {
+    uint peers = FULL_MASK;
+#pragma unroll
+    for (int b = 0; b < 8; ++b) {
+        if (b >= bits) break;  // the same for all
+        const uint set = __ballot_sync(FULL_MASK, digit >> b & 1u);
+        peers &= digit >> b & 1u ? set : ~set;
+    }
+    return peers;
+}
+
+template <class Key> struct SortShared {
+    uint counts[SORT_WARPS][DIGITS];  // of each warp; then how many of the digit lie before it in the piece
+    uint sums[2][SORT_THREADS];
+    uint starts[DIGITS];    // where each digit begins in the piece
+    uint targets[DIGITS];   // where the first one of the piece goes, less that; modulo 2^32
+    Key keys[PIECE];
+    uint payloads[PIECE];
+};
+
+template <class Key> __device__ __forceinline__ void sort_pass(const SortArguments& a, SortShared<Key>& s) {
+    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+    for (int w = 0; w < SORT_WARPS; ++w) s.counts[w][threadIdx.x] = 0u;
+    const int64 piece = next_piece(a.ticket), begin = piece * PIECE;
+    const int count = a.count - begin < PIECE ? int(a.count - begin) : PIECE;
+    const uint mask = (1u << a.bits) - 1u;
+    Key keys[SORT_ITEMS];
+    uint payloads[SORT_ITEMS], ranks[SORT_ITEMS];
+    uint* counts = s.counts[warp];
+#pragma unroll
+    for (int j = 0; j < SORT_ITEMS; ++j) {
+        const int at = WARP_ITEMS * warp + 32 * j + lane;
+        const int64 i = begin + at;
+        keys[j] = Key(~Key(0)), payloads[j] = uint(i);  // behind the last one: digits that come last
+        if (at < count) {
+            keys[j] = static_cast<const Key*>(a.keys)[i];
+            if (a.payloads) payloads[j] = a.payloads[i];
+        }
+    }
+#pragma unroll
+    for (int j = 0; j < SORT_ITEMS; ++j) {
+        const uint digit = uint(keys[j]) >> a.shift & mask;
+        const uint peers = peers_of(digit, a.bits);
+        const int before = __popc(peers & ((1u << lane) - 1u));
+        const uint first = counts[digit];
+        ranks[j] = first + uint(before);
+        __syncwarp();
+        if (before == 0) counts[digit] = first + uint(__popc(peers));
+        __syncwarp();
+    }
+    __syncthreads();
+
+    const int own = threadIdx.x;  // a digit each
+    uint total = 0u;
+    for (int w = 0; w < SORT_WARPS; ++w) {
+        const uint of_warp = s.counts[w][own];
+        s.counts[w][own] = total, total += of_warp;
+    }
+    uint* words = a.words + DIGITS * piece + own;
+    publish(words, piece == 0 ? SUM | total : OWN | total);
+    uint before = 0u;
+    for (int64 p = piece - 1; p >= 0; --p) {
+        const uint word = said(a.words + DIGITS * p + own);
+        before += word & NUMBER;
+        if (word >= SUM) break;
+    }
+    if (piece > 0) publish(words, SUM | (before + total));
+    uint starts[2] = {total, a.digits[own]};  // in the piece, and of all
+    sums_before<2>(starts, s.sums);
+    s.starts[own] = starts[0], s.targets[own] = starts[1] + before - starts[0];
+    __syncthreads();
+
+#pragma unroll
+    for (int j = 0; j < SORT_ITEMS; ++j) {
+        const uint digit = uint(keys[j]) >> a.shift & mask;
+        const uint at = s.starts[digit] + counts[digit] + ranks[j];
+        s.keys[at] = keys[j], s.payloads[at] = payloads[j];
+    }
+    __syncthreads();
+    for (int at = threadIdx.x; at < count; at += SORT_THREADS) {
+        const Key key = s.keys[at];
+        const uint to = s.targets[uint(key) >> a.shift & mask] + uint(at);
+        if (a.sorted_keys) static_cast<Key*>(a.sorted_keys)[to] = key;
+        a.sorted_payloads[to] = s.payloads[at];
+    }
+}
+
+// What all pieces before one say, added up by its first warp: 32 of them at a time.
+__device__ __forceinline__ uint sum_before(const uint* words, int64 piece, int lane) {
+    uint sum = 0u;
+    for (int64 last = piece - 1; last >= 0; last -= 32) {
+        const int64 p = last - lane;
+        const uint word = p >= 0 ? said(words + p) : SUM;
+        const uint ends = __ballot_sync(FULL_MASK, word >= SUM);  // the nearest of these is as far as to look
+        const int furthest = ends ? __ffs(int(ends)) - 1 : 31;
+        uint number = lane <= furthest ? word & NUMBER : 0u;
+#pragma unroll
+        for (int step = 16; step > 0; step >>= 1) number = saturated(number, __shfl_xor_sync(FULL_MASK, number, step));
+        sum = saturated(sum, number);
+        if (ends) break;
+    }
+    return sum;
+}
+
+// Where the pairs of each splat end, in the order of depth; the last piece says how many there are.
+extern "C" __global__ void __launch_bounds__(256) running_counts(RunningArguments a) {
+    __shared__ uint sums[1][SORT_THREADS];
+    __shared__ uint of_piece, before_piece;
+    const int64 piece = next_piece(a.ticket), begin = piece * PIECE + SORT_ITEMS * int64(threadIdx.x);
+    uint counts[SORT_ITEMS], total[1] = {0u};
+#pragma unroll
+    for (int j = 0; j < SORT_ITEMS; ++j) {
+        counts[j] = begin + j < a.count ? uint(a.tile_counts[a.order[begin + j]]) : 0u;
+        total[0] = saturated(total[0], counts[j]);
+    }
+    const uint mine = total[0];
+    sums_before<1>(total, sums);
+    if (threadIdx.x == SORT_THREADS - 1) of_piece = saturated(total[0], mine);
+    __syncthreads();
+    if (threadIdx.x < 32) {
+        const int lane = threadIdx.x;
+        if (lane == 0) publish(a.words + piece, piece == 0 ? SUM | of_piece : OWN | of_piece);
+        const uint before = sum_before(a.words, piece, lane);
+        if (lane == 0) {
+            before_piece = before;
+            if (piece > 0) publish(a.words + piece, SUM | saturated(before, of_piece));
+        }
+    }
+    __syncthreads();
+    uint sum = saturated(before_piece, total[0]);
+#pragma unroll
+    for (int j = 0; j < SORT_ITEMS; ++j) {
+        sum = saturated(sum, counts[j]);
+        if (begin + j < a.count) a.ends[begin + j] = sum;
+        if (begin + j == a.count - 1) *a.pairs = int64(sum), *a.overflow = int64(sum) > a.room;
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(256) count_digits_16(DigitArguments a) { count_digits<ushort>(a); }
+extern "C" __global__ void __launch_bounds__(256) count_digits_32(DigitArguments a) { count_digits<uint>(a); }
+extern "C" __global__ void __launch_bounds__(256) sort_pass_16(SortArguments a) {
+    __shared__ SortShared<ushort> shared;
+    sort_pass<ushort>(a, shared);
+}
+extern "C" __global__ void __launch_bounds__(256) sort_pass_32(SortArguments a) {
+    __shared__ SortShared<uint> shared;
+    sort_pass<uint>(a, shared);
+}
+
+}  // namespace gs2d

@@ -1,0 +1,120 @@
+"""Iterations that a backend does in one piece: which are of that kind, and how they are described to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from torch import Tensor
+
+from gs2d.config.recipe import LossTerm, Stage
+from gs2d.render.types import RasterSettings
+from gs2d.render.whole_step import Learned, WholeStep
+from gs2d.training.adam import lr_at
+from gs2d.training.densify.densifier import Densifier
+from gs2d.training.objective import FullRender, Objective, learning_rows
+from gs2d.training.state import TrainState
+
+__all__ = ["WholeSteps"]
+
+KINDS = frozenset({"l1", "ssim", "normal_consistency"})
+NOTHING: Mapping[str, Tensor] = MappingProxyType({})
+
+
+class WholeSteps:
+    """The iterations of a stage whose losses are a photograph's L1 and SSIM and normal consistency.
+
+    What a term is weighted by, pixel by pixel, a second view, or anything that is learned of photographs and cameras
+    is not for here: :class:`~gs2d.training.objective.FullRender` does all of it.
+
+    Parameters
+    ----------
+    whole : FullRender
+    objective : Objective
+        Of the stage.
+    stage : Stage
+    """
+
+    def __init__(self, whole: FullRender, objective: Objective | None, stage: Stage) -> None:
+        self._whole, self._stage = whole, stage
+        self._terms = whole.protocol.resolve(stage.losses)
+        self._possible = objective is whole and whole.recipe.multiview is None
+        self._settings: dict[int, RasterSettings] = {}  # by SH degree
+        self._rows: tuple[tuple[Tensor, ...], Tensor | None] | None = None  # groups, and what they are together
+
+    def learn(self, state: TrainState, iteration: int, index: int, densifier: Densifier | None) -> bool:
+        """Do an iteration; False: it is of another kind, and nothing was done."""
+        if not self._possible or state.exposures is not None or state.poses is not None:
+            return False
+        active = [term for term in self._terms if term.is_active(iteration)]
+        gathered = NOTHING if densifier is None else densifier.gathers(state, iteration)
+        if gathered is None or not _is_plain(active):
+            return False
+        photograph = self._whole.targets.photograph(index)
+        if photograph is None:
+            return False
+        stage, whole = self._stage, self._whole
+        learned = self._learned(state, iteration)
+        kinds = [(term.depth or whole.protocol.depth, term.edges) for term in active if term.kind not in ("l1", "ssim")]
+        depth, edges = kinds[0] if kinds else ("mean", "undefined")
+        if not learned or depth not in ("mean", "median"):
+            return False
+        step = WholeStep(
+            splats=state.splats,
+            camera=whole.camera(state, index),
+            settings=self._settings_at(iteration),
+            photograph=photograph.image,
+            mask=photograph.mask,
+            valid=photograph.valid,
+            background=whole.protocol.background,
+            weights={term.kind: float(term.weight or 0.0) for term in active},
+            depth=depth,
+            at_camera=edges == "camera",
+            rows=None if gathered else self._learning_rows(state),
+            learned=learned,
+            betas=(stage.lr.beta1, stage.lr.beta2, stage.lr.eps),
+            gathered=gathered,
+        )
+        if not whole.backend.step(step):
+            return False
+        for name in learned:
+            state.moments[name].steps += 1
+        return True
+
+    def _learned(self, state: TrainState, iteration: int) -> dict[str, Learned]:
+        rates, stage, found = lr_at(self._stage.lr, iteration, self._whole.scene.extent), self._stage, {}
+        for name, parameter in state.splats.items():
+            if name in stage.train and parameter.numel() > 0:
+                moments, group = state.moments[name], stage.train[name]
+                trained = None if group == "all" else state.groups[group]
+                found[name] = Learned(moments.mean, moments.square, rates[name], moments.steps + 1, trained)
+        return found
+
+    def _settings_at(self, iteration: int) -> RasterSettings:
+        """Return the rasterizer's constants: the same object while they are the same."""
+        degree = self._stage.active_sh_degree(iteration, self._whole.recipe.sh_degree)
+        if degree not in self._settings:
+            self._settings[degree] = self._whole.settings(self._stage, iteration)
+        return self._settings[degree]
+
+    def _learning_rows(self, state: TrainState) -> Tensor | None:
+        """Return the splats of which the stage trains anything; worked out anew where the groups are others."""
+        groups = tuple(state.groups[group] for group in set(self._stage.train.values()) - {"all"})
+        if self._rows is None or len(groups) != len(self._rows[0]) or any(map(_differ, groups, self._rows[0])):
+            self._rows = groups, learning_rows(state, self._stage)
+        return self._rows[1]
+
+
+def _differ(a: Tensor, b: Tensor) -> bool:
+    return a is not b
+
+
+def _is_plain(terms: list[LossTerm]) -> bool:
+    """Whether all terms are of the kinds that are done in one piece: each once, every pixel alike."""
+    kinds = [term.kind for term in terms]
+    return (
+        KINDS.issuperset(kinds)
+        and len(kinds) == len(set(kinds))
+        and not {"l1", "ssim"}.isdisjoint(kinds)
+        and all(term.where == "image" and term.edge_power == 0 and not term.options for term in terms)
+    )

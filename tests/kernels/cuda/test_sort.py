@@ -1,0 +1,123 @@
+"""The sort and the running sums of sort.cu, emulated: torch's stable sort, in any order of threads and blocks."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from emulate import Emulator
+from gs2d.kernels.cuda.arguments import ClearArguments, DigitArguments, RunningArguments, SortArguments, fill
+from gs2d.kernels.cuda.sort import (
+    DIGITS,
+    MOST_PASSES,
+    MOST_SORTED,
+    PIECE,
+    SORT_THREADS,
+    clear_blocks,
+    digit_blocks,
+    passes_of,
+    pieces_of,
+)
+
+pytestmark = pytest.mark.timeout(170)
+SEEDS = (0, 7)  # ascending; shuffled
+
+
+def sort(emulator: Emulator, keys: Tensor, payloads: Tensor | None, bits: int) -> tuple[Tensor, Tensor]:
+    """Keys int16 or int32 by their lowest bits, with payloads, or the places that they had."""
+    width = 16 if keys.dtype == torch.int16 else 32
+    count, plan = len(keys), passes_of(bits)
+    digits = torch.zeros(MOST_PASSES, DIGITS, dtype=torch.int32)
+    counting = DigitArguments(count=count, passes=len(plan))
+    fill(counting, keys=keys, digits=digits)
+    emulator.launch(f"count_digits_{width}", digit_blocks(count), SORT_THREADS, counting)
+    for number, (shift, of_digit) in enumerate(plan):
+        words = torch.zeros(pieces_of(count) * DIGITS, dtype=torch.int32)
+        ticket = torch.zeros(1, dtype=torch.int32)
+        sorted_keys, sorted_payloads = torch.full_like(keys, -1), torch.full((count,), -1, dtype=torch.int32)
+        arguments = SortArguments(count=count, shift=shift, bits=of_digit)
+        fill(arguments, keys=keys, payloads=payloads, sorted_keys=sorted_keys, sorted_payloads=sorted_payloads)
+        fill(arguments, digits=digits[number], ticket=ticket, words=words)
+        emulator.launch(f"sort_pass_{width}", pieces_of(count), SORT_THREADS, arguments)
+        keys, payloads = sorted_keys, sorted_payloads
+    assert payloads is not None
+    return keys, payloads
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("count", [1, 31, PIECE - 1, PIECE, 2 * PIECE + 77])
+def test_a_sort_by_radix_is_torchs_stable_sort(emulator: Emulator, count: int, seed: int) -> None:
+    emulator = Emulator(emulator.folder, reuse=True, seed=seed)
+    generator = torch.Generator().manual_seed(count)
+    depths = torch.rand(count, generator=generator).mul(100).floor().div(7)  # many equal ones
+    depths[::5] = float("inf")
+    found = sort(emulator, depths.view(torch.int32), None, 32)
+    expected = torch.sort(depths, stable=True)
+    assert torch.equal(found[1].long(), expected.indices)
+    assert torch.equal(found[0].view(torch.float32), expected.values)
+
+
+@pytest.mark.parametrize(("tiles", "width"), [(1, 16), (200, 16), (2500, 16), (40_000, 32), (1 << 17, 32)])
+def test_tiles_are_sorted_with_what_lies_in_them(emulator: Emulator, tiles: int, width: int) -> None:
+    count = PIECE + 300
+    generator = torch.Generator().manual_seed(tiles)
+    keys = torch.randint(0, tiles + 1, (count,), generator=generator, dtype=torch.int32)
+    payloads = torch.randint(0, 1 << 31, (count,), generator=generator, dtype=torch.int64).to(torch.int32)
+    given = keys.to(torch.int16) if width == 16 else keys
+    found = sort(Emulator(emulator.folder, reuse=True, seed=3), given, payloads, tiles.bit_length())
+    order = torch.sort(keys, stable=True).indices
+    assert torch.equal(found[0].to(torch.int32), keys[order])
+    assert torch.equal(found[1], payloads[order])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("count", [1, 300, PIECE, 40 * PIECE + 5])
+def test_running_sums_follow_an_order_and_say_whether_there_is_room(emulator: Emulator, count: int, seed: int) -> None:
+    """Of 41 pieces the last looks back further than a warp is wide, unless one before it has said its sum."""
+    emulator = Emulator(emulator.folder, reuse=True, seed=seed)
+    generator = torch.Generator().manual_seed(count)
+    counts = torch.randint(0, 9, (count,), generator=generator, dtype=torch.int32)
+    order = torch.randperm(count, generator=generator).to(torch.int32)
+    total = int(counts.sum())
+    for room, short in ((total, 0), (total - 1, 1)):
+        found = run_counts(emulator, order, counts, room)
+        assert torch.equal(found[0].long(), counts[order.long()].cumsum(0))
+        assert (found[1], found[2]) == (total, short)
+
+
+def run_counts(emulator: Emulator, order: Tensor, counts: Tensor, room: int) -> tuple[Tensor, int, int]:
+    count = len(order)
+    ends, pairs = torch.full((count,), -1, dtype=torch.int32), torch.full((1,), -1, dtype=torch.int64)
+    overflow, ticket = torch.full((1,), -1, dtype=torch.int32), torch.zeros(1, dtype=torch.int32)
+    words = torch.zeros(pieces_of(count), dtype=torch.int32)
+    arguments = RunningArguments(count=count, room=room)
+    fill(arguments, order=order, tile_counts=counts, ends=ends, ticket=ticket, words=words)
+    fill(arguments, pairs=pairs, overflow=overflow)
+    emulator.launch("running_counts", pieces_of(count), SORT_THREADS, arguments)
+    return ends, int(pairs), int(overflow)
+
+
+def test_more_pairs_than_can_be_counted_are_too_many(emulator: Emulator) -> None:
+    """Sums stay at the largest number instead of beginning anew."""
+    count = 3 * PIECE
+    counts = torch.full((count,), 1 << 22, dtype=torch.int32)  # 2.6e10 in all
+    ends, pairs, overflow = run_counts(emulator, torch.arange(count, dtype=torch.int32), counts, MOST_SORTED)
+    assert (pairs, overflow) == ((1 << 30) - 1, 1)
+    assert bool((ends[1:] >= ends[:-1]).all())
+
+
+@pytest.mark.parametrize("count", [1, 5, 70_001])
+def test_memory_is_cleared_to_its_end_and_no_further(emulator: Emulator, count: int) -> None:
+    words = torch.full((4 * count + 4,), 3.0)
+    arguments = ClearArguments(count=count)
+    fill(arguments, words=words)
+    emulator.launch("clear_words", clear_blocks(count), SORT_THREADS, arguments)
+    assert not words[:-4].any()
+    assert words[-4:].tolist() == [3.0] * 4
+
+
+def test_passes_take_eight_bits_and_the_last_what_is_left() -> None:
+    assert passes_of(1) == ((0, 1),)
+    assert passes_of(12) == ((0, 8), (8, 4))
+    assert passes_of(32) == ((0, 8), (8, 8), (16, 8), (24, 8))

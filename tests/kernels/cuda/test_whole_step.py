@@ -1,0 +1,284 @@
+"""An iteration by kernels alone: the bits of the one that goes through torch part by part, alone and as a graph."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from benchmarks.gpu.host import OperationCount
+
+import fake_driver
+import train_toys
+from emulate import Emulator
+from fake_backends import cuda_on_host
+from fake_driver import FakeDriver, Result
+from gs2d.config.protocols import GENERIC, Protocol
+from gs2d.config.recipe import PoseRefinement, Recipe
+from gs2d.data.scene import Scene, View
+from gs2d.errors import BackendError
+from gs2d.kernels.cuda import launch
+from gs2d.kernels.cuda.launch import GpuLauncher, Launcher
+from gs2d.render import cuda_step, pair_budget
+from gs2d.training import objective as views
+from gs2d.training import trainer as loop
+from gs2d.training.densify.gradient import GradientDensifier
+from gs2d.training.trainer import Trainer
+
+pytestmark = pytest.mark.timeout(170)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return train_toys.make_scene()
+
+
+@contextmanager
+def mode(chosen: str, launcher: Launcher) -> Iterator[list[bool]]:
+    """Training on a device that is not waited for, in one way of doing iterations; which were done in one piece."""
+    done: list[bool] = []
+    run = cuda_step.Stepper.run
+
+    def recorded(self: Any, *given: Any) -> bool:
+        done.append(run(self, *given))
+        return done[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(launch.STEP_VARIABLE, chosen)
+        patch.setattr(launch, "launcher_for", lambda device: launcher)
+        patch.setattr(loop, "is_async", lambda device: True)
+        patch.setattr(views, "is_async", lambda device: True)
+        patch.setattr(cuda_step.Stepper, "run", recorded)
+        yield done
+
+
+def trained(
+    launcher: Launcher, scene: Scene, recipe: Recipe, chosen: str, protocol: Protocol = GENERIC, **options: Any
+) -> tuple[Trainer, int]:
+    """The trainer at the end, and its iterations in one piece."""
+    with mode(chosen, launcher) as done:
+        trainer = Trainer(scene, recipe, protocol, backend=cuda_on_host(), **{"progress_every": 100, **options})
+        trainer.run()
+    return trainer, sum(done)
+
+
+def same(a: Trainer, b: Trainer) -> bool:
+    """Splats and Adam's memory, bit for bit."""
+    assert {name: m.steps for name, m in a.state.moments.items()} == {k: m.steps for k, m in b.state.moments.items()}
+    pairs = [(m.square, b.state.moments[name].square) for name, m in a.state.moments.items()]
+    return train_toys.same(a.splats, b.splats) and all(torch.equal(x, y) for x, y in pairs)
+
+
+def masked(scene: Scene) -> Scene:
+    """With masks, and with alpha in every other photograph."""
+    rng, views = np.random.default_rng(1), []
+    for number, view in enumerate(scene.train):
+        image = view.image()
+        alpha = rng.integers(0, 256, (*image.shape[:2], 1), dtype=np.uint8)
+        pixels = np.concatenate([image, alpha], axis=2) if number % 2 else image
+        views.append(View.from_arrays(view.name, view.camera, pixels, rng.uniform(size=image.shape[:2]) < 0.7))
+    return replace(scene, train=tuple(views))
+
+
+def two_sizes(scene: Scene) -> Scene:
+    """Every third photograph has half as many rows."""
+    small = []
+    for number, view in enumerate(scene.train):
+        camera = view.camera if number % 3 else view.camera.resized(view.camera.width, view.camera.height // 2)
+        image = view.image() if number % 3 else np.ascontiguousarray(view.image()[::2])
+        small.append(View.from_arrays(view.name, camera, image))
+    return replace(scene, train=tuple(small))
+
+
+def at_camera(recipe: Recipe) -> Recipe:
+    """Normals of depth as in the official code."""
+    stages = (
+        replace(
+            stage,
+            losses=tuple(replace(t, edges="camera") if t.kind.startswith("normal") else t for t in stage.losses),
+        )
+        for stage in recipe.stages
+    )
+    return replace(recipe, stages=tuple(stages))
+
+
+VARIANTS = {
+    "plain": (lambda scene: scene, train_toys.short(), GENERIC),
+    "absolute": (two_sizes, train_toys.short(absgs=True), replace(GENERIC, depth="median")),
+    "masks": (masked, at_camera(train_toys.short()), replace(GENERIC, background=(0.2, 1.0, 0.7))),
+}
+
+
+@pytest.mark.parametrize("variant", list(VARIANTS))
+def test_three_stages_have_the_bits_of_those_that_go_through_torch(
+    emulator: Emulator, scene: Scene, variant: str
+) -> None:
+    """Densified, reset, ranked and cloned in between; what counts then has been gathered by a kernel."""
+    change, recipe, protocol = VARIANTS[variant]
+    given = emulator, change(scene), recipe
+    parts, none = trained(*given, "autograd", protocol)
+    whole, some = trained(*given, "launches", protocol)
+    assert none == 0
+    assert some >= 10  # of 19: those that densify or end a stage, and the first one of a size, are looked at
+    assert same(parts, whole)
+
+
+@pytest.mark.parametrize("seed", [5, 11])
+def test_memory_of_before_and_the_order_of_threads_change_nothing(
+    emulator: Emulator, scene: Scene, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that is not promised to be zeros is NaN or -1 when an iteration begins; the sums are zeros when it ends."""
+    checked = Counter[str]()
+    run = cuda_step.Stepper.run
+
+    def poisoned(self: Any, *given: Any) -> bool:
+        held = self._arena._held
+        for name, tensor in held.items():
+            if name not in ("gradient_rows", "extras"):
+                tensor.view(torch.int16).fill_(-1)
+        done = run(self, *given)
+        for name in ("gradient_rows", "extras"):
+            if done:
+                assert not held[name].any()
+                checked[name] += 1
+        return done
+
+    monkeypatch.setattr(cuda_step.Stepper, "run", poisoned)
+    shuffled = Emulator(emulator.folder, reuse=True, seed=seed)
+    parts, _ = trained(shuffled, scene, train_toys.short(), "autograd")
+    whole, some = trained(shuffled, scene, train_toys.short(), "launches")
+    assert some == checked["extras"] >= 11
+    for (name, a), (_, b) in zip(parts.splats.items(), whole.splats.items(), strict=True):
+        assert float((a - b).norm()) <= 1e-3 * float(a.norm()), name  # atomics in another order
+
+
+def test_an_iteration_without_room_for_its_pairs_changes_nothing_and_is_done_again(
+    emulator: Emulator, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = train_toys.short()
+    plain, _ = trained(emulator, scene, recipe, "launches")
+    for name in ("SLACK", "VIEW_SLACK"):
+        monkeypatch.setattr(pair_budget, name, 0.5)
+    monkeypatch.setattr(pair_budget, "STEP", 1)
+    short, some = trained(emulator, scene, recipe, "launches")
+    assert some > 5
+    assert same(plain, short)
+
+
+def on_gpu(driver: FakeDriver) -> GpuLauncher:
+    return fake_driver.launcher(driver)
+
+
+def test_an_iteration_that_comes_again_is_a_graph_with_the_same_bits(emulator: Emulator, scene: Scene) -> None:
+    """Rows are added in between and cameras, rates and rooms change: in the graph, where they differ."""
+    recipe = train_toys.short()
+    plain, some = trained(emulator, scene, recipe, "launches")
+    driver = FakeDriver(emulator=emulator)
+    replayed, as_many = trained(on_gpu(driver), scene, recipe, "graph")
+    assert some == as_many
+    assert same(plain, replayed)
+    assert len(driver.replays) >= 8
+    assert driver.changes > 0
+    launched = Counter(done.kernel for done in driver.launches)
+    assert 0 < launched["running_counts"] < some  # until it was a graph
+
+
+@pytest.mark.parametrize(
+    "driver",
+    [
+        FakeDriver(version=11080),
+        FakeDriver(failing={"cuGraphInstantiate": Result.CUDA_ERROR_NOT_SUPPORTED}),
+        FakeDriver(failing={"cuGraphExecKernelNodeSetParams": Result.CUDA_ERROR_NOT_SUPPORTED}),
+    ],
+    ids=["too old", "makes none", "changes none"],
+)
+def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: Scene, driver: FakeDriver) -> None:
+    plain, some = trained(emulator, scene, train_toys.short(), "launches")
+    driver.emulator = emulator
+    found, as_many = trained(on_gpu(driver), scene, train_toys.short(), "graph")
+    assert same(plain, found)
+    assert some == as_many
+    assert len(driver.replays) <= 2  # both halves once, where the refusal comes afterwards
+
+
+def test_a_way_that_does_not_exist_is_one_line(scene: Scene, emulator: Emulator) -> None:
+    with pytest.raises(BackendError, match="GS2D_CUDA_STEP must be graph, launches or autograd, got 'fast'; unset it"):
+        trained(emulator, scene, train_toys.short(), "fast")
+
+
+class OfItsOwn(GradientDensifier):
+    """Looks at every iteration itself."""
+
+    seen = 0
+
+    def after_backward(self, state: Any, output: Any, iteration: int) -> Any:
+        type(self).seen += output is not None
+        return super().after_backward(state, output, iteration)
+
+
+def test_what_is_learned_of_cameras_and_densifiers_with_steps_of_their_own_go_through_torch(
+    emulator: Emulator, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = train_toys.short()
+    short = replace(recipe, stages=(replace(recipe.stages[0], iterations=5),))
+    assert trained(emulator, scene, short, "launches")[1] == 2  # 1 and 3 are looked at, 5 is the last
+    posed = replace(short, poses=PoseRefinement(start=2, decay_steps=10))
+    assert trained(emulator, scene, posed, "launches")[1] == 0
+    made = loop.densifier_of
+    monkeypatch.setattr(
+        loop, "densifier_of", lambda given, around: None if made(given, around) is None else OfItsOwn(around, given)
+    )
+    assert trained(emulator, scene, short, "launches")[1] == 0
+    assert OfItsOwn.seen == 5
+
+
+def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -> None:
+    """Neither an operation nor memory; only the order of the views is drawn, once in an epoch."""
+    recipe = train_toys.short()
+    first = replace(recipe.stages[0], iterations=200, densify=replace(recipe.stages[0].densify, start=500, stop=900))
+    with mode("launches", emulator) as done:
+        trainer = Trainer(scene, replace(recipe, stages=(first,)), GENERIC, backend=cuda_on_host(), progress_every=1000)
+        trainer.enter(0)
+        for _ in range(14):
+            trainer.step()
+        before = sum(done)
+        with OperationCount() as count:
+            for _ in range(6):
+                trainer.step()
+    assert sum(done) - before == 6
+    assert set(count.names) <= {"randperm", "detach"}, count.names  # detach: the number of pairs, in the host's memory
+
+
+def test_photographs_in_the_hosts_memory_come_to_the_same_place_each_time(emulator: Emulator, scene: Scene) -> None:
+    """Where the device has no room for their bytes."""
+    recipe = train_toys.short()
+    parts, _ = trained(emulator, scene, recipe, "autograd", target_bytes=0)
+    whole, some = trained(emulator, scene, recipe, "launches", target_bytes=0)
+    assert some >= 11
+    assert same(parts, whole)
+
+
+def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:
+    """All 256: a row of them, against a target of floats, is an L1 of exactly 0."""
+    from gs2d.kernels.cuda.arguments import PhotometricArguments, fill
+    from gs2d.kernels.cuda.losses import THREADS, strips
+
+    width = 86  # 258 reals
+    values = torch.arange(3 * width) % 256
+    rendered = (values.to(torch.float32) / 255).view(1, width, 3).contiguous()
+    partials = torch.full((3, strips(1, width)), torch.nan)
+    arguments, pixels = PhotometricArguments(1, width), values.to(torch.uint8)
+    fill(arguments, rendered=rendered, partials=partials)
+    arguments.photograph.bytes = pixels.data_ptr()
+    emulator.launch("photometric_forward_rgb", strips(1, width), THREADS, arguments)
+    assert float(partials[1].sum()) == 0
+    assert float(partials[0].sum()) == 3 * width
+
+
+assert os.environ.get(launch.STEP_VARIABLE) is None, "the tests choose how iterations are done"
