@@ -125,7 +125,8 @@ __device__ __forceinline__ float target_of(const Arguments& a, int64 y, int64 co
     const int64 x = column / 3;
     const int channel = int(column - 3 * x);
     const uchar* pixel = from.bytes + 4 * (y * a.width + x);
-    const float behind = from.background[channel];
+    // not by its number: the arguments would be copied to memory of the thread for that
+    const float behind = channel == 0 ? from.background[0] : channel == 1 ? from.background[1] : from.background[2];
     return (part_of_255(pixel[channel]) - behind) * part_of_255(pixel[3]) + behind;
 }
 

@@ -245,8 +245,8 @@ extern "C" __global__ void __launch_bounds__(256) running_counts(RunningArgument
     for (int j = 0; j < SORT_ITEMS; ++j) {
         sum = saturated(sum, counts[j]);
         if (begin + j < a.count) a.ends[begin + j] = sum;
-        if (begin + j == a.count - 1) *a.pairs = int64(sum), *a.overflow = int64(sum) > a.room;
     }
+    if (begin < a.count && a.count <= begin + SORT_ITEMS) *a.pairs = int64(sum), *a.overflow = int64(sum) > a.room;
 }
 
 extern "C" __global__ void __launch_bounds__(256) count_digits_16(DigitArguments a) { count_digits<ushort>(a); }
