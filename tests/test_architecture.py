@@ -58,7 +58,7 @@ INSIDE = {
         "build": 4,
         "bounds": 3,
         "scene": 2,
-        "priors": 1,
+        "priors faces": 1,
         "cache masks undistort": 0,
     },
     "render": {

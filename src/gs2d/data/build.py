@@ -17,6 +17,7 @@ from gs2d.core.images import image_size, read_image, read_mask
 from gs2d.core.transforms import camera_extent
 from gs2d.data.bounds import scene_bounds
 from gs2d.data.cache import DecodedImage, ImageCache
+from gs2d.data.faces import Face, face_name, face_positions, faces_of, wrapped
 from gs2d.data.masks import EMPTY, Masks, find_masks
 from gs2d.data.priors import (
     DEPTH_SUFFIXES,
@@ -67,6 +68,8 @@ class PosedImage:
         Depth and normal maps.
     mask_is_alpha : bool
         What the mask leaves out is empty: it becomes the alpha channel, which is 1 where there is no mask.
+    face : Face or None
+        The part of the photograph that this is; name and pose are the part's, path and intrinsics the whole's.
     """
 
     name: str
@@ -79,6 +82,7 @@ class PosedImage:
     alpha_is_silhouette: bool = False
     maps: MapFiles | None = None
     mask_is_alpha: bool = False
+    face: Face | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +134,9 @@ class Decoder:
             image = image[:, :, :3]
         valid = None
         if k.lens is not None:
-            positions, inside = self.lens_maps(k)
+            positions, inside = self.lens_maps(k) if frame.face is None else face_positions(k, frame.face)
+            image = wrapped(image, k)
+            mask, object_mask = (None if a is None else wrapped(a, k) for a in (mask, object_mask))
             valid = inside
             image = undistort_image(image, positions, inside)
             mask = None if mask is None else inside & undistort_mask(mask, positions, need=1.0)
@@ -256,11 +262,12 @@ def build_scene(
     lens_maps = functools.lru_cache(maxsize=4)(source_positions)  # 12 bytes a pixel; cameras are mostly shared
     frames, mask_notes, masks = _with_masks(capture, root, masks)
     frames = sorted((fit_to_file(frame) for frame in frames), key=lambda frame: frame.name)
+    frames, cut = _cut(frames)
     names = [frame.name for frame in frames]
     if len(set(names)) != len(names):
         twice = next(a for a, b in itertools.pairwise(names) if a == b)
         raise DataError(f"{root} must name each view once, got {twice} more than once")
-    frames, map_notes = _with_maps(frames, capture.home or root)
+    frames, map_notes = (frames, ()) if cut else _with_maps(frames, capture.home or root)
     views = [_view(frame, factor, cache, lens_maps) for frame in frames]
     train, test = _split(frames, views, capture.default_test_every, test_every, root)
     cameras = [view.camera for view in train]
@@ -277,10 +284,17 @@ def build_scene(
         bounds=bounds,
         T_metric_scene=capture.T_metric_scene,
         skipped=capture.skipped,
-        notes=capture.notes + mask_notes + _lens_notes(frames) + map_notes + place_notes + point_notes + bound_notes,
+        notes=capture.notes
+        + mask_notes
+        + cut
+        + _lens_notes(frames)
+        + map_notes
+        + place_notes
+        + point_notes
+        + bound_notes,
         root=root,
         masks=masks,
-        observe=None if capture.observe is None else functools.cache(capture.observe),  # asked for by view after view
+        observe=_observed(capture, frames),
     )
 
 
@@ -323,12 +337,56 @@ def _view(frame: PosedImage, factor: int, cache: ImageCache, lens_maps: LensMaps
             f"view {frame.name}: a focal length of {_LENSES[0]:g} to {_LENSES[1]:g} times the image's side expected, "
             f"got {k.fx:.4g}, {k.fy:.4g} px for {k.width}x{k.height} px; is it in pixels?"
         )
+    seen = k if frame.face is None else frame.face.intrinsics
     try:
-        camera = Camera(k.width, k.height, k.fx, k.fy, k.cx, k.cy, frame.T_cam_world).downscaled(factor)
+        camera = Camera(seen.width, seen.height, seen.fx, seen.fy, seen.cx, seen.cy, frame.T_cam_world)
+        camera = camera.downscaled(factor)
     except ShapeError as error:
         raise DataError(f"view {frame.name}: {error}") from error
     maps = None if frame.maps is None else PriorMaps(frame.maps, k, camera, lens_maps)
-    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps, k)
+    return View(frame.name, camera, Decoder(frame, factor, lens_maps), cache, frame.path, maps, seen)
+
+
+def _cut(frames: Sequence[PosedImage]) -> tuple[list[PosedImage], tuple[str, ...]]:
+    """Return the frames with panoramas and wide fisheyes in faces, and a note about them."""
+    faces = {k: faces_of(k) for k in dict.fromkeys(frame.intrinsics for frame in frames)}
+    found: list[PosedImage] = []
+    kinds: dict[str, int] = {}
+    for frame in frames:
+        lens, parts = frame.intrinsics.lens, faces[frame.intrinsics]
+        if lens is None or not parts:
+            found.append(frame)
+            continue
+        kinds[lens.kind] = kinds.get(lens.kind, 0) + 1
+        for face in parts:
+            T = frame.T_cam_world.copy()
+            T[:3] = face.rotation @ T[:3]
+            found.append(replace(frame, name=face_name(frame.name, face), T_cam_world=T, face=face, maps=None))
+    if not kinds:
+        return list(frames), ()
+    what = " and ".join(f"{count} {kind} photographs" for kind, count in kinds.items())
+    number = sum(frame.face is not None for frame in found)
+    maps = any(frame.maps is not None for frame in frames)
+    note = f"{what} are cut into {number} pinhole faces of 90 degrees, so that nothing is lost"
+    return found, (note + ("; their depth and normal maps are not used" if maps else ""),)
+
+
+def _observed(capture: Capture, frames: Sequence[PosedImage]) -> Callable[[], ObservedPoints] | None:
+    """Return what reads which points the views show: a face those of its photograph that lie in it."""
+    if capture.observe is None:
+        return None
+    observe = functools.cache(capture.observe)  # asked for by view after view
+    wholes = {frame.path: frame.name for frame in capture.frames}
+    parts = {frame.name: wholes[frame.path] for frame in frames if frame.face is not None}
+    if not parts:
+        return observe
+
+    def by_face() -> ObservedPoints:
+        found = observe()
+        seen = {name: found.seen[whole] for name, whole in parts.items() if whole in found.seen}
+        return replace(found, seen={**found.seen, **seen})
+
+    return functools.cache(by_face)
 
 
 def _with_masks(capture: Capture, root: Path, masks: Masks) -> tuple[list[PosedImage], tuple[str, ...], Masks]:
@@ -372,7 +430,9 @@ def _split(
         is_test = [frame.split == "test" for frame in frames]
     else:
         every = default_every if test_every is None else test_every
-        is_test = [bool(every) and index % every == 0 for index in range(len(views))]
+        wholes = [frame.name if frame.face is None else str(frame.path) for frame in frames]
+        numbers = {whole: number for number, whole in enumerate(dict.fromkeys(wholes))}  # faces stay together
+        is_test = [bool(every) and numbers[whole] % every == 0 for whole in wholes]
     train = tuple(view for view, test in zip(views, is_test, strict=True) if not test)
     test = tuple(view for view, test in zip(views, is_test, strict=True) if test)
     if not train:
@@ -393,6 +453,7 @@ def _finite_points(points: PointCloud | None) -> tuple[PointCloud | None, tuple[
 
 
 def _lens_notes(frames: list[PosedImage]) -> tuple[str, ...]:
+    frames = [frame for frame in frames if frame.face is None]
     lenses = {frame.intrinsics for frame in frames if frame.intrinsics.lens is not None}
     if not lenses:
         return ()

@@ -68,6 +68,8 @@ def key_of(view: View) -> str | None:
         return None
     frame = view.decode.frame
     facts: list[object] = [FORMAT, view.decode.downscale, repr(frame.intrinsics), frame.alpha_is_silhouette]
+    if frame.face is not None:
+        facts.append(repr(frame.face))
     if frame.mask_is_alpha:
         facts.append("mask is alpha")
     for path in (frame.path, frame.mask, frame.object_mask):

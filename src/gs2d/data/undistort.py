@@ -7,7 +7,7 @@ tangential ones (OpenCV and COLMAP write them the same way):
 perspective  s = (1 + n1 r^2 + n2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
              x' = x s + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y s + 2 p2 x y + p1 (r^2 + 2 y^2)
 fisheye      t = atan(r);  (x', y') = (x, y) t (1 + n1 t^2 + n2 t^4 + ...) / r, plus the tangential terms above of
-             (x, y) t / r (Metashape, OpenSfM's fisheye62)
+             (x, y) t / r (Metashape, OpenSfM's fisheye62), and those of a thin prism: s1 t^2, s2 t^2
 fov          (x', y') = (x, y) atan(2 r tan(w/2)) / (w r)
 
 A sensor whose axes are not at right angles (Metashape's b2) shears what the lens made: x' + skew y'.
@@ -36,6 +36,7 @@ _COLMAP_LENSES = {
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", "n1"),
     "RADIAL_FISHEYE": ("fisheye", "n1 n2"),
     "OPENCV_FISHEYE": ("fisheye", "n1 n2 n3 n4"),
+    "THIN_PRISM_FISHEYE": ("fisheye", "n1 n2 p1 p2 n3 n4 s1 s2"),
     "FOV": ("fov", "w"),
 }
 
@@ -56,6 +57,8 @@ class Lens:
         p1, p2 ("perspective" and "fisheye").
     skew : float
         Shear of the sensor, in units of fx.
+    prism : tuple of 2 floats
+        s1, s2 ("fisheye").
     """
 
     kind: str
@@ -63,6 +66,7 @@ class Lens:
     divisor: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
     skew: float = 0.0
+    prism: tuple[float, float] = (0.0, 0.0)
 
     @property
     def is_identity(self) -> bool:
@@ -77,13 +81,29 @@ class Lens:
         """Ideal points [..., 2] to the points that the sensor saw [..., 2] (plane z = 1)."""
         x, y = points[..., 0], points[..., 1]
         r2 = x * x + y * y
+        if self.kind == "fisheye":
+            return self.bend(points, np.arctan(np.maximum(np.sqrt(r2), 1e-12)))
         scale = self._radial_scale(np.sqrt(r2))
         p1, p2 = self.tangential
         u, v = x * scale, y * scale
-        if self.kind == "fisheye" and (p1 or p2):  # of the bent point
-            r = np.maximum(np.sqrt(r2), 1e-12)
-            x, y, r2 = x * np.arctan(r) / r, y * np.arctan(r) / r, np.arctan(r) ** 2
         u, v = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), v + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+        return np.stack([u + self.skew * v if self.skew else u, v], axis=-1)
+
+    def bend(self, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return where a fisheye shows rays at angles ``t`` [...], rad, from its axis: points as of :meth:`distort`.
+
+        ``directions`` [..., 2] point from the axis to the rays; their length does not matter. Unlike a point on the
+        plane z = 1 an angle may be 90 degrees and more.
+        """
+        x, y = directions[..., 0], directions[..., 1]
+        r = np.maximum(np.sqrt(x * x + y * y), 1e-12)
+        scale = np.asarray(t * _polynomial(self.radial, t * t) / r)
+        u, v = x * scale, y * scale
+        p1, p2 = self.tangential
+        if p1 or p2 or any(self.prism):  # of the bent point
+            x, y, r2 = x * t / r, y * t / r, t**2
+            u = u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + self.prism[0] * r2
+            v = v + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + self.prism[1] * r2
         return np.stack([u + self.skew * v if self.skew else u, v], axis=-1)
 
     def _radial_scale(self, r: np.ndarray) -> np.ndarray:
@@ -221,6 +241,7 @@ def colmap_intrinsics(camera: str, model: str, width: int, height: int, params: 
             radial=tuple(value[w] for w in sorted(words) if w[0] == "n"),
             divisor=tuple(value[w] for w in sorted(words) if w[0] == "d"),
             tangential=(value.get("p1", 0.0), value.get("p2", 0.0)),
+            prism=(value.get("s1", 0.0), value.get("s2", 0.0)),
         )
     return Intrinsics(width, height, fx, fy, cx, cy, None if lens is None or lens.is_identity else lens)
 

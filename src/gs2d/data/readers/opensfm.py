@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage
+from gs2d.data.faces import panorama
 from gs2d.data.readers.common import ImageFiles, entries, real, reals, required, whole
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
@@ -33,6 +34,7 @@ _MODELS: Mapping[str, tuple[str, int, bool, bool]] = {
     "fisheye_opencv": ("fisheye", 4, True, False),
     "fisheye62": ("fisheye", 6, True, True),
 }
+_PANORAMAS = ("spherical", "equirectangular")
 FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 
 
@@ -111,6 +113,10 @@ def _pose(shot: Mapping[str, Any], where: str) -> np.ndarray:
 def _intrinsics(camera: Mapping[str, Any], image: Path, where: str) -> Intrinsics:
     """Pixels of normalised numbers, whose unit is the larger side."""
     model = str(camera.get("projection_type", "perspective"))
+    if model in _PANORAMAS:
+        size = [whole(camera.get(side, 0), f"{where}: {side}") for side in ("width", "height")]
+        width, height = size if all(size) else image_size(image)
+        return panorama(width, height, where)
     if model not in _MODELS:
         raise DataError(
             f"{where} has the projection {model}, which no pinhole image holds (known: {', '.join(sorted(_MODELS))}); "

@@ -13,6 +13,7 @@ import numpy as np
 from gs2d.core.images import image_size
 from gs2d.core.json_files import read_json
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
+from gs2d.data.faces import panorama
 from gs2d.data.priors import MapFiles
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, Lens
@@ -23,6 +24,7 @@ _LARGEST = 1e300  # JSON has whole numbers of any size
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _FISHEYE = {"OPENCV_FISHEYE", "FISHEYE"}
+_PANORAMA = "EQUIRECTANGULAR"
 
 
 def read_blender(root: Path) -> Capture:
@@ -172,6 +174,8 @@ def frame_intrinsics(entry: Mapping[str, Any], image: Path, where: str) -> Intri
 
     w, h = number("w"), number("h")
     width, height = (round(w), round(h)) if w and h else image_size(image)
+    if _model(entry) == _PANORAMA:
+        return panorama(width, height, where)
     fl_x, fl_y = number("fl_x"), number("fl_y")
     fx = fl_x if fl_x is not None else _focal(number("camera_angle_x"), width, f"{where}: camera_angle_x")
     fy = fl_y
@@ -203,12 +207,16 @@ def _focal(angle: float | None, size: int, where: str) -> float | None:
     return 0.5 * size / math.tan(0.5 * angle)
 
 
+def _model(entry: Mapping[str, Any]) -> str:
+    return str(entry.get("camera_model", "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV")).upper()
+
+
 def _lens(entry: Mapping[str, Any], value: Mapping[str, float], where: str) -> Lens | None:
-    model = str(entry.get("camera_model", "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV")).upper()
+    model = _model(entry)
     if model not in _PERSPECTIVE | _FISHEYE:
         raise DataError(
             f"{where}: camera_model {model} cannot be undistorted here "
-            f"(known: {', '.join(sorted(_PERSPECTIVE | _FISHEYE))}); undistort the images first"
+            f"(known: {', '.join(sorted(_PERSPECTIVE | _FISHEYE | {_PANORAMA}))}); undistort the images first"
         )
     if "PINHOLE" in model and any(value.values()):
         bent = {key: number for key, number in value.items() if number}
