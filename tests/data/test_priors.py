@@ -95,6 +95,12 @@ def test_depths_of_8_16_and_32_bits_are_read_as_they_are(tmp_path: Path, kind: t
         assert (read_depth(tmp_path / f"d{suffix}") == values).all()
 
 
+def test_three_channels_that_are_alike_are_one(tmp_path: Path) -> None:
+    values = np.array([[1, 2, 3], [4, 5, 250]], np.uint8)
+    Image.fromarray(np.repeat(values[..., None], 3, axis=2)).save(tmp_path / "d.png")
+    assert (read_depth(tmp_path / "d.png") == values).all()
+
+
 def test_an_array_may_have_an_axis_of_one_channel(tmp_path: Path) -> None:
     for k, shape in enumerate(((1, 2, 3), (2, 3, 1))):
         np.save(tmp_path / f"{k}.npy", np.arange(1, 7).reshape(shape))
@@ -102,7 +108,7 @@ def test_an_array_may_have_an_axis_of_one_channel(tmp_path: Path) -> None:
 
 
 def broken_files(folder: Path) -> dict[str, Path]:
-    Image.fromarray(np.zeros((4, 5, 3), np.uint8) + 9).save(folder / "colour.png")
+    Image.fromarray(np.full((4, 5, 3), (9, 9, 8), np.uint8)).save(folder / "colour.png")
     Image.fromarray(np.zeros((4, 5), np.uint16)).save(folder / "zero.png")
     np.save(folder / "nan.npy", np.full((4, 5), np.nan))
     np.save(folder / "words.npy", np.array([["a"]]))

@@ -201,6 +201,8 @@ def find_map(folder: Path, name: str, suffixes: tuple[str, ...]) -> Path | None:
 def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
     """Return the numbers of a depth map [h, w]: a grey image of 8, 16 or 32 bits, or an array of numpy.
 
+    An image of three channels that are alike is grey, too: networks write such.
+
     Raises
     ------
     DataError
@@ -216,6 +218,8 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
     else:
         size = image_size(path)  # a file that is no image is named here
         values, mode = read_grey(path)
+        if mode == "RGB" and values.ndim == 3 and (values == values[..., :1]).all():
+            values = values[..., 0]
         if values.ndim != 2 or values.shape != (size[1], size[0]) or mode == "P":
             raise DataError(
                 f"depth map {path} must be a grey image of 16 bits (or 8, or floats), or .npy, got one of mode {mode}; "
