@@ -209,7 +209,7 @@ def _drop(*path: Any) -> Any:
         (lambda m: m["frames"][1].update(transform_matrix=(2 * np.eye(4)).tolist()), "remove scale or mirroring"),
         (lambda m: m["frames"][1].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "remove scale or mirror"),
         (lambda m: m["frames"].__setitem__(1, 5), "frame 1 must be an object, got int"),
-        (lambda m: m.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR cannot be undistorted"),
+        (lambda m: m.update(camera_model="OMNIDIRECTIONALSTEREO_L"), "OMNIDIRECTIONALSTEREO_L cannot be undistorted"),
         (lambda m: m.update(camera_model="PINHOLE", k1=0.1), "must have no distortion, got {'k1': 0.1}"),
         (lambda m: m.update(train_filenames="images/f_00.png"), "train_filenames must be a list"),
         (lambda m: [f.update(file_path="gone") for f in m["frames"]], r"at least one view, got none \(9 skipped"),
