@@ -39,7 +39,7 @@ def connected(backend: str) -> Iterator[OneProcess]:
     Parameters
     ----------
     backend : str
-        As it was asked for: each process of a machine takes a GPU of its own where one may be used.
+        As it was asked for: each process of a machine takes a GPU of its own, unless it is of the CPU.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def _connect(place: Place, backend: str) -> ManyProcesses:
     """Join the group of all processes."""
     if not torch.distributed.is_available():
         raise BackendError("several processes need torch.distributed, which this torch is built without; use one")
-    on_gpu = backend in ("auto", "cuda") and torch.cuda.is_available()
+    on_gpu = backend not in ("cpu", "reference") and torch.cuda.is_available()
     if on_gpu:
         _take_gpu(place)
     both = on_gpu and torch.distributed.is_nccl_available()
