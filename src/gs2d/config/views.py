@@ -23,9 +23,10 @@ class Exposure:
         Weight of the summed squares of what a transform differs from the identity by.
     beta1, beta2, eps : float
         Adam's.
-    initial : "identity" or "points"
+    initial : "identity", "points" or "given"
         What transforms begin as: all the same, or the gains by which the colours of sparse points differ between
-        photographs (``training/point_gains.py``), so that no splat ever explains an exposure.
+        photographs (``training/point_gains.py``), so that no splat ever explains an exposure. "given": the trainer
+        is handed transforms that another training found, and they stay as they are.
     """
 
     rate: float = 0.05
@@ -123,7 +124,7 @@ def check_exposure(where: str, exposure: Exposure) -> None:
     require(max(exposure.beta1, exposure.beta2) < 1, f"{where}.beta1 and {where}.beta2 must be below 1")
     integer(f"{where}.decay_steps", exposure.decay_steps, low=1)
     integer(f"{where}.start", exposure.start, low=0)
-    one_of(f"{where}.initial", exposure.initial, ("identity", "points"))
+    one_of(f"{where}.initial", exposure.initial, ("identity", "points", "given"))
 
 
 def check_intrinsics(where: str, intrinsics: IntrinsicsRefinement) -> None:

@@ -104,6 +104,11 @@ class Splats:
             device, dtype = None, device
         return Splats(**{name: tensor.to(device=device, dtype=dtype) for name, tensor in self.items()})
 
+    def followed_by(self, others: Splats) -> Splats:
+        """Return these splats and then others, of the same SH degree; gradients reach both."""
+        rest = dict(others.items())
+        return Splats(**{name: torch.cat([tensor, rest[name]]) for name, tensor in self.items()})
+
     def rows(self, index: Tensor) -> Splats:
         """Return the rows picked by a boolean mask or an index tensor, detached."""
         return Splats(**{name: tensor.detach()[index] for name, tensor in self.items()})

@@ -47,7 +47,8 @@ def choose_objective(
 ) -> Objective:
     """Return cached views where the stage allows them and ``limit_bytes`` hold enough of them, else ``whole``."""
     backend, views = whole.backend, len(whole.scene.train)
-    if limit_bytes > 0 and is_cacheable(whole.recipe, stage, backend=backend, views=views, processes=processes):
+    fits = is_cacheable(whole.recipe, stage, backend=backend, views=views, processes=processes)
+    if limit_bytes > 0 and whole.frozen is None and fits:
         cached = CachedViews(whole, state, stage, limit_bytes, least=MIN_FRACTION * views)
         return cached if cached.views else whole
     return whole

@@ -38,12 +38,22 @@ class Exposures:
         Running means of the gradient and of its square.
     steps : list of int
         Updates of each view.
+    settled : bool
+        The transforms were found elsewhere: I + theta, of which nothing is taken off and nothing is learned.
     """
 
     offsets: Tensor
     mean: Tensor
     square: Tensor
     steps: list[int]
+    settled: bool = False
+
+    @classmethod
+    def given(cls, transforms: Tensor, like: Tensor) -> Exposures:
+        """Return transforms [V, 3, 4] that stay as they are."""
+        found = cls.start(len(transforms), like)
+        known = transforms.to(like)
+        return replace(found, offsets=(known - identity(known)).detach(), settled=True)
 
     @classmethod
     def start(cls, views: int, like: Tensor) -> Exposures:
@@ -61,11 +71,14 @@ class Exposures:
 
     def transforms(self) -> Tensor:
         """All transforms [V, 3, 4]."""
-        return identity(self.offsets) + (self.offsets - self.offsets.mean(dim=0))
+        return identity(self.offsets) + (self.offsets - self._mean())
+
+    def _mean(self) -> Tensor | float:
+        return 0.0 if self.settled else self.offsets.mean(dim=0)
 
     def transform(self, index: int) -> Tensor:
         """Return that of view ``index`` [3, 4], a tensor of its own."""
-        return identity(self.offsets) + (self.offsets[index] - self.offsets.mean(dim=0))
+        return identity(self.offsets) + (self.offsets[index] - self._mean())
 
     def move_to(self, device: torch.device | str) -> None:
         """Move all tensors to a device."""
@@ -75,14 +88,15 @@ class Exposures:
         """Return a deep copy in the host's memory."""
         tensors = {"offsets": self.offsets, "mean": self.mean, "square": self.square}
         return {name: tensor.detach().to("cpu", copy=True) for name, tensor in tensors.items()} | {
-            "steps": list(self.steps)
+            "steps": list(self.steps),
+            **({"settled": True} if self.settled else {}),
         }
 
     @classmethod
     def from_state_dict(cls, data: Mapping[str, Any]) -> Exposures:
         """Return what :meth:`state_dict` described (KeyError, TypeError, AttributeError: something else)."""
         offsets, mean, square = (data[name].clone() for name in ("offsets", "mean", "square"))
-        return cls(offsets, mean, square, [int(count) for count in data["steps"]])
+        return cls(offsets, mean, square, [int(count) for count in data["steps"]], bool(data.get("settled", False)))
 
     def check(self) -> None:
         """Raise ShapeError unless everything has the same V."""
@@ -133,7 +147,7 @@ def exposure_step(
         Writes the new values. Where it does not, the count has gone on all the same (:func:`uncount`).
     """
     settings, rate = recipe.exposure, _rate(recipe, stage, iteration)
-    if settings is None or rate == 0:
+    if settings is None or rate == 0 or exposures.settled:
         return
     exposures.steps[index] += 1
     count, beta1, beta2 = exposures.steps[index], settings.beta1, settings.beta2
@@ -148,7 +162,7 @@ def exposure_step(
 
 def uncount(exposures: Exposures, index: int, recipe: Recipe, stage: int, iteration: int) -> None:
     """Take back the count of an update that was cancelled on the device."""
-    exposures.steps[index] -= int(_rate(recipe, stage, iteration) > 0)
+    exposures.steps[index] -= int(_rate(recipe, stage, iteration) > 0 and not exposures.settled)
 
 
 def apply_exposure(

@@ -91,11 +91,14 @@ class ViewResidual:
     camera : Camera
         That it was seen by, and ``settings`` that it was rendered with.
     settings : RasterSettings
+    frozen : Splats or None
+        Splats that were rendered too, and are not in training.
     """
 
     error: Tensor
     camera: Camera
     settings: RasterSettings
+    frozen: Splats | None = None
 
 
 class Objective(Interface):
@@ -113,14 +116,21 @@ class Objective(Interface):
 
 
 class FullRender:
-    """Every splat is rendered each time."""
+    """Every splat is rendered each time, and with them those of ``frozen``, which stay as they are."""
 
     rows: Tensor | None = None
 
     def __init__(
-        self, scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, targets: TargetSource
+        self,
+        scene: Scene,
+        recipe: Recipe,
+        protocol: Protocol,
+        backend: Backend,
+        targets: TargetSource,
+        frozen: Splats | None = None,
     ) -> None:
         self.scene, self.recipe, self.protocol, self.backend = scene, recipe, protocol, backend
+        self.frozen = frozen
         self.targets = targets
         self._background = torch.tensor(protocol.background, device=backend.device)
         if recipe.multiview is not None:
@@ -142,6 +152,10 @@ class FullRender:
         asked = (term.depth or self.protocol.depth for term in stage.losses if term.is_active(iteration))
         return settings.for_depths(*asked)
 
+    def drawn(self, splats: Splats) -> Splats:
+        """Return the splats, and in rows behind them those that are frozen: what photographs show."""
+        return splats if self.frozen is None else splats.followed_by(self.frozen)
+
     def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
         """Return the camera of training view ``index`` where it is now; with ``learns`` it gets a gradient."""
         camera = self.scene.train[index].camera
@@ -159,23 +173,34 @@ class FullRender:
         camera = self.camera(state, index, learns=learns)
         settings = self.settings(stage, iteration)
         rows = learning_rows(state, stage) if probe is None else None  # the signal is of every splat
-        output = rasterize(leaves, camera, settings, backend=self.backend, screen_probe=probe, gradient_rows=rows)
+        drawn, of_all, rows = self.drawn(leaves), probe, self._with_frozen(rows, len(splats), camera)
+        if self.frozen is not None and probe is not None:
+            of_all = torch.cat([probe, probe.new_zeros(len(self.frozen), probe.shape[1])])
+        output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)
         neighbour = self._neighbour_of(state, stage, iteration, index)
         given = (index, camera, output, dict(leaves.items()), neighbour)
         losses, gradients = self.differentiate(state, stage, iteration, *given)
-        return StepResult(losses, gradients, None if probe is None else _gradient(probe), output.radii)
+        return StepResult(losses, gradients, None if probe is None else _gradient(probe), output.radii[: len(splats)])
+
+    def _with_frozen(self, rows: Tensor | None, count: int, camera: Camera) -> Tensor | None:
+        """Return the rows [N + frozen] that have gradients, of those [N] among ``count`` splats in training."""
+        if self.frozen is None or camera.pose is not None:  # a camera's gradient is a sum over all splats
+            return rows
+        own = self.frozen.means.new_ones(count, dtype=torch.bool) if rows is None else rows
+        return torch.cat([own, own.new_zeros(len(self.frozen))])
 
     @torch.no_grad()
     def residual(self, state: TrainState, stage: Stage, iteration: int, index: int) -> ViewResidual:
         """Render view ``index`` as it is trained on at an iteration (from 1), beside its photograph."""
         camera, target = self.camera(state, index), self.targets[index]
         settings = replace(self.settings(stage, iteration), with_distortion=False)
-        color = rasterize(state.splats, camera, settings, backend=self.backend).color
+        color = rasterize(self.drawn(state.splats), camera, settings, backend=self.backend).color
         if state.exposures is not None:
             clipped, transform = clipped_pixels(target), state.exposures.transform(index)
             color = expose(color, transform, target.silhouette, self._background, clipped=clipped)
         error = (color - target.image).abs().mean(dim=2)
-        return ViewResidual(error if target.mask is None else error * target.mask, camera, settings)
+        error = error if target.mask is None else error * target.mask
+        return ViewResidual(error, camera, settings, self.frozen)
 
     @torch.no_grad()
     def _neighbour_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Neighbour | None:
@@ -191,7 +216,7 @@ class FullRender:
         kind = kind or self.protocol.depth
         bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False).for_depths(kind)
         small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
-        depth = rasterize(state.splats, small, bare, backend=self.backend).depth(kind)
+        depth = rasterize(self.drawn(state.splats), small, bare, backend=self.backend).depth(kind)
         here, there = (self._images.of(i, self.targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 
@@ -208,7 +233,7 @@ class FullRender:
     ) -> dict[str, LossReport]:
         """Return what the losses say of training view ``index`` as it is now."""
         camera, target = self.camera(state, index), self.targets[index]
-        output = rasterize(state.splats, camera, settings, backend=backend)
+        output = rasterize(self.drawn(state.splats), camera, settings, backend=backend)
         view = LossView(target.image, target.mask, camera, depth_kind=self.protocol.depth, index=index)
         view.silhouette = target.silhouette
         said = {name: loss.report(output, view) for name, loss in self.reporters.items()}  # type: ignore[attr-defined]

@@ -9,6 +9,7 @@ from torch import Tensor
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Zoom
 from gs2d.data.scene import Scene
+from gs2d.errors import RecipeError
 from gs2d.kernels.reference import finite
 from gs2d.render.backends import Backend
 from gs2d.training.exposure import Exposures, check_views, exposure_step, uncount
@@ -18,9 +19,23 @@ from gs2d.training.state import TrainState
 from gs2d.training.zooms import Zooms, check_zooms, zoom_rate, zoom_step
 
 
-def start(state: TrainState, recipe: Recipe, scene: Scene) -> TrainState:
-    """Return the state with what the recipe learns of views, at its beginning."""
-    if recipe.exposure is not None:
+def start(state: TrainState, recipe: Recipe, scene: Scene, exposures: Tensor | None = None) -> TrainState:
+    """Return the state with what the recipe learns of views, at its beginning.
+
+    Raises
+    ------
+    RecipeError
+        The recipe takes exposures [V, 3, 4] that are given, and none are, or of another number of views.
+    """
+    if recipe.exposure is not None and recipe.exposure.initial == "given":
+        count = None if exposures is None else len(exposures)
+        if exposures is None or count != len(scene.train):
+            raise RecipeError(
+                f"exposure.initial=given needs a transform of each of {len(scene.train)} training views, got "
+                f"{count or 'none'}; `gs2d blocks` gives them, elsewhere take points or identity"
+            )
+        state.exposures = Exposures.given(exposures, state.splats.means)
+    elif recipe.exposure is not None:
         state.exposures = Exposures.start(len(scene.train), state.splats.means)
         known = point_gains(scene) if recipe.exposure.initial == "points" else None
         if known is not None:

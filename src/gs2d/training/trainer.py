@@ -79,6 +79,11 @@ class Trainer:
         To go on from; without it training starts anew from ``recipe.seed``.
     init : Splats, optional
         To start anew from, instead of points: copied, with the recipe's SH degree.
+    frozen : Splats, optional
+        Of the recipe's SH degree: rendered with those in training, and never changed, counted, densified or returned.
+        They are what lies around a part of a scene that is trained by itself.
+    exposures : Tensor [V, 3, 4], optional
+        Transforms of the training views, for a recipe whose exposures are given.
     progress_every : int
         Iterations between Progress events (the last of a stage always sends one).
     target_bytes : int, optional
@@ -110,6 +115,8 @@ class Trainer:
         between: Callable[[], None] = lambda: None,
         state: TrainState | None = None,
         init: Splats | None = None,
+        frozen: Splats | None = None,
+        exposures: Tensor | None = None,
         progress_every: int = 10,
         target_bytes: int | None = None,
         stage2_cache_bytes: int = 1 << 30,
@@ -132,8 +139,12 @@ class Trainer:
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes)
         if state is not None:
             check_resumable(state, self.recipe, len(scene.train))
-        self.state = processes.share(lambda: self._new_state(dtype, init) if state is None else state)
+        self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
         self.state.trained_by(processes.size)
+        self._frozen = None if frozen is None or len(frozen) == 0 else frozen.detach().to(self.backend.device)
+        if self._frozen is not None and self._frozen.sh_degree != self.recipe.sh_degree:
+            degrees = f"{self._frozen.sh_degree}, the recipe trains {self.recipe.sh_degree}"
+            raise RecipeError(f"frozen splats must have the recipe's SH degree, got {degrees}; set sh_degree")
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
@@ -152,6 +163,11 @@ class Trainer:
     def splats(self) -> Splats:
         """The splats as they are now."""
         return self.state.splats
+
+    @property
+    def drawn(self) -> Splats:
+        """The splats as they are now, and in rows behind them those that are frozen: what photographs show."""
+        return self._whole.drawn(self.state.splats)
 
     @property
     def settings(self) -> RasterSettings:
@@ -362,7 +378,7 @@ class Trainer:
         self._downscale, self._objective, self._whole_steps = downscale, None, None
         scene = self.scene.downscaled(downscale)
         self._targets: TargetSource = self._make_targets(scene, self._target_bytes)
-        self._whole = FullRender(scene, self.recipe, self.protocol, self._learner, self._targets)
+        self._whole = FullRender(scene, self.recipe, self.protocol, self._learner, self._targets, self._frozen)
 
     def _make_targets(self, scene: Scene, limit_bytes: int | None) -> TargetSource:
         """Return the photographs, where the splats are."""
@@ -394,12 +410,12 @@ class Trainer:
             limit_bytes=limit_bytes if limit_bytes is not None else 0 if scene.ahead else TARGET_BYTES,
         )
 
-    def _new_state(self, dtype: torch.dtype, init: Splats | None) -> TrainState:
+    def _new_state(self, dtype: torch.dtype, init: Splats | None, exposures: Tensor | None) -> TrainState:
         generator = torch.Generator().manual_seed(self.recipe.seed)
         if init is not None:
             splats = splats_as_start(init, sh_degree=self.recipe.sh_degree, dtype=dtype)
             self._pending.append(events.Initialised(len(splats), "splats", 0))
-            return per_image.start(TrainState(splats, generator), self.recipe, self.scene)
+            return per_image.start(TrainState(splats, generator), self.recipe, self.scene, exposures)
         start = with_known_points(self._robust.scene, self.recipe)
         initial = initial_splats(
             start,
@@ -413,7 +429,8 @@ class Trainer:
         source = "sweep" if source == "points" and self._robust.starts_densely else source
         lacks = self._robust.lacks
         self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped, lacks))
-        return per_image.start(TrainState(self._robust.fitted(initial), generator), self.recipe, self.scene)
+        state = TrainState(self._robust.fitted(initial), generator)
+        return per_image.start(state, self.recipe, self.scene, exposures)
 
     def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
         """Run an entry action."""
@@ -428,7 +445,7 @@ class Trainer:
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """Yield the inner sum of E_i [N] for each training view that this process looks at."""
         for index in self.processes.part(range(len(self.scene.train))):
-            target, splats, settings = self._targets[index], self.state.splats, self.settings
+            target, splats, settings = self._targets[index], self.drawn, self.settings
             camera = self._whole.camera(self.state, index)
             if self.state.exposures is not None:
                 transform = self.state.exposures.transform(index)
@@ -441,7 +458,7 @@ class Trainer:
                 backend=self.backend,
                 mask=target.mask,
                 occlusion=occlusion,
-            )
+            )[: len(self.state.splats)]
 
     def _finish(self, stage: Stage) -> None:
         """Point the state at the next stage and say that this one is done."""

@@ -66,11 +66,13 @@ def blended_sums(splats: Splats, found: ViewResidual, backend: Backend) -> tuple
 
     They are derivatives, by the splat's red and green, of a picture's red times the error plus its green.
     """
-    parts = {name: tensor.detach() for name, tensor in splats.items()}
+    drawn = splats if found.frozen is None else splats.followed_by(found.frozen)
+    parts = {name: tensor.detach() for name, tensor in drawn.items()}
     grey = torch.zeros_like(parts["sh0"]).requires_grad_()  # no channel is clipped, none depends on the direction
     bare = replace(found.settings, sh_degree=0, with_distortion=False)
     with torch.enable_grad():
         color = rasterize(Splats(**{**parts, "sh0": grey}), found.camera, bare, backend=backend).color
         wanted = (color[..., 0] * found.error + color[..., 1]).sum()
         (sums,) = torch.autograd.grad(wanted, grey)
-    return sums[:, 0, 0] / C0, sums[:, 0, 1] / C0
+    own = sums[: len(splats)]
+    return own[:, 0, 0] / C0, own[:, 0, 1] / C0

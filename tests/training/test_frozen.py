@@ -1,0 +1,153 @@
+"""Splats that are rendered with those in training and never change, and exposures that are given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Exposure, GradDensify, Recipe
+from gs2d.core.splats import Splats
+from gs2d.errors import RecipeError
+from gs2d.training.densify.by_error import blended_sums
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from train_toys import backends, compared, make_scene, random_splats, short
+
+SCENE = make_scene()
+
+
+def trainer_of(
+    recipe: Recipe, own: Splats, frozen: Splats | None, backend: str, state: TrainState | None = None, **more: object
+) -> Trainer:
+    init = own if state is None else None
+    return Trainer(SCENE, recipe, GENERIC, backend=backend, init=init, frozen=frozen, state=state, **more)  # type: ignore[arg-type]
+
+
+def same(one: Splats, other: Splats) -> bool:
+    return all(torch.equal(a, b) for (_, a), (_, b) in zip(one.items(), other.items(), strict=True))
+
+
+@pytest.mark.parametrize("backend", backends())
+def test_what_is_in_training_learns_as_if_all_did(backend: str) -> None:
+    whole = random_splats(40)
+    own, frozen = whole.rows(torch.arange(25)), whole.rows(torch.arange(25, 40))
+    apart, together = (
+        trainer_of(compared(), splats, others, backend) for splats, others in ((own, frozen), (whole, None))
+    )
+    for trainer in (apart, together):
+        trainer.enter(0)
+        trainer.state.step = 7  # the losses of two views have begun
+    stage, found = compared().stages[0], []
+    for trainer in (apart, together):
+        probe = torch.zeros(len(trainer.splats), 2, requires_grad=True)
+        found.append(trainer._whole.evaluate(trainer.state, stage, 8, 1, probe))
+    part, all_of_it = found
+    assert part.losses == all_of_it.losses
+    assert part.gradients.keys() == all_of_it.gradients.keys()
+    for name, gradient in part.gradients.items():
+        assert torch.equal(gradient, all_of_it.gradients[name][:25]), name
+        assert bool(gradient.any()), name
+    assert part.signal is not None
+    assert all_of_it.signal is not None
+    assert torch.equal(part.signal, all_of_it.signal[:25])
+    assert part.radii is not None
+    assert all_of_it.radii is not None
+    assert torch.equal(part.radii, all_of_it.radii[:25])
+
+
+@pytest.mark.parametrize("backend", backends())
+def test_frozen_splats_stay_through_densification_resets_ranking_and_clones(backend: str) -> None:
+    whole = random_splats(60)
+    own, frozen = whole.rows(torch.arange(45)), whole.rows(torch.arange(45, 60))
+    before = frozen.clone()
+    trainer = trainer_of(short(), own, frozen, backend)
+    counts = []
+    trainer._on_event = lambda event: counts.append(getattr(event, "splats", None))
+    splats = trainer.run()
+    assert same(frozen, before)
+    assert len(trainer.drawn) == len(splats) + 15
+    assert same(trainer.drawn.rows(torch.arange(len(splats), len(splats) + 15)), before)
+    assert len(splats) != 45  # densified and cloned
+    assert not same(splats, trainer_of(short(), own, None, backend).run())  # what is around matters
+
+
+def test_a_run_with_frozen_splats_goes_on_from_its_state_to_the_same_bytes() -> None:
+    whole = random_splats(60)
+    own, frozen = whole.rows(torch.arange(45)), whole.rows(torch.arange(45, 60))
+    saved: list[dict[str, object]] = []
+    straight = trainer_of(short(), own, frozen, backends()[-1], progress_every=1)
+    straight._on_event = lambda event: saved.append(straight.state.state_dict()) if straight.state.step == 7 else None
+    end = straight.run()
+    state = TrainState.from_state_dict(saved[-1])
+    assert (state.stage, state.step) == (0, 7)
+    assert same(trainer_of(short(), own, frozen, backends()[-1], state).run(), end)
+
+
+def test_who_is_drawn_where_a_picture_is_wrong_counts_what_hides_it() -> None:
+    whole = random_splats(60)
+    own, frozen = whole.rows(torch.arange(45)), whole.rows(torch.arange(45, 60))
+    apart, together = (
+        trainer_of(short(), splats, others, backends()[-1]) for splats, others in ((own, frozen), (whole, None))
+    )
+    sums = []
+    for trainer in (apart, together):
+        trainer.enter(0)
+        found = trainer._whole.residual(trainer.state, short().stages[0], 1, 0)
+        sums.append(blended_sums(trainer.splats, found, trainer.backend))
+    for part, all_of_it in zip(*sums, strict=True):
+        assert torch.equal(part, all_of_it[:45])
+
+
+def test_densification_keeps_its_budget_of_what_is_in_training() -> None:
+    recipe = short()
+    first = recipe.stages[0]
+    assert isinstance(first.densify, GradDensify)
+    tight = replace(first, densify=replace(first.densify, max_splats=50, grad_threshold=1e-9))
+    own, frozen = random_splats(45), random_splats(30, seed=1)
+    splats = trainer_of(replace(recipe, stages=(tight,)), own, frozen, backends()[-1]).run()
+    assert 45 < len(splats) <= 50
+
+
+def test_frozen_splats_must_have_the_degree_of_the_recipe() -> None:
+    with pytest.raises(RecipeError, match="frozen splats must have the recipe's SH degree, got 1, the recipe trains 3"):
+        trainer_of(short(), random_splats(20), random_splats(5, degree=1), backends()[-1])
+
+
+# -- exposures ---------------------------------------------------------------------------------------------------------
+GIVEN = replace(short(), exposure=Exposure(initial="given", start=0, decay_steps=10))
+
+
+def transforms() -> torch.Tensor:
+    """Six, whose mean is not the identity."""
+    gains = torch.linspace(0.5, 0.9, 6)
+    return torch.cat([torch.eye(3) * gains[:, None, None], torch.zeros(6, 3, 1)], dim=2)
+
+
+def test_given_exposures_are_taken_as_they_are_and_stay() -> None:
+    trainer = trainer_of(GIVEN, random_splats(40), None, backends()[-1], exposures=transforms())
+    assert trainer.state.exposures is not None
+    assert torch.allclose(trainer.state.exposures.transforms(), transforms(), atol=1e-7)
+    before = trainer.state.exposures.transforms().clone()
+    trainer.run()
+    assert torch.equal(trainer.state.exposures.transforms(), before)
+    again = TrainState.from_state_dict(trainer.state.state_dict()).exposures
+    assert again is not None
+    assert torch.equal(again.transforms(), before)
+    assert torch.equal(again.transform(2), before[2])
+
+
+def test_given_exposures_are_seen_in_training() -> None:
+    found = [
+        trainer_of(GIVEN, random_splats(40), None, backends()[-1], exposures=given).run()
+        for given in (transforms(), 2 * transforms())
+    ]
+    assert not same(*found)
+
+
+@pytest.mark.parametrize("given", [None, torch.zeros(2, 3, 4)])
+def test_exposures_that_are_to_be_given_must_be(given: torch.Tensor | None) -> None:
+    with pytest.raises(RecipeError, match="a transform of each of 6 training views, got (none|2)"):
+        trainer_of(GIVEN, random_splats(40), None, backends()[-1], exposures=given)
