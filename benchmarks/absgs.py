@@ -28,7 +28,8 @@ from gs2d.core.files import atomic_write
 from gs2d.core.json_files import write_json
 from gs2d.errors import Gs2dError
 from gs2d.experiments.aggregate import Cell, read_cell
-from gs2d.experiments.execute import Job, execute
+from gs2d.experiments.execute import execute
+from gs2d.experiments.jobs import Job
 from gs2d.experiments.options import PaperOptions
 from gs2d.experiments.plan import make_job, trained_recipe
 from gs2d.experiments.scenes import FoundScene, find_scenes

@@ -18,7 +18,9 @@ import pytest
 from gs2d.cli import run
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.experiments import execute as execute_module
-from gs2d.experiments.execute import Job, _startable, execute, failures, stage_keys
+from gs2d.experiments import jobs as jobs_module
+from gs2d.experiments.execute import _startable, execute, failures
+from gs2d.experiments.jobs import Job, stage_keys
 from gs2d.pipeline.events import Notice, OnEvent
 from sweep_jobs import fail_or_die, make_jobs
 from tiny import write_capture
@@ -39,7 +41,7 @@ def test_a_job_that_fails_does_not_stop_the_rest_and_is_tried_again_by_the_next_
         done.append(job.name)
         return {}
 
-    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
     jobs = make_jobs(tmp_path, {"a": ("1",), "b": ("2",), "c": ("3",)})
     execute(jobs, tmp_path)
     assert done == ["a", "c"]
@@ -51,7 +53,7 @@ def test_a_job_that_fails_does_not_stop_the_rest_and_is_tried_again_by_the_next_
 
 
 def test_a_fault_of_ours_is_written_down_with_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(execute_module, "train_and_evaluate", lambda *_: 1 / 0)
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", lambda *_: 1 / 0)
     (job,) = make_jobs(tmp_path, {"a": ()})
     execute((job,), tmp_path)
     assert job.outcome()["reason"] == "ZeroDivisionError: division by zero"
@@ -72,7 +74,7 @@ def test_a_finished_job_is_scored_again_when_more_is_wanted_and_done_again_when_
     def run_that_wants(*wanted: str) -> None:
         execute([replace(job, wanted=wanted) for job in make_jobs(tmp_path, {"a": ("1",)})], tmp_path)
 
-    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
     run_that_wants("surface: x")
     run_that_wants("surface: x")
     run_that_wants()  # less is wanted: what is there stays
@@ -93,7 +95,7 @@ def test_a_job_that_was_trained_and_could_not_be_scored_says_so(
             (job.train.out / "splats.ply").touch()
         raise DataError("the log does not fit")
 
-    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
     jobs = make_jobs(tmp_path, {"trained": ("1",), "not": ("2",)})
     execute(jobs, tmp_path)
     assert [job.outcome()["trained"] for job in jobs] == [True, False]
@@ -105,6 +107,7 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from gs2d.experiments import execute as module
+from gs2d.experiments import jobs
 sys.path.insert(0, sys.argv[2])
 from sweep_jobs import fail_or_die, make_jobs
 def train(job, on_event):
@@ -112,7 +115,7 @@ def train(job, on_event):
         print("at b", flush=True)
         time.sleep(60)
     return {}
-module.train_and_evaluate = train
+jobs.train_and_evaluate = train
 module.execute(make_jobs(Path(sys.argv[1]), {"a": ("s",), "b": ("s", "t"), "c": ("s", "t")}), Path(sys.argv[1]))
 """
 
@@ -121,7 +124,7 @@ def test_a_folder_that_another_command_works_in_is_refused_and_taken_over_when_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(execute_module, "train_and_evaluate", lambda job, _on_event: done.append(job.name) or {})
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", lambda job, _on_event: done.append(job.name) or {})
     jobs = make_jobs(tmp_path, {"a": ("s",), "b": ("s", "t"), "c": ("s", "t")})
     with subprocess.Popen(
         [sys.executable, "-c", KILLED, str(tmp_path), HELPERS], stdout=subprocess.PIPE, text=True
@@ -150,7 +153,7 @@ def test_the_refusal_is_one_line_of_the_command_and_changes_nothing(
         assert about["recipes"] == ["2dgs"]  # nothing of the command that was refused
         return {}
 
-    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
     run(["sweep", "2dgs", *words])
     assert codes == [2]
     first = capsys.readouterr().err.splitlines()[0]

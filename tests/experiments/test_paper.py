@@ -18,7 +18,7 @@ import pytest
 
 from gs2d.cli import run
 from gs2d.errors import DataError, RecipeError, RunError
-from gs2d.experiments import execute as execute_module
+from gs2d.experiments import jobs as jobs_module
 from gs2d.experiments.aggregate import FIGURES, Results, Row, check_claim, read_cell
 from gs2d.experiments.options import PaperOptions, parse_seeds
 from gs2d.experiments.paper import paper
@@ -330,11 +330,11 @@ def test_what_is_done_is_not_done_again(
     out, words = finished
     tried: list[str] = []
 
-    def train(job: execute_module.Job, _on_event: object) -> dict[str, str]:
+    def train(job: jobs_module.Job, _on_event: object) -> dict[str, str]:
         tried.append(job.name)
         raise DataError("still broken")
 
-    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
     before = (out / "runs" / "ball-2dgs-s0" / "splats.ply").stat().st_mtime_ns
     assert run([*words, "--json"]) == 2
     assert len(tried) == 4

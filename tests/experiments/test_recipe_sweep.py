@@ -16,7 +16,7 @@ from gs2d.cli.app import parse
 from gs2d.cli.commands import Sweep
 from gs2d.config.presets import get_recipe
 from gs2d.config.serialize import to_json
-from gs2d.experiments import execute as execute_module
+from gs2d.experiments import jobs as jobs_module
 from gs2d.experiments.aggregate import Results
 from gs2d.experiments.deviations import deviations_of
 from gs2d.experiments.options import SweepOptions
@@ -82,7 +82,7 @@ def test_the_rows_that_were_there_are_named_and_the_same_command_does_nothing_ag
     swept: tuple[Path, list[str], int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     draw_nothing(monkeypatch)
-    monkeypatch.setattr(execute_module, "train_and_evaluate", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", lambda *_: pytest.fail("trained again"))
     words = [word for word in swept[1] if word != "--quiet"]
     assert run([*words, "--json"]) == 0
     said = capsys.readouterr()
@@ -101,7 +101,7 @@ def test_the_table_of_what_is_there_can_be_written_while_a_command_trains(
         found.append(paper(replace(mine, train=False)).unfinished)
         return {}
 
-    monkeypatch.setattr(execute_module, "train_and_evaluate", train)
+    monkeypatch.setattr(jobs_module, "train_and_evaluate", train)
     assert paper(mine).unfinished == 0
     assert found == [1]
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from gs2d.experiments.options import PaperOptions, SweepOptions
+from gs2d.experiments.options import BlocksOptions, PaperOptions, SweepOptions
 from gs2d.pipeline.options import (
     BoxOption,
     DemoOptions,
@@ -64,6 +64,11 @@ class Plan(PlanOptions, Common):
 @dataclass(frozen=True, kw_only=True)
 class Train(TrainOptions, Common):
     """Posed photographs to splats, mesh and report."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks(BlocksOptions, Common):
+    """Train a capture in blocks where it is too large for one training; the merged scene is a run as any other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +249,7 @@ class Info(Common):
 
 
 COMMANDS: tuple[type[Common], ...] = (
-    Demo, Reconstruct, Poses, Plan, Train, Mesh, Render, View, Page, Evaluate, Export, Georeference, Orthophoto,
+    Demo, Reconstruct, Poses, Plan, Train, Blocks, Mesh, Render, View, Page, Evaluate, Export, Georeference, Orthophoto,
     Report, Recipes, Paper, Sweep, Doctor, Info, Completion
 )  # fmt: skip
 Command = (
@@ -253,6 +258,7 @@ Command = (
     | Annotated[Poses, subcommand("poses")]
     | Annotated[Plan, subcommand("plan")]
     | Annotated[Train, subcommand("train")]
+    | Annotated[Blocks, subcommand("blocks")]
     | Annotated[Mesh, subcommand("mesh")]
     | Annotated[Render, subcommand("render")]
     | Annotated[View, subcommand("view")]

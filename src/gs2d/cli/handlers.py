@@ -24,6 +24,7 @@ def execute(command: Common, console: Console) -> None:
         c.Poses: poses,
         c.Plan: plan,
         c.Train: train,
+        c.Blocks: blocks,
         c.Mesh: mesh,
         c.Render: render,
         c.View: view,
@@ -71,6 +72,15 @@ def train(command: c.Train, console: Console) -> None:
     console.close()
     if here().leads:  # another process of the same training tells
         show_run(run.path, run.metrics(), console)
+
+
+def blocks(command: c.Blocks, console: Console) -> None:
+    """``gs2d blocks``."""
+    from gs2d.experiments.blocks import blocks as run_blocks
+
+    run = run_blocks(command, console.on_event)
+    console.close()
+    show_run(run.path, run.metrics(), console)
 
 
 def demo(command: c.Demo, console: Console) -> None:

@@ -21,7 +21,7 @@ _FIRST_DAY = (
 )
 GROUPS: dict[str, tuple[str, ...]] = {
     "To begin with": ("doctor", "demo", "reconstruct", "view", "completion"),
-    "Step by step": ("poses", "plan", "train", "mesh"),
+    "Step by step": ("poses", "plan", "train", "blocks", "mesh"),
     "Look, keep and share": ("info", "render", "page", "export", "report"),
     "Real-world coordinates": ("georeference", "orthophoto"),
     "Measure and compare": ("evaluate", "recipes", "sweep", "paper"),
@@ -39,6 +39,7 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
     "train": (
         "scene", "out", "recipe", "schedule_scale", "downscale", "exposure", "viewer", "resume", "overwrite"
     ),
+    "blocks": ("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
     "mesh": ("run", "out", "texture", "voxel", "bbox", "unbounded"),
     "render": ("run", "split", "orbit", "flight", "video", "out"),
     "evaluate": ("run", "ground_truth", "thresholds", "lpips_weights"),

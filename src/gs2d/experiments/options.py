@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from gs2d.errors import RecipeError
-from gs2d.pipeline.options import Overrides, paths_of
+from gs2d.pipeline.options import Overrides, Resources, Training, paths_of
 
 SWEEP = "sweep"  # the name of a table of chosen recipes
 
@@ -107,3 +107,43 @@ def parse_seeds(words: Iterable[str | int]) -> tuple[int, ...]:
     numbers = tuple(int(part) for part in parts)
     listed = len(numbers) > 1 or "," in str(given[0]) or numbers == (0,)
     return numbers if listed else tuple(range(numbers[0]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlocksOptions(Training, Resources):
+    """What is trained in blocks, how it is cut, and where."""
+
+    scene: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """Folder of the capture, as in `gs2d train`."""
+    out: Annotated[Path, arg(metavar="JOB")]
+    """Job folder, which becomes the run of the merged scene. The command can be stopped and given again."""
+    blocks: str = "auto"
+    """Blocks along the ground, as 3x3, or in space, as 2x2x2; auto: none where one training of everything fits into
+    --memory, else as many as it needs."""
+    partition: Annotated[tuple[str, ...], arg(metavar="FIELD=VALUE"), UseAppendAction] = ()
+    """Change how it is cut, e.g. --partition margin=0.3, --partition coarse.side=800; may be repeated."""
+    slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
+    """Runs at the same time (default: one a GPU, else one)."""
+    format: str = "auto"
+    """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
+    downscale: int = 1
+    """Shrink the photographs by this integer, area-filtered; the coarse model has smaller ones."""
+    schedule_scale: float = 1.0
+    """Fraction of the full schedule, of each block."""
+    backend: str = "auto"
+    """Rasterizer, as in `gs2d train`."""
+    seed: int = 0
+    """Seed of every random choice; the same seed gives the same bytes."""
+    threads: int | None = None
+    """CPU threads, of each of several blocks (default: the cores divided among them)."""
+    masks: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
+    # Of one training:
+    start_from: Annotated[Path | None, Fixed, Suppress] = None
+    cache: Annotated[Path | None, Fixed, Suppress] = None
+    viewer: Annotated[bool, Fixed, Suppress] = False
+    viewer_port: Annotated[int | None, Fixed, Suppress] = None
+    refine_poses: Annotated[bool, Fixed, Suppress] = False
+
+    def __post_init__(self) -> None:
+        paths_of(self, "scene", "out", "masks", "start_from", "cache")

@@ -18,7 +18,7 @@ from gs2d.config.recipe_files import short_name
 from gs2d.config.schedule import scale_schedule
 from gs2d.config.serialize import apply_overrides, to_json
 from gs2d.errors import RecipeError
-from gs2d.experiments.execute import Job, stage_keys
+from gs2d.experiments.jobs import Job, stage_keys
 from gs2d.experiments.options import PaperOptions, SweepOptions, TableOptions
 from gs2d.experiments.scenes import FoundScene, find_scenes
 from gs2d.experiments.tables import PAPER_TABLES, PaperTable, recipe_table

@@ -40,6 +40,7 @@ from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
 from gs2d.pipeline.masks import with_masks, without_masked_points
 from gs2d.pipeline.memory import check_memory
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.part import LoadedPart, load_part, part_scene
 from gs2d.pipeline.photographs import HOW, already_prepared, with_prepared
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined_poses import with_found_poses
@@ -78,6 +79,8 @@ class Job:
         What training starts from instead of points, and the hash of its file.
     processes : int
         That train together.
+    part : LoadedPart or None
+        What a part of a larger training begins with and is surrounded by.
     """
 
     recipe: Recipe
@@ -91,6 +94,7 @@ class Job:
     init: Splats | None = None
     init_digest: str | None = None
     processes: int = 1
+    part: LoadedPart | None = None
 
     def definition(self) -> dict[str, Any]:
         """Return what ``run.json`` says and a resume compares."""
@@ -114,6 +118,7 @@ class Job:
             "backend": self.backend.facts(),
             "stage2_cache_bytes": self.stage2_cache_bytes,
             **({} if self.init_digest is None else {"init": self.init_digest}),
+            **({} if self.part is None else {"part": self.part.digest}),
         }
 
     def stage_key(self, index: int, processes: Sequence[tuple[int, int, int]] | None = None) -> str:
@@ -136,6 +141,7 @@ class Job:
             "stages": recipe["stages"][: index + 1],
             "stage2_cache_bytes": self.stage2_cache_bytes if self._uses_cached_views(index) else 0,
             **({} if self.init_digest is None else {"init": self.init_digest}),
+            **({} if self.part is None else {"part": self.part.digest}),
             **({} if self.recipe.exposure is None else {"exposure": recipe["exposure"]}),
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
             **({} if not processes else {"processes": list(map(list, processes))}),
@@ -343,19 +349,39 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event, masks)
     protocol = with_masks(protocol, scene, on_event)
     check_memory(scene, options.downscale, backend.device)
-    disk = None if options.disk is None else int(options.disk * 2**30)
-    scene = with_prepared(scene, options.out, options.prepare, on_event, disk=disk, threads=options.threads)
+    disk, home = None if options.disk is None else int(options.disk * 2**30), options.out
+    if options.part is not None:
+        scene, home = part_scene(scene, options.part), options.part.prepared or options.out
+    scene = with_prepared(
+        scene, home, options.prepare, on_event, disk=disk, threads=options.threads, shared=home != options.out
+    )
     _say_some(missing_lines(options.scene), "pieces are missing", on_event)
     digest = scene_digest(scene, on_event, uses_masks=protocol.use_mask_in_training)
     scene = without_masked_points(scene, protocol, on_event)
-    recipe = fit_recipe(options, scene, protocol, on_event)
-    protocol = with_fused_depth(with_backdrop(protocol, recipe, scene, on_event), recipe)
+    if options.part is None:
+        recipe, protocol = settled(options, scene, protocol, on_event)
+    else:
+        recipe = validate(replace(recipe_of(options.recipe), seed=options.seed))
     digest = with_priors(digest, scene, recipe, on_event)
     settings = raster_settings(protocol, scene.extent, recipe.sh_degree)
     if protocol.near is None:
         on_event(Notice(f"near plane at {settings.near:.4g}: 1 % of the scene's extent of {scene.extent:.4g}"))
     cache_bytes = options.stage2_cache_mb << 20
+    if options.part is not None and options.part.splats is not None:
+        part = load_part(options.part, scene, recipe)
+        return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, cache_bytes, part=part)
     return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, cache_bytes, *init)
+
+
+def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: OnEvent) -> tuple[Recipe, Protocol]:
+    """Return recipe and protocol as this capture is trained with.
+
+    Raises
+    ------
+    RecipeError, DataError
+    """
+    recipe = fit_recipe(options, scene, protocol, on_event)
+    return recipe, with_fused_depth(with_backdrop(protocol, recipe, scene, on_event), recipe)
 
 
 def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
@@ -551,7 +577,7 @@ def check_same_run(run: RunFolder, job: Job) -> None:
     RunError
         Names the first thing that differs.
     """
-    before, after = run.definition(), {"init": None, **json.loads(json.dumps(job.definition()))}
+    before, after = run.definition(), {"init": None, "part": None, **json.loads(json.dumps(job.definition()))}
     after = {"backend": after.pop("backend"), **after}  # first: another processor reads cameras with other last digits
     for name, value in after.items():
         old = before.get(name)
@@ -573,8 +599,10 @@ def check_same_run(run: RunFolder, job: Job) -> None:
             name = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
         elif name == "init":
             name = "--init: another file, or none"
+        elif name == "part":
+            name = "start: the model that this part is cut of changed"
         else:
-            where = _difference(old, value)
+            where = difference(old, value)
         if old != value:
             raise RunError(
                 f"{run.path} was made with another {name}{where}; resume with the same options, or choose another --out"
@@ -587,17 +615,17 @@ def _training_facts(protocol: dict[str, Any]) -> dict[str, Any]:
     return {**{name: value for name, value in protocol.items() if name != "robust"}, "fusion": fusion}
 
 
-def _difference(old: Any, new: Any, where: str = "") -> str:
+def difference(old: Any, new: Any, where: str = "") -> str:
     """Where two JSON values first differ, in words."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in new:
             if old.get(key) != new[key]:
-                return _difference(old.get(key), new[key], f"{where}.{key}" if where else key)
+                return difference(old.get(key), new[key], f"{where}.{key}" if where else key)
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for i, (a, b) in enumerate(zip(old, new, strict=True)):
             if a != b:
                 name = b.get("name", i) if isinstance(b, dict) else i
-                return _difference(a, b, f"{where}.{name}" if where else str(name))
+                return difference(a, b, f"{where}.{name}" if where else str(name))
     return f" ({where + ': ' if where else ''}{str(old)[:60]}, now {str(new)[:60]})"
 
 

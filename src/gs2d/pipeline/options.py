@@ -169,6 +169,30 @@ class Finding:
     """Hard links instead of copies of the photographs: no disk is used."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """That a training is a part of a larger one: recipe and protocol are settled, and only splats are written.
+
+    Attributes
+    ----------
+    views : tuple of str
+        Training views, by name, and no test views; () = the views of the capture as they are.
+    splats, start : Path or None
+        Splats that were trained before; and a file of which of them train, which stay frozen around them, and of the
+        exposures of the views (``pipeline.part``).
+    extent : float or None
+        Of the part, world units, where it is not that of the capture.
+    prepared : Path or None
+        Where prepared photographs lie, so that parts share them; None: in the run.
+    """
+
+    views: tuple[str, ...] = ()
+    splats: Path | None = None
+    start: Path | None = None
+    extent: float | None = None
+    prepared: Path | None = None
+
+
 # -- verbs that make a run ---------------------------------------------------------------------------------------------
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions(Training, Resources, HowItRuns):
@@ -198,6 +222,8 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Names that may already be in ``out`` (the demo's capture)."""
     estimate: Annotated[bool, Fixed, Suppress] = False
     """Tell before training how long it will take and what is held out."""
+    part: Annotated[Part | None, Fixed, Suppress] = None
+    """What is trained of something larger."""
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks", "init", "start_from", "cache")

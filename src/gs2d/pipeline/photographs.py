@@ -23,7 +23,14 @@ def fits(scene: Scene) -> bool:
 
 
 def with_prepared(
-    scene: Scene, run: Path, how: str, on_event: OnEvent, *, disk: int | None = None, threads: int | None = None
+    scene: Scene,
+    run: Path,
+    how: str,
+    on_event: OnEvent,
+    *,
+    disk: int | None = None,
+    threads: int | None = None,
+    shared: bool = False,
 ) -> Scene:
     """Return the scene as it is trained on, its photographs prepared in the run folder where that is wanted.
 
@@ -33,6 +40,8 @@ def with_prepared(
         "always", "never", or "auto": where the pictures would not stay in memory.
     disk : int or None
         Bytes that may be written.
+    shared : bool
+        Other runs keep photographs there too: what is not of this scene stays.
 
     Raises
     ------
@@ -49,7 +58,8 @@ def with_prepared(
     on_event(Notice(f"photographs of {size:.2g} GiB do not stay in memory: {where} (--prepare never reads the files)"))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        forget_others(chosen, folder)
+        if not shared:
+            forget_others(chosen, folder)
     except OSError as error:
         raise disk_error(folder, error) from error
     if missing:

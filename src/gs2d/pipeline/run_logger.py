@@ -194,7 +194,7 @@ class RunLogger:
             extra: dict[str, Any] = {"total_iteration": self._iterations_before(event.index) + event.iteration}
             extra["mean_area"] = event.mean_k_a
             if last or self._due(event.iteration, event.iterations, PROBES):
-                psnr = self._probe_psnr(state.splats)
+                psnr = self._probe_psnr(self._drawn)
                 if psnr is not None:
                     self.psnr = psnr
                     extra["psnr"] = psnr
@@ -331,7 +331,7 @@ class RunLogger:
 
     def _score(self, split: str, views: Sequence[View], name: str, visitors: Sequence[Visitor] = ()) -> Any:
         return score_views(
-            self._state.splats,
+            self._drawn,
             self._now(views),
             self._settings,
             self._job.backend,
@@ -346,7 +346,8 @@ class RunLogger:
         state = self._state
         shown = zip((split for split, _ in self._shown), self._now([view for _, view in self._shown]), strict=True)
         with attempted(f"pictures of stage {stage}", None, self._on_event):
-            draw_stage(self._run, self._job, list(shown), stage, state.splats, _group(state), self._exposures, outputs)
+            group = _group(state) if len(self._drawn) == len(state.splats) else None  # none of what is frozen
+            draw_stage(self._run, self._job, list(shown), stage, self._drawn, group, self._exposures, outputs)
 
     # -- small things --------------------------------------------------------------------------------------------------
     @property
@@ -367,6 +368,12 @@ class RunLogger:
     def _state(self) -> TrainState:
         assert self._trainer is not None
         return self._trainer.state
+
+    @property
+    def _drawn(self) -> Splats:
+        """The splats as photographs show them: with those that are frozen around them."""
+        assert self._trainer is not None
+        return self._trainer.drawn
 
     @property
     def _unseen(self) -> bool:

@@ -117,14 +117,20 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
             run.write_definition({**job.definition(), "schedule_scale": options.schedule_scale, **extra})
         job = lead(job, options, together, on_event)
         start = choose_start(run, job, options, on_event)
-        if start.state is None and (options.estimate or options.memory or options.disk or len(job.scene.views) >= MANY):
+        if start.state is None and _is_planned(options, len(job.scene.views)):
             for line in plan_notices(job, options.prepare):
                 on_event(line)
         if options.estimate and start.state is None:
             for event in pretraining_notices(job):
                 on_event(event)
-        collected = Collector(job.scene, job.settings.background)
         hold()
+        if options.part is not None:
+            splats, exposures, _ = train_stages(run, job, options, start, watch)
+            release(job.scene)
+            write_exposures(run, exposures, on_event)
+            write_splats(run.file(SPLATS), splats)
+            return run
+        collected = Collector(job.scene, job.settings.background)
         with MeshFrames(job) as frames:
             visitors = [frames.visit, collected.visit]
             splats, exposures, poses = train_stages(run, job, options, start, watch, visitors, together)
@@ -135,6 +141,11 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
             finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
     return run
+
+
+def _is_planned(options: TrainOptions, views: int) -> bool:
+    """Whether a plan is told before a training begins."""
+    return options.part is None and bool(options.estimate or options.memory or options.disk or views >= MANY)
 
 
 def _train_archive(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> RunFolder:
@@ -235,7 +246,9 @@ def train_stages(
         on_event=listen,
         between=between,
         state=start.state,
-        init=job.init if start.state is None else None,
+        init=None if start.state is not None else job.init if job.part is None else job.part.own,
+        frozen=None if job.part is None else job.part.frozen,
+        exposures=None if job.part is None else job.part.exposures,
         progress_every=recorder.progress_every,
         stage2_cache_bytes=job.stage2_cache_bytes,
         processes=together,

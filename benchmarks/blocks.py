@@ -1,0 +1,209 @@
+"""Blocks against one training of everything, of the same budget of splats and the same iterations in all.
+
+::
+
+    python -m benchmarks.blocks FOLDER [--photographs 100] [--size 96] [--grid 2x2] [--iterations 4000] [--splats 40000]
+
+A flown capture (``benchmarks.flown_capture``) is trained on whole and by ``gs2d blocks``; the coarse model and
+all blocks together have as many iterations as the one training. Both are scored on the views that are held out (PSNR
+over all pixels, and over those that show the land within ``--near`` of a seam) and against the true surface (F at
+``--within``, overall and near seams). Pictures of the views with the most seam go to ``FOLDER/seam-*.png``: photograph,
+whole, blocks, and the seam on the photograph. The table goes to standard output, figures to ``FOLDER/blocks.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from gs2d.config.partition import make_partition
+from gs2d.core.camera import Camera
+from gs2d.core.mesh import Mesh
+from gs2d.data.scene import View
+from gs2d.errors import Gs2dError
+from gs2d.evaluation.surface import evaluate_surface
+from gs2d.experiments.blocks import blocks
+from gs2d.experiments.options import BlocksOptions
+from gs2d.io.meshes import read_mesh
+from gs2d.meshing.raycast import cast_camera
+from gs2d.pipeline.blocks.cells import Cells
+from gs2d.pipeline.blocks.split import read_split
+from gs2d.pipeline.events import Notice
+from gs2d.pipeline.finished import open_job
+from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.train import train
+from gs2d.render.api import rasterize
+from gs2d.synthetic.flight import Flight, write_flight
+
+ALL_OF = {"2dgs": 30_000, "best": 20_000}  # iterations of the recipes
+ZOOM = 6  # of the pictures of seams
+
+
+def trained_both(folder: Path, args: argparse.Namespace) -> dict[str, float]:
+    """Make the capture, train whole and in blocks; what is finished stays. Returns seconds."""
+    capture = folder / "capture"
+    if not (capture / "sparse/0/cameras.bin").exists():
+        flight = Flight(args.photographs, args.size, args.size * 3 // 4, side=args.side, points=args.points)
+        write_flight(capture, flight)
+    changes = (f"min_views={args.min_views}", f"margin={args.margin}", f"extent={args.extent}")
+    changes += (f"coarse.side={args.coarse_side}", f"coarse.schedule={args.coarse_schedule}")
+    changes += (f"coarse.max_splats={args.coarse_splats}",)
+    parts = make_partition(args.grid).blocks + args.coarse_schedule
+    scale = args.iterations / ALL_OF[args.recipe]
+    common = {
+        "scene": capture,
+        "recipe": args.recipe,
+        "robust": args.robust,
+        "overrides": (f"surface.densify.max_splats={args.splats}",),
+        "backend": "cpu",
+        "threads": args.threads,
+        "page": False,
+        "whole_scene": True,
+    }
+
+    def tell(event: object) -> None:
+        if isinstance(event, Notice):
+            print(event.text, file=sys.stderr, flush=True)
+
+    seconds = {}
+    begun = time.perf_counter()
+    if not (folder / "whole/splats.ply").exists():
+        whole = TrainOptions(out=folder / "whole", schedule_scale=scale, resume=True, **common)  # type: ignore[arg-type]
+        train(whole, tell)
+    seconds["whole"] = time.perf_counter() - begun
+    begun = time.perf_counter()
+    options = BlocksOptions(
+        out=folder / "blocks",
+        schedule_scale=scale / parts,
+        blocks=args.grid,
+        partition=changes,
+        slots=args.slots,
+        **common,  # type: ignore[arg-type]
+    )
+    blocks(options, tell)
+    seconds["blocks"] = time.perf_counter() - begun
+    return seconds
+
+
+def seam_distances(camera: Camera, truth: Mesh, cells: Cells) -> np.ndarray:
+    """Return how far what each pixel shows is from a seam [H, W], world units; infinite where it shows nothing."""
+    hits = cast_camera(truth.vertices, truth.faces, camera)
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1)
+    places = camera.center + (rays * hits.depth[..., None]) @ camera.rotation
+    found = cells.distance_to_seam(places.reshape(-1, 3)).reshape(hits.depth.shape)
+    return np.where(hits.face >= 0, found, np.inf)
+
+
+def psnr(squares: list[np.ndarray]) -> float:
+    """Return the PSNR of all pixels together, dB."""
+    return -10 * math.log10(float(np.concatenate(squares).mean()))
+
+
+def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Score both runs, overall and near seams, and draw the views with the most seam."""
+    cells, truth = read_split(folder / "blocks/partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
+    runs = {name: open_job(folder / name, args.threads, lambda _event: None) for name in ("whole", "blocks")}
+    views = runs["whole"][1].scene.test
+    distances = {view.name: seam_distances(view.camera, truth, cells) for view in views}
+    shown = sorted(views, key=lambda view: -float((distances[view.name] < args.near / 4).mean()))[:3]
+    found: dict[str, dict[str, float]] = {}
+    colors: dict[str, dict[str, np.ndarray]] = {view.name: {} for view in shown}
+    for name, (run, job, splats) in runs.items():
+        everywhere, near = [], []
+        for view in views:
+            with torch.no_grad():
+                color = rasterize(splats, view.camera, job.settings, backend=job.backend).color.clamp(0, 1).numpy()
+            square = ((color - view.target(job.settings.background)) ** 2).mean(axis=2)
+            everywhere.append(square.reshape(-1))
+            near.append(square[distances[view.name] < args.near])
+            if view.name in colors:
+                colors[view.name][name] = color
+        cameras = [view.camera for view in job.scene.train]
+        score = evaluate_surface(read_mesh(run.file("mesh.ply")), truth, cameras=cameras, thresholds=(args.within,))
+        assert score.clouds is not None
+        at_seam = [cells.distance_to_seam(points) < args.near for points in (score.clouds.mesh, score.clouds.truth)]
+        precision = float((score.clouds.mesh_distances[at_seam[0]] < args.within).mean())
+        recall = float((score.clouds.truth_distances[at_seam[1]] < args.within).mean())
+        found[name] = {
+            "splats": len(splats),
+            "iterations": sum(stage["iterations"] for stage in run.metrics()["stages"]),
+            "psnr": psnr(everywhere),
+            "psnr_near_seams": psnr(near),
+            "pixels_near_seams": float(np.concatenate(near).size / np.concatenate(everywhere).size),
+            "f": score.scores[0].f_score,
+            "f_near_seams": 2 * precision * recall / max(precision + recall, 1e-12),
+        }
+    for number, view in enumerate(shown):
+        draw(folder / f"seam-{number}.png", view, colors[view.name], distances[view.name], args.near)
+    return found
+
+
+def draw(path: Path, view: View, colors: dict[str, np.ndarray], distances: np.ndarray, near: float) -> None:
+    """Write photograph, whole, blocks, and the photograph with what is near a seam in red."""
+    photograph = view.target((0.0, 0.0, 0.0))
+    red = photograph.copy()
+    red[distances < near / 8] = (1.0, 0.0, 0.0)
+    panels = [photograph, colors["whole"], colors["blocks"], red]
+    picture = (np.concatenate(panels, axis=1).clip(0, 1) * 255).round().astype(np.uint8)
+    size = (picture.shape[1] * ZOOM, picture.shape[0] * ZOOM)
+    Image.fromarray(picture).resize(size, Image.Resampling.NEAREST).save(path)
+
+
+def table(found: dict[str, dict[str, float]], seconds: dict[str, float]) -> str:
+    """Return the figures in Markdown."""
+    lines = ["| | splats | iterations | seconds | PSNR | near seams | F | near seams |", "|---" * 8 + "|"]
+    for name, of in found.items():
+        lines.append(
+            f"| {name} | {of['splats']:,.0f} | {of['iterations']:,.0f} | {seconds[name]:.0f} | {of['psnr']:.2f} dB | "
+            f"{of['psnr_near_seams']:.2f} dB | {of['f']:.4f} | {of['f_near_seams']:.4f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure; 2 for what the user can mend."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.blocks", description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--photographs", type=int, default=100)
+    parser.add_argument("--size", type=int, default=96, help="px, of the longer side")
+    parser.add_argument("--side", type=float, help="m of land, about")
+    parser.add_argument("--points", type=int, help="sparse points")
+    parser.add_argument("--grid", default="2x2")
+    parser.add_argument("--recipe", choices=ALL_OF, default="best")
+    parser.add_argument("--robust", choices=("auto", "on", "off"), default="off")
+    parser.add_argument("--iterations", type=int, default=4000, help="in all, of either")
+    parser.add_argument("--splats", type=int, default=40_000, help="budget in all, of either")
+    parser.add_argument("--coarse-splats", type=int, default=15_000)
+    parser.add_argument("--coarse-side", type=int, default=48, help="px")
+    parser.add_argument("--coarse-schedule", type=float, default=0.5)
+    parser.add_argument("--min-views", type=int, default=20)
+    parser.add_argument("--margin", type=float, default=0.2)
+    parser.add_argument("--extent", choices=("scene", "block"), default="scene")
+    parser.add_argument("--near", type=float, default=8.0, help="m from a seam that is near")
+    parser.add_argument("--within", type=float, default=0.5, help="m, of F")
+    parser.add_argument("--slots", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args(arguments)
+    try:
+        args.folder.mkdir(parents=True, exist_ok=True)
+        seconds = trained_both(args.folder, args)
+        found = measured(args.folder, args)
+    except (Gs2dError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(table(found, seconds))
+    (args.folder / "blocks.json").write_text(json.dumps({"seconds": seconds, **found}, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

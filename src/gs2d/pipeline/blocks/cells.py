@@ -1,0 +1,177 @@
+"""Where blocks are cut: axes along which cameras and points spread, and cells with equal shares of what is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gs2d.errors import RunError
+
+TRIMMED = 0.01  # of the weight on either side, beyond which nothing is a measure of a cell's side
+_DIGITS = 12  # to which weights are rounded before they are compared: the last bits are the machine's
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Boxes in a turned frame that leave no place out and share none.
+
+    Attributes
+    ----------
+    axes : ndarray [A, 3]
+        Unit, orthogonal; blocks are cut across them, A is 2 or 3.
+    low, high : ndarray [B, A], world units along the axes
+        A place belongs to a cell if ``low <= axes @ place < high``; infinite at the rim.
+    margin : float, world units
+        By which a block trains beyond its cell.
+    names : tuple of str
+        Of the blocks, by their place in the grid: ``1-3``.
+    """
+
+    axes: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    margin: float
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def owners(self, places: np.ndarray) -> np.ndarray:
+        """Return the cell [N] int64 of each place [N, 3]; exactly one."""
+        along = places.astype(np.float64) @ self.axes.T
+        found = np.full(len(places), -1, np.int64)
+        for cell in range(len(self)):
+            found[((along >= self.low[cell]) & (along < self.high[cell])).all(axis=1)] = cell
+        return found
+
+    def near(self, cell: int, places: np.ndarray) -> np.ndarray:
+        """Return which places [N, 3] lie in a cell or within its margin [N] bool."""
+        along = places.astype(np.float64) @ self.axes.T
+        low, high = self.low[cell] - self.margin, self.high[cell] + self.margin
+        return np.asarray(((along >= low) & (along < high)).all(axis=1))
+
+    def distance_to_seam(self, places: np.ndarray) -> np.ndarray:
+        """Return how far each place [N, 3] is from the nearest side of its cell that another cell touches [N]."""
+        along, owner = places.astype(np.float64) @ self.axes.T, self.owners(places)
+        sides = np.concatenate([along - self.low[owner], self.high[owner] - along], axis=1)
+        return np.asarray(sides.min(axis=1))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values; null is infinity."""
+
+        def finite(values: np.ndarray) -> list[list[float | None]]:
+            return [[float(value) if np.isfinite(value) else None for value in row] for row in values]
+
+        return {
+            "axes": self.axes.tolist(),
+            "margin": self.margin,
+            "cells": [
+                {"name": name, "low": low, "high": high}
+                for name, low, high in zip(self.names, finite(self.low), finite(self.high), strict=True)
+            ],
+        }
+
+    @classmethod
+    def from_json(cls, data: Any) -> Cells:
+        """Return the cells that :meth:`to_json` described.
+
+        Raises
+        ------
+        RunError
+        """
+        try:
+            cells = data["cells"]
+            low, high = (
+                np.array([[sign * np.inf if v is None else v for v in cell[name]] for cell in cells], np.float64)
+                for name, sign in (("low", -1), ("high", 1))
+            )
+            names = tuple(str(cell["name"]) for cell in cells)
+            return cls(np.array(data["axes"], np.float64), low, high, float(data["margin"]), names)
+        except (LookupError, TypeError, ValueError) as error:
+            raise RunError(f"the cells of a partition are damaged ({type(error).__name__}: {error})") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How far cameras and sparse points reach.
+
+    Attributes
+    ----------
+    axes : ndarray [3, 3]
+        Unit, orthogonal, the one of the largest spread first; each looks to where its largest component is positive.
+    sides : ndarray [3], world units
+        Standard deviation along each.
+    """
+
+    axes: np.ndarray
+    sides: np.ndarray
+
+
+def spread_of(centers: np.ndarray, points: np.ndarray | None) -> Spread:
+    """Return the principal axes of camera centres [V, 3] and sparse points [P, 3], which count as much as each other.
+
+    Of points only those within the middle 90 % along each coordinate count: a few are always astray.
+    """
+    clouds = [centers.astype(np.float64)]  # apart: cameras fly above what they see, which is no side of the scene
+    if points is not None and len(points) >= 10:
+        points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        low, high = np.percentile(points, [5, 95], axis=0)
+        inside = points[((points >= low) & (points <= high)).all(axis=1)]
+        clouds += [inside] if len(inside) >= 10 else []
+    spread = np.mean([np.cov(cloud.T, bias=True) for cloud in clouds], axis=0)
+    values, vectors = np.linalg.eigh(spread)
+    axes = vectors.T[::-1]
+    signs = np.sign(axes[np.arange(3), np.abs(axes).argmax(axis=1)])
+    return Spread(axes * signs[:, None], np.sqrt(np.maximum(values[::-1], 0.0)))
+
+
+def cut(places: np.ndarray, weights: np.ndarray, axes: np.ndarray, grid: Sequence[int], margin: float) -> Cells:
+    """Return cells of equal weight: slabs along the first axis, each cut along the next.
+
+    Parameters
+    ----------
+    places : ndarray [N, 3], world units
+    weights : ndarray [N]
+        What is to be shared out; places with weight 0 decide nothing.
+    axes : ndarray [A, 3]
+        As many as the grid has numbers.
+    grid : A numbers
+    margin : float
+        Of the mean side of a cell, the outermost 1 % of the weight on either side left out.
+    """
+    seen = weights > 0
+    along, weights = places[seen].astype(np.float64) @ axes.T, np.round(weights[seen] / weights.max(), _DIGITS)
+    cells: list[tuple[list[float], list[float], str, np.ndarray]] = [([], [], "", np.arange(len(along)))]
+    lengths: list[list[float]] = [[] for _ in grid]
+    for axis, count in enumerate(grid):
+        finer = []
+        for low, high, name, rows in cells:
+            values, share = along[rows, axis], weights[rows]
+            inner = [weighted_quantile(values, share, k / count) for k in range(1, count)]
+            edges = [-np.inf, *inner, np.inf]
+            lengths[axis].append(_length(values, share) / count)
+            for k in range(count):
+                inside = rows[(values >= edges[k]) & (values < edges[k + 1])]
+                label = f"{name}-{k}" if name else f"{k}"
+                finer.append(([*low, edges[k]], [*high, edges[k + 1]], label, inside))
+        cells = finer
+    lows, highs = (np.array([cell[i] for cell in cells], np.float64).reshape(-1, len(axes)) for i in (0, 1))
+    side = np.mean([np.mean(of) for of in lengths])
+    return Cells(axes, lows, highs, float(margin * side), tuple(cell[2] for cell in cells))
+
+
+def weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float) -> float:
+    """Return the value below which about this fraction of the weight lies; 0 of nothing."""
+    if not len(values):
+        return 0.0
+    order = np.argsort(values, kind="stable")
+    up_to = np.cumsum(weights[order])
+    return float(values[order[min(np.searchsorted(up_to, fraction * up_to[-1]), len(order) - 1)]])
+
+
+def _length(values: np.ndarray, weights: np.ndarray) -> float:
+    ends = [weighted_quantile(values, weights, fraction) for fraction in (TRIMMED, 1 - TRIMMED)]
+    return ends[1] - ends[0]

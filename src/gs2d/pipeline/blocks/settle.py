@@ -1,0 +1,257 @@
+"""What all blocks have in common, settled before anything is trained: recipe, protocol, capture, grid."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gs2d.config.densify import Densify
+from gs2d.config.partition import Partition, grid_for
+from gs2d.config.partition import to_json as partition_json
+from gs2d.config.protocols import Protocol
+from gs2d.config.recipe import GradDensify, Recipe, validate
+from gs2d.config.schedule import longer_steps, scale_schedule
+from gs2d.config.serialize import to_json
+from gs2d.core.memory_limit import memory_budget
+from gs2d.core.text import name_bytes
+from gs2d.data import Scene, detect_format
+from gs2d.data.archive import is_archive
+from gs2d.data.masks import Masks
+from gs2d.errors import DataError, RecipeError
+from gs2d.pipeline.blocks.cells import spread_of
+from gs2d.pipeline.blocks.split import Block
+from gs2d.pipeline.capture_plan import CapturePlan, expected_splats, plan_capture
+from gs2d.pipeline.events import Notice, OnEvent
+from gs2d.pipeline.job import check_train_options, choose_backend, choose_protocol, read_scene, settled
+from gs2d.pipeline.masks import with_masks, without_masked_points
+from gs2d.pipeline.memory import check_memory
+from gs2d.pipeline.options import TrainOptions
+from gs2d.render.backends import Backend
+
+FORMAT = 1
+COARSE_PART = 3  # of the splats that fit, at least, are the blocks': the coarse model has a third at most
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """What all blocks have in common.
+
+    Attributes
+    ----------
+    scene : Scene
+    format : str
+        Of the capture.
+    recipe : Recipe
+        As one training of everything would have it.
+    protocol : Protocol
+        With the near plane and the background of the whole.
+    backend : Backend
+    capture : str
+        A hash of cameras, points, and sizes and times of files: whether the capture is still what it was.
+    """
+
+    scene: Scene
+    format: str
+    recipe: Recipe
+    protocol: Protocol
+    backend: Backend
+    capture: str
+
+    def definition(self, options: TrainOptions, partition: Partition) -> dict[str, Any]:
+        """Return what is written down and compared when the command is given again."""
+        return {
+            "format": FORMAT,
+            "capture": {"path": str(options.scene.resolve()), "digest": self.capture, "format": self.format},
+            "downscale": options.downscale,
+            "partition": partition_json(partition),
+            "recipe": to_json(self.recipe),
+            "protocol": json.loads(json.dumps(asdict(self.protocol))),
+            "seed": self.recipe.seed,
+            "backend": self.backend.name,
+        }
+
+
+def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
+    """Read the headers of a capture and settle what all blocks have in common; nothing is written.
+
+    Raises
+    ------
+    Gs2dError
+    """
+    recipe = check_train_options(options)
+    if is_archive(options.scene):
+        raise DataError(f"blocks need the folder of a capture, got the file {options.scene}; unpack it first")
+    kind = detect_format(options.scene) if options.format == "auto" else options.format
+    found = open_settled(options, recipe, choose_protocol(options, kind, on_event), on_event)
+    scene = without_masked_points(found.scene, found.protocol, on_event)
+    recipe, protocol = settled(options, scene, found.protocol, on_event)
+    if recipe.poses is not None:
+        raise RecipeError(
+            "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "
+            "its own, or leave --refine-poses out"
+        )
+    return replace(found, recipe=recipe, protocol=replace(protocol, near=protocol.near_for(scene.extent)))
+
+
+def open_settled(options: TrainOptions, recipe: Recipe, protocol: Protocol, on_event: OnEvent) -> Settled:
+    """Read the headers of a capture for a recipe and a protocol that are settled.
+
+    Raises
+    ------
+    Gs2dError
+    """
+    backend = choose_backend(options.backend, on_event)
+    kind = detect_format(options.scene) if options.format == "auto" else options.format
+    masks = Masks(options.masks, options.masked)
+    scene = read_scene(options.scene, kind, options.downscale, protocol, on_event, masks)
+    protocol = with_masks(protocol, scene, on_event)
+    check_memory(scene, options.downscale, backend.device)
+    return Settled(scene, kind, recipe, protocol, backend, capture_digest(scene))
+
+
+def capture_digest(scene: Scene) -> str:
+    """Return a hash of what a scene is made of: cameras, points, and names, sizes and times of photographs.
+
+    Raises
+    ------
+    DataError
+        A photograph is gone.
+    """
+    digest = hashlib.sha256()
+    for split, views in (("train", scene.train), ("test", scene.test)):
+        for view in views:
+            camera = view.camera
+            numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+            digest.update(name_bytes(f"{split} {view.name}"))
+            digest.update(np.array(numbers, np.float64).tobytes() + np.asarray(camera.T_cam_world).tobytes())
+            if view.path is None:
+                continue
+            try:
+                stat = view.path.stat()
+            except OSError as error:
+                raise DataError(f"image {view.path} cannot be read: {error.strerror or error}") from error
+            digest.update(f"{stat.st_size} {stat.st_mtime_ns}".encode())
+    if scene.points is not None:
+        digest.update(np.ascontiguousarray(scene.points.points).tobytes())
+    return digest.hexdigest()
+
+
+# -- the grid ----------------------------------------------------------------------------------------------------------
+def fitting_partition(
+    settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent
+) -> Partition | None:
+    """Return the partition with as many blocks as memory needs; None where everything fits into one training.
+
+    Raises
+    ------
+    Gs2dError
+    """
+    found: CapturePlan | None = None
+    recipe = settled.recipe
+    try:
+        found = plan_capture(
+            settled.scene,
+            recipe,
+            settled.protocol,
+            settled.backend,
+            downscale=options.downscale,
+            prepare=options.prepare,
+        )
+    except DataError as error:
+        on_event(Notice(f"not in one training: {error}"))
+    if found is not None and found.max_splats is None:
+        on_event(Notice("one training of everything fits into memory: no blocks (--blocks 3x3 makes some)"))
+        return None
+    room = partition.splats if found is None or found.max_splats is None else found.max_splats
+    coarse = replace(partition.coarse, max_splats=max(2, min(partition.coarse.max_splats, room // COARSE_PART)))
+    trained = max(2, min(partition.splats, room - coarse.max_splats))
+    photographs = math.ceil(len(settled.scene.train) / partition.photographs)
+    count = max(2, photographs)
+    if found is not None:
+        wanted = expected_splats(recipe, found.start).expected * (1 + 2 * partition.margin) ** 2
+        count = max(count, math.ceil(wanted / trained))
+    points = settled.scene.points
+    centers = np.array([view.camera.center for view in settled.scene.train])
+    spread = spread_of(centers, None if points is None else points.points)
+    grid = grid_for(count, [float(side) for side in spread.sides], partition.flat)
+    allowed = memory_budget()
+    on_event(
+        Notice(
+            f"blocks: {'x'.join(map(str, grid))}, of {trained:,} splats at most in "
+            f"{'the memory there is' if allowed is None else f'{allowed / 2**30:.3g} GiB'}"
+        )
+    )
+    return replace(partition, grid=grid, splats=trained, coarse=coarse)
+
+
+# -- recipes -----------------------------------------------------------------------------------------------------------
+def with_budget(recipe: Recipe, splats: int) -> Recipe:
+    """Return the recipe with no more than so many splats, where it densifies by numbers that are known."""
+
+    def kept(densify: GradDensify | Densify | None) -> GradDensify | Densify | None:
+        if isinstance(densify, GradDensify):
+            return replace(densify, max_splats=min(splats, densify.max_splats or splats))
+        if densify is not None and "max_splats" in densify.options:
+            most = min(splats, int(densify.options["max_splats"]))
+            return replace(densify, options={**densify.options, "max_splats": most})
+        return densify
+
+    return replace(recipe, stages=tuple(replace(stage, densify=kept(stage.densify)) for stage in recipe.stages))
+
+
+def budget_of(recipe: Recipe) -> int | None:
+    """Return the splats that a recipe allows everything; None: any number."""
+    for stage in recipe.stages:
+        options = getattr(stage.densify, "options", {})
+        most = getattr(stage.densify, "max_splats", None) or options.get("max_splats")
+        if most is not None:
+            return int(most)
+    return None
+
+
+def coarse_recipe(recipe: Recipe, partition: Partition) -> Recipe:
+    """Return the recipe of the coarse model."""
+    coarse = partition.coarse
+    value = scale_schedule(recipe, coarse.schedule)
+    value = longer_steps(value, coarse.schedule) if recipe.free_space is not None else value
+    return validate(with_budget(value, coarse.max_splats))
+
+
+def coarse_downscale(scene: Scene, partition: Partition, downscale: int) -> int:
+    """Return by how much photographs are shrunk for the coarse model, in all."""
+    longer = max(max(view.camera.width, view.camera.height) for view in scene.views)
+    return downscale * max(1, round(longer / partition.coarse.side))
+
+
+def block_recipe(recipe: Recipe, partition: Partition, block: Block) -> Recipe:
+    """Return the recipe of a block: from splats whose colours have all degrees, in exposures that are settled.
+
+    Its budget is its share of that of everything, by how much of all that is seen lies in it.
+    """
+    whole = budget_of(recipe)
+    most = partition.splats if whole is None else min(partition.splats, math.ceil(whole * block.weight))
+    exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
+    stages = tuple(replace(stage, sh_interval=0) for stage in recipe.stages)
+    value = replace(recipe, stages=stages, exposure=exposure, dense_start=None)
+    return validate(with_budget(value, max(2, most)))
+
+
+def coarse_folder(out: Path) -> Path:
+    """Return the run folder of the coarse model."""
+    return out / "coarse"
+
+
+def partition_folder(out: Path) -> Path:
+    """Return where cells and beginnings of blocks are."""
+    return out / "partition"
+
+
+def block_folder(out: Path, name: str) -> Path:
+    """Return the run folder of a block."""
+    return out / "blocks" / name

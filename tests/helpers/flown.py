@@ -1,0 +1,48 @@
+"""A tiny flight, and `gs2d blocks` on it in seconds."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from gs2d.experiments.options import BlocksOptions
+from gs2d.synthetic.flight import Flight, write_flight
+
+WORDS = (
+    "surface.densify.start=3",
+    "surface.densify.stop=14",
+    "surface.densify.every=4",
+    "surface.densify.reset_every=0",
+)
+
+
+def write_tiny_flight(folder: Path, photographs: int = 12) -> Path:
+    """Write photographs of 32x24 over 120 m of land."""
+    write_flight(folder, Flight(photographs, width=32, height=24, points=400, side=120.0), threads=1)
+    return folder
+
+
+def tiny_blocks(capture: Path, out: Path, **changes: Any) -> BlocksOptions:
+    """Return options of 2x2 blocks of 18 iterations each."""
+    options = BlocksOptions(
+        scene=capture,
+        out=out,
+        blocks="2x2",
+        partition=("min_views=3", "coarse.schedule=0.5"),
+        recipe="2dgs",
+        robust="off",
+        schedule_scale=0.0006,
+        overrides=(*WORDS, "surface.densify.max_splats=600"),
+        backend="cpu",
+        threads=1,
+        page=False,
+        checkpoint_every=4,
+    )
+    return replace(options, **changes)
+
+
+def digest(path: Path) -> str:
+    """Return a hash of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
