@@ -41,7 +41,7 @@ def test_the_job_is_a_run_of_all_blocks(straight: Path) -> None:
     run_folder = open_run(straight)
     (stage,) = run_folder.metrics()["stages"]
     assert stage["name"] == "blocks"
-    assert stage["iterations"] == 9 + 4 * 18
+    assert stage["iterations"] == 9 + 4 * 18 + 2  # coarse, blocks, seams
     assert stage["splats"] == len(read_splats(straight / "splats.ply"))
     assert stage["train"]["psnr"] > 6
     assert stage["test"]["psnr"] > 6
@@ -69,7 +69,7 @@ def test_each_block_trained_its_own_splats_and_photographs_with_the_rest_frozen(
 
 
 def test_the_merged_scene_has_of_each_block_what_lies_in_its_cell(straight: Path) -> None:
-    split, merged = read_split(straight / "partition"), read_splats(straight / "splats.ply")
+    split, merged = read_split(straight / "partition"), read_splats(straight / "merged.ply")
     owners = split.cells.owners(merged.means.numpy())
     assert (np.diff(owners) >= 0).all()  # block after block
     for cell, block in enumerate(split.blocks):
@@ -79,6 +79,22 @@ def test_the_merged_scene_has_of_each_block_what_lies_in_its_cell(straight: Path
         part = merged.rows(torch.from_numpy(owners == cell))
         assert torch.equal(part.means[: len(expected)], expected.means)
         assert torch.equal(part.shN[: len(expected)], expected.shN)
+
+
+def test_what_lies_at_seams_learns_once_more_and_nothing_else(straight: Path) -> None:
+    split, merged = read_split(straight / "partition"), read_splats(straight / "merged.ply")
+    end = read_splats(straight / "splats.ply")
+    rows, _ = read_start(straight / "partition/seams.npz")
+    own = torch.from_numpy(rows == OWN)
+    assert 0 < own.sum() < len(merged) / 2
+    assert (split.cells.distance_to_seam(merged.means.numpy()[own]) < 0.03 * split.cells.side).all()
+    rest = int((~own).sum())
+    assert torch.equal(end.means[:rest], merged.means[~own])
+    assert torch.equal(end.shN[:rest], merged.shN[~own])
+    learned = read_splats(straight / "seams/splats.ply")
+    assert torch.equal(end.means[rest:], learned.means)
+    assert len(learned) == own.sum()
+    assert not torch.equal(learned.sh0, merged.sh0[own])
 
 
 def test_a_finished_job_does_nothing_again(capture: Path, straight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,7 +267,7 @@ def test_a_block_that_fails_leaves_the_others_and_the_merge_waits(
         blocks(tiny_blocks(capture, job))
     states = {path.stem: json.loads(path.read_text())["state"] for path in (job / "jobs").glob("*.json")}
     assert states.pop("block-0-1") == "failed"
-    assert {states.pop(name) for name in ("merge", "finish")} == {"failed"}
+    assert {states.pop(name) for name in ("merge", "seams", "finish")} == {"failed"}
     assert set(states.values()) == {"done"}
     assert not (job / "splats.ply").exists()
     monkeypatch.setattr(module, "train", real)

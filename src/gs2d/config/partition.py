@@ -69,6 +69,11 @@ class Partition:
     flat : float
         A third axis is cut, where the grid is open, if the spread along it is more than this of that along the second:
         land and streets are cut along the ground, a hall or a tower in space.
+    seam : float
+        After the merge, splats within this fraction of a cell's mean side of a seam learn once more, with all others
+        frozen: what is left of two blocks at a seam was never drawn together.
+    seam_schedule : float
+        Fraction of the recipe's iterations for that, at its last steps, without coming or going; 0: not done.
     ownership : "center"
         The block keeps the splats whose centre lies in its cell; cells share no point and leave none out.
     extent : "scene" or "block"
@@ -83,6 +88,8 @@ class Partition:
     splats: int = 3_000_000
     photographs: int = 600
     flat: float = 0.5
+    seam: float = 0.03
+    seam_schedule: float = 0.1
     ownership: str = "center"
     extent: str = "scene"
 
@@ -113,10 +120,12 @@ def check_partition(partition: Partition) -> Partition:
     require(partition.blocks <= MAX_BLOCKS, f"{where}.grid must be at most {MAX_BLOCKS:,} blocks, got more")
     for name, low in (("min_views", 1), ("splats", 1), ("photographs", 1)):
         integer(f"{where}.{name}", getattr(partition, name), low=low)
-    for name in ("margin", "min_share", "flat"):
+    for name in ("margin", "min_share", "flat", "seam", "seam_schedule"):
         number(f"{where}.{name}", getattr(partition, name), low=0.0)
     require(partition.margin <= 1, f"{where}.margin must be at most 1 side of a cell, got {partition.margin}")
     require(partition.min_share < 1, f"{where}.min_share must be below 1, got {partition.min_share}")
+    for name in ("seam", "seam_schedule"):
+        require(getattr(partition, name) <= 1, f"{where}.{name} must be at most 1, got {getattr(partition, name)}")
     one_of(f"{where}.ownership", partition.ownership, OWNERSHIP)
     one_of(f"{where}.extent", partition.extent, EXTENTS)
     integer(f"{where}.coarse.side", coarse.side, low=16)

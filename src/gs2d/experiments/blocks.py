@@ -1,7 +1,7 @@
 """``gs2d blocks``: a coarse model, the blocks that it is cut into, and the merged scene, as a list of tasks.
 
-coarse -> partition -> blocks, side by side -> merge -> finish. Each is a value that any process can do, with its state
-in the job folder; what is done is not done again.
+coarse -> partition -> blocks, side by side -> merge -> seams -> finish. Each is a value that any process can do, with
+its state in the job folder; what is done is not done again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gs2d.errors import RecipeError, RunError
 from gs2d.experiments.execute import Task, execute, failures
 from gs2d.experiments.options import BlocksOptions
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
-from gs2d.pipeline.blocks.merged import finish_merged, write_merged
+from gs2d.pipeline.blocks.merged import MERGED, SEAM_VIEWS, finish_merged, write_merged, write_result
 from gs2d.pipeline.blocks.settle import (
     Settled,
     block_folder,
@@ -29,9 +29,11 @@ from gs2d.pipeline.blocks.settle import (
     fitting_partition,
     open_settled,
     partition_folder,
+    seam_folder,
+    seam_recipe,
     settle,
 )
-from gs2d.pipeline.blocks.split import CELLS, read_split, split_model, start_file
+from gs2d.pipeline.blocks.split import CELLS, SEAMS, read_split, split_model, start_file
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import finished_splats
@@ -174,12 +176,27 @@ class BlockTask(BlocksTask):
 
 @dataclass(frozen=True, kw_only=True)
 class MergeTask(BlocksTask):
-    """Crop each block to its cell and write one scene."""
+    """Crop each block to its cell and join them."""
 
     def work(self, on_event: OnEvent) -> dict[str, Any]:
         """Merge."""
-        settled = self.settled(on_event)
-        return {"splats": write_merged(settled, self.options, self.partition(), on_event)}
+        return write_merged(self.settled(on_event), self.options, self.partition(), on_event)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeamsTask(BlocksTask):
+    """Let what lies at seams learn once more, with all else frozen, and write the scene."""
+
+    def work(self, on_event: OnEvent) -> dict[str, Any]:
+        """Train, or go on; write."""
+        out, settled, partition = self.options.out, self.settled(on_event), self.partition()
+        views = tuple(read_json(out / SEAM_VIEWS)["views"])
+        if views:
+            start = start_file(partition_folder(out), SEAMS)
+            part = Part(views=views, splats=out / MERGED, start=start, prepared=out)
+            recipe = seam_recipe(settled.recipe, partition)
+            train(self.training(recipe=recipe, out=seam_folder(out), part=part), on_event)
+        return {"splats": write_result(settled, self.options, partition, on_event)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,6 +219,7 @@ def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) 
     names = [f"block-{name}" for name in partition.names]
     whole: dict[str, Any] = {"options": options, "alone": True, "memory": options.memory}
     coarse, cells = coarse_folder(out) / SPLATS, partition_folder(out) / CELLS
+    merged = (out / MERGED, out / SEAM_VIEWS)
     starts = {name: start_file(partition_folder(out), name) for name in partition.names}
     return [
         CoarseTask(**common(COARSE), **whole, outputs=(coarse,)),
@@ -216,8 +234,9 @@ def tasks_of(options: TrainOptions, partition: Partition, memory: float | None) 
             )
             for task, name in zip(names, partition.names, strict=True)
         ),
-        MergeTask(**common(MERGE, names), **whole, inputs=(coarse, cells), outputs=(out / SPLATS,)),
-        FinishTask(**common(FINISH, [MERGE]), **whole, inputs=(out / SPLATS,), outputs=(out / REPORT,)),
+        MergeTask(**common(MERGE, names), **whole, inputs=(coarse, cells), outputs=merged),
+        SeamsTask(**common(SEAMS, [MERGE]), **whole, inputs=merged, outputs=(out / SPLATS,)),
+        FinishTask(**common(FINISH, [SEAMS]), **whole, inputs=(out / SPLATS,), outputs=(out / REPORT,)),
     ]
 
 

@@ -26,6 +26,8 @@ class Cells:
         A place belongs to a cell if ``low <= axes @ place < high``; infinite at the rim.
     margin : float, world units
         By which a block trains beyond its cell.
+    side : float, world units
+        Mean side of a cell, the outermost 1 % of the weight on either side of everything left out.
     names : tuple of str
         Of the blocks, by their place in the grid: ``1-3``.
     """
@@ -34,6 +36,7 @@ class Cells:
     low: np.ndarray
     high: np.ndarray
     margin: float
+    side: float
     names: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -68,6 +71,7 @@ class Cells:
         return {
             "axes": self.axes.tolist(),
             "margin": self.margin,
+            "side": self.side,
             "cells": [
                 {"name": name, "low": low, "high": high}
                 for name, low, high in zip(self.names, finite(self.low), finite(self.high), strict=True)
@@ -89,7 +93,8 @@ class Cells:
                 for name, sign in (("low", -1), ("high", 1))
             )
             names = tuple(str(cell["name"]) for cell in cells)
-            return cls(np.array(data["axes"], np.float64), low, high, float(data["margin"]), names)
+            numbers = float(data["margin"]), float(data["side"])
+            return cls(np.array(data["axes"], np.float64), low, high, *numbers, names)
         except (LookupError, TypeError, ValueError) as error:
             raise RunError(f"the cells of a partition are damaged ({type(error).__name__}: {error})") from error
 
@@ -140,7 +145,7 @@ def cut(places: np.ndarray, weights: np.ndarray, axes: np.ndarray, grid: Sequenc
         As many as the grid has numbers.
     grid : A numbers
     margin : float
-        Of the mean side of a cell, the outermost 1 % of the weight on either side left out.
+        Of the mean side of a cell.
     """
     seen = weights > 0
     along, weights = places[seen].astype(np.float64) @ axes.T, np.round(weights[seen] / weights.max(), _DIGITS)
@@ -159,8 +164,8 @@ def cut(places: np.ndarray, weights: np.ndarray, axes: np.ndarray, grid: Sequenc
                 finer.append(([*low, edges[k]], [*high, edges[k + 1]], label, inside))
         cells = finer
     lows, highs = (np.array([cell[i] for cell in cells], np.float64).reshape(-1, len(axes)) for i in (0, 1))
-    side = np.mean([np.mean(of) for of in lengths])
-    return Cells(axes, lows, highs, float(margin * side), tuple(cell[2] for cell in cells))
+    side = float(np.mean([np.mean(of) for of in lengths]))
+    return Cells(axes, lows, highs, margin * side, side, tuple(cell[2] for cell in cells))
 
 
 def weighted_quantile(values: np.ndarray, weights: np.ndarray, fraction: float) -> float:

@@ -6,17 +6,20 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gs2d.config.partition import Partition
 from gs2d.config.partition import to_json as partition_json
+from gs2d.core.json_files import read_json, write_json
 from gs2d.core.memory import hold
 from gs2d.core.splats import Splats
 from gs2d.data import Scene
 from gs2d.errors import RunError
-from gs2d.io.run_dir import SPLATS, RunFolder, open_run
+from gs2d.io.run_dir import SPLATS, RunFolder, is_run, open_run
 from gs2d.io.splat_ply import read_splats, write_splats
 from gs2d.pipeline.attempts import attempted
-from gs2d.pipeline.blocks.settle import Settled, block_folder, coarse_folder, partition_folder
-from gs2d.pipeline.blocks.split import merge, read_split, start_file
+from gs2d.pipeline.blocks.settle import Settled, block_folder, coarse_folder, partition_folder, seam_folder
+from gs2d.pipeline.blocks.split import SEAMS, merge, read_split, split_seams, start_file
 from gs2d.pipeline.events import OnEvent
 from gs2d.pipeline.exposure import read_exposures, write_exposures
 from gs2d.pipeline.finished import finished_splats
@@ -24,7 +27,7 @@ from gs2d.pipeline.job import Job
 from gs2d.pipeline.memory import release
 from gs2d.pipeline.mesh import MeshFrames
 from gs2d.pipeline.options import MeshOptions, TrainOptions
-from gs2d.pipeline.part import read_start
+from gs2d.pipeline.part import OWN, read_start
 from gs2d.pipeline.photographs import with_prepared
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.render import choose_views, draw_stage
@@ -33,6 +36,7 @@ from gs2d.pipeline.train import finish
 from gs2d.pipeline.verdict.measures import Collector
 from gs2d.training.trainer import raster_settings
 
+MERGED, SEAM_VIEWS = "merged.ply", "seams.json"  # in the job folder: all blocks, and the photographs of their seams
 STAGE = "blocks"  # the one stage of a merged run in metrics.json
 
 
@@ -52,14 +56,48 @@ def merged_splats(out: Path) -> Splats:
     return merge(coarse, split, splats, rows)
 
 
-def write_merged(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> int:
-    """Write the merged scene as a run; returns its splats.
+def write_merged(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> dict[str, Any]:
+    """Write the merged splats, and what of them learns once more: ``MERGED``, ``seams.npz``, ``seams.json``.
+
+    Returns
+    -------
+    dict
+        ``splats``, and ``views``: how many photographs show a seam.
 
     Raises
     ------
     RunError, DiskError
     """
-    run, splats = RunFolder(options.out), merged_splats(options.out)
+    out, splats, views = options.out, merged_splats(options.out), tuple[str, ...]()
+    if partition.seam > 0 and partition.seam_schedule > 0:
+        views = split_seams(
+            splats.to(settled.backend.device),
+            read_split(partition_folder(out)),
+            settled.scene,
+            partition,
+            raster_settings(settled.protocol, settled.scene.extent, settled.recipe.sh_degree),
+            settled.backend,
+            partition_folder(out),
+            on_event,
+            read_exposures(open_run(coarse_folder(out)), settled.recipe),
+        )
+    write_splats(out / MERGED, splats)
+    write_json(out / SEAM_VIEWS, {"views": list(views)})
+    return {"splats": len(splats), "views": len(views)}
+
+
+def write_result(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> int:
+    """Write the merged scene as a run, its seams as they have learned; returns its splats.
+
+    Raises
+    ------
+    RunError, DiskError
+    """
+    run, splats = RunFolder(options.out), read_splats(options.out / MERGED)
+    if read_json(options.out / SEAM_VIEWS)["views"]:
+        rows, _ = read_start(start_file(partition_folder(options.out), SEAMS))
+        rest = splats.rows(torch.from_numpy(rows != OWN))
+        splats = rest.followed_by(finished_splats(open_run(seam_folder(options.out))))
     job = merged_job(settled, options, settled.scene)
     title = {"title": options.title or settled.scene.name, "schedule_scale": options.schedule_scale}
     run.write_definition({**job.definition(), **title, "partition": partition_json(partition)})
@@ -144,5 +182,5 @@ def _spent(out: Path) -> dict[str, Any]:
 
 def _trained(out: Path) -> Iterable[RunFolder]:
     split = read_split(partition_folder(out))
-    names = [block.name for block in split.blocks if not block.skipped]
-    return [RunFolder(coarse_folder(out)), *(RunFolder(block_folder(out, name)) for name in names)]
+    folders = [block_folder(out, block.name) for block in split.blocks if not block.skipped]
+    return [RunFolder(path) for path in (coarse_folder(out), *folders, seam_folder(out)) if is_run(path)]

@@ -15,7 +15,7 @@ from gs2d.config.densify import Densify
 from gs2d.config.partition import Partition, grid_for
 from gs2d.config.partition import to_json as partition_json
 from gs2d.config.protocols import Protocol
-from gs2d.config.recipe import GradDensify, Recipe, validate
+from gs2d.config.recipe import ALL, GradDensify, Recipe, validate
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import to_json
 from gs2d.core.memory_limit import memory_budget
@@ -240,6 +240,31 @@ def block_recipe(recipe: Recipe, partition: Partition, block: Block) -> Recipe:
     stages = tuple(replace(stage, sh_interval=0) for stage in recipe.stages)
     value = replace(recipe, stages=stages, exposure=exposure, dense_start=None)
     return validate(with_budget(value, max(2, most)))
+
+
+def seam_recipe(recipe: Recipe, partition: Partition) -> Recipe:
+    """Return the recipe by which splats at seams learn once more: the last steps of all of them, none comes or goes."""
+    stage = scale_schedule(recipe, partition.seam_schedule).stages[0]
+    stage = replace(
+        stage,
+        name="seams",
+        train=dict.fromkeys(ALL, "all"),
+        losses=tuple(replace(term, start=0) for term in stage.losses),
+        lr=stage.lr.at_end(recipe.stages[0].iterations),
+        densify=None,
+        on_enter=(),
+        sh_interval=0,
+        downscale=1,
+        halve_at=(),
+    )
+    exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
+    found = replace(recipe, stages=(stage,), exposure=exposure, dense_start=None, free_space=None)
+    return validate(replace(found, opacity_decay=None, seen_area=None))
+
+
+def seam_folder(out: Path) -> Path:
+    """Return the run folder of the seams."""
+    return out / "seams"
 
 
 def coarse_folder(out: Path) -> Path:

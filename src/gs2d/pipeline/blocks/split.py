@@ -26,6 +26,7 @@ from gs2d.training.seen_area import shown_weights, shrunk
 
 SIDE = 200  # px, of the pictures in which is looked at what shows what: fractions do not need more
 LEAST_WEIGHT = 1e-3  # px of a splat in a picture, from which it is shown there
+SEAMS = "seams"  # what is trained once more after the merge
 CELLS = "cells.json"  # in the folder of the partition, last: it is whole then
 FORMAT = 1
 
@@ -170,6 +171,39 @@ def split_model(
     found = Split(cells, tuple(blocks))
     write_json(folder / CELLS, found.to_json())
     return found
+
+
+def split_seams(
+    splats: Splats,
+    split: Split,
+    scene: Scene,
+    partition: Partition,
+    raster: RasterSettings,
+    backend: Backend,
+    folder: Path,
+    on_event: OnEvent,
+    exposures: Transforms,
+) -> tuple[str, ...]:
+    """Write which splats of a merged scene learn once more, those at seams that are seen; arguments as of a model.
+
+    Returns
+    -------
+    tuple of str
+        Photographs that show them: at least half as much as a block's photographs show of it. None: nothing to do.
+    """
+    places, width = splats.means.detach().cpu().numpy(), partition.seam * split.cells.side
+    strip = split.cells.distance_to_seam(places) < width
+    looks, shares, seen = Looks(splats, scene.train, raster, backend), [], np.zeros(len(splats), dtype=bool)
+    for weights in counted(looks.all(), "looking at seams", len(looks), on_event):
+        shares.append(weights[strip].sum() / max(weights.sum(), LEAST_WEIGHT))
+        if shares[-1] >= partition.min_share / 2:
+            seen |= weights > LEAST_WEIGHT
+    chosen = [view.name for view, share in zip(scene.train, shares, strict=True) if share >= partition.min_share / 2]
+    own = strip & seen
+    rows = np.where(own, OWN, FROZEN).astype(np.uint8)
+    known = np.stack([exposures[view].cpu().numpy() for view in chosen]) if exposures and chosen else None
+    write_start(start_file(folder, SEAMS), rows, known)
+    return tuple(chosen) if own.any() else ()
 
 
 class Looks:
