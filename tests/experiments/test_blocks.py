@@ -23,6 +23,7 @@ from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.blocks.split import read_split
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.part import FROZEN, OWN, read_start
+from gs2d.synthetic.flight import Flight, write_flight
 
 
 @pytest.fixture(scope="module")
@@ -168,6 +169,32 @@ def test_a_damaged_beginning_of_a_block_is_one_line_and_is_made_again_when_it_is
     start.unlink()
     blocks(tiny_blocks(capture, job))
     assert digest(job / "splats.ply") == digest(straight / "splats.ply")
+
+
+@pytest.mark.slow
+def test_blocks_of_the_default_recipe_begin_with_a_dense_start_of_their_own_cell_and_settled_exposures(
+    tmp_path: Path,
+) -> None:
+    capture, job = tmp_path / "capture", tmp_path / "job"
+    write_flight(capture, Flight(16, width=64, height=48, points=800, side=90.0), threads=1)
+    options = tiny_blocks(capture, job, recipe="best", robust="auto", exposure=True, overrides=(), schedule_scale=0.002)
+    blocks(options)
+    split, starts = read_split(job / "partition"), []
+    for cell, block in enumerate(split.blocks):
+        run_folder = open_run(job / "blocks" / block.name)
+        (begun,) = (event for event in run_folder.events.read() if event["kind"] == "initialised")
+        assert begun["source"] == "sweep"
+        starts.append(begun["splats"])
+        trained = read_splats(run_folder.path / "splats.ply").means.numpy()
+        assert split.cells.near(cell, trained).mean() > 0.95  # a few wander
+        found = json.loads((run_folder.path / "exposure.json").read_text())["photographs"]
+        coarse = json.loads((job / "coarse/exposure.json").read_text())["photographs"]
+        known = {entry["name"]: entry["transform"] for entry in coarse}
+        for entry in found:
+            assert np.allclose(entry["transform"], known[entry["name"]], atol=1e-6)
+        assert run_folder.definition()["protocol"] == open_run(job).definition()["protocol"]
+    assert min(starts) > 50
+    assert json.loads((job / "exposure.json").read_text())["photographs"] == coarse
 
 
 # -- what differs ------------------------------------------------------------------------------------------------------

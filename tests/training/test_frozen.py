@@ -116,6 +116,19 @@ def test_frozen_splats_must_have_the_degree_of_the_recipe() -> None:
         trainer_of(short(), random_splats(20), random_splats(5, degree=1), backends()[-1])
 
 
+def test_a_part_without_a_dense_start_begins_with_the_splats_that_it_is_given() -> None:
+    own, frozen = random_splats(45), random_splats(30, seed=1)
+    asked: list[int] = []
+
+    def within(places: torch.Tensor) -> torch.Tensor:
+        asked.append(len(places))
+        return places[:, 0] > 0
+
+    trainer = trainer_of(short(), own, frozen, backends()[-1], within=within)
+    assert same(trainer.splats, own)
+    assert asked == []  # only a dense start is of places
+
+
 # -- exposures ---------------------------------------------------------------------------------------------------------
 GIVEN = replace(short(), exposure=Exposure(initial="given", start=0, decay_steps=10))
 

@@ -21,6 +21,7 @@ from gs2d.errors import RecipeError
 MAX_BLOCKS = 10_000
 OWNERSHIP = ("center",)
 EXTENTS = ("scene", "block")
+STARTS = ("dense", "coarse")
 AUTO = "auto"
 
 
@@ -74,6 +75,9 @@ class Partition:
         frozen: what is left of two blocks at a seam was never drawn together.
     seam_schedule : float
         Fraction of the recipe's iterations for that, at its last steps, without coming or going; 0: not done.
+    start : "dense" or "coarse"
+        What a block begins with: the recipe's dense start, where it has one, of the block's own photographs, or the
+        coarse model's splats. Where photographs are large the coarse model knows a fraction of what they show.
     ownership : "center"
         The block keeps the splats whose centre lies in its cell; cells share no point and leave none out.
     extent : "scene" or "block"
@@ -90,6 +94,7 @@ class Partition:
     flat: float = 0.5
     seam: float = 0.03
     seam_schedule: float = 0.1
+    start: str = "dense"
     ownership: str = "center"
     extent: str = "scene"
 
@@ -127,6 +132,7 @@ def check_partition(partition: Partition) -> Partition:
     for name in ("seam", "seam_schedule"):
         require(getattr(partition, name) <= 1, f"{where}.{name} must be at most 1, got {getattr(partition, name)}")
     one_of(f"{where}.ownership", partition.ownership, OWNERSHIP)
+    one_of(f"{where}.start", partition.start, STARTS)
     one_of(f"{where}.extent", partition.extent, EXTENTS)
     integer(f"{where}.coarse.side", coarse.side, low=16)
     integer(f"{where}.coarse.max_splats", coarse.max_splats, low=2)

@@ -155,7 +155,8 @@ class BlockTask(BlocksTask):
     def work(self, on_event: OnEvent) -> dict[str, Any]:
         """Train, or go on."""
         out, partition = self.options.out, self.partition()
-        blocks = {block.name: block for block in read_split(partition_folder(out)).blocks}
+        split = read_split(partition_folder(out))
+        blocks = {block.name: block for block in split.blocks}
         if self.block not in blocks:
             raise RunError(f"{partition_folder(out)} has no block {self.block}; delete the folder and run this again")
         block = blocks[self.block]
@@ -166,6 +167,7 @@ class BlockTask(BlocksTask):
             views=block.views,
             splats=coarse_folder(out) / SPLATS,
             start=start_file(partition_folder(out), self.block),
+            region=split.cells.region(split.cells.names.index(self.block)),
             extent=block.extent if partition.extent == "block" else None,
             prepared=out,
         )

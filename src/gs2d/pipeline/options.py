@@ -180,6 +180,8 @@ class Part:
     splats, start : Path or None
         Splats that were trained before; and a file of which of them train, which stay frozen around them, and of the
         exposures of the views (``pipeline.part``).
+    region : three tuples, or ()
+        Axes, lower and upper ends along them of where the part lies, world units: a dense start is made there.
     extent : float or None
         Of the part, world units, where it is not that of the capture.
     prepared : Path or None
@@ -189,6 +191,7 @@ class Part:
     views: tuple[str, ...] = ()
     splats: Path | None = None
     start: Path | None = None
+    region: tuple[tuple[Any, ...], ...] = ()
     extent: float | None = None
     prepared: Path | None = None
 

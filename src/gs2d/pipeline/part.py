@@ -6,8 +6,11 @@ import hashlib
 import io
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,12 +43,15 @@ class LoadedPart:
         Of its training views, where the recipe learns exposures.
     digest : str
         Of all that.
+    within : callable or None
+        Which places [M, 3] it is of, [M] bool, where training begins with a dense start of those.
     """
 
     own: Splats
     frozen: Splats
     exposures: Tensor | None
     digest: str
+    within: Callable[[Tensor], Tensor] | None = None
 
 
 def part_scene(scene: Scene, part: Part) -> Scene:
@@ -125,5 +131,13 @@ def load_part(part: Part, scene: Scene, recipe: Recipe) -> LoadedPart:
         digest.update(exposures.numpy().tobytes())
         if exposures.shape != (len(scene.train), 3, 4):
             raise RunError(f"{part.start} must have exposures of {len(scene.train)} views, got {len(exposures)}")
-    found = torch.from_numpy(rows)
-    return LoadedPart(splats.rows(found == OWN), splats.rows(found == FROZEN), exposures, digest.hexdigest())
+    digest.update(repr(part.region).encode() if part.region else b"")
+    found, within = torch.from_numpy(rows), partial(inside, part.region) if part.region else None
+    return LoadedPart(splats.rows(found == OWN), splats.rows(found == FROZEN), exposures, digest.hexdigest(), within)
+
+
+def inside(region: tuple[tuple[Any, ...], ...], places: Tensor) -> Tensor:
+    """Return which places [M, 3] lie in a region: axes, lower and upper ends along them."""
+    axes, low, high = (np.array(part, np.float64) for part in region)
+    along = places.detach().cpu().numpy().astype(np.float64) @ axes.T
+    return torch.from_numpy(((along >= low) & (along < high)).all(axis=1)).to(places.device)

@@ -248,6 +248,7 @@ def train_stages(
         state=start.state,
         init=None if start.state is not None else job.init if job.part is None else job.part.own,
         frozen=None if job.part is None else job.part.frozen,
+        within=None if job.part is None or job.recipe.dense_start is None else job.part.within,
         exposures=None if job.part is None else job.part.exposures,
         progress_every=recorder.progress_every,
         stage2_cache_bytes=job.stage2_cache_bytes,

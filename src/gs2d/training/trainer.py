@@ -57,6 +57,7 @@ from gs2d.training.whole_steps import WholeSteps
 __all__ = ["OnEvent", "Trainer", "raster_settings"]
 
 OnEvent = Callable[[events.Event], None]
+MIN_START = 10  # splats that a dense start must find where there are others to start from
 MIN_SIDE = 11  # px of a photograph in training: the window of SSIM
 
 
@@ -82,6 +83,9 @@ class Trainer:
     frozen : Splats, optional
         Of the recipe's SH degree: rendered with those in training, and never changed, counted, densified or returned.
         They are what lies around a part of a scene that is trained by itself.
+    within : callable, optional
+        Which places [M, 3] are to be trained, [M] bool. With ``init``, and where the recipe has a dense start: training
+        starts from what that finds there, and from ``init`` only where photographs agree on nothing.
     exposures : Tensor [V, 3, 4], optional
         Transforms of the training views, for a recipe whose exposures are given.
     progress_every : int
@@ -116,6 +120,7 @@ class Trainer:
         state: TrainState | None = None,
         init: Splats | None = None,
         frozen: Splats | None = None,
+        within: Callable[[Tensor], Tensor] | None = None,
         exposures: Tensor | None = None,
         progress_every: int = 10,
         target_bytes: int | None = None,
@@ -134,7 +139,8 @@ class Trainer:
         if state is not None and init is not None:
             raise RunError("training goes on from a state or starts from init, got both; leave one out")
         # What goes on has begun; free space is found by the settings of the dense start, so that sweep is made again.
-        goes_on = init is not None or (state is not None and self.recipe.free_space is None)
+        self._within = within
+        goes_on = (init is not None and within is None) or (state is not None and self.recipe.free_space is None)
         begins = replace(self.recipe, dense_start=None) if goes_on else self.recipe
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes)
         if state is not None:
@@ -412,10 +418,15 @@ class Trainer:
 
     def _new_state(self, dtype: torch.dtype, init: Splats | None, exposures: Tensor | None) -> TrainState:
         generator = torch.Generator().manual_seed(self.recipe.seed)
-        if init is not None:
-            splats = splats_as_start(init, sh_degree=self.recipe.sh_degree, dtype=dtype)
-            self._pending.append(events.Initialised(len(splats), "splats", 0))
-            return per_image.start(TrainState(splats, generator), self.recipe, self.scene, exposures)
+        found = None if init is not None and not self._robust.starts_densely else self._started(dtype, generator)
+        if init is not None and (found is None or len(found) < MIN_START):
+            found = splats_as_start(init, sh_degree=self.recipe.sh_degree, dtype=dtype)
+            self._pending = [events.Initialised(len(found), "splats", 0)]
+        assert found is not None
+        return per_image.start(TrainState(found, generator), self.recipe, self.scene, exposures)
+
+    def _started(self, dtype: torch.dtype, generator: torch.Generator) -> Splats:
+        """Return the first splats as the recipe has them, of the places that are to be trained."""
         start = with_known_points(self._robust.scene, self.recipe)
         initial = initial_splats(
             start,
@@ -427,10 +438,10 @@ class Trainer:
         )
         source = initial.source if start is self._robust.scene else "depths"
         source = "sweep" if source == "points" and self._robust.starts_densely else source
-        lacks = self._robust.lacks
-        self._pending.append(events.Initialised(len(initial.splats), source, initial.dropped, lacks))
-        state = TrainState(self._robust.fitted(initial), generator)
-        return per_image.start(state, self.recipe, self.scene, exposures)
+        splats = self._robust.fitted(initial)
+        splats = splats if self._within is None else splats.rows(self._within(splats.means))
+        self._pending.append(events.Initialised(len(splats), source, initial.dropped, self._robust.lacks))
+        return splats
 
     def _act(self, stage: Stage, action: RankByError | CloneInPlace) -> events.Event:
         """Run an entry action."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from gs2d.errors import RunError
 from gs2d.pipeline.blocks.cells import Cells, cut, spread_of, weighted_quantile
+from gs2d.pipeline.part import inside
 
 RNG = np.random.default_rng(0)
 PLACES = RNG.normal(size=(4000, 3)) * [10.0, 5.0, 1.0] + [100.0, -7.0, 3.0]
@@ -76,6 +78,14 @@ def test_the_distance_to_a_seam_is_that_to_another_cell() -> None:
     seam = cells.high[0, 0]
     places = np.array([[seam + 3, 1e3, 0], [seam - 2, -1e3, 5]])
     assert cells.distance_to_seam(places) == pytest.approx([3, 2])
+
+
+def test_the_region_of_a_cell_is_what_lies_near_it() -> None:
+    cells = cut(PLACES, ONES, np.eye(3)[:2], (2, 2), 0.3)
+    for cell in range(4):
+        found = inside(cells.region(cell), torch.from_numpy(PLACES)).numpy()
+        assert np.array_equal(found, cells.near(cell, PLACES))
+        assert 0.25 * len(PLACES) < found.sum() < 0.7 * len(PLACES)
 
 
 def test_quantiles_by_weight() -> None:

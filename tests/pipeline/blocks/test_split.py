@@ -105,7 +105,9 @@ def test_recipes_of_a_block_have_a_share_of_the_budget_given_exposures_and_all_d
     assert budget_of(recipe) == 1000
     found = block_recipe(recipe, Partition(grid=(2, 2)), BLOCK)
     assert budget_of(found) == 400
-    assert found.dense_start is None
+    assert found.dense_start is not None
+    assert not found.dense_start.required
+    assert block_recipe(recipe, Partition(grid=(2, 2), start="coarse"), BLOCK).dense_start is None
     assert found.exposure is not None
     assert found.exposure.initial == "given"
     assert [stage.sh_interval for stage in found.stages] == [0]

@@ -56,6 +56,11 @@ class Cells:
         low, high = self.low[cell] - self.margin, self.high[cell] + self.margin
         return np.asarray(((along >= low) & (along < high)).all(axis=1))
 
+    def region(self, cell: int) -> tuple[tuple[Any, ...], ...]:
+        """Return a cell with its margin as plain values: axes, lower and upper ends along them."""
+        low, high = self.low[cell] - self.margin, self.high[cell] + self.margin
+        return tuple(map(tuple, self.axes.tolist())), tuple(low.tolist()), tuple(high.tolist())
+
     def distance_to_seam(self, places: np.ndarray) -> np.ndarray:
         """Return how far each place [N, 3] is from the nearest side of its cell that another cell touches [N]."""
         along, owner = places.astype(np.float64) @ self.axes.T, self.owners(places)

@@ -238,7 +238,11 @@ def block_recipe(recipe: Recipe, partition: Partition, block: Block) -> Recipe:
     most = partition.splats if whole is None else min(partition.splats, math.ceil(whole * block.weight))
     exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
     stages = tuple(replace(stage, sh_interval=0) for stage in recipe.stages)
-    value = replace(recipe, stages=stages, exposure=exposure, dense_start=None)
+    dense = recipe.dense_start if partition.start == "dense" else None
+    dense = (
+        None if dense is None else replace(dense, required=False)
+    )  # where it finds nothing there is the coarse model
+    value = replace(recipe, stages=stages, exposure=exposure, dense_start=dense)
     return validate(with_budget(value, max(2, most)))
 
 
