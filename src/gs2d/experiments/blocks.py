@@ -57,6 +57,7 @@ NOT_OF_BLOCKS = {  # options of a training that mean nothing in several
     "viewer": "--viewer",
     "viewer_port": "--viewer-port",
     "refine_poses": "--refine-poses",
+    "refine_cameras": "--refine-cameras",
 }
 
 

@@ -144,6 +144,7 @@ class BlocksOptions(Training, Resources):
     viewer: Annotated[bool, Fixed, Suppress] = False
     viewer_port: Annotated[int | None, Fixed, Suppress] = None
     refine_poses: Annotated[bool, Fixed, Suppress] = False
+    refine_cameras: Annotated[bool, Fixed, Suppress] = False
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks", "start_from", "cache")
