@@ -53,15 +53,16 @@ def test_twenty_kills_of_blocks_and_of_the_command_change_no_byte(tmp_path: Path
         assert time.monotonic() < deadline
         with subprocess.Popen(command(capture, job), stderr=subprocess.PIPE, text=True) as process:
             while kills < KILLS and process.poll() is None:
-                time.sleep(draws.uniform(0.5, 6.0))
-                below = children(process.pid)
-                if below and draws.random() < 0.6:
+                of_worker = draws.random() < 0.6
+                while of_worker and process.poll() is None and not children(process.pid):
+                    time.sleep(0.05)
+                time.sleep(draws.uniform(1.0, 8.0))
+                below = children(process.pid) if of_worker else []
+                if below:
                     kill(draws.choice(below))
                     workers += 1
-                elif process.poll() is None:
+                else:
                     kill(process.pid)
-                    kills += 1
-                    break
                 kills += 1
             said = process.communicate()[1]
         if process.returncode == 0:
