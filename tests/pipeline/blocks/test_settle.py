@@ -1,0 +1,92 @@
+"""How many blocks memory needs, and whether a capture is what it was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gs2d.config.partition import CoarseModel, Partition
+from gs2d.config.presets import get_recipe
+from gs2d.config.protocols import GENERIC
+from gs2d.errors import DataError
+from gs2d.pipeline.blocks import settle as module
+from gs2d.pipeline.blocks.settle import Settled, capture_digest, fitting_partition, seam_recipe
+from gs2d.pipeline.capture_plan import CapturePlan, Range
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.options import TrainOptions
+from gs2d.render.backends import get_backend
+from train_toys import backends, make_scene
+
+SCENE = make_scene()
+SETTLED = Settled(SCENE, "colmap", get_recipe("best"), GENERIC, get_backend(backends()[-1]), "digest")
+OPTIONS = TrainOptions(scene=Path("capture"), out=Path("job"))
+PLAN = CapturePlan(
+    photographs=6, pixels=1, trained_pixels=1, downscale=1, iterations=1, start=1_000_000, splats=Range(1, 2, 3),
+    max_splats=None, memory=Range(1, 2, 3), allowed=None, prepared=False, disk=1, temporary=1, seconds=Range(1, 2, 3),
+)  # fmt: skip
+
+
+def fitting(monkeypatch: pytest.MonkeyPatch, plan: CapturePlan | DataError, partition: Partition) -> Partition | None:
+    def planned(*_: object, **__: object) -> CapturePlan:
+        if isinstance(plan, DataError):
+            raise plan
+        return plan
+
+    monkeypatch.setattr(module, "plan_capture", planned)
+    return fitting_partition(SETTLED, OPTIONS, partition, lambda event: TOLD.append(event))
+
+
+TOLD: list[Event] = []
+
+
+def test_there_are_no_blocks_where_one_training_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert fitting(monkeypatch, PLAN, Partition()) is None
+    assert isinstance(TOLD[-1], Notice)
+    assert TOLD[-1].text.startswith("one training of everything fits into memory: no blocks")
+
+
+def test_there_are_as_many_blocks_as_memory_needs_with_the_coarse_model_beside_each(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """4 million splats are expected, times (1 + 2 x 0.25)^2 for the margin: 9; 1.5 fit beside 0.75 of the coarse."""
+    found = fitting(monkeypatch, replace(PLAN, max_splats=2_250_000), Partition(margin=0.25))
+    assert found is not None
+    assert found.coarse.max_splats == 750_000  # a third
+    assert found.splats == 1_500_000
+    assert found.blocks >= 6
+    assert found.blocks - min(found.grid) < 6  # not a row more than that takes
+
+
+def test_photographs_make_blocks_too_where_the_start_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    partition = Partition(photographs=2, coarse=CoarseModel(max_splats=500))
+    found = fitting(monkeypatch, DataError("6 photographs start from too many splats"), partition)
+    assert found is not None
+    assert found.blocks >= 3
+    assert found.coarse.max_splats == 500
+    texts = [event.text for event in TOLD if isinstance(event, Notice)]
+    assert "not in one training: 6 photographs start from too many splats" in texts
+
+
+def test_a_capture_is_known_by_its_cameras_points_and_split() -> None:
+    one = capture_digest(SCENE)
+    assert capture_digest(make_scene()) == one
+    first = SCENE.train[0]
+    turned = first.camera.T_cam_world.copy()
+    turned[0, 3] += 1e-9
+    assert capture_digest(replace(SCENE, train=(first.at(turned), *SCENE.train[1:]))) != one
+    assert capture_digest(replace(SCENE, train=SCENE.train[1:], test=SCENE.train[:1])) != one
+    assert SCENE.points is not None
+    assert capture_digest(replace(SCENE, points=None)) != one
+
+
+def test_seams_learn_by_the_last_steps_and_nothing_comes_or_goes() -> None:
+    recipe = get_recipe("2dgs-r")
+    (stage,) = seam_recipe(recipe, Partition(seam_schedule=0.1)).stages
+    assert stage.iterations == 3_000
+    assert stage.densify is None
+    assert stage.lr.means_at(1) == pytest.approx(recipe.stages[0].lr.means_final)
+    assert stage.lr.means_at(3_000) == pytest.approx(recipe.stages[0].lr.means_final)
+    assert set(stage.train.values()) == {"all"}
+    assert all(term.start == 0 for term in stage.losses)
