@@ -14,6 +14,7 @@ from gs2d.errors import RecipeError
 from gs2d.training.densify.by_error import blended_sums
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
+from gs2d.training.whole_steps import WholeSteps
 from train_toys import backends, compared, make_scene, random_splats, short
 
 SCENE = make_scene()
@@ -109,6 +110,15 @@ def test_densification_keeps_its_budget_of_what_is_in_training() -> None:
     own, frozen = random_splats(45), random_splats(30, seed=1)
     splats = trainer_of(replace(recipe, stages=(tight,)), own, frozen, backends()[-1]).run()
     assert 45 < len(splats) <= 50
+
+
+def test_iterations_in_one_piece_are_not_for_what_has_frozen_splats() -> None:
+    own, frozen = random_splats(45), random_splats(30, seed=1)
+    found = []
+    for others in (frozen, None):
+        whole = trainer_of(short(), own, others, backends()[-1])._whole
+        found.append(WholeSteps(whole, whole, short().stages[0])._possible)
+    assert found == [False, True]
 
 
 def test_frozen_splats_must_have_the_degree_of_the_recipe() -> None:
