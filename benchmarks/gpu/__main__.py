@@ -88,14 +88,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def host_alone(out: Path) -> int:
-    """What an iteration costs the host, on any machine."""
+    """What an iteration costs the host in each way, and what the compiler makes of its kernels, on any machine."""
     from benchmarks.gpu import host
     from benchmarks.gpu.bench import commit, write
     from benchmarks.timing import machine
 
-    found = host.host_cost()
-    write(out, {"command": "host", "commit": commit(), "machine": machine(), "results": found})
-    print(*host.table(found), f"written: {out}", sep="\n")
+    found = {way: host.host_cost(way=way) for way in host.WAYS}
+    made = host.machine_code()
+    write(out, {"command": "host", "commit": commit(), "machine": machine(), "results": found, "machine_code": made})
+    for way, stages in found.items():
+        print(f"{way}:", *host.table(stages), sep="\n  ")
+    print("sm_90:", *(f"{name}: {row}" for name, row in made.items()), f"written: {out}", sep="\n  ")
     return 0
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.gpu import whole
 from benchmarks.gpu.bench import ROOT, Bench, run_program
 from benchmarks.gpu.probes import ceilings
 from gs2d.core.splats import Splats
@@ -38,6 +39,7 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
         "ceilings": lambda: ceilings(bench),
         "registers": lambda: registers(bench),
         "parity": lambda: parity(bench, 2 if bench.dry else 60),
+        "whole_steps": lambda: whole_steps(bench),
         "determinism": lambda: determinism(bench),
         "tests": lambda: gpu_tests(bench),
         **{tool: lambda tool=tool: sanitize(bench, tool) for tool in TOOLS},
@@ -124,6 +126,7 @@ def exercise(bench: Bench) -> list[str]:
         _render_all_ways(bench)
         _all_losses(bench)
         _three_stages(bench)
+        whole.run_kernels(bench, *small_scene(bench))
         _fusion(bench)
     bench.wait()
     return sorted(set(kernel_sources()) - launched)
@@ -183,6 +186,13 @@ def _fusion(bench: Bench) -> None:
     colors = {"color": random(blocks, 512, 3), "color_weight": random(blocks, 512)}
     arrays = depth | pixels | place | {"offsets": 0.1 * random(3, 512)} | volume | colors
     fuse_on_gpu(launch.launcher_for(bench.device), arguments_of((height, width), 0.5, arrays))
+
+
+def whole_steps(bench: Bench) -> dict[str, Any]:
+    """Iterations by kernels alone beside those through torch: wrong where a hundredth of what was learned differs."""
+    _scenes()
+    found = whole.differences(bench)
+    return found | {"exit": int(max(value for way in found.values() for value in way.values()) > 1e-2)}
 
 
 def determinism(bench: Bench) -> dict[str, Any]:

@@ -6,6 +6,7 @@ way to the driver, which does nothing. What a GPU adds is the driver's own time 
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
 from collections import Counter
@@ -20,18 +21,26 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.gpu.bench import EmulatedBackend
+from benchmarks.gpu.sass import listing
 from benchmarks.iteration import steady
 from benchmarks.workload import PLACES, camera, room
 from gs2d.config.presets import two_dgs_r
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Recipe
 from gs2d.data.scene import Scene, View
+from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
+from gs2d.kernels.cuda.compile import compile_source
 from gs2d.render import pair_budget
 from gs2d.training import objective, trainer
 from gs2d.training.state import TrainState
 from gs2d.training.trainer import Trainer
 
+WAYS = ("autograd", "launches", "graph")
+SOURCES = tuple(
+    f"cuda/{name}.cu"
+    for name in "sort project emit order blend photometric losses blend_vjp blend_colors project_vjp adam".split()
+)
 SPLATS, WIDTH, HEIGHT = 256, 64, 48
 # Of torch on a GPU: what makes or looks at a tensor launches nothing, a sort by radix launches one kernel a pass of
 # 8 bits and five more (indices, histogram, offsets, two copies), everything else one.
@@ -159,10 +168,14 @@ def null_trainer() -> Trainer:
     )
 
 
-def host_cost(repeats: int = 300, stages: int = 3) -> dict[str, Any]:
-    """By stage: microseconds of the host an iteration, its launches, torch operations and allocations."""
-    threads = torch.get_num_threads()
+def host_cost(repeats: int = 300, stages: int = 3, way: str = "") -> dict[str, Any]:
+    """By stage: microseconds of the host an iteration, its launches, torch operations and allocations.
+
+    ``way`` is that of ``GS2D_CUDA_STEP``; "": as it is set.
+    """
+    threads, before = torch.get_num_threads(), os.environ.get(launch.STEP_VARIABLE, "")
     torch.set_num_threads(1)
+    os.environ[launch.STEP_VARIABLE] = way or before
     found: dict[str, Any] = {}
     try:
         with nothing_runs() as driver:
@@ -174,7 +187,28 @@ def host_cost(repeats: int = 300, stages: int = 3) -> dict[str, Any]:
                 found[stage.name] = {**_time(made, repeats), **_count(made, driver)}
     finally:
         torch.set_num_threads(threads)
+        os.environ[launch.STEP_VARIABLE] = before
     return found
+
+
+def machine_code(arch: str = "sm_90") -> dict[str, Any]:
+    """By kernel of an iteration: registers, shared memory, instructions and accesses; empty without a compiler here."""
+    try:
+        code = {name: compile_source(name, arch) for name in SOURCES}
+        kernels = {name: listing(made.code) for name, made in code.items()}
+    except (BackendError, FileNotFoundError):
+        return {}
+    return {
+        kernel: {
+            "registers": usage.registers,
+            "shared_bytes": usage.shared_bytes,
+            "instructions": len(kernels[name][kernel].instructions),
+            "accesses": kernels[name][kernel].accesses(),
+        }
+        for name, made in code.items()
+        for kernel, usage in sorted(made.usage().items())
+        if not kernel.endswith(("_32", "_abs", "distortion", "transmittance")) or kernel.endswith("pass_32")
+    }
 
 
 def _time(made: Trainer, repeats: int) -> dict[str, float]:

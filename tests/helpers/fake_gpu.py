@@ -169,9 +169,13 @@ def install(guard: str, emulator: Emulator) -> Counter[str]:
         launched[name] += 1
         emulator.launch(name, blocks, threads, arguments, shared_bytes)
 
+    def run_all(works: Any) -> None:
+        for work in works:
+            run_kernel(work.name, work.blocks, work.threads, work.arguments)
+
     def launcher_for(device: torch.device) -> Any:
         assert device.type == "cuda", device
-        return SimpleNamespace(launch=run_kernel)
+        return SimpleNamespace(launch=run_kernel, run=run_all)
 
     ctypes.CDLL(guard)
     nothing: Callable[..., Any] = lambda *_, **__: None  # noqa: E731

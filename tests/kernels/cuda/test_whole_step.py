@@ -20,7 +20,7 @@ from emulate import Emulator
 from fake_backends import cuda_on_host
 from fake_driver import FakeDriver, Result
 from gs2d.config.protocols import GENERIC, Protocol
-from gs2d.config.recipe import PoseRefinement, Recipe
+from gs2d.config.recipe import GradDensify, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import launch
@@ -108,6 +108,15 @@ def at_camera(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
+QUIET = GradDensify(every=100, start=500, stop=900, reset_every=0, opacity_cull=0.005)
+
+
+def brief() -> Recipe:
+    """Eight iterations of the first stage, six of which nobody looks at."""
+    recipe = train_toys.short()
+    return replace(recipe, stages=(replace(recipe.stages[0], iterations=8, densify=QUIET),))
+
+
 VARIANTS = {
     "plain": (lambda scene: scene, train_toys.short(), GENERIC),
     "absolute": (two_sizes, train_toys.short(absgs=True), replace(GENERIC, depth="median")),
@@ -115,6 +124,7 @@ VARIANTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_three_stages_have_the_bits_of_those_that_go_through_torch(
     emulator: Emulator, scene: Scene, variant: str
@@ -129,6 +139,7 @@ def test_three_stages_have_the_bits_of_those_that_go_through_torch(
     assert same(parts, whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 11])
 def test_memory_of_before_and_the_order_of_threads_change_nothing(
     emulator: Emulator, scene: Scene, seed: int, monkeypatch: pytest.MonkeyPatch
@@ -161,13 +172,13 @@ def test_memory_of_before_and_the_order_of_threads_change_nothing(
 def test_an_iteration_without_room_for_its_pairs_changes_nothing_and_is_done_again(
     emulator: Emulator, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe = train_toys.short()
+    recipe = brief()
     plain, _ = trained(emulator, scene, recipe, "launches")
     for name in ("SLACK", "VIEW_SLACK"):
         monkeypatch.setattr(pair_budget, name, 0.5)
     monkeypatch.setattr(pair_budget, "STEP", 1)
     short, some = trained(emulator, scene, recipe, "launches")
-    assert some > 5
+    assert some >= 4
     assert same(plain, short)
 
 
@@ -175,15 +186,18 @@ def on_gpu(driver: FakeDriver) -> GpuLauncher:
     return fake_driver.launcher(driver)
 
 
-def test_an_iteration_that_comes_again_is_a_graph_with_the_same_bits(emulator: Emulator, scene: Scene) -> None:
+@pytest.mark.parametrize("stages", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_an_iteration_that_comes_again_is_a_graph_with_the_same_bits(
+    emulator: Emulator, scene: Scene, stages: int
+) -> None:
     """Rows are added in between and cameras, rates and rooms change: in the graph, where they differ."""
-    recipe = train_toys.short()
+    recipe = brief() if stages == 1 else train_toys.short()
     plain, some = trained(emulator, scene, recipe, "launches")
     driver = FakeDriver(emulator=emulator)
     replayed, as_many = trained(on_gpu(driver), scene, recipe, "graph")
     assert some == as_many
     assert same(plain, replayed)
-    assert len(driver.replays) >= 8
+    assert len(driver.replays) >= 6  # two an iteration, from the third on
     assert driver.changes > 0
     launched = Counter(done.kernel for done in driver.launches)
     assert 0 < launched["running_counts"] < some  # until it was a graph
@@ -199,9 +213,9 @@ def test_an_iteration_that_comes_again_is_a_graph_with_the_same_bits(emulator: E
     ids=["too old", "makes none", "changes none"],
 )
 def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: Scene, driver: FakeDriver) -> None:
-    plain, some = trained(emulator, scene, train_toys.short(), "launches")
+    plain, some = trained(emulator, scene, brief(), "launches")
     driver.emulator = emulator
-    found, as_many = trained(on_gpu(driver), scene, train_toys.short(), "graph")
+    found, as_many = trained(on_gpu(driver), scene, brief(), "graph")
     assert same(plain, found)
     assert some == as_many
     assert len(driver.replays) <= 2  # both halves once, where the refusal comes afterwards
@@ -209,7 +223,7 @@ def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: 
 
 def test_a_way_that_does_not_exist_is_one_line(scene: Scene, emulator: Emulator) -> None:
     with pytest.raises(BackendError, match="GS2D_CUDA_STEP must be graph, launches or autograd, got 'fast'; unset it"):
-        trained(emulator, scene, train_toys.short(), "fast")
+        trained(emulator, scene, brief(), "fast")
 
 
 class OfItsOwn(GradientDensifier):
@@ -240,12 +254,13 @@ def test_what_is_learned_of_cameras_and_densifiers_with_steps_of_their_own_go_th
 
 def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -> None:
     """Neither an operation nor memory; only the order of the views is drawn, once in an epoch."""
-    recipe = train_toys.short()
-    first = replace(recipe.stages[0], iterations=200, densify=replace(recipe.stages[0].densify, start=500, stop=900))
+    first = replace(brief().stages[0], iterations=200)
     with mode("launches", emulator) as done:
-        trainer = Trainer(scene, replace(recipe, stages=(first,)), GENERIC, backend=cuda_on_host(), progress_every=1000)
+        trainer = Trainer(
+            scene, replace(brief(), stages=(first,)), GENERIC, backend=cuda_on_host(), progress_every=1000
+        )
         trainer.enter(0)
-        for _ in range(14):
+        for _ in range(7):
             trainer.step()
         before = sum(done)
         with OperationCount() as count:
@@ -257,10 +272,9 @@ def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -
 
 def test_photographs_in_the_hosts_memory_come_to_the_same_place_each_time(emulator: Emulator, scene: Scene) -> None:
     """Where the device has no room for their bytes."""
-    recipe = train_toys.short()
-    parts, _ = trained(emulator, scene, recipe, "autograd", target_bytes=0)
-    whole, some = trained(emulator, scene, recipe, "launches", target_bytes=0)
-    assert some >= 11
+    parts, _ = trained(emulator, scene, brief(), "autograd", target_bytes=0)
+    whole, some = trained(emulator, scene, brief(), "launches", target_bytes=0)
+    assert some == 6
     assert same(parts, whole)
 
 
@@ -281,4 +295,4 @@ def test_a_byte_is_the_same_number_as_by_a_division(emulator: Emulator) -> None:
     assert float(partials[0].sum()) == 3 * width
 
 
-assert os.environ.get(launch.STEP_VARIABLE) is None, "the tests choose how iterations are done"
+assert not os.environ.get(launch.STEP_VARIABLE), "the tests choose how iterations are done"
