@@ -240,6 +240,9 @@ def georeference(command: c.Georeference, console: Console) -> None:
     console.close()
     for line in [] if found is None else found.lines():
         console.say(line)
+    if found is not None:
+        run = shlex.quote(str(command.run))
+        console.say(f"shown in report and page after: gs2d report {run}; gs2d page {run}")
     if found is None:
         console.say("no georeference: --gps, --positions, --control, --known-distance or --markers finds one")
     console.result({"run": str(command.run), "georeference": None if found is None else found.to_json()})

@@ -26,6 +26,7 @@ from gs2d.report.links import links
 from gs2d.report.plots import curves, read_history
 from gs2d.report.sections.capture import capture_section
 from gs2d.report.sections.exposure import exposure_section
+from gs2d.report.sections.georeference import georeference_section
 from gs2d.report.sections.losses import loss_section, loss_titles
 from gs2d.report.sections.pictures import hero, mesh_section, view_sections
 from gs2d.report.sections.poses import poses_section
@@ -151,6 +152,7 @@ def _parts(record: RunRecord, cameras: Sequence[Camera]) -> dict[str, Callable[[
         "curves": lambda: curve_section(record),
         "story of the training": lambda: story(record.events),
         "photographs": lambda: capture_section(path, record.definition),
+        "place in the world": lambda: georeference_section(path),
         "exposures": lambda: exposure_section(path / EXPOSURE, last),
         "cameras": lambda: poses_section(path / POSES, last),
         "facts of the run": lambda: macro("macros.html", "facts", definition_facts(record.definition)),
