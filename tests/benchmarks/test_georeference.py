@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from benchmarks.georeference import (
 )
 
 from gs2d.core.georeference import Georeference
+from gs2d.data import View
 from gs2d.geo.control import locate, read_control
 from gs2d.geo.positions import read_positions
 from gs2d.synthetic.flight import Flight, flown_cameras
@@ -30,13 +30,16 @@ GROUND = np.stack([*np.meshgrid(np.linspace(0, 60, 20), np.linspace(0, 60, 20))]
 TRUTH = Truth(CAMERAS, np.column_stack([GROUND - GROUND.mean(axis=0), np.zeros(len(GROUND))]))
 
 
+def undecoded() -> Any:
+    raise AssertionError("no photograph is looked at")
+
+
 def test_marks_of_control_points_meet_where_the_points_are(tmp_path: Path) -> None:
     count = write_control(tmp_path / "control.csv", TRUTH, list(CAMERAS), np.random.default_rng(0))
     assert count == CONTROL
     points = read_control(tmp_path / "control.csv").points
     assert sum(point.check for point in points) == CONTROL // 3
-    views: list[Any] = [SimpleNamespace(name=name, camera=camera) for name, camera in CAMERAS.items()]
-    located = locate(points, views)
+    located = locate(points, [View(name, camera, undecoded) for name, camera in CAMERAS.items()])
     np.testing.assert_allclose(located.source + WORLD, located.world, atol=1.5)  # of 0.5 px, which are 0.2 m there
     assert np.abs(located.source + WORLD - located.world).max() > 0.05  # there is noise
 

@@ -30,7 +30,7 @@ def colmap(folder: Path, model: int = 1) -> None:
     (folder / "images").mkdir(parents=True)
     (folder / "sparse" / "0").mkdir(parents=True)
     c = cameras[0]
-    params = [c.fx, c.fy, c.cx, c.cy] + [0.0] * (8 if model == 10 else 0)
+    params = [c.fx, c.fy, c.cx, c.cy] + [0.0] * (12 if model == 11 else 0)
     head = struct.pack("<QiiQQ", 1, 1, model, c.width, c.height)
     (folder / "sparse/0/cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
     from PIL import Image
@@ -56,7 +56,7 @@ def truncated_images_bin(folder: Path) -> None:
 
 
 def unsupported_camera(folder: Path) -> None:
-    colmap(folder, model=10)  # THIN_PRISM_FISHEYE
+    colmap(folder, model=11)  # RAD_TAN_THIN_PRISM_FISHEYE
 
 
 def wrong_json_key(folder: Path) -> None:
@@ -108,7 +108,7 @@ def meshroom_before_its_poses(folder: Path) -> None:
         (missing, "capture"),
         (empty, "capture"),
         (truncated_images_bin, "images.bin"),
-        (unsupported_camera, "THIN_PRISM_FISHEYE"),
+        (unsupported_camera, "RAD_TAN_THIN_PRISM_FISHEYE"),
         (wrong_json_key, "transform_matrix"),
         (broken_json, "transforms_train.json"),
         (image_that_does_not_decode, "r_2.png"),

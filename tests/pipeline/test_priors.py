@@ -138,7 +138,8 @@ def test_relative_maps_without_points_are_fitted_to_what_is_rendered(valid: Path
 def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(valid: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     shutil.copytree(valid, broken)
-    Image.fromarray(np.zeros((SIZE, SIZE, 3), np.uint8)).save(broken / "depths" / "train" / "r_4.png")
+    coloured = np.full((SIZE, SIZE, 3), (90, 120, 90), np.uint8)
+    Image.fromarray(coloured).save(broken / "depths" / "train" / "r_4.png")
     with pytest.raises(DataError, match=r"r_4.png must be a grey image of 16 bits"):
         train(knowing(broken, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
