@@ -204,6 +204,8 @@ def test_ctrl_c_before_the_first_iteration_leaves_nothing_and_says_so(
         MemoryError(),
         RuntimeError("[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory"),
         RuntimeError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+        RuntimeError("std::bad_alloc"),
+        ImportError("libtorch_cpu.so: failed to map segment from shared object"),
     ],
 )
 def test_out_of_memory_names_the_remedy(
@@ -217,6 +219,22 @@ def test_out_of_memory_names_the_remedy(
     monkeypatch.setattr(report, "report_run", hungry)
     assert run(["report", str(trained)]) == 2
     assert "--downscale" in one_line(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("can't start new thread"), BlockingIOError(11, "Resource temporarily unavailable")]
+)
+def test_no_more_threads_is_not_taken_for_no_more_memory(
+    error: Exception, trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from gs2d.pipeline import report
+
+    def crowded(_path: Path, _on_event: object) -> Path:
+        raise error
+
+    monkeypatch.setattr(report, "report_run", crowded)
+    assert run(["report", str(trained)]) == 2
+    assert "--threads" in one_line(capsys.readouterr().err)
 
 
 def test_an_os_error_that_the_user_can_mend_is_one_line(

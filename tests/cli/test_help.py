@@ -43,7 +43,7 @@ from gs2d.cli.usage import NAMES
         ("mesh here --voxel wide", "--voxel must be a number, got 'wide'"),
         ("mesh here --bbox 1 2 3", "--bbox needs 6 numbers, got 3"),
         ("train here --out", "--out needs a value: --out RUN"),
-        ("train here --out there --downscale None", "--downscale must be a whole number, got 'None'"),
+        ("train here --out there --stage2-cache-mb None", "--stage2-cache-mb must be a whole number, got 'None'"),
         ("train here --out there --robust None", "--robust must be auto, on or off, got 'None'"),
         ("train here --out there --resume=yes", "--resume takes no value, got 'yes'"),
         ("train here --out there --resume --overwrite", "exclude each other"),

@@ -11,7 +11,7 @@ from dataclasses import replace
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -19,8 +19,10 @@ from gs2d.cli import run
 from gs2d.errors import BackendError, DataError, RunError
 from gs2d.experiments import execute as execute_module
 from gs2d.experiments import jobs as jobs_module
-from gs2d.experiments.execute import _startable, execute, failures
+from gs2d.experiments.execute import execute
 from gs2d.experiments.jobs import Job, stage_keys
+from gs2d.experiments.schedule import startable
+from gs2d.experiments.tasks import failures
 from gs2d.pipeline.events import Notice, OnEvent
 from sweep_jobs import fail_or_die, make_jobs
 from tiny import write_capture
@@ -171,13 +173,12 @@ def test_keys_are_equal_as_far_as_the_stages_are() -> None:
 
 def test_a_job_waits_while_another_one_trains_a_stage_of_its(tmp_path: Path) -> None:
     first, second, third = make_jobs(tmp_path, {"a": ("s", "x"), "b": ("s", "y"), "c": ("r",)})
-    running = {0: (first, cast(BaseProcess, None))}
-    assert _startable([second], running) is None
-    assert _startable([second, third], running) == third
+    assert startable([second], [first]) is None
+    assert startable([second, third], [first]) == third
     first.train.out.mkdir(parents=True)
     stage = {"name": "surface", "iterations": 1, "seconds": 1, "splats": 1, "bytes": 1}
     (first.train.out / "metrics.json").write_text(json.dumps({"stages": [stage]}))
-    assert _startable([second], running) == second  # takes it from the cache
+    assert startable([second], [first]) == second  # takes it from the cache
 
 
 def test_slots_must_be_a_number_of_processes(tmp_path: Path) -> None:

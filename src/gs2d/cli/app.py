@@ -36,6 +36,7 @@ from gs2d.cli.commands import (
 from gs2d.cli.console import Console, show_help
 from gs2d.cli.interrupts import INTERRUPTED, Interruptible
 from gs2d.cli.usage import HELP_WORDS, NAMES, UsageError, check
+from gs2d.core.memory_limit import address_space, check_address_space
 from gs2d.core.processes import here
 from gs2d.core.text import printable
 from gs2d.errors import Gs2dError
@@ -59,7 +60,12 @@ _MENDABLE = {
     errno.EIO,
 }
 _HEAVY = tuple(command for command in COMMANDS if command not in (Recipes, Doctor, Info, Completion))
-_NO_MEMORY = re.compile("can't allocate memory|out of memory")  # how torch says it, on the CPU and on a GPU
+_LIGHT = (Recipes, Completion)  # which load no numbers
+# How torch says it on the CPU and on a GPU, how C++ does, and the loader of shared libraries.
+_NO_MEMORY = re.compile(
+    "can't allocate memory|out of memory|std::bad_alloc|failed to map segment|cannot allocate memory", re.IGNORECASE
+)
+_NO_THREAD = re.compile("can't start new thread|Resource temporarily unavailable")  # Python, the kernel
 
 
 def run(argv: Sequence[str]) -> int:
@@ -79,6 +85,8 @@ def run(argv: Sequence[str]) -> int:
     interruptible = Interruptible()
     console = Console(quiet=command.quiet, as_json=command.json, before_each=interruptible.check)
     try:
+        if not isinstance(command, _LIGHT):
+            check_address_space()
         actions = importlib.import_module("gs2d.cli.handlers")
         if isinstance(command, _HEAVY):
             importlib.import_module("gs2d.pipeline.train")  # torch and all: see `interrupts`
@@ -209,7 +217,13 @@ def _report(error: Exception, debug: bool) -> int:
         return _fail(str(error))
     if isinstance(error, OSError) and error.errno in _MENDABLE:
         return _fail(f"{error.strerror}: {error.filename or 'no file named'}; mend that and run the command again")
-    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
+    said = str(error) if isinstance(error, RuntimeError | ImportError | OSError) else ""
+    no_thread = _NO_THREAD.search(said)
+    if isinstance(error, MemoryError) or no_thread or _NO_MEMORY.search(said):
+        if (limit := address_space()) is not None:
+            return _fail(f"out of memory: the address space is limited to {limit / 2**30:.2f} GiB; raise ulimit -v")
+        if no_thread:
+            return _fail("no more threads or processes may be begun here; raise ulimit -u, or use fewer --threads")
         return _fail("out of memory; use a larger --downscale, or fewer splats (--set surface.densify.max_splats=N)")
     text = " ".join(str(error).split()) or "no message"
     hint = "" if debug else "; run again with --debug and report it with the traceback"

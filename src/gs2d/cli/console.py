@@ -97,7 +97,7 @@ class Console:
                 soft_wrap=True,
             )
         elif isinstance(event, StageDone):
-            self._lines(wrapped(stage_line(event.metrics), self._err.width, rest="  "))
+            self._lines(wrapped(event.line(), self._err.width, rest="  "))
 
     def _note(self, text: str) -> None:
         """Print a notice; on a terminal its lines break between words."""
@@ -199,17 +199,6 @@ class Console:
             if self.missing and isinstance(value, dict):
                 value = {**value, "missing": [{"what": m.what, "reason": m.reason} for m in self.missing]}
             print(json.dumps(value, indent=2, allow_nan=False))
-
-
-def stage_line(metrics: dict[str, Any]) -> str:
-    """One line about a finished stage."""
-    words = [f"{metrics['name']}: {metrics['iterations']} iterations in {metrics['seconds']:.0f} s"]
-    words.append(f"{metrics['splats']:,} splats")
-    for split in ("train", "test"):
-        scores = metrics.get(split)
-        if scores and scores.get("psnr") is not None:
-            words.append(f"{split} PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
-    return "; ".join(words) + (" (from a cache)" if metrics.get("reused_from") else "")
 
 
 def figure(value: float | None, digits: int, unit: str = "") -> str:

@@ -8,6 +8,7 @@ from types import MappingProxyType
 # extra -> what pyproject.toml says of it (a test compares them)
 EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
+        "cluster": ("ray>=2.60,<3",),
         "cuda12": ("cuda-bindings>=12.8,<13", "nvidia-cuda-nvrtc-cu12>=12.4"),
         "cuda13": ("cuda-bindings>=13,<14", "nvidia-cuda-nvrtc>=13,<14"),
         "geo": ("pyproj>=3.6", "tifffile>=2024.1"),

@@ -15,8 +15,9 @@ from gs2d.config.partition import Partition, from_json, make_partition
 from gs2d.config.serialize import from_json as recipe_from_json
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RecipeError, RunError
-from gs2d.experiments.execute import Task, execute, failures
+from gs2d.experiments.execute import execute
 from gs2d.experiments.options import BlocksOptions
+from gs2d.experiments.tasks import Task, failures
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
 from gs2d.pipeline.blocks.merged import MERGED, SEAM_VIEWS, finish_merged, write_merged, write_result
 from gs2d.pipeline.blocks.settle import (
@@ -34,7 +35,7 @@ from gs2d.pipeline.blocks.settle import (
     settle,
 )
 from gs2d.pipeline.blocks.split import CELLS, SEAMS, read_split, split_model, start_file
-from gs2d.pipeline.events import OnEvent, ignore
+from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import check_train_options, difference, protocol_from_json
@@ -114,7 +115,7 @@ class CoarseTask(BlocksTask):
     def work(self, on_event: OnEvent) -> dict[str, Any]:
         """Train, or go on."""
         settled, partition = self.settled(on_event), self.partition()
-        downscale = coarse_downscale(settled.scene, partition, self.options.downscale)
+        downscale = coarse_downscale(settled.scene, partition, self.options.downscale or 1)
         recipe, out = coarse_recipe(settled.recipe, partition), coarse_folder(self.options.out)
         run = train(self.training(recipe=recipe, downscale=downscale, out=out), on_event)
         return {"stages": run.metrics()["stages"]}
@@ -264,10 +265,11 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     check_train_options(training)
     check_job_folder(options.out)
     use_threads(options.threads)
-    use_memory(_share(options.memory, options.slots))
+    share = _share(options.memory, None if options.cluster else options.slots)  # on a cluster: of each machine
+    use_memory(share)
     begun = (options.out / BLOCKS_JSON).exists()
     if not begun and is_run(options.out):  # there were no blocks
-        return train(training, on_event)
+        return _one_training(options, training, on_event)
     settled = settle(training, on_event)
     if not partition.grid and begun:
         found = read_json(options.out / BLOCKS_JSON)["partition"]
@@ -275,15 +277,15 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
     elif not partition.grid:
         fitting = fitting_partition(settled, training, partition, on_event)
         if fitting is None:
-            return train(training, on_event)
+            return _one_training(options, training, on_event)
         partition = fitting
     if partition.blocks == 1:
-        return train(training, on_event)
+        return _one_training(options, training, on_event)
     use_memory(options.memory)
     definition = settled.definition(training, partition)
     if begun:
         check_same_job(options.out, definition)
-    tasks = tasks_of(replace(training, recipe="", resume=True), partition, _share(options.memory, options.slots))
+    tasks = tasks_of(replace(training, recipe="", resume=True), partition, share)
 
     def write() -> None:
         if not (options.out / BLOCKS_JSON).exists():
@@ -297,10 +299,18 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
         slots=options.slots,
         threads=options.threads,
         backend=options.backend,
+        cluster=options.cluster,
         before=write,
     )
     _check_all_done(tasks)
     return RunFolder(options.out)
+
+
+def _one_training(options: BlocksOptions, training: TrainOptions, on_event: OnEvent) -> RunFolder:
+    """Train without blocks."""
+    if options.cluster is not None:
+        on_event(Notice("one training, without blocks: it runs on this machine, not on the cluster"))
+    return train(training, on_event)
 
 
 def training_of(options: BlocksOptions) -> TrainOptions:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gs2d.experiments.execute import Task
+from gs2d.experiments.tasks import Task
 from gs2d.io.run_dir import MESH, SPLATS, RunFolder
 from gs2d.pipeline.events import Event, MissingFile, OnEvent
 from gs2d.pipeline.options import EvaluateOptions, TrainOptions

@@ -37,6 +37,9 @@ class TableOptions:
     """Rasterizer."""
     slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
     """Runs at the same time (default: one a GPU, else one)."""
+    cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
+    machine is of."""
     threads: int | None = None
     """CPU threads of each of several runs (default: the cores divided among them)."""
     cache: Annotated[Path | None, arg(metavar="DIR")] = None
@@ -124,6 +127,9 @@ class BlocksOptions(Training, Resources):
     """Change how it is cut, e.g. --partition margin=0.3, --partition coarse.side=800; may be repeated."""
     slots: Annotated[int | None, arg(aliases=["--jobs"])] = None
     """Runs at the same time (default: one a GPU, else one)."""
+    cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
+    machine is of."""
     format: str = "auto"
     """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
     downscale: int = 1

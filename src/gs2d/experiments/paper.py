@@ -15,12 +15,13 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import RunError
 from gs2d.experiments.aggregate import FIGURES, ClaimResult, Results, Row, check_claims, read_cell
 from gs2d.experiments.deviations import deviations_of
-from gs2d.experiments.execute import execute, failures
+from gs2d.experiments.execute import execute
 from gs2d.experiments.options import PaperOptions, SweepOptions, TableOptions
 from gs2d.experiments.plan import Plan, commands_of, make_plan, paper_command
 from gs2d.experiments.render import to_csv, to_latex, to_markdown, write_page
 from gs2d.experiments.scenes import FoundScene
 from gs2d.experiments.tables import DTU, TNT, PaperRow, PaperTable
+from gs2d.experiments.tasks import failures
 from gs2d.io.run_dir import machine, make_folder, versions
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 
@@ -80,6 +81,7 @@ def paper(options: PaperOptions | SweepOptions, on_event: OnEvent = ignore) -> P
             slots=options.slots,
             threads=options.threads,
             backend=options.backend,
+            cluster=options.cluster,
             before=lambda: write_json(options.out / ABOUT, about(plan, None, ())),
             after_job=lambda _job: tabulate(plan, images=False),
         )

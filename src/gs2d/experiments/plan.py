@@ -153,7 +153,7 @@ def _wanted(scene: FoundScene, options: TableOptions) -> Iterator[str]:
 def paper_command(options: PaperOptions | SweepOptions) -> str:
     """Return the command that makes a table."""
     words = ["sweep", *options.recipes] if isinstance(options, SweepOptions) else ["paper", options.table]
-    return _command(words, options, ("table", "recipes", "slots", "threads", "train"))
+    return _command(words, options, ("table", "recipes", "slots", "threads", "cluster", "train"))
 
 
 def commands_of(job: Job) -> list[str]:

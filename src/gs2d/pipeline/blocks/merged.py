@@ -118,7 +118,7 @@ def merged_job(settled: Settled, options: TrainOptions, scene: Scene) -> Job:
         scene,
         settled.backend,
         settings,
-        options.downscale,
+        options.downscale or 1,
         settled.capture,
         options.stage2_cache_mb << 20,
     )

@@ -68,7 +68,7 @@ class Settled:
         return {
             "format": FORMAT,
             "capture": {"path": str(options.scene.resolve()), "digest": self.capture, "format": self.format},
-            "downscale": options.downscale,
+            "downscale": (options.downscale or 1),
             "partition": partition_json(partition),
             "recipe": to_json(self.recipe),
             "protocol": json.loads(json.dumps(asdict(self.protocol))),
@@ -109,9 +109,9 @@ def open_settled(options: TrainOptions, recipe: Recipe, protocol: Protocol, on_e
     backend = choose_backend(options.backend, on_event)
     kind = detect_format(options.scene) if options.format == "auto" else options.format
     masks = Masks(options.masks, options.masked)
-    scene = read_scene(options.scene, kind, options.downscale, protocol, on_event, masks)
+    scene = read_scene(options.scene, kind, (options.downscale or 1), protocol, on_event, masks)
     protocol = with_masks(protocol, scene, on_event)
-    check_memory(scene, options.downscale, backend.device)
+    check_memory(scene, (options.downscale or 1), backend.device)
     return Settled(scene, kind, recipe, protocol, backend, capture_digest(scene))
 
 
@@ -160,7 +160,7 @@ def fitting_partition(
             recipe,
             settled.protocol,
             settled.backend,
-            downscale=options.downscale,
+            downscale=(options.downscale or 1),
             prepare=options.prepare,
         )
     except DataError as error:
