@@ -12,39 +12,32 @@ takes code of its own major version of CUDA and of older ones. Kernels that spil
 
 from __future__ import annotations
 
-import json
 import sys
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import gs2d
 from gs2d.errors import BackendError
 from gs2d.kernels.cuda import compile as nvrtc
-from gs2d.kernels.cuda.shipped import FOLDER, MANIFEST, PTX, SHIPPED, digest_of, entry_of
+from gs2d.kernels.cuda.shipped import FOLDER, MANIFEST, PTX, SHIPPED, digest_of, write_archives
 
 
 def build(folder: Path, architectures: Sequence[str] = (*SHIPPED, PTX), names: Sequence[str] | None = None) -> int:
-    """Write an archive for each architecture and the manifest, which comes last; bytes of all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / MANIFEST).unlink(missing_ok=True)
-    for arch in architectures:
-        with zipfile.ZipFile(folder / f"{arch}.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-            for name in nvrtc.source_names() if names is None else names:
-                made = nvrtc.compile_source(name, arch)
-                spilled = [kernel for kernel, usage in made.usage().items() if usage.spilled_bytes]
-                if spilled and arch.startswith("sm_"):
-                    raise BackendError(f"{', '.join(spilled)} of {name} spill on {arch}; build with another CUDA")
-                archive.writestr(zipfile.ZipInfo(entry_of(name)), made.code, zipfile.ZIP_DEFLATED, 9)
-        print(f"{arch}: {(folder / f'{arch}.zip').stat().st_size} bytes")
-    manifest = {
+    """Write archives and their manifest; bytes of all."""
+
+    def code_of(name: str, arch: str) -> bytes:
+        made = nvrtc.compile_source(name, arch)
+        spilled = [kernel for kernel, usage in made.usage().items() if usage.spilled_bytes]
+        if spilled and arch.startswith("sm_"):
+            raise BackendError(f"{', '.join(spilled)} of {name} spill on {arch}; build with another CUDA")
+        return made.code
+
+    facts = {
         "version": gs2d.__version__,
         "sources": digest_of(nvrtc.sources(), nvrtc.OPTIONS),
         "cuda": list(nvrtc.nvrtc_version()),
-        "architectures": list(architectures),
     }
-    (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
-    return sum(path.stat().st_size for path in folder.iterdir())
+    return write_archives(folder, architectures, names or nvrtc.source_names(), code_of, MANIFEST, facts)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,6 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BackendError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    for path in sorted(folder.glob("*.zip")):
+        print(f"{path.stem}: {path.stat().st_size} bytes")
     print(f"{folder}: {size} bytes, CUDA {'.'.join(map(str, nvrtc.nvrtc_version()))}")
     return 0
 

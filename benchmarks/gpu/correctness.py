@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import re
 import shutil
@@ -19,6 +20,7 @@ from torch import Tensor
 from benchmarks.gpu import whole
 from benchmarks.gpu.bench import ROOT, Bench, run_program
 from benchmarks.gpu.probes import ceilings
+from gs2d.config.recipe import Stage
 from gs2d.core.splats import Splats
 from gs2d.kernels.cuda import launch
 from gs2d.kernels.cuda import losses as ops
@@ -26,7 +28,7 @@ from gs2d.kernels.cuda.compile import ARCHITECTURES, compile_source, kernel_sour
 from gs2d.kernels.tsdf import arguments_of, fuse_on_gpu
 from gs2d.render import cuda, reference
 from gs2d.render.api import rasterize, splat_errors
-from gs2d.render.types import RasterSettings
+from gs2d.render.types import TRANSMITTANCE, RasterSettings
 
 TOOLS = ("memcheck", "racecheck", "synccheck", "initcheck")
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
@@ -137,14 +139,14 @@ def _render_all_ways(bench: Bench) -> None:
     splats, camera = small_scene(bench)
     launcher = launch.launcher_for(bench.device)
     every = ("color", "normal", "depth_median", "distortion")
-    for names in (every[:1], every[:3], every):
-        for columns in (2, 4):
-            for deterministic in (False, True):
-                leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
-                probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
-                given = (launcher, leaves, camera, SETTINGS, probe)
-                output = cuda.rasterize_with(*given, deterministic=deterministic)
-                sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
+    searched = SETTINGS.for_depths(TRANSMITTANCE)
+    kinds = [(SETTINGS, names) for names in (every[:1], every[:3], every)]
+    kinds += [(searched, (*names, "depth_transmittance")) for names in (every[:3], every)]
+    for (settings, names), columns, deterministic in itertools.product(kinds, (2, 4), (False, True)):
+        leaves = Splats(**{name: tensor.detach().requires_grad_() for name, tensor in splats.items()})
+        probe = torch.zeros(len(splats), columns, device=bench.device, requires_grad=True)
+        output = cuda.rasterize_with(launcher, leaves, camera, settings, probe, deterministic=deterministic)
+        sum(getattr(output, name).sum() for name in names).backward()  # type: ignore[union-attr]
     image = torch.rand(camera.height, camera.width, 3, device=bench.device)
     for occlusion in (False, True):
         splat_errors(splats, camera, image, SETTINGS, backend=bench.backend, occlusion=occlusion)
@@ -162,12 +164,16 @@ def _all_losses(bench: Bench) -> None:
 
 
 def _three_stages(bench: Bench) -> None:
-    """Three short stages: normals, Adam, densification, ranking, clones, frozen rows."""
+    """Three short stages: normals, Adam, densification, ranking, clones, frozen rows, two views in the first."""
     sys.path.insert(0, str(ROOT / "tests" / "helpers"))
     import train_toys
 
-    recipe = train_toys.short()
-    stages = tuple(replace(stage, iterations=min(stage.iterations, 2 if bench.dry else 4)) for stage in recipe.stages)
+    def shortened(stage: Stage) -> Stage:
+        at_once = tuple(replace(term, start=0) if "multiview" in term.kind else term for term in stage.losses)
+        return replace(stage, losses=at_once, iterations=min(stage.iterations, 2 if bench.dry else 4))
+
+    recipe = train_toys.compared()
+    stages = tuple(map(shortened, recipe.stages))
     train_toys.train(train_toys.make_scene(), replace(recipe, stages=stages), backend=bench.backend)
 
 

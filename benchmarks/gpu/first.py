@@ -34,7 +34,7 @@ def run(bench: Bench, only: list[str], progress: Any) -> dict[str, Any]:
         "machine": machine,
         "exercise": lambda: exercise(bench),
         "parity": lambda: correctness.parity(bench, 1 if bench.dry else 10),
-        "host": lambda: host.host_cost(5 if bench.dry else 200, stages=1 if bench.dry else 3),
+        "host": lambda: host.host_cost(5 if bench.dry else 200, stages=1 if bench.dry else 4),
         **{scene_name(*size, "A"): lambda size=size: speed(bench, *size) for size in sizes},
     }
     return bench.attempt_all(parts, only, progress)

@@ -15,6 +15,7 @@ from gs2d.pipeline.events import Phase, StageDone
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
 
+RECIPE = "2dgs-r"  # the paper's, three stages; goals of seconds are its
 STAGE = ("name", "iterations", "seconds", "splats", "bytes", "train", "test", "after_clone")
 
 
@@ -71,6 +72,7 @@ def whole_run(
     overrides = ("init_points=60", "surface.densify.max_splats=90") if bench.dry else ()
     options = TrainOptions(
         scene=capture,
+        recipe=RECIPE,
         out=folder / f"run-{capture.resolve().name}",
         backend="cuda",
         downscale=downscale,

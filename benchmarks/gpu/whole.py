@@ -52,6 +52,7 @@ def _step(bench: Bench, splats: Splats, camera: Camera, channels: int) -> None:
         weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05},
         depth="mean",
         at_camera=False,
+        of_object=True,
         rows=None,
         learned=learned,
         betas=(0.9, 0.999, 1e-15),

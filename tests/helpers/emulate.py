@@ -30,6 +30,8 @@ FLAGS = (
     "-Wno-unknown-pragmas",
 )
 ADDRESSES = ("-fsanitize=address", "-fno-omit-frame-pointer", "-g")  # needs the run-time library in the process
+# -fsanitize=alignment of float4 included: a misaligned one is an error on a GPU.
+UNDEFINED = ("-fsanitize=undefined", "-fno-sanitize-recover=all", "-g")
 KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
 
 
@@ -69,17 +71,22 @@ def build(
     *,
     approximate: bool = False,
     addresses: bool = False,
+    undefined: bool = False,
+    wave: int = 0,
 ) -> EmulatedKernels:
     """Compile; the compiler gets two minutes. ``folder`` receives a wrapper and the library. Skips without g++.
 
-    ``approximate``: with the largest errors of the approximate instructions. ``addresses``: with AddressSanitizer.
+    ``approximate``: with the largest errors of the approximate instructions. ``addresses``: with AddressSanitizer;
+    ``undefined``: undefined behaviour ends the process. ``wave``: 32 or 64, as for AMD's GPUs with waves of so many.
     """
     if shutil.which("g++") is None:
         pytest.skip("no g++ here, which runs the CUDA kernels on the CPU; install one")
     names = [kernel for source in sources for kernel in KERNEL.findall(source.read_text())]
     wrapper = folder / f"{name}.cpp"
-    lines = [f'#include "{HERE / "emulator.h"}"', *(f'#include "{source}"' for source in sources)]
+    headers = [HERE / "emulator.h", *([KERNELS / "cuda" / "amd.h"] if wave else [])]
+    lines = [f'#include "{path}"' for path in headers]
     lines.append("namespace gs2d {}\nusing namespace gs2d;")  # where our kernels live
+    lines += [f'#include "{path}"' for path in sources]
     signature = "(unsigned x, unsigned y, unsigned block, int order, const void* a)"
     for kernel in names:
         body = f"return emulator::launch({kernel}, x, y, block, order, a);"
@@ -88,6 +95,8 @@ def build(
     library = folder / f"{name}.so"
     chosen = ["-DEMULATE_APPROXIMATIONS"] if approximate else []
     chosen += ADDRESSES if addresses else []
+    chosen += UNDEFINED if undefined else []
+    chosen += [f"-DGS2D_WAVE={wave}", "-DGS2D_EMULATED"] if wave else []
     command = ["g++", *FLAGS, *chosen, f"-I{include}", str(wrapper), "-o", str(library)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     if done.returncode != 0:
@@ -109,6 +118,8 @@ class Emulator(OneByOne):
     seed: int = 0
     approximate: bool = False
     addresses: bool = False
+    undefined: bool = False
+    wave: int = 0
     _built: dict[str, EmulatedKernels] = field(default_factory=dict)
 
     def launch(self, name: str, blocks: int, threads: int, arguments: ctypes.Structure, shared_bytes: int = 0) -> None:
@@ -121,7 +132,8 @@ class Emulator(OneByOne):
             if self.reuse and there.exists():
                 built = EmulatedKernels(there)
             else:
-                options = {"approximate": self.approximate, "addresses": self.addresses}
+                sanitizers = {"addresses": self.addresses, "undefined": self.undefined}
+                options = {"approximate": self.approximate, "wave": self.wave, **sanitizers}
                 built = build([source], KERNELS, self.folder, source.stem, **options)
             self._built.update(dict.fromkeys(KERNEL.findall(source.read_text()), built))
         self._built[name].launch(name, (blocks, 1), threads, arguments, descending=self.descending, seed=self.seed)

@@ -82,3 +82,17 @@ extern "C" __global__ void barrier_of_one_warp(Ints a) {
     if (threadIdx.x < 32) __syncthreads();
     a.out[threadIdx.x] = 1;
 }
+
+extern "C" __global__ void warps_that_part(Ints a) {  // they vote different numbers of times, and one leaves early
+    const int warp = int(threadIdx.x >> 5);
+    if (warp == 2) return;
+    int votes = 0;
+    for (int i = 0; i < a.in[warp]; ++i) {
+        votes += __popc(__ballot_sync(0xffffffffu, int(threadIdx.x & 31) <= i));
+        if (i == 2) continue;
+        __syncwarp();
+    }
+    int sum = int(threadIdx.x);
+    for (int step = 16; step > 0; step >>= 1) sum += __shfl_xor_sync(0xffffffffu, sum, step);
+    a.out[2 * threadIdx.x] = votes, a.out[2 * threadIdx.x + 1] = sum;
+}

@@ -168,6 +168,7 @@ def _key(step: WholeStep) -> tuple[object, ...]:
         "normal_consistency" in step.weights,
         step.depth,
         step.at_camera,
+        step.of_object,
         0 if step.rows is None else step.rows.data_ptr(),
         tuple([(name, tensor.data_ptr()) for name, tensor in step.gathered.items()]),
         tuple([tensor.data_ptr() for _, tensor in splats.items()]),
@@ -423,6 +424,8 @@ class _Plan:
             depth = self._pixels[f"depth_{self._step.depth}"]
             structures.fill(normals, normal=self._pixels["normal"], depth=depth, alpha=self._pixels["alpha"])
             structures.fill(normals, g_normal=self._pixels["g_normal"], g_depth=self._pixels["g_depth"])
+            if self._step.of_object and channels == 3:
+                structures.fill(normals, weights=self._pixels["alpha"])
             tiles = -(-self._width // NORMAL_W) * -(-self._height // NORMAL_H)
             works.append(Work("normal_consistency_vjp", tiles, THREADS, normals))
             self._normals = normals
@@ -522,6 +525,7 @@ class _Plan:
         if self._normals is not None:
             normals = self._normals
             normals.mask = mask
+            normals.object = photograph if step.of_object and step.photograph.shape[2] == 4 else None
             normals.fx, normals.fy, normals.cx, normals.cy = view.fx, view.fy, view.cx, view.cy
             normals.rotation = view.R
             weight = np.float32(step.weights["normal_consistency"])

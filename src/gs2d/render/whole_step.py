@@ -59,6 +59,8 @@ class WholeStep:
     depth : "mean" or "median"
         That normals come from, and ``at_camera``: see ``LossTerm.edges``.
     at_camera : bool
+    of_object : bool
+        Whether normals are asked for on the object alone: by the photograph's alpha, else the rendered one.
     rows : Tensor [N] bool or None
         The splats of which anything learns; None: all of them.
     learned : mapping of attribute to Learned
@@ -78,6 +80,7 @@ class WholeStep:
     weights: Mapping[str, float]
     depth: str
     at_camera: bool
+    of_object: bool
     rows: Tensor | None
     learned: Mapping[str, Learned]
     betas: tuple[float, float, float]

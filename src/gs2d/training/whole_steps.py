@@ -24,8 +24,8 @@ NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 class WholeSteps:
     """The iterations of a stage whose losses are a photograph's L1 and SSIM and normal consistency.
 
-    What a term is weighted by, pixel by pixel, a second view, or anything that is learned of photographs and cameras
-    is not for here: :class:`~gs2d.training.objective.FullRender` does all of it.
+    Weights of pixels but those of the object, a second view, or anything that is learned of photographs and cameras
+    are not for here: :class:`~gs2d.training.objective.FullRender` does all of it.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class WholeSteps:
     def __init__(self, whole: FullRender, objective: Objective | None, stage: Stage) -> None:
         self._whole, self._stage = whole, stage
         self._terms = whole.protocol.resolve(stage.losses)
-        self._possible = objective is whole and whole.recipe.multiview is None and whole.frozen is None
+        self._possible = objective is whole and whole.frozen is None
         self._settings: dict[int, RasterSettings] = {}  # by SH degree
         self._rows: tuple[tuple[Tensor, ...], Tensor | None] | None = None  # groups, and what they are together
 
@@ -55,8 +55,8 @@ class WholeSteps:
             return False
         stage, whole = self._stage, self._whole
         learned = self._learned(state, iteration)
-        kinds = [(term.depth or whole.protocol.depth, term.edges) for term in active if term.kind not in ("l1", "ssim")]
-        depth, edges = kinds[0] if kinds else ("mean", "undefined")
+        normals = next((term for term in active if term.kind == "normal_consistency"), None)
+        depth = "mean" if normals is None else normals.depth or whole.protocol.depth
         if not learned or depth not in ("mean", "median"):
             return False
         step = WholeStep(
@@ -69,7 +69,8 @@ class WholeSteps:
             background=whole.protocol.background,
             weights={term.kind: float(term.weight or 0.0) for term in active},
             depth=depth,
-            at_camera=edges == "camera",
+            at_camera=normals is not None and normals.edges == "camera",
+            of_object=normals is not None and normals.where == "object",
             rows=None if gathered else self._learning_rows(state),
             learned=learned,
             betas=(stage.lr.beta1, stage.lr.beta2, stage.lr.eps),
@@ -110,11 +111,11 @@ def _differ(a: Tensor, b: Tensor) -> bool:
 
 
 def _is_plain(terms: list[LossTerm]) -> bool:
-    """Whether all terms are of the kinds that are done in one piece: each once, every pixel alike."""
+    """Whether all terms are of the kinds that are done in one piece: each once, edges of photographs like the rest."""
     kinds = [term.kind for term in terms]
     return (
         KINDS.issuperset(kinds)
         and len(kinds) == len(set(kinds))
         and not {"l1", "ssim"}.isdisjoint(kinds)
-        and all(term.where == "image" and term.edge_power == 0 and not term.options for term in terms)
+        and all(term.edge_power == 0 and not term.options for term in terms)
     )

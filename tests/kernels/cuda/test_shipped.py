@@ -146,7 +146,7 @@ def test_what_the_script_builds_is_what_the_package_takes(tmp_path: Path) -> Non
     assert size == sum(path.stat().st_size for path in tmp_path.iterdir())
     found = shipped.shipped(gs2d.__version__, shipped.digest_of(nvrtc.sources(), nvrtc.OPTIONS), tmp_path)
     assert found is not None
-    assert found.cuda == version
+    assert found.compiler == version
     code, text = (found.code("cuda/slots.cu", arch) for arch in ("sm_90", shipped.PTX))
     assert code is not None
     assert code.startswith(b"\x7fELF")

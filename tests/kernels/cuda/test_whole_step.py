@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ import train_toys
 from emulate import Emulator
 from fake_backends import cuda_on_host
 from fake_driver import FakeDriver, Result
+from fake_hip import FakeHip
 from gs2d.config.protocols import GENERIC, Protocol
 from gs2d.config.recipe import GradDensify, PoseRefinement, Recipe
 from gs2d.data.scene import Scene, View
@@ -108,18 +110,30 @@ def at_camera(recipe: Recipe) -> Recipe:
     return replace(recipe, stages=tuple(stages))
 
 
+def of_object(recipe: Recipe) -> Recipe:
+    """Normal consistency of the object alone, as in ``best``."""
+    stages = (
+        replace(
+            stage, losses=tuple(replace(t, where="object") if t.kind.startswith("normal") else t for t in stage.losses)
+        )
+        for stage in recipe.stages
+    )
+    return replace(recipe, stages=tuple(stages))
+
+
 QUIET = GradDensify(every=100, start=500, stop=900, reset_every=0, opacity_cull=0.005)
 
 
-def brief() -> Recipe:
+def brief(recipe: Recipe | None = None) -> Recipe:
     """Eight iterations of the first stage, six of which nobody looks at."""
-    recipe = train_toys.short()
+    recipe = recipe or train_toys.short()
     return replace(recipe, stages=(replace(recipe.stages[0], iterations=8, densify=QUIET),))
 
 
 VARIANTS = {
     "plain": (lambda scene: scene, train_toys.short(), GENERIC),
     "absolute": (two_sizes, train_toys.short(absgs=True), replace(GENERIC, depth="median")),
+    "object": (masked, of_object(train_toys.short()), replace(GENERIC, depth="median")),
     "masks": (masked, at_camera(train_toys.short()), replace(GENERIC, background=(0.2, 1.0, 0.7))),
 }
 
@@ -161,7 +175,7 @@ def test_memory_of_before_and_the_order_of_threads_change_nothing(
         return done
 
     monkeypatch.setattr(cuda_step.Stepper, "run", poisoned)
-    shuffled = Emulator(emulator.folder, reuse=True, seed=seed)
+    shuffled = Emulator(emulator.folder, reuse=True, wave=emulator.wave, seed=seed)
     parts, _ = trained(shuffled, scene, train_toys.short(), "autograd")
     whole, some = trained(shuffled, scene, train_toys.short(), "launches")
     assert some == checked["extras"] >= 11
@@ -221,6 +235,21 @@ def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: 
     assert len(driver.replays) <= 2  # both halves once, where the refusal comes afterwards
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("chosen", ["launches", "graph"])
+def test_training_by_way_of_hip_in_waves_of_64_has_the_bits_of_warps(
+    fake_hip: FakeHip, emulator: Emulator, scene: Scene, tmp_path: Path, chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = brief()
+    expected, some = trained(emulator, scene, recipe, "launches")
+    fake_hip.run_by(Emulator(tmp_path, wave=64))
+    monkeypatch.setenv(launch.STEP_VARIABLE, chosen)
+    found, as_many = trained(fake_hip.launcher(), scene, recipe, chosen)
+    assert some == as_many == 6
+    assert same(expected, found)
+    assert any(line["call"] == "replay" for line in fake_hip.said()) is (chosen == "graph")
+
+
 def test_a_way_that_does_not_exist_is_one_line(scene: Scene, emulator: Emulator) -> None:
     with pytest.raises(BackendError, match="GS2D_CUDA_STEP must be graph, launches or autograd, got 'fast'; unset it"):
         trained(emulator, scene, brief(), "fast")
@@ -252,13 +281,36 @@ def test_what_is_learned_of_cameras_and_densifiers_with_steps_of_their_own_go_th
     assert OfItsOwn.seen == 5
 
 
-def test_an_iteration_asks_torch_for_nothing(emulator: Emulator, scene: Scene) -> None:
+def test_normals_of_the_object_alone_have_the_bits_of_those_that_go_through_torch(
+    emulator: Emulator, scene: Scene
+) -> None:
+    """By the alpha of the photographs that have one, of the others by the rendered one; and they are other normals."""
+    recipe, some_alpha = brief(), masked(scene)
+    parts, _ = trained(emulator, some_alpha, of_object(recipe), "autograd")
+    whole, some = trained(emulator, some_alpha, of_object(recipe), "launches")
+    assert some == 6
+    assert same(parts, whole)
+    assert not same(whole, trained(emulator, some_alpha, recipe, "launches")[0])
+
+
+def test_iterations_that_compare_no_views_are_done_in_one_piece(emulator: Emulator, scene: Scene) -> None:
+    """Of a recipe that compares them at its end, as ``best-surface``."""
+    recipe = brief(train_toys.compared())  # from the seventh on
+    parts, _ = trained(emulator, scene, recipe, "autograd")
+    whole, some = trained(emulator, scene, recipe, "launches")
+    assert some == 5
+    assert same(parts, whole)
+
+
+@pytest.mark.parametrize("change", [lambda recipe: recipe, of_object], ids=["image", "object"])
+def test_an_iteration_asks_torch_for_nothing(
+    emulator: Emulator, scene: Scene, change: Callable[[Recipe], Recipe]
+) -> None:
     """Neither an operation nor memory; only the order of the views is drawn, once in an epoch."""
-    first = replace(brief().stages[0], iterations=200)
+    recipe = change(brief())
+    first = replace(recipe.stages[0], iterations=200)
     with mode("launches", emulator) as done:
-        trainer = Trainer(
-            scene, replace(brief(), stages=(first,)), GENERIC, backend=cuda_on_host(), progress_every=1000
-        )
+        trainer = Trainer(scene, replace(recipe, stages=(first,)), GENERIC, backend=cuda_on_host(), progress_every=1000)
         trainer.enter(0)
         for _ in range(7):
             trainer.step()

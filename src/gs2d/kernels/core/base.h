@@ -6,7 +6,7 @@
 // backend round alike.
 #pragma once
 
-#if defined(__CUDACC__) || defined(__CUDACC_RTC__)
+#if defined(__CUDACC__) || defined(__CUDACC_RTC__) || defined(__AMDGCN__)
 #define GS2D_HD __host__ __device__ __forceinline__
 #define GS2D_UNROLL _Pragma("unroll")
 #else
@@ -75,6 +75,12 @@ GS2D_HD float reciprocal(float a) {
     asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(a));
     return r;
 }
+GS2D_HD float quotient(float a, float b) { return a * reciprocal(b); }
+#elif defined(__AMDGCN__)
+#if __has_builtin(__builtin_amdgcn_exp2f)  // older compilers make the same instruction of exp2
+GS2D_HD float exp2_small(float x) { return __builtin_amdgcn_exp2f(x); }
+#endif
+GS2D_HD float reciprocal(float a) { return __builtin_amdgcn_rcpf(a); }
 GS2D_HD float quotient(float a, float b) { return a * reciprocal(b); }
 #endif
 

@@ -35,12 +35,13 @@ template <class V> struct Hit {
     mask_t<V> ray;  // the plane decides
 };
 
-// All of a hit but its alpha where the plane is known to decide (see `is_plain`); `ray` is left out.
+// All of a hit but its alpha where the plane is known to decide (see `is_plain`).
 template <class V> GS2D_HD Hit<V> meet_plane(const PlaneAt<V>& p) {
     Hit<V> h;
     h.inverse_depth = p.I, h.depth = reciprocal(p.I);
     h.u = p.X * h.depth, h.v = p.Y * h.depth;
     h.rho = fma(h.u, h.u, h.v * h.v);
+    h.ray = p.I > V(0);
     return h;
 }
 

@@ -90,7 +90,7 @@ def missing(facts: Facts) -> MissingFile | None:
         )
     if facts.torch_cuda < OLDEST_CUDA:
         return MissingFile(
-            f"torch is built for CUDA {_dotted(facts.torch_cuda)}, CUDA 12 or newer is needed",
+            f"torch is built for CUDA {dotted(facts.torch_cuda)}, CUDA 12 or newer is needed",
             f"install a torch build for CUDA 12 or 13, {ANYWAY}",
         )
     if facts.bindings_error:
@@ -105,7 +105,7 @@ def missing(facts: Facts) -> MissingFile | None:
     for name, needs in (("torch", facts.torch_cuda), ("NVRTC" if facts.shipped is None else "gs2d", compiler)):
         if needs is not None and facts.driver[0] < needs[0]:  # within a major version newer code runs on older drivers
             return MissingFile(
-                f"the driver supports CUDA {_dotted(facts.driver)}, but {name} is of CUDA {_dotted(needs)}",
+                f"the driver supports CUDA {dotted(facts.driver)}, but {name} is of CUDA {dotted(needs)}",
                 f"{OLD_DRIVER}, {ANYWAY}",
             )
     if not facts.devices:
@@ -130,17 +130,19 @@ def _install(major: int) -> str:
 def describe(facts: Facts) -> str:
     """One line about a machine that can run the backend."""
     names = [f"{name} (sm_{major}{minor})" for name, (major, minor) in facts.devices]
-    compiler = f"NVRTC {_dotted(facts.nvrtc)}"
+    compiler = f"NVRTC {dotted(facts.nvrtc)}"
     if facts.shipped is not None:
-        return f"{', '.join(names)}; driver CUDA {_dotted(facts.driver)}, kernels of the package"
-    versions = f"driver CUDA {_dotted(facts.driver)}, {compiler}"
-    kept = ""
-    if not facts.cache_writable:
-        where = (
-            "there is no home folder (set GS2D_CACHE)" if facts.cache is None else f"{facts.cache} cannot be written"
-        )
-        kept = f"; {where}: kernels are compiled at every start"
-    return f"{', '.join(names)}; {versions}{kept}"
+        return f"{', '.join(names)}; driver CUDA {dotted(facts.driver)}, kernels of the package"
+    versions = f"driver CUDA {dotted(facts.driver)}, {compiler}"
+    return f"{', '.join(names)}; {versions}{cache_words(facts.cache, facts.cache_writable)}"
+
+
+def cache_words(cache: Path | None, writable: bool) -> str:
+    """Return what to say of a cache that keeps nothing."""
+    if writable:
+        return ""
+    where = "there is no home folder (set GS2D_CACHE)" if cache is None else f"{cache} cannot be written"
+    return f"; {where}: kernels are compiled at every start"
 
 
 def gather() -> Facts:
@@ -153,17 +155,17 @@ def gather() -> Facts:
     try:
         bindings = load_driver()
     except BackendError as error:
-        bindings_error = _inner(error)
+        bindings_error = inner(error)
     else:
         try:
             driver = driver_version(bindings)
         except BackendError as error:
-            driver_error = _inner(error)
+            driver_error = inner(error)
     try:
         compiler = nvrtc.nvrtc_version()
     except BackendError as error:
-        nvrtc_error = _inner(error)
-    devices, torch_error = _devices()
+        nvrtc_error = inner(error)
+    devices, torch_error = seen_devices()
     shipped = nvrtc.shipped_kernels()
     if shipped is not None and (not devices or shipped.architecture_for(devices[0][1]) is None):
         shipped = None
@@ -175,7 +177,7 @@ def gather() -> Facts:
     folder = nvrtc.cache_folder()
     return Facts(
         torch.__version__,
-        _version(cuda),
+        version_of(cuda),
         bindings_error,
         nvrtc_error,
         compiler,
@@ -187,12 +189,12 @@ def gather() -> Facts:
         folder,
         nvrtc.is_writable(folder),
         own_default_stream(),
-        None if shipped is None else shipped.cuda,
+        None if shipped is None else shipped.compiler,
     )
 
 
-def _devices() -> tuple[tuple[tuple[str, tuple[int, int]], ...], str]:
-    """Devices that torch sees, the current one first, and what it said where it sees none."""
+def seen_devices() -> tuple[tuple[tuple[str, tuple[int, int]], ...], str]:
+    """Return devices that torch sees, the current one first, and what it said where it sees none."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         usable = torch.cuda.is_available()
@@ -203,16 +205,18 @@ def _devices() -> tuple[tuple[tuple[str, tuple[int, int]], ...], str]:
     return tuple((torch.cuda.get_device_name(i), torch.cuda.get_device_capability(i)) for i in order), ""
 
 
-def _version(text: str) -> tuple[int, int]:
+def version_of(text: str) -> tuple[int, int]:
+    """Return (6, 2) of "6.2.41133"."""
     major, _, rest = text.partition(".")
     return int(major), int(rest.partition(".")[0] or 0)
 
 
-def _dotted(version: tuple[int, int] | None) -> str:
+def dotted(version: tuple[int, int] | None) -> str:
+    """Return "6.2" of (6, 2)."""
     return "?" if version is None else f"{version[0]}.{version[1]}"
 
 
-def _inner(error: BackendError) -> str:
+def inner(error: BackendError) -> str:
     """Return what lies between the brackets of an error's message: the library's own words, one line of them."""
     text = str(error.__cause__ if error.__cause__ is not None else error).strip().splitlines()
     return text[0] if text else type(error).__name__

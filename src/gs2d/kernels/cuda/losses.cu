@@ -24,6 +24,7 @@ struct NormalArguments {
     const float *means, *cotangent;       // backward: means[0] = 1 / valid pixels; null where `scale` says it
     float *g_normal, *g_depth, *g_alpha;  // null where not wanted
     float scale;                          // cotangent / valid pixels
+    const uchar* object;                  // instead of weights: bytes of a photograph [H, W, 4], 1 where its alpha is above 1/2
 };
 
 struct MeanArguments {
@@ -51,6 +52,7 @@ __device__ __forceinline__ float depth_at(const NormalArguments& a, int64 x, int
 }
 
 __device__ __forceinline__ float weight_at(const NormalArguments& a, int64 at) {
+    if (a.object) return a.object[4 * at + 3] > 127 ? 1.f : 0.f;
     return a.weights ? a.weights[at] : 1.f;
 }
 

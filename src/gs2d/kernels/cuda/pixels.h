@@ -12,10 +12,13 @@ __device__ __forceinline__ int64 word_of(int64 begin, int tile, int64 chunk) {
     return 8 * ((begin >> 5) + tile + chunk);
 }
 
+// Step by step, in words: AMD's compiler leaves such a loop as it is where it stands in another.
 __device__ __forceinline__ uint or_over_warp(uint bits) {
-#pragma unroll
-    for (int step = 16; step > 0; step >>= 1) bits |= __shfl_xor_sync(FULL_MASK, bits, step);
-    return bits;
+    bits |= __shfl_xor_sync(FULL_MASK, bits, 16);
+    bits |= __shfl_xor_sync(FULL_MASK, bits, 8);
+    bits |= __shfl_xor_sync(FULL_MASK, bits, 4);
+    bits |= __shfl_xor_sync(FULL_MASK, bits, 2);
+    return bits | __shfl_xor_sync(FULL_MASK, bits, 1);
 }
 
 // A word that is the same for all lanes, in a form that lets the compiler know it: branches on it are uniform.

@@ -207,8 +207,10 @@ __device__ __forceinline__ uint sum_before(const uint* words, int64 piece, int l
         const uint ends = __ballot_sync(FULL_MASK, word >= SUM);  // the nearest of these is as far as to look
         const int furthest = ends ? __ffs(int(ends)) - 1 : 31;
         uint number = lane <= furthest ? word & NUMBER : 0u;
-#pragma unroll
-        for (int step = 16; step > 0; step >>= 1) number = saturated(number, __shfl_xor_sync(FULL_MASK, number, step));
+        const auto exchange = [&](int step) {
+            number = saturated(number, __shfl_xor_sync(FULL_MASK, number, step));
+        };
+        exchange(16), exchange(8), exchange(4), exchange(2), exchange(1);
         sum = saturated(sum, number);
         if (ends) break;
     }

@@ -1,0 +1,163 @@
+"""Every kernel of the package once or more, on sizes that are a multiple of nothing: what comes out, by name.
+
+For the sanitizers, which must be in the process from its start, and for the hardware's waves: the same bits of both.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import two_views
+from emulate import Emulator
+from gs2d.config.multiview import MultiView
+from gs2d.core.splats import Splats
+from gs2d.kernels.cuda import losses as ops
+from gs2d.kernels.cuda.adam import AdamUpdate, adam_step
+from gs2d.kernels.cuda.multiview import compare_views
+from gs2d.render import cuda
+from gs2d.render.cuda_step import Stepper
+from gs2d.render.pair_budget import PairBudget, Rendering
+from gs2d.render.types import RasterSettings
+from gs2d.render.whole_step import Learned, WholeStep
+from kernel_cases import SETTINGS, Case, many_tiles
+from render_scenes import contraction, random_cotangents
+
+ROOM = 1 << 12
+
+
+def rendering(emulator: Emulator, case: Case) -> dict[str, Tensor]:
+    """Images, all gradients in both ways of adding them up, and errors."""
+    cotangents, found = random_cotangents(np.random.default_rng(1), case.camera), {}
+
+    def render(name: str, trained: tuple[str, ...], settings: RasterSettings = SETTINGS, **options: object) -> None:
+        leaves = Splats(**{k: t.clone().requires_grad_(k in trained) for k, t in case.splats.items()})
+        probe = torch.zeros(len(leaves), 4, requires_grad=True) if "means" in trained else None
+        output = cuda.rasterize_with(emulator, leaves, case.camera, settings, probe, **options)  # type: ignore[arg-type]
+        there = {k: c for k, c in cotangents.items() if k != "distortion" or settings.with_distortion}
+        total = contraction(output, there)
+        if settings.with_transmittance_depth:
+            total = total + output.depth("transmittance").sum()
+        total.backward()
+        found[f"{name}.color"] = output.color.detach()
+        for key, tensor in (*leaves.items(), ("probe", probe)):
+            if tensor is not None and tensor.grad is not None:
+                found[f"{name}.{key}"] = tensor.grad
+
+    every = tuple(name for name, _ in case.splats.items())
+    rows = torch.arange(len(case.splats)) % 3 == 0
+    for sure in (False, True):
+        render(f"all {sure}", every, deterministic=sure)
+        render(f"colours {sure}", ("sh0", "shN"), deterministic=sure, gradient_rows=rows)
+    render("by transmittance", every, SETTINGS.for_depths("transmittance"))
+    image, mask = torch.rand(45, 70, 3, generator=_numbers()), torch.rand(45, 70, generator=_numbers()) > 0.3
+    for occlusion in (False, True):
+        given = (case.splats, case.camera, image, SETTINGS, mask, occlusion)
+        found[f"errors {occlusion}"] = cuda.splat_errors_with(emulator, *given)
+    return found
+
+
+def losses(emulator: Emulator, case: Case) -> dict[str, Tensor]:
+    """Values and gradients of all losses."""
+    g, found = _numbers(), {}
+    for size in ((37, 44), (1, 1), (12, 43)):
+        x, y, m = torch.rand(*size, 3, generator=g), torch.rand(*size, 3, generator=g), torch.rand(*size, generator=g)
+        x, m = x.requires_grad_(), m > 0.4
+        depth = torch.rand(*size, generator=g).add(1).requires_grad_()
+        alpha = torch.rand(*size, generator=g).requires_grad_()
+        l1, ssim = ops.photometric(x, y, m, ops.blur(y, launcher=emulator), launcher=emulator)
+        l1_too, ssim_too = ops.photometric(x, y, launcher=emulator)
+        camera = case.camera.resized(size[1], size[0])
+        normals = sum(
+            ops.normal_consistency(
+                x,
+                depth,
+                alpha,
+                camera,
+                m,
+                per_splat=form,
+                edges=edges,
+                weights=y[..., 0].contiguous(),
+                launcher=emulator,
+            )
+            for form, edges in ((False, "undefined"), (True, "camera"))
+        )
+        total = l1 + ssim + l1_too + ssim_too + normals + ops.masked_mean(depth, m, launcher=emulator)
+        total.backward()
+        values = {"value": total.detach(), "x": x.grad, "depth": depth.grad, "alpha": alpha.grad}
+        found |= {f"losses {size}.{name}": value for name, value in values.items() if value is not None}
+    pair = two_views.scenario(settings=MultiView(patches=61, radius=3, texture=0.03, occluded=4.0), masked=True)
+    leaves = pair.depth.requires_grad_(), pair.normal.requires_grad_(), torch.zeros(6, requires_grad=True)
+    both = sum(pair.views(*leaves).compared(partial(compare_views, launcher=emulator)))
+    assert isinstance(both, Tensor)
+    both.backward()
+    return found | {f"two views.{k}": leaf.grad for k, leaf in enumerate(leaves) if leaf.grad is not None}
+
+
+def steps(emulator: Emulator) -> dict[str, Tensor]:
+    """Adam alone, on all rows, on some, and on a gradient of these alone."""
+    g, found = _numbers(), {}
+    trained = torch.arange(57) % 2 == 0
+    index = trained.nonzero().squeeze(1)
+    given = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "launcher": emulator}
+    for columns in ((3,), (15, 3), ()):
+        tensors = [torch.rand(57, *columns, generator=g) for _ in range(3)]
+        gradient = torch.rand(57, *columns, generator=g)
+        for choice in ({}, {"trained": trained}, {"rows": index}):
+            adam_step([AdamUpdate(*tensors, gradient, 0.1, 1, **choice)], **given)  # type: ignore[arg-type]
+        adam_step([AdamUpdate(*tensors, gradient[index], 0.1, 1, rows=index, compact=True)], **given)  # type: ignore[arg-type]
+        found |= {f"adam {columns}.{k}": tensor for k, tensor in enumerate(tensors)}
+    return found
+
+
+def whole_steps(emulator: Emulator, case: Case) -> dict[str, Tensor]:
+    """Iterations in one piece: photographs with and without alpha, all that learns and colours alone."""
+    g, found = _numbers(), {}
+    height, width, count = case.camera.height, case.camera.width, len(case.splats)
+    stepper = Stepper(emulator, torch.device("cpu"))
+    for channels, names, absolute in ((3, None, False), (4, None, True), (4, ("sh0", "shN"), False)):
+        splats = case.splats.clone()
+        learned = {
+            name: Learned(torch.zeros_like(tensor), torch.zeros_like(tensor), 1e-3, 1, None)
+            for name, tensor in splats.items()
+            if names is None or name in names
+        }
+        gathered = {name: torch.zeros(count) for name in ("signed", "count", *(("absolute",) if absolute else ()))}
+        step = WholeStep(
+            splats=splats,
+            camera=case.camera,
+            settings=RasterSettings(with_distortion=False),
+            photograph=torch.randint(0, 256, (height, width, channels), generator=g, dtype=torch.uint8),
+            mask=torch.rand(height, width, generator=g) < 0.8,
+            valid=height * width,
+            background=(0.1, 0.5, 0.2),
+            weights={"l1": 0.8, "ssim": 0.2, "normal_consistency": 0.05},
+            depth="mean",
+            at_camera=False,
+            of_object=True,
+            rows=None if names is None else torch.arange(count) % 3 == 0,
+            learned=learned,
+            betas=(0.9, 0.999, 1e-15),
+            gathered=gathered if names is None else {},
+        )
+        budget = PairBudget()
+        budget.learn(Rendering(-(-width // 16) * -(-height // 16)), ROOM)
+        assert stepper.run(step, budget)
+        assert not budget.overflowed()
+        found |= {f"whole {channels} {names}.{k}": t for k, t in (*splats.items(), *gathered.items())}
+    return found
+
+
+def everything(emulator: Emulator) -> dict[str, Tensor]:
+    """What all kernels make of the same numbers; finite, all of it."""
+    case = many_tiles()  # 70 x 45 px
+    found = rendering(emulator, case) | losses(emulator, case) | steps(emulator) | whole_steps(emulator, case)
+    assert all(bool(tensor.isfinite().all()) for tensor in found.values())
+    return found
+
+
+def _numbers() -> torch.Generator:
+    return torch.Generator().manual_seed(4)
