@@ -24,8 +24,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.config.presets import with_fading_backdrop
 from gs2d.config.protocols import GENERIC, Protocol
 from gs2d.config.recipe import Recipe
+from gs2d.config.robust import OpacityDecay
 from gs2d.core.sh import C0
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View, load_scene
@@ -54,6 +56,8 @@ VARIANTS: Mapping[str, tuple[dict[str, Any], Callable[[Recipe], Recipe]]] = {  #
     "no dense start": ({}, _without("dense_start")),
     "no free space": ({}, _without("free_space")),
     "no decay": ({}, _without("opacity_decay")),
+    "backdrop stays": ({}, lambda recipe: replace(recipe, opacity_decay=OpacityDecay())),
+    "backdrop fades": ({}, with_fading_backdrop),
     "no exposure": ({"exposure": False}, lambda recipe: recipe),
     "black background": ({}, lambda recipe: recipe),
     "off, exposure": ({"robust": "off", "exposure": True}, lambda recipe: recipe),
@@ -70,7 +74,7 @@ def train_variant(scene: Scene, name: str, recipe: str, scale: float, seed: int)
     fitted = fit_recipe(options, scene, GENERIC, lambda event: None)
     protocol: Protocol = GENERIC
     if name != "black background":
-        protocol = with_backdrop(GENERIC, fitted, scene, lambda event: None)
+        fitted, protocol = with_backdrop(fitted, GENERIC, scene, lambda event: None)
     trainer = Trainer(scene, change(fitted), protocol, backend="cpu")
     trainer.run()
     return trainer, time.process_time() - start

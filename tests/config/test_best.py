@@ -7,7 +7,14 @@ from dataclasses import replace
 import pytest
 
 from gs2d.config.describe import describe_recipe
-from gs2d.config.presets import DEFAULT_RECIPE, OFFICIAL_ITERATIONS, RECIPES, get_recipe, with_robustness
+from gs2d.config.presets import (
+    DEFAULT_RECIPE,
+    OFFICIAL_ITERATIONS,
+    RECIPES,
+    get_recipe,
+    with_fading_backdrop,
+    with_robustness,
+)
 from gs2d.config.recipe import GradDensify, LearningRates, Recipe, validate
 from gs2d.config.robust import DenseStart, FreeSpace
 from gs2d.config.schedule import longer_steps, scale_schedule
@@ -98,3 +105,15 @@ def test_normal_consistency_is_asked_of_the_object_alone(name: str) -> None:
     terms = [term for stage in get_recipe(name).stages for term in stage.losses if term.kind == "normal_consistency"]
     assert terms
     assert all(term.where == "object" for term in terms)
+
+
+def test_the_backdrop_fades_only_where_opacity_decays_and_no_rate_was_chosen() -> None:
+    plain, robust = get_recipe("best"), with_robustness(get_recipe("best"))
+    assert robust.opacity_decay is not None
+    assert with_fading_backdrop(plain) == plain
+    fading = with_fading_backdrop(robust).opacity_decay
+    assert fading is not None
+    assert fading.backdrop_rate is not None
+    assert fading.backdrop_rate > fading.rate
+    own = replace(robust, opacity_decay=replace(robust.opacity_decay, backdrop_rate=0.0))
+    assert with_fading_backdrop(own) == own

@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from gs2d.config.presets import with_robustness
+from gs2d.config.presets import with_fading_backdrop, with_robustness
 from gs2d.config.protocols import DTU, GENERIC
 from gs2d.config.recipe import LearningRates
+from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.job import as_begun, check_same_run, fit_recipe, reload_job
+from gs2d.pipeline.job import as_begun, check_same_run, fit_recipe, reload_job, settled
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
 
@@ -158,3 +159,43 @@ def test_a_run_of_before_seen_area_goes_on_as_it_began(undisturbed: RunFolder, t
     del data["recipe"]["seen_area"]
     run.file("run.json").write_text(json.dumps(data))
     assert as_begun(run, robust).recipe == replace(robust.recipe, seen_area=None)
+
+
+def test_a_run_of_before_backdrops_faded_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    job = reload_job(run, lambda _: None)
+    begun = with_robustness(job.recipe)
+    data = json.loads(run.file("run.json").read_text())
+    data["recipe"] = to_json(begun)  # as it was written before there was such a rate
+    run.file("run.json").write_text(json.dumps(data))
+    fading = with_fading_backdrop(begun)
+    assert fading != begun
+    assert as_begun(run, replace(job, recipe=fading)).recipe == begun
+    assert begun.opacity_decay is not None
+    own = replace(begun, opacity_decay=replace(begun.opacity_decay, backdrop_rate=0.2))
+    assert as_begun(run, replace(job, recipe=own)).recipe == own  # asked for: another run, which is refused
+    data["recipe"] = to_json(fading)
+    run.file("run.json").write_text(json.dumps(data))
+    assert as_begun(run, replace(job, recipe=fading)).recipe == fading
+
+
+@pytest.mark.parametrize(
+    ("overrides", "varied", "rate", "said"),
+    [
+        ((), False, 0.3, True),
+        ((), True, None, False),
+        (("opacity_decay.backdrop_rate=0.01",), False, 0.01, False),
+        (("opacity_decay.backdrop_rate=0.2",), True, 0.2, True),
+    ],
+)
+def test_splats_of_an_even_backdrop_fade_and_that_is_said(
+    overrides: tuple[str, ...], varied: bool, rate: float | None, said: bool
+) -> None:
+    scene = ring(np.linspace(0.4, 1.6, COUNT) if varied else np.ones(COUNT))
+    heard: list[Event] = []
+    recipe, protocol = settled(options(overrides=overrides), scene, GENERIC, heard.append)
+    assert recipe.opacity_decay is not None
+    assert recipe.opacity_decay.backdrop_rate == rate
+    assert protocol.background == pytest.approx((0.5, 0.5, 0.5), abs=0.02 if not varied else 0.1)
+    (line,) = [event.text for event in heard if isinstance(event, Notice) and event.text.startswith("background")]
+    assert line.endswith("splats of that colour fade") == said

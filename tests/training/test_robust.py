@@ -16,13 +16,14 @@ from gs2d.config.recipe import Recipe, validate
 from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, StartFit
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.camera import Camera, look_at
+from gs2d.core.sh import rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.data.scene import PointCloud, View
 from gs2d.errors import DataError, RecipeError
 from gs2d.render.backends import PLAIN, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events
-from gs2d.training.backdrop import backdrop_color
+from gs2d.training.backdrop import EVEN, find_backdrop
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.initialize import initial_splats
 from gs2d.training.plane_sweep import start_points, sweep_views
@@ -313,6 +314,18 @@ def test_opacity_decays_by_its_rate_every_so_many_iterations_and_not_below_the_l
     assert state.splats.opacities == pytest.approx(torch.tensor([0.81, 0.45, 0.02, 0.01]), abs=1e-6)
 
 
+def test_what_has_the_colour_behind_everything_decays_faster() -> None:
+    decay = OpacityDecay(rate=0.1, every=1, backdrop_rate=0.5, backdrop_within=0.1)
+    recipe = short(dense_start=None, free_space=None, opacity_decay=decay)
+    raster = RasterSettings(background=(0.2, 0.6, 1.0))
+    robust, state = Robustness(make_scene(), recipe, raster, BACKEND), full_state(4)
+    state.splats.opacity_logits[:] = torch.logit(torch.tensor([0.8]))
+    colours = [[0.2, 0.6, 1.0], [0.29, 0.51, 1.09], [0.2, 0.6, 1.11], [0.0, 0.0, 0.0]]  # one channel too far is other
+    state.splats.sh0[:] = rgb_to_sh0(torch.tensor(colours))
+    robust.decay(state, recipe.stages[0], 1, PLAIN)
+    assert state.splats.opacities == pytest.approx(torch.tensor([0.4, 0.4, 0.72, 0.72]), abs=1e-6)
+
+
 def test_frozen_opacity_does_not_decay() -> None:
     recipe = short(dense_start=None, free_space=None)
     robust, state = Robustness(make_scene(), recipe, RASTER, BACKEND), full_state(4)
@@ -353,15 +366,27 @@ def test_exposures_begin_with_the_gains_of_points_where_the_recipe_says_so() -> 
 
 # -- the colour behind everything ------------------------------------------------------------------------------------
 def test_the_backdrop_is_the_colour_of_what_shows_no_sparse_points() -> None:
-    assert backdrop_color(wall()) == pytest.approx((0.5, 0.5, 0.5), abs=0.02)
+    found = find_backdrop(wall())
+    assert found is not None
+    assert found.color == pytest.approx((0.5, 0.5, 0.5), abs=0.02)
+
+
+@pytest.mark.parametrize(("most", "even"), [(0, True), (200, False)])
+def test_a_backdrop_is_even_where_nearly_all_that_is_bare_has_one_colour(most: int, even: bool) -> None:
+    shades = np.linspace(0, most, HEIGHT).astype(np.uint8)[:, None, None]
+    views = [View.from_arrays(view.name, view.camera, view.image() // 16 + shades) for view in wall().train]
+    found = find_backdrop(replace(wall(), train=tuple(views)))
+    assert found is not None
+    assert found.is_even == even
+    assert (found.alike > 0.9) if even else (found.alike < EVEN / 2)
 
 
 def test_photographs_with_alpha_or_without_known_points_have_no_backdrop() -> None:
-    assert backdrop_color(make_scene()) is None
+    assert find_backdrop(make_scene()) is None
     view = wall().train[0]
     opaque = np.concatenate([view.image(), np.full((HEIGHT, WIDTH, 1), 255, np.uint8)], axis=2)
     cut_out = View.from_arrays(view.name, view.camera, opaque)
-    assert backdrop_color(replace(wall(), train=(cut_out, *wall().train[1:]))) is None
+    assert find_backdrop(replace(wall(), train=(cut_out, *wall().train[1:]))) is None
 
 
 # -- what cannot be trained with ------------------------------------------------------------------------------------

@@ -45,6 +45,7 @@ DEPTH_WEIGHT, NORMAL_WEIGHT = 0.2, 0.05  # docs/decisions/priors.md
 DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
+BACKDROP_RATE = 0.3  # docs/decisions/fog.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
@@ -252,6 +253,25 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
         opacity_decay=recipe.opacity_decay or OpacityDecay(),
         seen_area=recipe.seen_area or SeenArea(),
     )
+
+
+def with_fading_backdrop(recipe: Recipe) -> Recipe:
+    """Return the recipe, if opacity decays in it, with a faster decay of splats of the background's colour.
+
+    For captures before an even backdrop (docs/decisions/fog.md). A rate that the recipe has already stays.
+    """
+    decay = recipe.opacity_decay
+    if decay is None or decay.backdrop_rate is not None:
+        return recipe
+    return replace(recipe, opacity_decay=replace(decay, backdrop_rate=BACKDROP_RATE))
+
+
+def without_fading_backdrop(recipe: Recipe) -> Recipe:
+    """Return the recipe without what :func:`with_fading_backdrop` gives it; a rate of another's choice stays."""
+    decay = recipe.opacity_decay
+    if decay is None or decay.backdrop_rate != BACKDROP_RATE:
+        return recipe
+    return replace(recipe, opacity_decay=replace(decay, backdrop_rate=None))
 
 
 def _sparing_large_splats(stage: Stage) -> Stage:

@@ -136,11 +136,17 @@ class OpacityDecay:
 
     What many photographs need grows back at once; what one or two need for a veil does not. Unlike resets it works at
     any schedule. Splats never decay below ``least``, where they would be pruned or not drawn.
+
+    ``backdrop_rate``, instead of ``rate``, is that of splats whose colour (of degree 0) is within ``backdrop_within``
+    of the background's in every channel, both in [0, 1]; None: they are like all others. They draw what is drawn
+    without them, and only hide what is wrong behind them: in a new view they hide what is right.
     """
 
     rate: float = 0.01
     every: int = 10
     least: float = 0.005
+    backdrop_rate: float | None = field(default=None, metadata={"omit_empty": True})
+    backdrop_within: float = field(default=0.06, metadata={"omit_empty": True})
 
 
 @dataclass(frozen=True)
@@ -204,6 +210,10 @@ def check_robust(
         for name in ("rate", "least"):
             value = number(f"{at}.{name}", getattr(decay, name), low=0.0)
             require(value < 1, f"{at}.{name} must be below 1, got {value}")
+        number(f"{at}.backdrop_within", decay.backdrop_within, low=0.0)
+        if decay.backdrop_rate is not None:
+            value = number(f"{at}.backdrop_rate", decay.backdrop_rate, low=0.0)
+            require(value < 1, f"{at}.backdrop_rate must be below 1, got {value}")
     if seen is not None:
         at = f"{where}: seen_area"
         integer(f"{at}.times", seen.times, low=1)

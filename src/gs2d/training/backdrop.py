@@ -6,18 +6,44 @@ the cameras, and new views have black holes.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from gs2d.config.robust import OpacityDecay
 from gs2d.data.scene import Scene
 
 APART = 1 / 20  # of the longer side: pixels farther from every sparse point are taken to be bare
 MAX_VIEWS = 60  # that are asked, evenly chosen
 STRIDE = 7  # every so many of those pixels
+WITHIN = OpacityDecay.backdrop_within  # of the colour, in every channel: splats that near it may fade
+EVEN = 2 / 3  # of the bare pixels: 0.81 before a black cloth, 0.50 on a grey desk, 0.13 and less elsewhere
 
 
-def backdrop_color(scene: Scene) -> tuple[float, float, float] | None:
-    """Return the median colour, in [0, 1], of the pixels of training views that are far from every sparse point.
+@dataclass(frozen=True)
+class Backdrop:
+    """What lies behind everything.
+
+    Attributes
+    ----------
+    color : tuple of 3 floats
+        In [0, 1]: the median of the pixels of training views that are far from every sparse point.
+    alike : float
+        The share of those pixels that have nearly this colour.
+    """
+
+    color: tuple[float, float, float]
+    alike: float
+
+    @property
+    def is_even(self) -> bool:
+        """Whether a splat of this colour says no more than empty space: nearly all that is bare has it."""
+        return self.alike >= EVEN
+
+
+def find_backdrop(scene: Scene) -> Backdrop | None:
+    """Look at the pixels of training views that are far from every sparse point.
 
     None where photographs have an alpha channel, which says what is empty, or the capture does not say which points
     they show, or no pixel is bare.
@@ -41,4 +67,5 @@ def backdrop_color(scene: Scene) -> tuple[float, float, float] | None:
     if not len(colors):
         return None
     red, green, blue = (round(float(value), 3) for value in np.median(colors, axis=0))
-    return red, green, blue
+    alike = (np.abs(colors - np.array([red, green, blue])) <= WITHIN).all(axis=1)
+    return Backdrop((red, green, blue), float(alike.mean()))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gs2d.config.recipe import Recipe, Stage
 from gs2d.config.robust import DenseStart, SeenArea
+from gs2d.core.sh import C0, rgb_to_sh0
 from gs2d.core.splats import Splats
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError
@@ -152,6 +153,11 @@ class Robustness:
             return False
         return iteration * settings.times // stage.iterations > (iteration - 1) * settings.times // stage.iterations
 
+    def _like_backdrop(self, splats: Splats, within: float) -> Tensor:
+        """Find the splats [N] of the colour that is drawn where there is none."""
+        backdrop = rgb_to_sh0(splats.sh0.new_tensor([self._raster.background]))
+        return (splats.sh0 - backdrop).abs().amax(dim=(1, 2)) <= within / C0
+
     @torch.no_grad()
     def decay(self, state: TrainState, stage: Stage, iteration: int, backend: Backend) -> None:
         """Let opacity decay, where that is due."""
@@ -160,5 +166,9 @@ class Robustness:
             return
         logits = state.splats.opacity_logits
         least = math.log(settings.least / (1 - settings.least))
-        faded = torch.logit(torch.sigmoid(logits) * (1 - settings.rate)).clamp_min(least)
+        kept: Tensor | float = 1 - settings.rate
+        if settings.backdrop_rate is not None:
+            like = self._like_backdrop(state.splats, settings.backdrop_within)
+            kept = torch.where(like, 1 - settings.backdrop_rate, kept).reshape(logits.shape)
+        faded = torch.logit(torch.sigmoid(logits) * kept).clamp_min(least)
         backend.assign(logits, torch.where(logits > least, faded, logits))
