@@ -19,7 +19,10 @@ from __future__ import annotations
 
 
 class Gs2dError(Exception):
-    """Base of all errors that a user can mend."""
+    """Base of all errors that a user can mend; the ends of lines in what a message quotes become spaces."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(" ".join(arg.splitlines()) if isinstance(arg, str) else arg for arg in args))
 
 
 class DataError(Gs2dError):

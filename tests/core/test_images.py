@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from gs2d.core import images
 from gs2d.core.images import (
     area_downscale,
     composite,
@@ -238,3 +239,12 @@ def test_digits_of_other_scripts_are_no_number() -> None:
     assert [is_number(text) for text in ("0", "00012", "", "-1", "1.0", "\u00b2", "\u0663", "9" * 19)] == [True] * 2 + [
         False
     ] * 6
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_picture_is_shrunk_in_bands_as_in_one_piece(channels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (47, 31, channels), dtype=np.uint8)
+    whole = area_downscale(picture, 4)
+    assert whole.shape == (11, 7, channels)
+    monkeypatch.setattr(images, "_BAND", 31 * 4 * 3)  # three rows of it at a time
+    np.testing.assert_array_equal(area_downscale(picture, 4), whole)

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from gs2d.core import memory_limit as module
-from gs2d.core.memory_limit import cache_bytes, memory_limit
+from gs2d.core.memory_limit import cache_bytes, check_address_space, memory_limit
+from gs2d.errors import BackendError
 
 MB = 1 << 20
 
@@ -68,6 +69,30 @@ def test_the_limit_on_address_space_counts_what_is_mapped(tmp_path: Path, monkey
     assert limit is not None
     assert (limit.bytes, "ulimit -v" in limit.source) == (1000 * MB, True)
     assert limit.room == pytest.approx(100 * MB, abs=1 << 16)
+
+
+def test_too_little_address_space_to_load_the_libraries_in_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "5")
+    for allowed, fits in ((1300 * MB, False), (1400 * MB, True), (resource.RLIM_INFINITY, True)):
+        monkeypatch.setattr(resource, "getrlimit", lambda _which, allowed=allowed: (allowed, allowed))
+        if fits:
+            check_address_space()
+        else:
+            with pytest.raises(BackendError, match=r"at least 1.31 GiB .* got a limit of 1.27 GiB; raise it \(ulimit"):
+                check_address_space()
+
+
+@pytest.mark.parametrize("allowed", [100, 400, 700, 1000])
+def test_a_command_in_too_little_address_space_ends_with_a_line(tmp_path: Path, allowed: int) -> None:
+    """At 700 MB the libraries alone would ask for memory for ever, at 400 MB C++ would end the process."""
+    code = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({allowed} << 20, {allowed} << 20))\n"
+    code += "from gs2d.cli import main; main()"
+    words = [sys.executable, "-c", code, "train", str(tmp_path), "--out", str(tmp_path / "run")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2, done
+    assert done.stderr.count("\n") == 1
+    assert "of address space are needed, got a limit of" in done.stderr
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_cache_takes_a_part_of_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import os
 import pytest
 
 from gs2d.core.text import name_bytes, printable
+from gs2d.errors import DataError, DiskError
 
 
 @pytest.mark.parametrize("name", ["plain.png", "é.png", "日本", os.fsdecode(b"caf\xe9"), os.fsdecode(b"\xff\x1b[2J")])
@@ -37,3 +38,9 @@ def test_what_would_steer_a_terminal_is_spelled_out(text: str, shown: str) -> No
 
 def test_lines_stay_where_there_are_to_be_several() -> None:
     assert printable("a\n\tb\x1b", lines=True) == "a\n\tb\\x1b"
+
+
+def test_an_error_is_one_line_whatever_it_quotes() -> None:
+    assert str(DataError("intrinsics must hold a\nb\r\nc\u2028d")) == "intrinsics must hold a b c d"
+    assert str(DiskError("a\nb", 28)) == "a b"
+    assert DiskError("a", 28).errno == 28

@@ -96,13 +96,16 @@ def open_socket(url: str, **options: Any) -> Any:
     return connect(url.replace("http", "ws", 1), **options)
 
 
-def say(url: str, data: bytes | str) -> int:
-    """Say something; returns the code by which the connection was closed, 0 if it was not."""
+def say(url: str, data: bytes | str, patience: float = 0.5) -> int:
+    """Say something; returns the code by which the connection was closed, 0 if it was not.
+
+    ``patience``: seconds of silence after which it counts as not closed; a loaded machine needs more of them.
+    """
     with open_socket(url) as connection:
         try:
             connection.send(data)
             while True:
-                connection.recv(timeout=0.5)
+                connection.recv(timeout=patience)
         except TimeoutError:
             return 0
         except ConnectionClosed as closed:

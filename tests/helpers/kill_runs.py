@@ -16,6 +16,7 @@ import collections
 import contextlib
 import ctypes
 import errno
+import gc
 import json
 import os
 import random
@@ -23,34 +24,16 @@ import shutil
 import signal
 import sys
 import time
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-from ball_runs import comparable, options
-from gs2d.errors import Gs2dError
-from gs2d.io.run_dir import RunFolder, load_tensors
-from gs2d.pipeline.export import export_run
-from gs2d.pipeline.mesh import mesh_run
-from gs2d.pipeline.page import page_run
-from gs2d.pipeline.report import report_run
-from gs2d.pipeline.train import train
-from tiny import write_capture
+from gs2d.io.run_dir import load_tensors
+from kill_commands import COMMANDS, DONE, REFUSED, Command, ended, forked, import_all, started
 
-COMMANDS = ("train", "mesh", "export", "page", "report")
 AT_EACH_CALL = {"kill": -1, "tear": -2, "full": errno.ENOSPC}  # tear: half a write, or right after another call
-DONE, REFUSED, FAULT = 0, 2, 1  # exit codes, as of gs2d
-SHORT = {  # the three stages on few views: as many kinds of files as in a long run
-    "schedule_scale": 0.0002,
-    "overrides": ("init_points=40", "surface.densify.max_splats=60"),
-    "checkpoint_every": 2,
-    "shown_views": 1,
-    "page": True,
-}
-DATED = ("report.html", "run.json", "metrics.json", "verdict.json", "events.jsonl", ".lock")  # times, names of folders
 
 
 class Layer:
@@ -66,85 +49,6 @@ class Layer:
     def turn_back_the_clock(self) -> None:
         """Let the wall clock of this process run backwards."""
         self._library.failing_clock()
-
-
-def started(work: Callable[[], object]) -> int:
-    """Do something in a child; its process."""
-    child = os.fork()
-    if not child:
-        code = FAULT
-        try:
-            work()
-            code = DONE
-        except Gs2dError as error:
-            print(f"refused: {error}", file=sys.stderr)
-            code = REFUSED
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            os._exit(code)
-    return child
-
-
-def ended(child: int) -> int:
-    """Wait for a child; its exit code, or minus the signal that ended it."""
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-
-
-def forked(work: Callable[[], object]) -> int:
-    """Do something in a child and wait for it."""
-    return ended(started(work))
-
-
-class Command:
-    """One command: how it is begun on a fresh folder, gone on with after a kill, and what it leaves."""
-
-    def __init__(self, name: str, work: Path) -> None:
-        self.name, self.work, self.capture = name, work, work / "ball"
-        if not self.capture.exists():
-            write_capture(self.capture, train=3, test=1, size=16)
-
-    def train(self, out: Path) -> None:
-        """Train from what is there."""
-        train(options(self.capture, out, resume=True, **SHORT))
-
-    def prepare(self, folder: Path) -> None:
-        """Make the folder as it is before the command."""
-        if self.name == "train":
-            folder.mkdir()
-            return
-        finished = self.work / "finished"
-        if not finished.exists() and forked(lambda: self.train(finished)) != DONE:
-            raise SystemExit("the training before the command failed")
-        shutil.copytree(finished, folder / "run")
-
-    def run(self, folder: Path) -> None:
-        """Do it, or go on with it."""
-        run = folder / "run"
-        if self.name == "train":
-            self.train(run)
-        elif self.name == "mesh":
-            mesh_run(run)
-        elif self.name == "export":
-            export_run(run, folder / "out.spz")
-            export_run(run, folder / "out.splat")
-        elif self.name == "page":
-            page_run(run)
-        elif self.name == "report":
-            report_run(run)
-
-    def leaves(self, folder: Path) -> dict[str, Any]:
-        """Return what may not depend on how often the command was killed: all names, and bytes without times."""
-        files = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
-        found: dict[str, Any] = {
-            name: None if path.name in DATED or path.suffix == ".pt" else path.read_bytes()
-            for name, path in files.items()
-        }
-        run = RunFolder(folder / "run")
-        splats, events, stages = comparable(run)
-        others = {key: value for key, value in run.metrics().items() if key != "stages"}
-        others["mesh"] = {key: value for key, value in others.get("mesh", {}).items() if key != "file"}
-        return found | {"the splats": splats, "the log": events, "the scores": stages, "the other facts": others}
 
 
 def half_written(folder: Path) -> list[str]:
@@ -286,18 +190,21 @@ def undisturbed(command: Command, layer: Layer) -> tuple[list[str], dict[str, An
     """Return the calls of the command, one line each, what it leaves, and the seconds that it took."""
     with scratch(command.work) as folder:
         command.prepare(folder)
-        record = command.work / "calls.txt"
+        record, imported = command.work / "calls.txt", command.work / "imported.txt"
         descriptor = os.open(record, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o600)
 
         def counted() -> None:
             layer.arm(folder, record=descriptor)
             command.run(folder)
+            imported.write_text("\n".join(sys.modules))
 
         began = time.monotonic()
         if forked(counted) != DONE:
             raise SystemExit("the undisturbed command failed")
         seconds = time.monotonic() - began
         os.close(descriptor)
+        import_all(imported.read_text().split())
+        gc.freeze()  # what is loaded is not looked through by each child
         return record.read_text().splitlines(), command.leaves(folder), seconds
 
 
@@ -345,7 +252,7 @@ def main() -> None:
     work.mkdir(parents=True, exist_ok=True)
     for name in given.commands.split(","):
         for action in given.actions.split(","):
-            print(json.dumps(tries(Command(name, work), layer, action, given)), flush=True)
+            print(json.dumps(tries(COMMANDS[name](work), layer, action, given)), flush=True)
 
 
 if __name__ == "__main__":

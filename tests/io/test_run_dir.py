@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -345,3 +346,15 @@ def test_a_package_that_is_not_installed_is_said_to_be_so(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(run_module.importlib.metadata, "version", missing)
     assert run_module.versions()["torch"] == "not installed"
+
+
+def test_a_checkpoint_that_a_killed_process_had_no_time_to_drop_goes_with_the_lock(tmp_path: Path) -> None:
+    """Killed between the checkpoint at the end of a stage and the end of the one within it."""
+    run = new_run(tmp_path / "run")
+    for index, iteration in ((0, None), (1, None), (2, 4)):
+        run.save_checkpoint(index, "stage", iteration, {"a": torch.zeros(2)})
+    left = run.path / "checkpoints" / "1-stage-0000002.pt"
+    shutil.copyfile(run.path / "checkpoints" / "2-stage-0000004.pt", left)
+    with run.locked():
+        names = [checkpoint.path.name for checkpoint in run.checkpoints()]
+    assert names == ["0-stage-end.pt", "1-stage-end.pt", "2-stage-0000004.pt"]

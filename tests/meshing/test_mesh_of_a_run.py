@@ -18,6 +18,7 @@ from gs2d.io.meshes import read_mesh
 from gs2d.io.run_dir import RunFolder
 from gs2d.kernels.library import available_variants
 from gs2d.meshing.tsdf import Add, Volume, integrator
+from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import check_same_run, reload_job, with_fused_depth
 from gs2d.pipeline.mesh import extract_mesh, mesh_run
@@ -72,6 +73,23 @@ def test_memory_is_bounded_by_an_option_of_the_command(
     assert not out.exists()
     with pytest.raises(ProtocolError, match="--max-gib must be a positive number of GiB"):
         mesh_run(run, MeshOptions(max_gib=0.0), out=out)
+
+
+def test_voxels_that_nobody_asked_for_are_as_large_as_memory_needs(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fine = mesh_run(run, MeshOptions(), out=tmp_path / "fine.ply", threads=1)
+    allowed = fine["volume_bytes"] // 3
+    monkeypatch.setattr("gs2d.pipeline.mesh.memory_budget", lambda: allowed)
+    heard: list[Event] = []
+    coarse = mesh_run(run, MeshOptions(), out=tmp_path / "coarse.ply", threads=1, on_event=heard.append)
+    assert coarse["volume_bytes"] <= allowed
+    assert coarse["voxel"] > 1.3 * fine["voxel"]
+    assert coarse["faces"] > 0
+    (told,) = {event.text for event in heard if isinstance(event, Notice) and "voxel" in event.text}
+    assert "was expected, voxels of" in told
+    with pytest.raises(ProtocolError, match="use a voxel of about"):
+        mesh_run(run, MeshOptions(voxel=fine["voxel"]), out=tmp_path / "asked.ply", threads=1)
 
 
 def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_resumes(

@@ -63,11 +63,11 @@ def test_a_page_and_an_export_that_end_at_any_of_their_calls_leave_the_old_file_
 def test_the_layer_would_notice_a_file_that_is_written_in_place(layer: Path, tmp_path: Path) -> None:
     """A stand-in for an export that writes in place: killed half-way it leaves half a file, which must be found."""
     code = (
-        "import kill_runs, sys\n"
+        "import kill_commands, kill_runs, sys\n"
         "def write(run, out):\n"
         "    with open(out.with_suffix('.json'), 'wb', buffering=0) as file:\n"
         "        file.write(b'[' + b'1, ' * 50 + b'1]')\n"
-        "kill_runs.export_run = write\n"
+        "kill_commands.export_run = write\n"
         "sys.argv = ['x', '--commands', 'export', '--actions', 'tear', '--work', sys.argv[1]]\n"
         "kill_runs.main()\n"
     )
@@ -92,6 +92,19 @@ def test_a_training_that_ends_at_any_of_its_calls_is_resumed_to_the_same_bytes(
 def test_a_mesh_and_a_report_that_end_at_any_of_their_calls_are_made_again(layer: Path, tmp_path: Path) -> None:
     for result in tried(layer, tmp_path, "mesh,report", "kill,tear,full"):
         assert result["tried"] == result["calls"] >= 5
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(6000)
+@pytest.mark.parametrize("action", ["kill", "tear", "full"])
+@pytest.mark.parametrize("command", ["reconstruct", "sweep"])
+def test_a_reconstruction_and_a_sweep_that_end_at_any_of_their_calls_are_gone_on_with(
+    layer: Path, tmp_path: Path, command: str, action: str
+) -> None:
+    if command == "reconstruct":
+        pytest.importorskip("pycolmap", reason="no pycolmap: pip install pycolmap")
+    (result,) = tried(layer, tmp_path, command, action)
+    assert result["tried"] == result["calls"] > 200
 
 
 @pytest.mark.slow

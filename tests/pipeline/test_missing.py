@@ -42,7 +42,7 @@ def finished(undisturbed: RunFolder, tmp_path: Path) -> Path:
     ("place", "error", "what", "reason", "command"),
     [
         ("train.extract_mesh", ProtocolError("no depth"), "mesh.ply", "no depth", "gs2d mesh {run}"),
-        ("train.extract_mesh", MemoryError("much"), "mesh.ply", "fault in gs2d: MemoryError: much", "gs2d mesh {run}"),
+        ("train.extract_mesh", MemoryError("much"), "mesh.ply", "out of memory", "gs2d mesh {run}"),
         (
             "train.report_run",
             OSError("broken data stream"),

@@ -84,7 +84,7 @@ def test_splats_at_the_end_are_those_at_the_start_times_growth_but_for_a_budget(
 
 
 def test_the_downscale_is_the_first_at_which_an_iteration_fits() -> None:
-    allowed = PROGRAM_BYTES + 24 * MEGA * (160 // 4 + 12)  # of 24 megapixels at half their size
+    allowed = PROGRAM_BYTES + 24 * MEGA * (216 // 4 + 12)  # of 24 megapixels at half their size
     assert fitting_downscale(24 * MEGA, 1, allowed, on_host=True) == 2
     assert fitting_downscale(24 * MEGA, 1, allowed - 1, on_host=True) == 3
     assert fitting_downscale(24 * MEGA, 4, allowed, on_host=True) == 4

@@ -21,7 +21,7 @@ from gs2d.pipeline.options import PosesOptions
 from gs2d.pipeline.sfm import find_poses
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, solve
 from gs2d.sfm.model import SfmModel, camera_line, check_any, why_not_placed
-from gs2d.sfm.workspace import check_out, put_in_place, workspace
+from gs2d.sfm.workspace import check_out, put_in_place, sweep_workspace, workspace
 
 
 def piece(*names: str) -> SfmModel:
@@ -250,6 +250,38 @@ def test_what_a_killed_command_left_is_removed_and_an_older_capture_comes_back(t
         assert [path.name for path in work.iterdir()] == [".lock"]
     assert (tmp_path / "room" / "poses.json").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["room"]
+
+
+@pytest.mark.parametrize(
+    ("left", "stays"),
+    [
+        (["database.db", "images/0.jpg"], False),  # killed while the workplace was removed
+        (["search.json", "database.db"], False),  # killed between the rename and the word that the search is over
+        (["search.json", "capture/images/0.jpg"], True),  # another capture is being made, to replace this one
+    ],
+)
+def test_the_workplace_of_a_capture_that_is_in_place_goes(tmp_path: Path, left: list[str], stays: bool) -> None:
+    work, out = tmp_path / ".room.poses", tmp_path / "room"
+    for path in (*(work / name for name in left), out / "poses.json"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    sweep_workspace(out)
+    assert work.exists() == stays
+    assert (out / "poses.json").exists()
+
+
+def test_the_workplace_of_no_capture_or_of_a_living_process_stays(tmp_path: Path) -> None:
+    work, out = tmp_path / ".room.poses", tmp_path / "room"
+    work.mkdir()
+    sweep_workspace(out)
+    assert work.exists()
+    out.mkdir()
+    (out / "poses.json").write_text("{}")
+    with RunFolder(work).locked():
+        sweep_workspace(out)
+        assert work.exists()
+    sweep_workspace(out)
+    assert not work.exists()
 
 
 def test_two_commands_do_not_make_the_same_capture(tmp_path: Path) -> None:

@@ -7,41 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from fake_viser import Control, Controls
 from gs2d.viewer.clip import ClipBox, clip_commands
 from gs2d.viewer.exact import ViewerFrame
 from gs2d.viewer.splats import Preview
 
 
-class Control(SimpleNamespace):
-    """A control of a page that nobody has opened."""
-
-    def on_update(self, call: Any) -> None:
-        self.call = call
-
-    def set(self, value: Any) -> None:
-        self.value = value
-        self.call(None)
-
-
-class Folder:
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-
-class Page:
+class Page(Controls):
     """As much of a viser server as the clip box uses."""
 
     def __init__(self) -> None:
-        self.gui = self.scene = self
-        self.controls: dict[str, Control] = {}
+        super().__init__()
         self.edges: list[np.ndarray] = []
-
-    def add_folder(self, _name: str, **_: Any) -> Folder:
-        return Folder()
-
-    def add_checkbox(self, name: str, *, initial_value: bool) -> Control:
-        return self.controls.setdefault(name, Control(value=initial_value))
 
     def add_multi_slider(self, name: str, *, initial_value: tuple[float, float], **limits: float) -> Control:
         return self.controls.setdefault(name, Control(value=initial_value, **limits))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from fake_viser import Control, Controls
 from gs2d.core.camera import Camera
 from gs2d.core.georeference import Georeference
 from gs2d.core.splats import Splats
@@ -54,38 +55,15 @@ def test_a_distance_is_in_metres_where_the_size_is_known() -> None:
     )
 
 
-class Control(SimpleNamespace):
-    def on_update(self, call: Any) -> None:
-        self.call = call
-
-    def set(self, value: Any) -> None:
-        self.value = value
-        self.call(None)
-
-
-class Page:
+class Page(Controls):
     """As much of a viser server as the ruler uses."""
 
     def __init__(self) -> None:
-        self.gui = self.scene = self
-        self.controls: dict[str, Control] = {}
+        super().__init__()
         self.clicked: list[Any] = []
         self.nodes: dict[str, Any] = {}
 
-    def add_folder(self, *_: str, **__: Any) -> Page:
-        return self
-
-    atomic = add_folder
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def __call__(self) -> Page:
-        return self
-
-    def add_checkbox(self, name: str, *, initial_value: bool) -> Control:
-        return self.controls.setdefault(name, Control(value=initial_value))
+    atomic = Controls.add_folder
 
     def add_number(self, name: str, *, initial_value: float, **more: Any) -> Control:
         return self.controls.setdefault(name, Control(value=initial_value, **more))

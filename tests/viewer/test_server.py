@@ -1,4 +1,4 @@
-"""The viewer: its numbers, its thread, its server; what is drawn in a browser was looked at by hand."""
+"""The viewer: its numbers, its thread, its server; what a browser shows is in `test_server_in_a_browser.py`."""
 
 from __future__ import annotations
 

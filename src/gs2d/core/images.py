@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import importlib
+import logging
 import os
 import re
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import IO
 
 import numpy as np
@@ -39,8 +43,25 @@ def is_number(text: str) -> bool:
 
 def open_image(path: str | os.PathLike[str] | IO[bytes]) -> Image.Image:
     """Open an image of one of ``FORMATS`` by Pillow, which has then read its header; errors are Pillow's."""
+    _silence_decoders()
     Image.init()  # asked for a format that it has not loaded, Pillow raises KeyError
     return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
+
+
+@cache
+def _silence_decoders() -> None:
+    """Keep Pillow, and libtiff below it, from writing lines of their own about a damaged file to the terminal.
+
+    Pillow's go to whoever listens to its log. The handlers of libtiff are found through Pillow's module, whose
+    dependency it is; where it is part of that (Windows), it says what it always said.
+    """
+    logging.getLogger("PIL").addHandler(logging.NullHandler())
+    with contextlib.suppress(AttributeError, OSError):
+        library = ctypes.CDLL(importlib.import_module("PIL._imaging").__file__)
+        for name in ("TIFFSetErrorHandler", "TIFFSetWarningHandler"):
+            handler = getattr(library, name)
+            handler.argtypes, handler.restype = (ctypes.c_void_p,), ctypes.c_void_p
+            handler(None)
 
 
 @contextlib.contextmanager
@@ -107,7 +128,8 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
             grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
             return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)
         has_alpha = file.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in file.info
-        return np.array(file.convert("RGBA" if has_alpha else "RGB"))
+        mode = "RGBA" if has_alpha else "RGB"
+        return np.array(file if file.mode == mode else file.convert(mode))  # which copies where nothing changes
 
 
 def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
@@ -212,6 +234,9 @@ def composite(image: np.ndarray, background: Sequence[float] | np.ndarray) -> np
     return np.asarray(rgb)
 
 
+_BAND = 1 << 21  # px that are averaged at a time
+
+
 def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     """Average n x n blocks of pixels; rows and columns left over at the end are cut.
 
@@ -228,6 +253,13 @@ def area_downscale(image: np.ndarray, factor: int) -> np.ndarray:
     """
     if factor == 1:
         return image
+    _block_parts(image, factor)  # raises
+    rows = max(1, _BAND // (image.shape[1] * factor)) * factor  # wider numbers of a part at a time
+    whole = image.shape[0] // factor * factor
+    return np.concatenate([_area_average(image[y : min(y + rows, whole)], factor) for y in range(0, whole, rows)])
+
+
+def _area_average(image: np.ndarray, factor: int) -> np.ndarray:
     count = np.uint32(factor * factor)
     if image.shape[2] == 3:
         parts = _block_parts(image, factor)

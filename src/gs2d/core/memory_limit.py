@@ -11,10 +11,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["MemoryLimit", "cache_bytes", "memory_budget", "memory_limit", "set_memory_budget"]
+from gs2d.errors import BackendError
+
+__all__ = [
+    "MemoryLimit",
+    "address_space",
+    "cache_bytes",
+    "check_address_space",
+    "memory_budget",
+    "memory_limit",
+    "set_memory_budget",
+]
 
 CACHE_FRACTION = 0.2  # of what is left, that a cache may take: what the work itself needs must fit beside it
 BUDGET_FRACTION = 0.5  # of the limit in force, that a command takes if nobody says how much
+LEAST_ADDRESSES = 1 << 30  # bytes of address space that Python, numpy, scipy and torch take to be loaded
+THREAD_ADDRESSES = 80 << 20  # and for each more thread of OpenBLAS, of which numpy and scipy have one each
 _UNLIMITED = 1 << 60  # cgroup v1 says 2^63 less a page where there is no limit
 
 
@@ -53,9 +65,9 @@ def memory_limit(root: Path = Path("/")) -> MemoryLimit | None:
     """
     mapped, resident = _own_pages(root)
     found = [MemoryLimit(limit, resident, source) for limit, source in (*_cgroups(root), *_physical(root))]
-    address_space = _address_space()
-    if address_space is not None:
-        found.append(MemoryLimit(address_space, mapped, "the limit on address space, ulimit -v"))
+    addresses = address_space()
+    if addresses is not None:
+        found.append(MemoryLimit(addresses, mapped, "the limit on address space, ulimit -v"))
     found += [MemoryLimit(budget, resident, "--memory") for budget in _budget]
     return min(found, key=lambda limit: limit.room, default=None)
 
@@ -80,6 +92,33 @@ def cache_bytes(wanted: int) -> int:
     """Return the bytes that a cache may take: ``wanted``, or less where memory is limited."""
     limit = memory_limit()
     return wanted if limit is None else min(wanted, int(CACHE_FRACTION * limit.room))
+
+
+def check_address_space() -> None:
+    """Refuse to go on where so little address space is allowed that the libraries cannot be loaded.
+
+    Looked at before they are: OpenBLAS asks for its buffers again and again for ever if it gets none, and C++ ends the
+    process. Python's package for CUDA takes more, and says so itself.
+
+    Raises
+    ------
+    BackendError
+    """
+    limit = address_space()
+    needed = LEAST_ADDRESSES + THREAD_ADDRESSES * (_blas_threads() - 1)
+    if limit is not None and limit < needed:
+        raise BackendError(
+            f"at least {needed / 2**30:.2f} GiB of address space are needed, got a limit of {limit / 2**30:.2f} GiB; "
+            "raise it (ulimit -v unlimited), and limit memory by a control group instead"
+        )
+
+
+def _blas_threads() -> int:
+    """Return the threads that OpenBLAS makes when it is loaded."""
+    for name in ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS"):
+        if (value := os.environ.get(name, "")).isdecimal() and int(value[:6]):
+            return int(value[:6])
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _own_pages(root: Path) -> tuple[int, int]:
@@ -132,7 +171,8 @@ def _physical(root: Path) -> Iterator[tuple[int, str]]:
         return
 
 
-def _address_space() -> int | None:
+def address_space() -> int | None:
+    """Return the limit on address space (RLIMIT_AS), bytes; None: there is none."""
     try:
         import resource  # not on Windows
     except ImportError:

@@ -35,6 +35,7 @@ from gs2d.errors import DataError, ShapeError
 
 # An image may differ from its camera's size by a factor; each axis may then be off by rounding.
 _ASPECT_TOLERANCE = 0.01
+_LARGEST_SIDE = 1 << 31  # px, of a camera
 
 _LENSES = (0.01, 1e5)  # focal length / side: fields of view from 178.9 degrees down to 2 arc seconds
 
@@ -210,6 +211,11 @@ def fit_to_file(frame: PosedImage) -> PosedImage:
     k = frame.intrinsics
     width, height = image_size(frame.path)
     if (width, height) != (k.width, k.height):
+        if max(k.width, k.height) > _LARGEST_SIDE:  # more than a double tells from its neighbours
+            raise DataError(
+                f"image {frame.path} must have a camera of its size, {width}x{height}, got one of more than "
+                f"{_LARGEST_SIDE:,} pixels a side; is the line of its camera whole?"
+            )
         _check_aspect(f"image {frame.path}", (width, height), (k.width, k.height), "camera")
         k = k.scaled(width, height)
     for path in (frame.mask, frame.object_mask):

@@ -134,5 +134,8 @@ def find_masks(
 
 def _shared_folder(names: Sequence[str]) -> str:
     """Return the folder that all names begin with, with a ``/`` at its end; "" without one."""
-    folder = os.path.commonpath([os.path.dirname(name) for name in names]) if names else ""
+    try:
+        folder = os.path.commonpath([os.path.dirname(name) for name in names]) if names else ""
+    except ValueError:  # some are absolute
+        folder = ""
     return f"{folder}/" if folder else ""

@@ -98,12 +98,13 @@ class Gaussians:
         w, x, y, z = self.quats.T
         orders = [m for degree in range(1, self.sh_degree + 1) for m in range(-degree, degree + 1)]
         signs = np.array([-1 if m % 2 else 1 for m in orders], np.float32)[:, None]  # Y(-x, -y, z) = (-1)^m Y(x, y, z)
-        return replace(
-            self,
-            means=self.means * np.array([-1, -1, 1], np.float32),
-            quats=np.stack([-z, -y, x, w], axis=1),
-            shN=self.shN * signs,
-        )
+        with np.errstate(invalid="ignore"):  # of a NaN that signals: what comes of it is checked
+            return replace(
+                self,
+                means=self.means * np.array([-1, -1, 1], np.float32),
+                quats=np.stack([-z, -y, x, w], axis=1),
+                shN=self.shN * signs,
+            )
 
     def rows(self, index: np.ndarray) -> Gaussians:
         """Return the rows of an index or a mask."""

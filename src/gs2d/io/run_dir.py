@@ -197,10 +197,15 @@ class RunFolder:
             file.close()
 
     def sweep(self) -> None:
-        """Remove the temporary files that killed processes left in the run's own folders."""
+        """Remove what killed processes left in the run's own folders: temporary files, checkpoints of ended stages."""
         drawn = (Path(folder) for folder, _, _ in os.walk(self.file(RENDERS)))
         for folder in (self.path, self.file(CHECKPOINTS), self.file(SURFACE), *drawn):
             sweep(folder)
+        ended = max((c.stage_index for c in self.checkpoints() if c.iteration is None), default=-1)
+        for checkpoint in self.checkpoints():
+            if checkpoint.iteration is not None and checkpoint.stage_index <= ended:
+                with contextlib.suppress(OSError):
+                    checkpoint.path.unlink()
 
     def clear(self) -> None:
         """Delete what a run writes, and nothing else; ``run.json`` last, so that a killed clear can be repeated."""

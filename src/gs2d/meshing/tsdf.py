@@ -131,6 +131,14 @@ def block_grid(limits: FusionBounds) -> tuple[int, int, int]:
     return int(dims[0]), int(dims[1]), int(dims[2])
 
 
+class VolumeTooLargeError(ProtocolError):
+    """A volume over the bound; ``voxel`` is about the one at which it is not, world units."""
+
+    def __init__(self, voxel: float, message: str) -> None:
+        super().__init__(message)
+        self.voxel = voxel
+
+
 @dataclass(frozen=True)
 class Budget:
     """The bound on memory, and the advice when it is reached."""
@@ -160,11 +168,12 @@ class Budget:
         voxel = self.limits.voxel * (expected / self.max_bytes) ** 0.5 * 1.1  # a surface: blocks go with voxel^-2
         if self.side is not None:
             voxel = 1.005 * self.side / (max(1, int(self.side / voxel) // self.step) * self.step)
-        raise ProtocolError(
+        raise VolumeTooLargeError(
+            voxel,
             f"a volume of at most {self.max_bytes / 2**30:.3g} GiB was expected, voxels of {self.limits.voxel:.4g} "
             "world units "
             f"need {least}{need / 2**30:.3g} GiB; use a voxel of about {voxel:.3g} or more, a smaller bbox, or "
-            "more memory"
+            "more memory",
         )
 
 

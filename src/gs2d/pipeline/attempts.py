@@ -48,4 +48,6 @@ def reason_of(error: Exception) -> str:
     text = " ".join(str(error).split())
     if isinstance(error, Gs2dError):
         return text
+    if isinstance(error, MemoryError):
+        return "out of memory"
     return f"fault in gs2d: {type(error).__name__}: {text[:LONGEST] or 'no message'}"

@@ -66,6 +66,17 @@ class StageDone:
 
     metrics: dict[str, Any] = field(default_factory=dict)
 
+    def line(self) -> str:
+        """Return it in one line: how long, how many splats, how good."""
+        metrics = self.metrics
+        words = [f"{metrics['name']}: {metrics['iterations']} iterations in {metrics['seconds']:.0f} s"]
+        words.append(f"{metrics['splats']:,} splats")
+        for split in ("train", "test"):
+            scores = metrics.get(split)
+            if scores and scores.get("psnr") is not None:
+                words.append(f"{split} PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f}")
+        return "; ".join(words) + (" (from a cache)" if metrics.get("reused_from") else "")
+
 
 @dataclass(frozen=True)
 class MissingFile:

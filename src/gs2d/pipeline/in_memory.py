@@ -25,7 +25,7 @@ from gs2d.evaluation.images import ImageMetrics, mean_metrics
 from gs2d.evaluation.lpips import Lpips
 from gs2d.pipeline.events import ignore
 from gs2d.pipeline.exposure import named
-from gs2d.pipeline.job import choose_backend, choose_protocol, fit_recipe, with_backdrop, with_fused_depth
+from gs2d.pipeline.job import choose_backend, choose_protocol, settled
 from gs2d.pipeline.masks import with_masks, without_masked_points
 from gs2d.pipeline.mesh import fused
 from gs2d.pipeline.options import MeshOptions, Robust, TrainOptions
@@ -144,8 +144,7 @@ def train(
     rules = choose_protocol(options, scene.format, on_event)
     rules = with_masks(rules, scene, on_event)
     scene = without_masked_points(scene, rules, on_event)
-    fitted = fit_recipe(options, scene, rules, on_event)
-    rules = with_fused_depth(with_backdrop(rules, fitted, scene, on_event), fitted)
+    fitted, rules = settled(options, scene, rules, on_event)
     trainer = Trainer(scene, fitted, rules, backend=chosen, on_event=on_event)
     trainer.run()
     exposures = named(scene.train, trainer.state.exposures)

@@ -17,10 +17,12 @@ from gs2d.config.presets import (
     get_recipe,
     with_depth_prior,
     with_exposure,
+    with_fading_backdrop,
     with_intrinsics,
     with_normal_prior,
     with_poses,
     with_robustness,
+    without_fading_backdrop,
 )
 from gs2d.config.protocols import BLACK, GENERIC, Protocol, get_protocol, protocol_for
 from gs2d.config.recipe import Recipe, validate
@@ -35,10 +37,10 @@ from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.subject import check_subject_box
 from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
 from gs2d.io.formats.registry import read_surfels
-from gs2d.io.run_dir import RUN_JSON, RunFolder, versions
-from gs2d.pipeline.events import Notice, OnEvent, Phase, Step
+from gs2d.io.run_dir import RUN_JSON, RunFolder, is_run, versions
+from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
 from gs2d.pipeline.masks import with_masks, without_masked_points
-from gs2d.pipeline.memory import check_memory
+from gs2d.pipeline.memory import check_memory, least_downscale
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.part import LoadedPart, load_part, part_scene
 from gs2d.pipeline.photographs import HOW, already_prepared, with_prepared
@@ -46,7 +48,7 @@ from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined_poses import with_found_poses
 from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
-from gs2d.training.backdrop import backdrop_color
+from gs2d.training.backdrop import find_backdrop
 from gs2d.training.cached_objective import is_cacheable
 from gs2d.training.point_gains import point_gains
 from gs2d.training.trainer import raster_settings
@@ -238,7 +240,7 @@ def check_train_options(options: TrainOptions) -> Recipe:
     recipe = _recipe_of(options, robust=options.robust != "off", exposure=bool(options.learns_exposure))
     if options.init is not None and options.start_from is not None:
         raise RecipeError("--init starts from splats, --from takes finished stages of another run, got both; give one")
-    if options.downscale < 1:
+    if options.downscale is not None and options.downscale < 1:
         raise RecipeError(f"--downscale must be a whole number >= 1, got {options.downscale}")
     if options.checkpoint_every < 1:
         raise RecipeError(f"--checkpoint-every must be a whole number >= 1, got {options.checkpoint_every}")
@@ -316,14 +318,21 @@ def _lacks_points(scene: Scene) -> str | None:
     return None
 
 
-def with_backdrop(protocol: Protocol, recipe: Recipe, scene: Scene, on_event: OnEvent) -> Protocol:
-    """Return the protocol with the colour of sky and bare walls behind everything, where training is robust."""
-    color = backdrop_color(scene) if recipe.free_space is not None and protocol.background == BLACK else None
-    if color is None:
-        return protocol
-    shown = ", ".join(f"{value:.2f}" for value in color)
-    on_event(Notice(f"background ({shown}): the colour of what shows no sparse points"))
-    return replace(protocol, background=color)
+def with_backdrop(recipe: Recipe, protocol: Protocol, scene: Scene, on_event: OnEvent) -> tuple[Recipe, Protocol]:
+    """Put the colour of sky and bare walls behind everything, where training is robust.
+
+    Where nearly all that is bare has that colour, splats of it say no more than empty space, and are made to fade.
+    """
+    found = find_backdrop(scene) if recipe.free_space is not None and protocol.background == BLACK else None
+    if found is None:
+        return recipe, protocol
+    shown = ", ".join(f"{value:.2f}" for value in found.color)
+    recipe = with_fading_backdrop(recipe) if found.is_even else recipe
+    decay = recipe.opacity_decay
+    fades = decay is not None and decay.backdrop_rate is not None and decay.backdrop_rate > decay.rate
+    also = "; splats of that colour fade" if fades else ""
+    on_event(Notice(f"background ({shown}): the colour of what shows no sparse points{also}"))
+    return recipe, replace(protocol, background=found.color)
 
 
 def with_fused_depth(protocol: Protocol, recipe: Recipe) -> Protocol:
@@ -345,10 +354,8 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     scene_format = detect_format(options.scene) if options.format == "auto" else options.format
     reader_of(scene_format)  # a wrong name is told before anything is read
     protocol = choose_protocol(options, scene_format, on_event)
-    masks = Masks(options.masks, options.masked)
-    scene = read_scene(options.scene, scene_format, options.downscale, protocol, on_event, masks)
+    downscale, scene = scene_that_fits(options, scene_format, protocol, backend, on_event)
     protocol = with_masks(protocol, scene, on_event)
-    check_memory(scene, options.downscale, backend.device)
     disk, home = None if options.disk is None else int(options.disk * 2**30), options.out
     if options.part is not None:
         scene, home = part_scene(scene, options.part), options.part.prepared or options.out
@@ -369,8 +376,8 @@ def prepare_job(options: TrainOptions, on_event: OnEvent) -> Job:
     cache_bytes = options.stage2_cache_mb << 20
     if options.part is not None and options.part.splats is not None:
         part = load_part(options.part, scene, recipe)
-        return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, cache_bytes, part=part)
-    return Job(recipe, protocol, scene, backend, settings, options.downscale, digest, cache_bytes, *init)
+        return Job(recipe, protocol, scene, backend, settings, downscale, digest, cache_bytes, part=part)
+    return Job(recipe, protocol, scene, backend, settings, downscale, digest, cache_bytes, *init)
 
 
 def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: OnEvent) -> tuple[Recipe, Protocol]:
@@ -380,8 +387,8 @@ def settled(options: TrainOptions, scene: Scene, protocol: Protocol, on_event: O
     ------
     RecipeError, DataError
     """
-    recipe = fit_recipe(options, scene, protocol, on_event)
-    return recipe, with_fused_depth(with_backdrop(protocol, recipe, scene, on_event), recipe)
+    recipe, protocol = with_backdrop(fit_recipe(options, scene, protocol, on_event), protocol, scene, on_event)
+    return recipe, with_fused_depth(protocol, recipe)
 
 
 def read_init(path: Path, on_event: OnEvent) -> tuple[Splats, str]:
@@ -434,7 +441,7 @@ def choose_backend(name: str, on_event: OnEvent) -> Backend:
     taken = [status.name for status in report].index(backend.name)
     if backend.device != "cpu":
         on_event(Notice(f"training on {report[taken].details} (--backend cpu for the processor)"))
-    elif torch.version.cuda is not None and torch.cuda.device_count() > 0:
+    elif (torch.version.cuda or torch.version.hip) is not None and torch.cuda.device_count() > 0:
         on_event(Notice(f"training without the GPU: {report[0].reason}; {report[0].remedy}"))
     if backend.slow:
         better = report[taken - 1]
@@ -465,6 +472,38 @@ def read_scene(
         on_event(Notice(text))
     _say_some(scene.skipped, "views skipped", on_event)
     return scene
+
+
+def scene_that_fits(
+    options: TrainOptions, scene_format: str, protocol: Protocol, backend: Backend, on_event: OnEvent
+) -> tuple[int, Scene]:
+    """Load a capture, and by what it is shrunk: as asked for, as the run was begun, or as much as memory needs.
+
+    Raises
+    ------
+    DataError
+        At the downscale that was asked for it cannot be trained in the memory there is, or at none.
+    """
+    masks = Masks(options.masks, options.masked)
+    fixed = options.downscale or _begun_with(options)
+    said: list[Event] = []
+    scene = read_scene(options.scene, scene_format, fixed or 1, protocol, said.append, masks)
+    fitting, need = (1, "") if fixed else least_downscale(scene, 1, backend.device)
+    if fitting is not None and fitting > 1:
+        said = [Notice(f"{need}: they are shrunk by {fitting}, as by --downscale {fitting}")]
+        scene = read_scene(options.scene, scene_format, fitting, protocol, said.append, masks)
+    for event in said:
+        on_event(event)
+    check_memory(scene, fixed or fitting or 1, backend.device)
+    return fixed or fitting or 1, scene
+
+
+def _begun_with(options: TrainOptions) -> int | None:
+    """Return the downscale of the run that is gone on with; None: there is none, or it was not written down."""
+    if not (options.resume and is_run(options.out)):
+        return None
+    begun = RunFolder(options.out).definition().get("downscale")
+    return begun if isinstance(begun, int) and begun >= 1 else None
 
 
 def _say_some(lines: Sequence[str], what: str, on_event: OnEvent) -> None:
@@ -563,10 +602,15 @@ def protocol_from_json(data: dict[str, Any]) -> Protocol:
 
 def as_begun(run: RunFolder, job: Job) -> Job:
     """Return a job without what runs of before did not have: it goes on as it began."""
-    before = run.definition().get("recipe")
-    if isinstance(before, dict) and "seen_area" not in before:
-        return replace(job, recipe=replace(job.recipe, seen_area=None))
-    return job
+    before, recipe = run.definition().get("recipe"), job.recipe
+    if not isinstance(before, dict):
+        return job
+    if "seen_area" not in before:
+        recipe = replace(recipe, seen_area=None)
+    decay = before.get("opacity_decay")
+    if isinstance(decay, dict) and "backdrop_rate" not in decay:
+        recipe = without_fading_backdrop(recipe)
+    return replace(job, recipe=recipe)
 
 
 def check_same_run(run: RunFolder, job: Job) -> None:

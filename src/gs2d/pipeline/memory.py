@@ -5,12 +5,13 @@ from __future__ import annotations
 import gc
 
 from gs2d.core.memory import trim
-from gs2d.core.memory_limit import memory_limit, set_memory_budget
+from gs2d.core.memory_limit import CACHE_FRACTION, memory_limit, set_memory_budget
 from gs2d.data import Scene
 from gs2d.errors import DataError, RecipeError
 from gs2d.kernels.library import available_variants, load
 
-ITERATION_BYTES = 160  # of a pixel, at least: images, their gradients, losses (docs/reliability.md)
+ITERATION_BYTES = 216  # of a pixel: images, their gradients, losses, and what the heap keeps (docs/reliability.md)
+CACHES = 2 * CACHE_FRACTION  # of the room, that those of photographs and of targets take beside it
 DECODING_BYTES = 12  # of a pixel of the file: what a JPEG is decoded through
 MAX_DOWNSCALE = 64
 
@@ -47,9 +48,24 @@ def check_memory(scene: Scene, downscale: int, device: str) -> None:
     DataError
         It cannot fit: the kernel would end the process without a word.
     """
+    fitting, need = least_downscale(scene, downscale, device)
+    if fitting == downscale:
+        return
+    smaller = f"--downscale {fitting}" if fitting is not None else "smaller files of the photographs"
+    raise DataError(f"{need}; use {smaller}, or raise the limit")
+
+
+def least_downscale(scene: Scene, downscale: int, device: str) -> tuple[int | None, str]:
+    """Return the downscale at which training fits into memory: the one that a scene has, or a larger one; and why.
+
+    Returns
+    -------
+    (int or None, str)
+        None: not even decoding fits. The words say what the given downscale would need and what there is.
+    """
     limit = memory_limit()
     if limit is None:
-        return
+        return downscale, ""
     pixels = max(view.camera.width * view.camera.height for view in (*scene.train, *scene.test))
     on_host = device == "cpu"
 
@@ -57,14 +73,13 @@ def check_memory(scene: Scene, downscale: int, device: str) -> None:
         shrunk = pixels * (downscale / factor) ** 2
         return shrunk * ITERATION_BYTES * on_host + pixels * downscale**2 * DECODING_BYTES
 
-    if need(downscale) <= limit.room:
-        return
-    fitting = next((f for f in range(downscale + 1, MAX_DOWNSCALE + 1) if need(f) <= limit.room), None)
-    smaller = f"--downscale {fitting}" if fitting is not None else "smaller files of the photographs"
-    raise DataError(
+    fits = need(downscale) <= limit.room
+    factors = [downscale] if fits else range(downscale + 1, MAX_DOWNSCALE + 1)
+    room = limit.room * (1 if fits else 1 - CACHES)  # what is shrunk anyway is to have its caches too
+    return next((f for f in factors if need(f) <= room), None), (
         f"photographs of up to {pixels / 1e6:.3g} megapixels need about {need(downscale) / 2**30:.2g} GiB to train on, "
         f"got {limit.room / 2**30:.2g} GiB that this process may still have of {limit.bytes / 2**30:.2g} GiB "
-        f"({limit.source}); use {smaller}, or raise the limit"
+        f"({limit.source})"
     )
 
 
@@ -75,6 +90,11 @@ def release(scene: Scene) -> None:
     Pictures are decoded again where somebody asks for one.
     """
     scene.forget()
+    release_buffers()
+
+
+def release_buffers() -> None:
+    """Drop reused buffers and whatever waits for the garbage collector; decoded pictures stay."""
     gc.collect()
     if available_variants():
         load().pool.clear()

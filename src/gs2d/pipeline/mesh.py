@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from gs2d.meshing.bare import bare_pixels
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.meshing.slabs import SLAB_BYTES
+from gs2d.meshing.tsdf import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finished import checked_output, open_job
@@ -57,6 +58,7 @@ KEPT = (  # of what is said of a mesh, in metrics.json
 )
 VOLUME_BYTES = 4 << 30  # of the fused volume, where it is not known how much memory there is
 MOSTLY_CUT = 0.5  # part of the depth left out from which the user is told
+COARSER = 3  # times that larger voxels are tried: the size that fits is a guess
 
 
 class MeshFrames:
@@ -168,8 +170,11 @@ def fused(
     check_mesh_options(options)
     depth = options.depth or job.protocol.fused_depth
     usable = seen is not None and seen.complete and depth == job.protocol.fused_depth
-    frames = seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
-    result = _extract(job, frames, options, on_event, subject)
+
+    def frames() -> Iterable[RenderedView] | Spool:
+        return seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
+
+    result = _extract_that_fits(job, frames, options, on_event, subject)
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         on_event(Notice(_cut_text(result, options)))
     return result
@@ -221,6 +226,24 @@ def check_mesh_options(options: MeshOptions) -> None:
         checked_box(options.bbox, "--bbox")
     if options.keep_components is not None and options.keep_components < 0:
         raise ProtocolError(f"--keep-components must be a whole number >= 0 (0 = all), got {options.keep_components}")
+
+
+def _extract_that_fits(
+    job: RenderedScene,
+    frames: Callable[[], Iterable[RenderedView] | Spool],
+    options: MeshOptions,
+    on_event: OnEvent,
+    subject: Subject | None,
+) -> Extraction:
+    """Extract a mesh; where nobody says how large its voxels are, they are as large as memory needs."""
+    free = options.voxel is None and options.max_gib is None and job.protocol.fusion.voxel is None
+    for _ in range(COARSER * free):
+        try:
+            return _extract(job, frames(), options, on_event, subject)
+        except VolumeTooLargeError as error:
+            on_event(Notice(f"{error}; the mesh has such voxels (--max-gib or --memory allow more)"))
+            options = replace(options, voxel=error.voxel)
+    return _extract(job, frames(), options, on_event, subject)
 
 
 def _extract(

@@ -208,8 +208,8 @@ class TrainOptions(Training, Resources, HowItRuns):
     """Run folder to make."""
     format: str = "auto"
     """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
-    downscale: int = 1
-    """Shrink the photographs by this integer, area-filtered."""
+    downscale: int | None = None
+    """Shrink the photographs by this integer, area-filtered (default: not, or so much that they fit into memory)."""
     masks: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of masks of the photographs, white = keep (default: where COLMAP, nerfstudio and Metashape put them)."""
     schedule_scale: float = 1.0

@@ -12,10 +12,8 @@ from gs2d.pipeline.job import (
     Job,
     choose_backend,
     choose_protocol,
-    fit_recipe,
     read_scene,
-    with_backdrop,
-    with_fused_depth,
+    settled,
 )
 from gs2d.pipeline.memory import use_memory
 from gs2d.pipeline.options import PlanOptions, TrainOptions
@@ -51,8 +49,7 @@ def plan(options: PlanOptions, on_event: OnEvent = ignore) -> CapturePlan:
     protocol = choose_protocol(training, kind, on_event)
     scene = read_scene(options.scene, kind, options.downscale, protocol, on_event)
     on_event(Phase("trying a few photographs", 0))
-    recipe = fit_recipe(training, scene, protocol, on_event)
-    protocol = with_fused_depth(with_backdrop(protocol, recipe, scene, on_event), recipe)
+    recipe, protocol = settled(training, scene, protocol, on_event)
     found = plan_capture(scene, recipe, protocol, backend, downscale=options.downscale, prepare=options.prepare)
     check_disk_of(found, options.disk)
     return found

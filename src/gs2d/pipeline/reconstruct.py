@@ -41,7 +41,7 @@ from gs2d.render.backends import get_backend
 from gs2d.sfm.colmap import check_installed
 from gs2d.sfm.images import find_photos
 from gs2d.sfm.video_frames import is_video, look_into
-from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace
+from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_workspace
 
 CAPTURE = "capture"
 FEW = 24  # photographs, below which each is needed for the surface and none is held out
@@ -117,6 +117,7 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
     capture = options.out / CAPTURE
     if options.resume and (capture / POSES_JSON).exists():
         poses = _same_poses(capture, options)
+        sweep_workspace(capture)
         on_event(Notice(f"the cameras were found before, in {capture}: {placed_line(poses)}"))
     else:
         with _claimed(options.out):

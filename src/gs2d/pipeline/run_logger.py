@@ -25,6 +25,7 @@ from gs2d.pipeline.exposure import Transforms, named
 from gs2d.pipeline.interruption import HeldSignals
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.loss_reports import report_losses
+from gs2d.pipeline.memory import release_buffers
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import with_predicted
 from gs2d.pipeline.render import choose_views, draw_stage
@@ -270,6 +271,7 @@ class RunLogger:
     def _finish_stage(self, index: int) -> None:
         self._save(index, None)
         self._signals.release()
+        release_buffers()  # scoring has its own
         self._score_stage(index)
         if index + 1 < len(self._job.recipe.stages):
             self._phase()

@@ -36,7 +36,17 @@ from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_
 from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
 from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
-from gs2d.sfm.workspace import IMAGES, POSES_JSON, POSES_PNG, SPARSE, check_out, put_in_place, workspace
+from gs2d.sfm.workspace import (
+    IMAGES,
+    POSES_JSON,
+    POSES_PNG,
+    SPARSE,
+    STAGED,
+    check_out,
+    put_in_place,
+    sweep_workspace,
+    workspace,
+)
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
@@ -72,6 +82,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
     video = look_into(options.photos) if is_video(options.photos) else None
     paths = [] if video else _folder_of(options.photos, on_event)
     out = options.out.resolve()
+    sweep_workspace(out)
     check_out(options.out, options.photos, overwrite=options.overwrite)
     threads = options.threads or _cores()
     made = make_folder(out.parent)
@@ -86,10 +97,10 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
             masks = _masks_of(options, photos, video is not None, on_event)
             made_of |= {"masks": [_stamp(mask) for mask in masks if mask is not None]} if any(masks) else {}
             request = _request(options, work, photos, threads, on_event)
-            capture = work / "capture"
+            capture = work / STAGED
             if any(masks) and not options.match_masked:
                 request = replace(request, masks=str(capture / FOLDER))
-            if line := go_on(work, {"photographs": made_of, **layers(request)}, ours=("capture",)):
+            if line := go_on(work, {"photographs": made_of, **layers(request)}, ours=(STAGED,)):
                 on_event(Notice(line))
             copy_masks(photos, masks, capture / FOLDER, options.max_size)
             staged = _stage(photos, capture / IMAGES, options, threads, on_event, ours=video is not None)
@@ -100,7 +111,7 @@ def find_poses(options: PosesOptions, on_event: OnEvent = ignore) -> dict[str, A
                 forget(work)  # it would end so again
                 raise
             check_out(options.out, options.photos, overwrite=options.overwrite)  # hours later it may hold something
-            put_in_place(work / "capture", out, work)
+            put_in_place(work / STAGED, out, work)
             forget(work)
     except BaseException:
         remove_made(made)
@@ -288,9 +299,9 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
     groups = camera_groups(photos, sizes, options.cameras)
     order, ordered_by = in_order_taken(photos)
     return Request(
-        images=str(work / "capture" / IMAGES),
+        images=str(work / STAGED / IMAGES),
         database=str(work / DATABASE),
-        output=str(work / "capture" / SPARSE),
+        output=str(work / STAGED / SPARSE),
         groups=tuple(
             Group(
                 tuple(photos[i].name for i in group),

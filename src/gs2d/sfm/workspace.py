@@ -16,11 +16,12 @@ from pathlib import Path
 from gs2d.core.files import disk_error
 from gs2d.core.json_files import read_json
 from gs2d.data.masks import FOLDER as MASKS
-from gs2d.errors import DataError, RunError
+from gs2d.errors import DataError, DiskError, RunError
 from gs2d.io.run_dir import LOCK, RunFolder, make_folder, remove_made
 from gs2d.sfm.search import SEARCH
 
 IMAGES, SPARSE, POSES_JSON, POSES_PNG = "images", "sparse", "poses.json", "poses.png"
+STAGED = "capture"  # the new one, in the workplace
 OLD = "old"  # an earlier capture, until the new one has its name
 EXIT_BUG = (IMAGES, SPARSE, POSES_JSON, POSES_PNG)
 
@@ -102,6 +103,18 @@ def workspace(out: Path) -> Iterator[Path]:
             if not (work / SEARCH).exists():
                 shutil.rmtree(work, ignore_errors=True)
     remove_made(made)  # where an open lock cannot be deleted
+
+
+def sweep_workspace(out: Path) -> None:
+    """Remove the workplace of a capture that is in place: a command was killed while it removed it.
+
+    One that another process holds stays, and so does one in which another capture is being made.
+    """
+    work = hidden_workspace(out)
+    done = (out / POSES_JSON).exists() and not ((work / SEARCH).exists() and (work / STAGED).exists())
+    if done and work.is_dir():
+        with contextlib.suppress(RunError, DiskError), RunFolder(work).locked():
+            shutil.rmtree(work, ignore_errors=True)
 
 
 def _empty(work: Path) -> None:

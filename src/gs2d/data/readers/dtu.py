@@ -110,6 +110,8 @@ def decompose_projection(P: np.ndarray, where: str) -> tuple[float, float, float
     DataError
         Not finite, singular, or with a skew that a pinhole camera does not have.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # by a power of two, which rounds nothing
+        P = np.ldexp(P, -int(np.frexp(np.abs(P[:3, :3]).max())[1]))
     M = P[:3, :3]
     if not np.isfinite(P[:3]).all() or not abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3:
         raise DataError(

@@ -178,11 +178,11 @@ def _words(path: object, vertex: PlyElement, name: str) -> np.ndarray:
 
 
 def _between(path: object, chunk: PlyElement, what: str, fractions: np.ndarray, at: np.ndarray) -> np.ndarray:
-    low, high = (
-        np.stack([_column(path, chunk, f"{end}_{x}").astype(np.float64) for x in _SPAN[what]], axis=1)
-        for end in ("min", "max")
-    )
-    with np.errstate(over="ignore", invalid="ignore"):  # between infinite ends: what comes of it is checked
+    with np.errstate(over="ignore", invalid="ignore"):  # of NaN and between infinite ends: what comes of it is checked
+        low, high = (
+            np.stack([_column(path, chunk, f"{end}_{x}").astype(np.float64) for x in _SPAN[what]], axis=1)
+            for end in ("min", "max")
+        )
         return np.asarray(low[at] * (1.0 - fractions) + high[at] * fractions)
 
 

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -144,7 +145,7 @@ def read_sog(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
             return _Reader(path, lambda name: _of_archive(path, archive, name), path.stat().st_size).read(), "SOG"
     except OSError as error:
         raise DataError(f"cannot read {error.filename or path}: {error.strerror or error}") from error
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
         raise DataError(f"{path}: SOG was expected, its ZIP file is broken ({error}); copy it again") from error
 
 

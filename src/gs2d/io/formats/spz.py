@@ -112,7 +112,7 @@ def _parts_4(g: Gaussians, bits: int, streams: list[bytes]) -> list[bytes]:
 
 
 def _fractional_bits(g: Gaussians, farthest: float) -> int:
-    size = float(np.median(g.log_scales.max(axis=1))) if len(g) else 0.0
+    size = float(np.median(g.log_scales.max(axis=1).astype(np.float64))) if len(g) else 0.0
     bits = int(np.clip(np.ceil((np.log(_STEPS) - size) / np.log(2.0)), 0, _FINEST))
     while bits and farthest * (1 << bits) > _LARGEST:
         bits -= 1

@@ -1,0 +1,310 @@
+"""The commands that ``kill_runs`` ends at each of their calls: on what, how they are gone on with, what they leave.
+
+Everything is small, and each run is a fork of a process that has imported all that the command imports. Curves are
+drawn for the command ``report`` alone: they are made in memory and take most of the time of a training of 12
+iterations. For ``reconstruct`` a real search for the cameras is made once, and what COLMAP's process made is laid where
+it would make it again, file by file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import pickle
+import shutil
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ball_runs import comparable, options
+from gs2d.errors import Gs2dError
+from gs2d.experiments.options import SweepOptions
+from gs2d.experiments.paper import paper
+from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline.export import export_run
+from gs2d.pipeline.mesh import mesh_run
+from gs2d.pipeline.options import ReconstructOptions, Training
+from gs2d.pipeline.page import page_run
+from gs2d.pipeline.report import report_run
+from gs2d.pipeline.train import train
+from room_photos import write_room
+from tiny import write_capture
+
+DONE, REFUSED, FAULT = 0, 2, 1  # exit codes, as of gs2d
+FEW = ("init_points=40", "surface.densify.max_splats=60")
+SHORT = {  # the three stages on few views: as many kinds of files as in a long run
+    "schedule_scale": 0.0002,
+    "overrides": FEW,
+    "checkpoint_every": 2,
+    "shown_views": 1,
+    "page": True,
+}
+DATED = {"report.html", "run.json", "metrics.json", "verdict.json", "events.jsonl", ".lock", "poses.json"} | {
+    "about.json",  # times, names of folders
+    "index.html",
+    *("table.csv", "table.md", "table.tex"),  # what table.json says, seconds among it
+}
+
+
+def started(work: Callable[[], object]) -> int:
+    """Do something in a child; its process."""
+    child = os.fork()
+    if not child:
+        code = FAULT
+        try:
+            work()
+            code = DONE
+        except Gs2dError as error:
+            print(f"refused: {error}", file=sys.stderr)
+            code = REFUSED
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    return child
+
+
+def ended(child: int) -> int:
+    """Wait for a child; its exit code, or minus the signal that ended it."""
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def forked(work: Callable[[], object]) -> int:
+    """Do something in a child and wait for it."""
+    return ended(started(work))
+
+
+def draw_little() -> None:
+    """Let every figure be one dot, and a report show no mesh: they are written as before, and take no time."""
+    import matplotlib.figure
+    from PIL import Image
+
+    from gs2d.report.sections import pictures
+
+    def dot(_figure: Any, file: Any, *, format: str, **_: Any) -> None:
+        if format == "svg":
+            file.write("<svg></svg>")
+        else:
+            Image.new("RGB", (1, 1)).save(file, format)
+
+    matplotlib.figure.Figure.savefig = dot
+    pictures.mesh_images = lambda *_: []
+
+
+def import_all(names: list[str]) -> None:
+    """Import what a child had imported at its end, so that no later child takes time for it."""
+    for name in names:
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
+
+
+def undated(path: Path) -> Any:
+    """What a file holds, without times; None where it holds nothing that must be the same."""
+    if path.name in DATED or path.suffix == ".pt" or path.parent.name == "jobs":
+        return None
+    return without_seconds(json.loads(path.read_text())) if path.name == "table.json" else path.read_bytes()
+
+
+def without_seconds(value: Any) -> Any:
+    """A document without the entries that are called so."""
+    if isinstance(value, dict):
+        return {key: without_seconds(inner) for key, inner in value.items() if key != "seconds"}
+    return [without_seconds(inner) for inner in value] if isinstance(value, list) else value
+
+
+class Command:
+    """One command: how it is begun on a fresh folder, gone on with after a kill, and what it leaves."""
+
+    name = ""
+    draws = False
+
+    def __init__(self, work: Path) -> None:
+        self.work, self.capture = work, work / "data" / "ball"
+        if not self.capture.exists():
+            write_capture(self.capture, train=3, test=1, size=16)
+        self.arrange()
+
+    def arrange(self) -> None:
+        """Make once what all runs of it begin with."""
+
+    def prepare(self, folder: Path) -> None:
+        """Make the folder as it is before the command."""
+        folder.mkdir()
+
+    def run(self, folder: Path) -> None:
+        """Do it, or go on with it, in a process of its own."""
+        if not self.draws:
+            draw_little()
+        self.act(folder)
+
+    def act(self, folder: Path) -> None:
+        """Do it."""
+        raise NotImplementedError
+
+    def leaves(self, folder: Path) -> dict[str, Any]:
+        """Return what may not depend on how often the command was killed: all names, and bytes without times."""
+        files = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
+        found = {name: undated(path) for name, path in files.items()}
+        for path in [path.parent for path in files.values() if path.name == "run.json"]:
+            run, where = RunFolder(path), path.relative_to(folder)
+            splats, events, stages = comparable(run)
+            others = {key: value for key, value in run.metrics().items() if key != "stages"}
+            others["mesh"] = {key: value for key, value in others.get("mesh", {}).items() if key != "file"}
+            mine = {"the splats": splats, "the log": events, "the scores": stages, "the other facts": others}
+            found |= {f"{where}: {what}": value for what, value in mine.items()}
+        return found
+
+
+class Train(Command):
+    """``gs2d train``."""
+
+    name = "train"
+
+    def act(self, folder: Path) -> None:
+        """From what is there."""
+        train(options(self.capture, folder / "run", resume=True, **SHORT))
+
+
+class OfRun(Command):
+    """A command on a run that is trained."""
+
+    def arrange(self) -> None:
+        """Train it."""
+        finished = self.work / "finished"
+        if not finished.exists() and forked(lambda: train(options(self.capture, finished, **SHORT))) != DONE:
+            raise SystemExit("the training before the command failed")
+
+    def prepare(self, folder: Path) -> None:
+        """A copy of the run."""
+        shutil.copytree(self.work / "finished", folder / "run")
+
+
+class Mesh(OfRun):
+    """``gs2d mesh``."""
+
+    name = "mesh"
+
+    def act(self, folder: Path) -> None:
+        """Its mesh."""
+        mesh_run(folder / "run")
+
+
+class Export(OfRun):
+    """``gs2d export``, twice."""
+
+    name = "export"
+
+    def act(self, folder: Path) -> None:
+        """Its splats in two layouts."""
+        export_run(folder / "run", folder / "out.spz")
+        export_run(folder / "run", folder / "out.splat")
+
+
+class Page(OfRun):
+    """``gs2d page``."""
+
+    name = "page"
+
+    def act(self, folder: Path) -> None:
+        """Its page."""
+        page_run(folder / "run")
+
+
+class Report(OfRun):
+    """``gs2d report``."""
+
+    name, draws = "report", True
+
+    def act(self, folder: Path) -> None:
+        """Its report."""
+        report_run(folder / "run")
+
+
+class Sweep(Command):
+    """``gs2d sweep`` of two recipes of which the second goes on from a stage of the first; ``gs2d paper`` is the same
+    function with another list of recipes."""
+
+    name = "sweep"
+
+    def act(self, folder: Path) -> None:
+        """The table."""
+        result = paper(
+            SweepOptions(
+                recipes=("2dgs", "2dgs-r"),
+                data=self.work / "data",
+                out=folder / "out",
+                schedule_scale=0.0002,
+                overrides=FEW,
+                threads=1,
+                backend="cpu",
+            )
+        )
+        if result.failures:
+            raise Gs2dError(f"of the runs failed: {result.failures}")
+
+
+class Reconstruct(Command):
+    """``gs2d reconstruct``, its COLMAP as it ended once."""
+
+    name = "reconstruct"
+
+    def arrange(self) -> None:
+        """Six photographs and one search for their cameras."""
+        self.photos, self.searched = self.work / "photos", self.work / "searched"
+        if not self.searched.exists():
+            write_room(self.photos, 6)
+            if forked(self._search) != DONE:
+                raise SystemExit("the search for the cameras failed")
+
+    def _search(self) -> None:
+        from gs2d.pipeline import sfm
+
+        real = sfm.solve
+
+        def kept(request: Any, *rest: Any) -> Any:
+            solved = real(request, *rest)
+            work, part = Path(request.database).parent, self.searched.with_suffix(".part")
+            shutil.copytree(request.output, part / "models")
+            shutil.copyfile(request.database, part / "database.db")
+            (part / "solved").write_bytes(pickle.dumps(solved))
+            (part / "place").write_text(str(Path(request.output).relative_to(work)))
+            part.rename(self.searched)
+            return solved
+
+        sfm.solve = kept
+        self._reconstruct(self.work / "first")
+
+    def _reconstruct(self, out: Path) -> None:
+        from gs2d.pipeline.reconstruct import reconstruct
+
+        reconstruct(
+            ReconstructOptions(
+                photos=self.photos,
+                out=out,
+                resume=True,
+                threads=1,
+                schedule_scale=0.0005,
+                downscale=8,
+                backend="cpu",
+                training=Training(overrides=FEW),
+            )
+        )
+
+    def act(self, folder: Path) -> None:
+        """The capture and the run."""
+        from gs2d.pipeline import sfm
+
+        def again(request: Any, *_: Any) -> Any:
+            shutil.copyfile(self.searched / "database.db", request.database)
+            shutil.copytree(self.searched / "models", request.output, dirs_exist_ok=True)
+            return pickle.loads((self.searched / "solved").read_bytes())
+
+        sfm.solve = again
+        self._reconstruct(folder / "run")
+
+
+COMMANDS = {command.name: command for command in (Train, Mesh, Export, Page, Report, Sweep, Reconstruct)}
