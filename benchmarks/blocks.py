@@ -8,8 +8,9 @@ A flown capture (``benchmarks.flown_capture``) is trained on whole and by ``gs2d
 blocks together have as many iterations as the one training, or each block has ``--block-iterations``. Both are scored
 on the views that are held out (mean PSNR; and that of all pixels which show the land within ``--near`` of a seam) and
 against the true surface (F at ``--within``, overall and near seams). Seconds are of training. Pictures of the views
-with the most seam go to ``FOLDER/seam-*.png``: photograph, whole, blocks, and the seam on the photograph. The table
-goes to standard output, figures to ``FOLDER/blocks_figures.json``.
+with the most seam go to ``FOLDER/JOB-seam-*.png``: photograph, whole, blocks, and the seam on the photograph. The table
+goes to standard output, figures to ``FOLDER/JOB-figures.json``. JOB is ``blocks``, or ``blocks-N`` with
+``--block-iterations N``, so that both fit in one folder, beside one training.
 """
 
 from __future__ import annotations
@@ -47,6 +48,11 @@ ALL_OF = {"2dgs": 30_000, "best": 20_000}  # iterations of the recipes
 ZOOM = 6  # of the pictures of seams
 
 
+def job_folder(folder: Path, args: argparse.Namespace) -> Path:
+    """Return where the blocks are: another job for another number of iterations."""
+    return folder / ("blocks" if args.block_iterations is None else f"blocks-{args.block_iterations}")
+
+
 def train_both(folder: Path, args: argparse.Namespace) -> None:
     """Make the capture, train whole and in blocks; what is finished stays."""
     capture = folder / "capture"
@@ -79,7 +85,7 @@ def train_both(folder: Path, args: argparse.Namespace) -> None:
         whole = TrainOptions(out=folder / "whole", schedule_scale=scale, resume=True, **common)  # type: ignore[arg-type]
         train(whole, tell)
     options = BlocksOptions(
-        out=folder / "blocks",
+        out=job_folder(folder, args),
         schedule_scale=of_block,
         blocks=args.grid,
         partition=changes,
@@ -106,8 +112,10 @@ def psnr(squares: list[np.ndarray]) -> float:
 
 def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Score both runs, overall and near seams, and draw the views with the most seam."""
-    cells, truth = read_split(folder / "blocks/partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
-    runs = {name: open_job(folder / name, args.threads, lambda _event: None) for name in ("whole", "blocks")}
+    job_of_blocks = job_folder(folder, args)
+    cells, truth = read_split(job_of_blocks / "partition").cells, read_mesh(folder / "capture/mesh_gt.ply")
+    folders = {"whole": folder / "whole", "blocks": job_of_blocks}
+    runs = {name: open_job(path, args.threads, lambda _event: None) for name, path in folders.items()}
     views = runs["whole"][1].scene.test
     distances = {view.name: seam_distances(view.camera, truth, cells) for view in views}
     shown = sorted(views, key=lambda view: -float((distances[view.name] < args.near / 4).mean()))[:3]
@@ -139,7 +147,9 @@ def measured(folder: Path, args: argparse.Namespace) -> dict[str, dict[str, floa
             "f_near_seams": 2 * precision * recall / max(precision + recall, 1e-12),
         }
     for number, view in enumerate(shown):
-        draw(folder / f"seam-{number}.png", view, colors[view.name], distances[view.name], args.near)
+        draw(
+            folder / f"{job_of_blocks.name}-seam-{number}.png", view, colors[view.name], distances[view.name], args.near
+        )
     return found
 
 
@@ -198,7 +208,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(table(found))
-    (args.folder / "blocks_figures.json").write_text(json.dumps(found, indent=1) + "\n")
+    (args.folder / f"{job_folder(args.folder, args).name}-figures.json").write_text(json.dumps(found, indent=1) + "\n")
     return 0
 
 
