@@ -62,6 +62,10 @@ def test_the_reason_for_a_photograph_without_a_place(name: str, expected: str) -
         (Facts({"a": 10, "b": 20, "c": 900}, {("a", "c"): 20}), "got 20 features in the median photograph"),
         (Facts(dict.fromkeys("abc", 900), {}), r"got no two that show the same points \(of 3 photographs\)"),
         (Facts(dict.fromkeys("abc", 900), {("a", "b"): 80}), r"1 pairs show the same points \(up to 80\), but none"),
+        (
+            Facts(dict.fromkeys("abcdefg", 900), {("a", "b"): 80, ("c", "d"): 500, ("d", "e"): 90}),
+            "at most 3 of 7 that show the same points as one another: the steps between them are too large",
+        ),
     ],
 )
 def test_no_model_at_all_says_at_which_step_it_ended(facts: Facts, expected: str) -> None:

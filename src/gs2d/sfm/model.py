@@ -108,10 +108,25 @@ def check_any(pieces: Sequence[SfmModel], facts: Facts, root: Path) -> None:
             f"{len(facts.features)} photographs); {_SHOOTING}"
         )
     best = max(facts.matches.values())
+    together = _largest_group(facts)
+    if 2 * together < len(facts.features):
+        raise DataError(
+            f"{root} must hold photographs that overlap, got at most {together} of {len(facts.features)} that show the "
+            f"same points as one another: the steps between them are too large; {_SHOOTING}"
+        )
     raise DataError(
         f"{root} must hold photographs taken from different places: {len(facts.matches)} pairs show the same points "
         f"(up to {best}), but none of them from two places far enough apart; do not turn on the spot: {_SHOOTING}"
     )
+
+
+def _largest_group(facts: Facts) -> int:
+    """How many photographs the largest group holds that pairs with the same points connect."""
+    groups: list[set[str]] = []
+    for pair in facts.matches:
+        touched = [group for group in groups if not group.isdisjoint(pair)]
+        groups = [group for group in groups if group.isdisjoint(pair)] + [set(pair).union(*touched)]
+    return max(map(len, groups), default=1)
 
 
 def why_not_placed(name: str, pieces: Sequence[SfmModel], facts: Facts, refused: Mapping[str, str] = _NONE) -> str:
