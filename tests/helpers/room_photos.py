@@ -71,6 +71,16 @@ def write_room(folder: Path, count: int = 12, *, seed: int = 0, suffix: str = ".
     return cameras
 
 
+def write_walk(folder: Path, count: int = 8) -> None:
+    """Write photographs of someone who walks along a wall and looks ahead: no two from places side by side."""
+    folder.mkdir(parents=True, exist_ok=True)
+    walls = textures()
+    for i, far in enumerate(np.linspace(3.9, 3.0, count)):
+        eye = np.array([0.55, far, 0.5])
+        camera = look_at(eye, eye - np.array([0.0, 1.0, 0.0]), UP, width=SIZE, height=SIZE, fx=0.75 * SIZE)
+        Image.fromarray(room_image(camera, walls)).save(folder / f"{i:03}.jpg", quality=95)
+
+
 def turn_file(path: Path, orientation: int) -> None:
     """Store a picture as a camera held otherwise stores it: turned, with the EXIF orientation that turns it back."""
     with Image.open(path) as file:

@@ -34,6 +34,14 @@ from gs2d.sfm.upright import up_direction
 Say = Callable[..., None]
 REPEATABLE = 50  # photographs: up to so many, one thread places them, and the same seed gives the same bytes
 SMALLEST_MODEL = 3  # photographs: smaller pieces are nothing that could be trained
+ATTEMPTS = (
+    "strictly",
+    "as on a walk",
+    "all at once",
+)  # ways of placing cameras, each where the one before placed too few
+ENOUGH = 0.5  # of the photographs in one model: no other way is tried
+CLEARLY = 1.5  # times as many photographs must an easier way place, or the stricter one is believed
+WALKED_ANGLE = 4.0  # degrees between the first two cameras, which may stand one before the other; COLMAP's are 16
 
 
 def main(request_path: str) -> None:
@@ -104,28 +112,54 @@ def _names(piece: Any) -> set[str]:
 
 
 def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
-    """Models from nothing: step "first" names them, the largest first."""
+    """Models from nothing: step "first" names them, the largest first.
+
+    Where COLMAP's own demands on the first two cameras leave most photographs without a place, easier ones are tried,
+    and then all cameras at once.
+    """
     total = len(request["in_order"])
     say(phase="cameras", total=total)
-    placed = 0
+    names, most = [], 0
+    attempts = ATTEMPTS[-1:] if request["mapper"] == "global" else ATTEMPTS
+    for attempt in attempts:
+        if (sizes := steps.facts(f"tried {attempt}")) is None:
+            sizes = _attempt(pycolmap, request, steps, say, attempt)
+            steps.finish(f"tried {attempt}", sizes)
+        if (placed := max(sizes.values(), default=0)) > CLEARLY * most:
+            if attempt != attempts[0]:
+                say(note=f"cameras were placed {attempt}: {placed} photographs, {most} by stricter rules")
+            names, most = list(sizes), placed
+        if most >= ENOUGH * total:
+            break
+    steps.finish("first", names)
+
+
+def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, attempt: str) -> dict[str, int]:
+    """Return how many photographs each model has that one way of placing cameras makes, by name, the largest first."""
+    total, placed = len(request["in_order"]), 0
 
     def count(more: int) -> None:
         nonlocal placed
         placed += more
         say(done=min(placed, total))
 
-    options, often = _options(pycolmap, request), total > REPEATABLE
-    if request["mapper"] == "global":
-        place_all(pycolmap, request, steps, "grown", threads=_threads(request))
+    say(done=0)
+    if attempt == "all at once":
+        place_all(pycolmap, request, steps, attempt, threads=_threads(request))
     else:
-        grow_all(pycolmap, request["database"], options, steps, "grown", count, often=often)
-    grown = [f"grown-{i}" for i in itertools.takewhile(lambda i: steps.has(f"grown-{i}"), itertools.count())]
-    sizes = {}
-    for name in grown:
-        piece = steps.read(pycolmap, name)
-        if piece.num_reg_images() >= SMALLEST_MODEL and piece.num_points3D():
-            sizes[name] = (-piece.num_reg_images(), -piece.num_points3D())
-    steps.finish("first", sorted(sizes, key=lambda name: sizes[name]))
+        options, often = _options(pycolmap, request), total > REPEATABLE
+        if attempt == "as on a walk":
+            options.mapper.init_max_forward_motion = 1.0
+            options.mapper.init_min_tri_angle = WALKED_ANGLE
+        grow_all(pycolmap, request["database"], options, steps, attempt, count, often=often)
+    found = [f"{attempt}-{i}" for i in itertools.takewhile(lambda i: steps.has(f"{attempt}-{i}"), itertools.count())]
+    pieces = {name: steps.read(pycolmap, name) for name in found}
+    sizes = {
+        name: (piece.num_reg_images(), piece.num_points3D())
+        for name, piece in pieces.items()
+        if piece.num_reg_images() >= SMALLEST_MODEL and piece.num_points3D()
+    }
+    return {name: sizes[name][0] for name in sorted(sizes, key=lambda name: sizes[name], reverse=True)}
 
 
 def _join_pieces(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
