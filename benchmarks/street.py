@@ -57,7 +57,7 @@ class Capture:
     may_be_shown: bool = False
 
 
-CAPTURES = (
+TUNED = (  # bust, monster tree and temple; the settings were chosen on all of them
     Capture("fox", "fox_instant_ngp/images", "NVIDIA Source Code License (non-commercial)"),
     Capture("castle", "sceaux_castle/images", "none stated, copyright Pierre Moulon"),
     Capture("fountain", "strecha_fountain_P11/images", "none stated"),
@@ -67,7 +67,22 @@ CAPTURES = (
     Capture("bust", "alexander_bust/images", "CC BY-NC-SA"),
     Capture("bottle", "rendered_bottle/train", "CC BY 4.0 (YCB) and public domain, rendered", may_be_shown=True),
 )
-STREET = tuple(capture.name for capture in CAPTURES if not capture.may_be_shown)  # the bottle is for the gallery
+UNTUNED = (  # nothing was chosen on these: examples in public repositories, OWNER+NAME/FOLDER below --data
+    Capture("frog", "snavely+bundler_sfm/examples/kermit", "none stated"),
+    Capture("doll", "snavely+bundler_sfm/examples/ET", "none stated"),
+    Capture("lane", "mapillary+OpenSfM/data/lund/images", "none stated"),
+    Capture("lounge", "InternRobotics+AnySplat/examples/vrnerf/riverview", "of VR-NeRF, CC BY-NC 4.0"),
+    Capture("kitchen", "facebookresearch+vggsfm/examples/kitchen/images", "of Mip-NeRF 360, none stated"),
+    Capture("museum", "facebookresearch+vggsfm/examples/british_museum/images", "of Flickr's users"),
+    Capture("statue", "facebookresearch+vggsfm/examples/statue/images", "CC BY-NC repository"),
+    Capture("cake", "facebookresearch+vggsfm/examples/cake/images", "of CO3D, CC BY-NC 4.0"),
+    Capture("flat", "CUT3R+CUT3R/examples/001", "CC BY-NC-SA repository"),
+    Capture("kitchenette", "CUT3R+CUT3R/examples/002", "CC BY-NC-SA repository"),
+    Capture("hall", "CUT3R+CUT3R/examples/004", "CC BY-NC-SA repository"),
+    Capture("buddha", "alicevision+dataset_buddha/buddha", "CC BY 4.0"),
+)
+CAPTURES = (*TUNED, *UNTUNED)
+STREET = tuple(capture.name for capture in TUNED if not capture.may_be_shown)  # the bottle is for the gallery
 COLUMNS = {
     "capture": lambda row: row["capture"],
     "exit": lambda row: str(row["exit_code"]),
