@@ -47,7 +47,7 @@ INSIDE = {
         "checks growth locks extras memory memory_limit processes spill text": 0,
         "files georeference similarity": 1,
         "arrays json_files camera images mesh sh splats": 2,
-        "exif transforms": 3,
+        "exif photometry transforms": 3,
     },
     "data": {
         "archive": 9,
@@ -64,10 +64,10 @@ INSIDE = {
     "render": {
         "tensor_api": 7,
         "api": 6,
-        "backends": 5,
+        "backends photometry": 5,
         "cpu_cached pose_gradient exposure": 4,
         "cpu cuda cuda_step reference_errors": 3,
-        "cuda_passes reference": 2,
+        "cuda_passes photometry_native reference": 2,
         "pair_budget whole_step reference_projection reference_transmittance pose_gradient_native exposure_native": 1,
         "types": 0,
     },

@@ -17,6 +17,13 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
             f"exposures: a colour transform for each photograph after iteration {e.start:,}, "
             f"rate {e.rate:g} to {e.rate_final:g} over {e.decay_steps:,} iterations, prior {e.prior:g}"
         )
+    if recipe.photometry is not None:
+        c = recipe.photometry
+        what = " and ".join(name for name in ("vignetting", "response") if getattr(c, name))
+        yield (
+            f"photometry: {what} of each camera after iteration {c.start:,}, rate {c.rate:g} to {c.rate_final:g} over "
+            f"{c.decay_steps:,} iterations, prior {c.prior:g}"
+        )
     if recipe.poses is not None:
         p = recipe.poses
         yield (

@@ -26,6 +26,7 @@ from gs2d.config.recipe import (
     IntrinsicsRefinement,
     LearningRates,
     LossTerm,
+    Photometry,
     PoseRefinement,
     RankByError,
     Recipe,
@@ -176,6 +177,20 @@ def with_exposure(recipe: Recipe, *, name: str | None = None) -> Recipe:
         return recipe
     stages = (replace(stage, sh_interval=SH_PATIENCE * stage.sh_interval) for stage in recipe.stages)
     return replace(recipe, name=name or f"{recipe.name}-exposure", stages=tuple(stages), exposure=Exposure())
+
+
+def with_photometry(
+    recipe: Recipe, *, vignetting: bool = True, response: bool = True, name: str | None = None
+) -> Recipe:
+    """Add what a recipe without it learns of cameras: vignetting, response or both (``NAME-photometry``).
+
+    Not in the paper. For lenses that darken corners, and for several cameras whose curves differ
+    (docs/decisions/exposure.md).
+    """
+    if recipe.photometry is not None:
+        return recipe
+    learned = Photometry(vignetting=vignetting, response=response)
+    return replace(recipe, name=name or f"{recipe.name}-photometry", photometry=learned)
 
 
 def with_multiview(

@@ -22,8 +22,9 @@ from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, ch
 from gs2d.config.validate import group, integer, number, one_of, require
 from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
 from gs2d.config.views import IntrinsicsRefinement as IntrinsicsRefinement
+from gs2d.config.views import Photometry as Photometry
 from gs2d.config.views import PoseRefinement as PoseRefinement
-from gs2d.config.views import check_exposure, check_intrinsics, check_poses
+from gs2d.config.views import check_exposure, check_intrinsics, check_photometry, check_poses
 
 MU, SIGMA, ALPHA, SH = ("means",), ("quats", "log_scales"), ("opacity_logits",), ("sh0", "shN")
 ALL = MU + SIGMA + ALPHA + SH
@@ -337,8 +338,9 @@ class Recipe:
 
     ``init_points`` is how many random points training starts from when the scene has none. ``exposure`` None: all
     photographs are taken to have one exposure. ``poses`` None: cameras are where the capture says; ``intrinsics`` None:
-    their focal lengths are the capture's. ``multiview``,
-    ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses that do.
+    their focal lengths are the capture's; ``photometry`` None: they have neither vignetting nor a response.
+    ``multiview``, ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses
+    that do.
     ``dense_start``, ``free_space``, ``opacity_decay``, ``seen_area``: what keeps fog out where photographs are few.
     ``fused_depth``: the depth that becomes the mesh ("mean", "median" or "transmittance"); None: the protocol says.
     """
@@ -359,6 +361,7 @@ class Recipe:
     seen_area: SeenArea | None = None
     fused_depth: str | None = field(default=None, metadata={"omit_empty": True})
     intrinsics: IntrinsicsRefinement | None = field(default=None, metadata={"omit_empty": True})
+    photometry: Photometry | None = field(default=None, metadata={"omit_empty": True})
 
     @property
     def iterations(self) -> int:
@@ -384,6 +387,8 @@ def validate(recipe: Recipe, *, to_train: bool = True) -> Recipe:
     require(recipe.init_points < 2**31, f"{where}: init_points must be at most 2^31 - 1, got {recipe.init_points}")
     if recipe.exposure is not None:
         check_exposure(f"{where}: exposure", recipe.exposure)
+    if recipe.photometry is not None:
+        check_photometry(f"{where}: photometry", recipe.photometry)
     if recipe.poses is not None:
         check_poses(f"{where}: poses", recipe.poses)
         learns = any(stage.moves_all for stage in recipe.stages)

@@ -1,8 +1,9 @@
 """Short runs that still behave: a recipe scaled by a factor.
 
 Scaled: stage lengths, loss starts, the SH interval, where ``downscale`` halves, start and stop of densification and of
-the prune by size, the horizons of the rates of means, exposures and poses (so that rates end where they should) and of
-the weights of priors, and resets of white backgrounds alone (``reset_at_on_white``), which go with the start.
+the prune by size, the horizons of the rates of means, exposures, poses and cameras (so that rates end where they
+should) and of the weights of priors, and resets of white backgrounds alone (``reset_at_on_white``), which go with the
+start.
 *Not* scaled: the densification interval, as long as ten densifications fit, the first iterations without exposures and
 poses, and opacity resets. A reset puts opacity at 0.01, below the 0.05 at which splats are pruned; Adam moves a logit
 by about its rate, 0.05, a step, and 1.65 are missing, so a splat needs dozens of views to come back.
@@ -22,6 +23,7 @@ from gs2d.config.recipe import (
     GradDensify,
     IntrinsicsRefinement,
     LearningRates,
+    Photometry,
     PoseRefinement,
     Recipe,
     Stage,
@@ -34,8 +36,8 @@ RESET_MARGIN = 200  # iterations of densification that a reset must leave
 MIN_INIT_POINTS = 10_000
 LONGER = 0.25  # power of 1 / factor by which steps are longer: docs/decisions/fog.md
 VIEWS_WAIT = 200  # iterations before exposures and poses are learned, where the schedule has them
-OfViews = TypeVar("OfViews", Exposure, PoseRefinement, IntrinsicsRefinement)
-OfCameras = TypeVar("OfCameras", PoseRefinement, IntrinsicsRefinement)
+OfViews = TypeVar("OfViews", Exposure, PoseRefinement, IntrinsicsRefinement, Photometry)
+OfCameras = TypeVar("OfCameras", PoseRefinement, IntrinsicsRefinement, Photometry)
 Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 MAX_SCALE = 100.0  # six million iterations of 2DGS-R: more is a slip of the keyboard
 
@@ -67,6 +69,7 @@ def scale_schedule(recipe: Recipe, factor: float) -> Recipe:
         exposure=None if recipe.exposure is None else _scale_views(recipe.exposure, factor),
         poses=None if recipe.poses is None else _scale_poses(recipe.poses, factor),
         intrinsics=None if recipe.intrinsics is None else _scale_poses(recipe.intrinsics, factor),
+        photometry=None if recipe.photometry is None else _scale_poses(recipe.photometry, factor),
         depth_prior=None if recipe.depth_prior is None else _scale_prior(recipe.depth_prior, factor),
         normal_prior=None if recipe.normal_prior is None else _scale_prior(recipe.normal_prior, factor),
     )

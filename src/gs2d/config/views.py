@@ -1,4 +1,4 @@
-"""What a recipe may learn of photographs: an exposure, a pose, a focal length. Pure Python; never imports torch."""
+"""What a recipe may learn of photographs and their cameras. Pure Python; never imports torch."""
 
 from __future__ import annotations
 
@@ -108,6 +108,45 @@ class IntrinsicsRefinement:
         return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
 
 
+@dataclass(frozen=True)
+class Photometry:
+    """Vignetting and response of each camera, learned with the splats (``training/photometry.py``).
+
+    Photographs whose files have the same intrinsics share a camera. Stands beside ``exposure``, or by itself.
+
+    Attributes
+    ----------
+    vignetting : bool
+        Whether light may fall off towards the corners.
+    response : bool
+        Whether the curves are learned by which the light of several cameras becomes values: what they differ by.
+    rate, rate_final, decay_steps : float, float, int
+        Adam's rate decays log-linearly over ``decay_steps`` iterations of the run, all stages counted. A camera that
+        all photographs share learns in every iteration. Grows with shorter schedules, as poses' do.
+    start : int
+        Learned when iteration of the run > start, as exposures.
+    prior : float
+        Weight of the summed squares of the numbers of a photograph's camera.
+    beta1, beta2, eps : float
+        Adam's.
+    """
+
+    vignetting: bool = True
+    response: bool = True
+    rate: float = 1e-3
+    rate_final: float = 1e-5
+    decay_steps: int = 30_000
+    start: int = 500
+    prior: float = 0.001
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+
+    def rate_at(self, iteration: int) -> float:
+        """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
+        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
+
+
 def _decayed(first: float, last: float, fraction: float) -> float:
     """Log-linear between the ends of [0, 1]."""
     t = min(max(fraction, 0.0), 1.0)
@@ -139,7 +178,20 @@ def check_poses(where: str, poses: PoseRefinement) -> None:
     _check_rates(where, poses, "poses=null leaves cameras alone", "rad, extents")
 
 
-def _check_rates(where: str, poses: PoseRefinement | IntrinsicsRefinement, without: str, units: str) -> None:
+def check_photometry(where: str, photometry: Photometry) -> None:
+    """Raise RecipeError for numbers that make no vignetting and no response."""
+    for name in ("vignetting", "response"):
+        value = getattr(photometry, name)
+        require(isinstance(value, bool), f"{where}.{name} must be true or false, got {value!r}")
+    either = photometry.vignetting or photometry.response
+    require(either, f"{where} must learn vignetting, response or both, got neither; photometry=null leaves both alone")
+    number(f"{where}.prior", photometry.prior, low=0.0)
+    _check_rates(where, photometry, "photometry=null leaves cameras alone", "of the numbers of a camera")
+
+
+def _check_rates(
+    where: str, poses: PoseRefinement | IntrinsicsRefinement | Photometry, without: str, units: str
+) -> None:
     for name in ("rate", "rate_final", "eps"):
         value = number(f"{where}.{name}", getattr(poses, name), low=0.0)
         require(value > 0, f"{where}.{name} must be positive, got {value} ({without})")

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from gs2d.core.camera import Camera, Zoom
 from gs2d.core.checks import check_shapes
 from gs2d.core.images import composite
 from gs2d.core.memory import trim
+from gs2d.core.photometry import CameraPhotometry
 from gs2d.data.cache import DecodedImage, ImageCache
 from gs2d.data.masks import Masks
 from gs2d.data.priors import ObservedPoints, PriorMaps
@@ -43,6 +45,8 @@ class View:
         Of the photograph's file, before its lens was taken out and before it was shrunk; None: as ``camera``.
     zoom : Zoom or None
         What training has made of the intrinsics of ``camera`` since they were read; None: nothing.
+    photometry : CameraPhotometry or None
+        What training has found of the vignetting and the response of its camera; None: nothing.
     """
 
     name: str
@@ -53,6 +57,7 @@ class View:
     maps: PriorMaps | None = None
     intrinsics: Intrinsics | None = None
     zoom: Zoom | None = None
+    photometry: CameraPhotometry | None = None
 
     @classmethod
     def from_arrays(
@@ -78,9 +83,15 @@ class View:
         camera = replace(self.camera, T_cam_world=T_cam_world)
         camera = camera if zoom is None else camera.zoomed(zoom)
         zoom = self.zoom if zoom is None else zoom
-        return View(
-            self.name, camera, self._image, path=self.path, maps=self.maps, intrinsics=self.intrinsics, zoom=zoom
-        )
+        return self._sharing(camera=camera, zoom=zoom)
+
+    def through(self, photometry: CameraPhotometry) -> View:
+        """Return the same photograph, with what is known of its camera's light."""
+        return self._sharing(photometry=photometry)
+
+    def _sharing(self, **changes: Any) -> View:
+        """Return a view with other facts whose picture stays in the cache of this one."""
+        return replace(self, decode=self._image, cache=ImageCache(0), **changes)
 
     def downscaled(self, factor: int) -> View:
         """Return the same photograph at 1 / ``factor`` of its size, with its camera, masks and maps.
@@ -91,15 +102,8 @@ class View:
             return self
         camera = self.camera.downscaled(factor)
         maps = None if self.maps is None else replace(self.maps, camera=camera)
-        return View(
-            self.name,
-            camera,
-            lambda: self._image().downscaled(factor),
-            path=self.path,
-            maps=maps,
-            intrinsics=self.intrinsics,
-            zoom=self.zoom,
-        )
+        small = self._sharing(camera=camera, maps=maps)
+        return replace(small, decode=lambda: self._image().downscaled(factor))
 
     def file_intrinsics(self) -> Intrinsics:
         """Return the intrinsics of the photograph's file, lens and all."""
@@ -280,6 +284,14 @@ class Scene:
 
         train = tuple(moved(view, poses.get(view.name)) for view in self.train)
         return replace(self, train=train, test=tuple(moved(view, None) for view in self.test))
+
+    def with_photometries(self, found: Mapping[str, CameraPhotometry]) -> Scene:
+        """Return the scene with what is known of the light of cameras, by the names of their views."""
+
+        def lit(views: tuple[View, ...]) -> tuple[View, ...]:
+            return tuple(view.through(found[view.name]) if view.name in found else view for view in views)
+
+        return replace(self, train=lit(self.train), test=lit(self.test))
 
     def downscaled(self, factor: int) -> Scene:
         """Return the scene with training photographs of 1 / ``factor`` of their size; test views stay as they are."""

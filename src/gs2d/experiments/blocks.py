@@ -59,6 +59,8 @@ NOT_OF_BLOCKS = {  # options of a training that mean nothing in several
     "viewer_port": "--viewer-port",
     "refine_poses": "--refine-poses",
     "refine_cameras": "--refine-cameras",
+    "vignetting": "--vignetting",
+    "response": "--response",
 }
 
 

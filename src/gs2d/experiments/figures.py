@@ -26,6 +26,7 @@ from gs2d.pipeline.job import Job, reload_job
 from gs2d.pipeline.render import choose_views, fraction_of_group, render_view, splatted
 from gs2d.pipeline.resume import stage_end
 from gs2d.render.api import splat_errors
+from gs2d.render.exposure import identity
 from gs2d.report.images import ERROR_TOP, error_image, error_scale, highlight_image, valid_image
 from gs2d.report.plots import Panel, compared, read_history
 from gs2d.training.exposure import apply_exposure
@@ -180,9 +181,10 @@ def rank_run(run: RunFolder, job: Job, on_event: OnEvent = ignore) -> Ranking:
     views, transforms = job.scene.train, read_exposures(run, job.recipe)
     for view in counted(views, "errors of each splat", len(views), on_event):
         seen, settings = splats, job.settings
-        if view.name in transforms:  # those of the end: after stage 1 they hardly move
-            transform = transforms[view.name].to(splats.means)
-            seen, settings = apply_exposure(splats, view.camera, transform, settings)
+        if view.name in transforms or view.photometry is not None:  # those of the end: after stage 1 they hardly move
+            known = view.name in transforms
+            transform = transforms[view.name].to(splats.means) if known else identity(splats.means)
+            seen, settings = apply_exposure(splats, view.camera, transform, settings, view.photometry)
         image = torch.from_numpy(view.target(job.settings.background)).to(splats.means)
         mask = view.usable(masks=job.protocol.use_mask_in_training)
         errors = splat_errors(

@@ -151,6 +151,8 @@ class BlocksOptions(Training, Resources):
     viewer_port: Annotated[int | None, Fixed, Suppress] = None
     refine_poses: Annotated[bool, Fixed, Suppress] = False
     refine_cameras: Annotated[bool, Fixed, Suppress] = False
+    vignetting: Annotated[bool, Fixed, Suppress] = False
+    response: Annotated[bool, Fixed, Suppress] = False
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks", "start_from", "cache")

@@ -19,7 +19,7 @@ import torch
 from gs2d.errors import BackendError
 from gs2d.kernels.buffer_pool import BufferPool
 
-ABI_VERSION = 8
+ABI_VERSION = 9
 VARIANTS = {"v4": 4, "v3": 3, "portable": 0}  # name -> processor level it needs, best first
 LANGUAGE = {"v4": "AVX-512 (x86-64-v4)", "v3": "AVX2 (x86-64-v3)", "portable": "portable", "f64": "portable, float64"}
 FOLDER = Path(__file__).parent / "lib"

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from types import MappingProxyType
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,8 @@ from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import EXPOSURE, RunFolder
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.job import Job
-from gs2d.render.exposure import expose, fit_exposure
+from gs2d.render.exposure import expose, fit_exposure, identity
+from gs2d.render.photometry import Shading, photograph, remove_photometry
 from gs2d.render.types import RenderOutput
 from gs2d.training.exposure import Exposures
 
@@ -82,10 +84,21 @@ def read_exposures(run: RunFolder, recipe: Recipe) -> Transforms:
 
 
 def photographed(view: View, color: Tensor, transforms: Transforms, background: tuple[float, float, float]) -> Tensor:
-    """Return a picture [H, W, 3] rendered from a view, in the exposure of its photograph where that is known."""
-    if view.name not in transforms:
+    """Return a picture [H, W, 3] rendered from a view as its photograph was taken, as far as that is known.
+
+    In the exposure of the photograph, and with the vignetting and the response of its camera.
+    """
+    if view.name not in transforms and view.photometry is None:
         return color
-    return expose(color, transforms[view.name].to(color), *over(view, color, background))
+    transform = transforms[view.name].to(color) if view.name in transforms else identity(color)
+    shading = None if view.photometry is None else Shading.of(view.photometry, view.camera, color)
+    return photograph(color, transform, *over(view, color, background), shading=shading)
+
+
+def as_scene(view: View, transforms: Transforms) -> np.ndarray:
+    """Return the photograph of a view, uint8 [H, W, 3 or 4], in the colours of the scene, as far as that is known."""
+    transform = transforms[view.name].numpy() if view.name in transforms else None
+    return remove_photometry(view.image(), transform, view.photometry, view.camera)
 
 
 def exposure_named(name: str, transforms: Transforms) -> Tensor:
@@ -134,7 +147,7 @@ def matched_by_halves(
         False = ignore this pixel.
     background : three floats
     """
-    cover = over(view, color, background)
+    color, cover = photographed(view, color, NONE, background), over(view, color, background)
     usable = torch.ones_like(color[..., 0], dtype=torch.bool) if mask is None else mask.clone()
     if cover:
         usable &= cover[0] > 0

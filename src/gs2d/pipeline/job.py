@@ -20,6 +20,7 @@ from gs2d.config.presets import (
     with_fading_backdrop,
     with_intrinsics,
     with_normal_prior,
+    with_photometry,
     with_poses,
     with_robustness,
     without_fading_backdrop,
@@ -44,6 +45,7 @@ from gs2d.pipeline.memory import check_memory, least_downscale
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.part import LoadedPart, load_part, part_scene
 from gs2d.pipeline.photographs import HOW, already_prepared, with_prepared
+from gs2d.pipeline.photometry import with_found_photometries
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined_poses import with_found_poses
 from gs2d.render.backends import Backend, backend_report, get_backend
@@ -148,6 +150,7 @@ class Job:
             **({} if self.recipe.poses is None else {"poses": recipe["poses"]}),
             **({} if not processes else {"processes": list(map(list, processes))}),
             **({} if self.recipe.intrinsics is None else {"intrinsics": recipe["intrinsics"]}),
+            **({} if self.recipe.photometry is None else {"photometry": recipe["photometry"]}),
             **{name: recipe[name] for name in LATER_FIELDS[2:] if recipe[name] is not None},
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -193,6 +196,8 @@ def build_recipe(
     exposure: bool = False,
     poses: bool = False,
     intrinsics: bool = False,
+    vignetting: bool = False,
+    response: bool = False,
     depth_prior: str | None = None,
     normal_prior: bool = False,
     robust: bool = False,
@@ -206,6 +211,8 @@ def build_recipe(
     """
     value = recipe_of(recipe)
     value = with_exposure(value) if exposure else value
+    if vignetting or response:
+        value = with_photometry(value, vignetting=vignetting, response=response)
     value = with_poses(value) if poses else value
     value = with_intrinsics(value) if intrinsics else value
     value = with_depth_prior(value, depth_prior) if depth_prior is not None else value
@@ -220,6 +227,8 @@ def build_recipe(
         ("--exposure", exposure, "exposure"),
         ("--refine-poses", poses, "poses"),
         ("--refine-cameras", intrinsics, "intrinsics"),
+        ("--vignetting", vignetting, "photometry"),
+        ("--response", response, "photometry"),
         ("--depth-prior", depth_prior is not None, "depth_prior"),
         ("--normal-prior", normal_prior, "normal_prior"),
     ):
@@ -273,6 +282,8 @@ def _recipe_of(options: TrainOptions, *, robust: bool, exposure: bool) -> Recipe
         exposure=exposure,
         poses=options.refine_poses,
         intrinsics=options.refine_cameras,
+        vignetting=options.vignetting,
+        response=options.response,
         depth_prior=options.depth_prior,
         normal_prior=options.normal_prior,
         robust=robust,
@@ -589,6 +600,7 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
             f"{data['scene']['train']} + {data['scene']['test']}; restore it or train again"
         )
     scene = with_found_poses(run, recipe, already_prepared(scene, run.path))
+    scene = with_found_photometries(run, recipe, scene)
     chosen = get_backend(named if backend == "auto" else backend)
     return Job(recipe, protocol, scene, chosen, settings, downscale, digest, cache_bytes)
 

@@ -82,6 +82,10 @@ class Training:
     """Learn an exposure and a white balance for each photograph (robust training does where photographs differ)."""
     no_exposure: bool = False
     """Take all photographs to have one exposure."""
+    vignetting: bool = False
+    """Learn how much darker each camera's corners are, one falloff for all photographs of a camera."""
+    response: bool = False
+    """Learn how the curves of several cameras differ, by which each turns light into values (one camera: nothing)."""
     test_every: int | None = None
     """Every so many-th view, by name, is a test view; 0: all train (default: what the protocol says, mostly 8)."""
     refine_poses: bool = False

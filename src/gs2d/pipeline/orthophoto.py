@@ -22,13 +22,12 @@ from gs2d.io.run_dir import MESH, open_run
 from gs2d.meshing.raycast import Hits, cast_down
 from gs2d.meshing.texture import ColorSource, Texels, surface_colors
 from gs2d.pipeline.events import OnEvent, Phase, counted, ignore
-from gs2d.pipeline.exposure import Transforms, read_exposures
+from gs2d.pipeline.exposure import Transforms, as_scene, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.options import OrthophotoOptions
 from gs2d.pipeline.placed import place_of
 from gs2d.pipeline.texture import usable_pixels
-from gs2d.render.exposure import remove_exposure
 
 ELEVATION = "_elevation"  # after the name of the orthophoto
 MAX_CELLS = 36_000_000  # a colour's choice takes about 70 bytes a cell: 2.5 GB
@@ -164,10 +163,7 @@ def _photographs(job: Job, exposures: Transforms, on_event: OnEvent) -> Iterator
     """Yield the training views, taken back to the mean exposure."""
     views: tuple[View, ...] = tuple(job.scene.train)
     for view in counted(views, "colouring from the photographs", len(views), on_event):
-        image = view.image()
-        if view.name in exposures:
-            image = remove_exposure(image, exposures[view.name].numpy())
-        yield ColorSource(view.camera, image, usable_pixels(view, job))
+        yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job))
 
 
 def _elevations(local: np.ndarray, mesh: Mesh, hits: Hits, place: Georeference) -> np.ndarray:

@@ -31,7 +31,7 @@ from gs2d.meshing.texture import (
     unwrap,
 )
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
-from gs2d.pipeline.exposure import NONE, Transforms, read_exposures
+from gs2d.pipeline.exposure import NONE, Transforms, as_scene, read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job, read_scene
 from gs2d.pipeline.mesh import fused, mesh_run
@@ -39,7 +39,6 @@ from gs2d.pipeline.options import MeshOptions, TextureOptions
 from gs2d.pipeline.placed import placed_output, placed_textured, say_where
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.subject import OPAQUE, meshed_subject
-from gs2d.render.exposure import remove_exposure
 
 PACKAGES = ("xatlas",)  # of the extra `texture`
 
@@ -184,10 +183,7 @@ def _images(
             shown = (output.alpha >= OPAQUE).cpu().numpy()
             yield ColorSource(view.camera, to_uint8(output.color.clamp(0, 1).cpu().numpy()), shown)
         else:
-            image = view.image()
-            if view.name in exposures:
-                image = remove_exposure(image, exposures[view.name].numpy())
-            yield ColorSource(view.camera, image, usable_pixels(view, job))
+            yield ColorSource(view.camera, as_scene(view, exposures), usable_pixels(view, job))
 
 
 def usable_pixels(view: View, job: Job) -> np.ndarray | None:

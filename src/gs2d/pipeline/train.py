@@ -11,6 +11,7 @@ from pathlib import Path
 from gs2d.core.memory import hold
 from gs2d.core.splats import Splats
 from gs2d.data.archive import is_archive, unpack
+from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError, RunError
 from gs2d.io.run_dir import (
     MESH,
@@ -37,10 +38,11 @@ from gs2d.pipeline.observer import TrainingObserver
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.photographs import PREPARED
+from gs2d.pipeline.photometry import write_photometries
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.planned import plan_notices
 from gs2d.pipeline.processes import connected, follow, lead, memory_of
-from gs2d.pipeline.refined_poses import FoundPoses, found_poses, write_poses
+from gs2d.pipeline.refined_poses import NONE, found_poses, write_poses
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.run_logger import RunLogger
@@ -133,11 +135,13 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
         collected = Collector(job.scene, job.settings.background)
         with MeshFrames(job) as frames:
             visitors = [frames.visit, collected.visit]
-            splats, exposures, poses = train_stages(run, job, options, start, watch, visitors, together)
+            splats, exposures, now = train_stages(run, job, options, start, watch, visitors, together)
+            poses = NONE if job.recipe.poses is None else found_poses(job.scene, now)
             release(job.scene)  # before the volume of the mesh
             write_exposures(run, exposures, on_event)
             write_poses(run, job.scene, poses, on_event)
-            job = replace(job, scene=poses.of(job.scene)) if poses else job
+            write_photometries(run, now, on_event)
+            job = replace(job, scene=now)
             mesh = MeshOptions(subject_box=options.subject_box, whole_scene=options.whole_scene)
             finish(run, job, splats, mesh, on_event, frames, collected, with_page=options.page)
     return run
@@ -215,8 +219,8 @@ def train_stages(
     watch: TrainingObserver,
     visitors: Sequence[Visitor] = (),
     together: OneProcess = ONE_PROCESS,
-) -> tuple[Splats, Transforms, FoundPoses]:
-    """Train from where ``start`` is to the end of the last stage; splats, exposures and poses of the photographs.
+) -> tuple[Splats, Transforms, Scene]:
+    """Train from where ``start`` is to the end of the last stage; splats, exposures, and the cameras as they are now.
 
     ``visitors`` see every view of the finished splats.
     """
@@ -258,8 +262,7 @@ def train_stages(
     with recorder.ending_well():
         trainer.run()
     state = trainer.state
-    poses = found_poses(job.scene, scene_now(state, job.scene))
-    return state.splats, named(job.scene.train, state.exposures), poses
+    return state.splats, named(job.scene.train, state.exposures), scene_now(state, job.scene)
 
 
 def pretraining_notices(job: Job) -> list[Event]:

@@ -25,7 +25,7 @@ class _Image(ctypes.Structure):
     )
 
 
-def _plain(library: Library, **tensors: Tensor | None) -> list[Tensor | None]:
+def plain_tensors(library: Library, **tensors: Tensor | None) -> list[Tensor | None]:
     """Return the tensors, contiguous, or ShapeError for one that native code cannot read."""
     for name, tensor in tensors.items():
         dtype = torch.bool if name in ("clipped", "over") else library.dtype
@@ -60,7 +60,7 @@ def exposed(
     ShapeError
         If a tensor has another dtype, or is not on the CPU.
     """
-    plain, cover, ceiling = _plain(library, color=color, coverage=coverage, clipped=clipped)
+    plain, cover, ceiling = plain_tensors(library, color=color, coverage=coverage, clipped=clipped)
     assert plain is not None
     out = torch.empty_like(plain)
     over = None if ceiling is None else torch.empty_like(ceiling)
@@ -81,7 +81,7 @@ def gradients(
     over: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Those of ``color`` [H, W, 3] and ``transform`` [3, 4]."""
-    given, plain, cover, cut = _plain(library, upstream=upstream, color=color, coverage=coverage, over=over)
+    given, plain, cover, cut = plain_tensors(library, upstream=upstream, color=color, coverage=coverage, over=over)
     assert given is not None
     assert plain is not None
     to_color, sums = torch.empty_like(plain), (ctypes.c_double * 12)()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from gs2d.io.run_dir import EVENTS, EXPOSURE, MESH, METRICS, PAGE, POSES, RUN_JSON, SPLATS, TEXTURED
+from gs2d.io.run_dir import EVENTS, EXPOSURE, MESH, METRICS, PAGE, PHOTOMETRY, POSES, RUN_JSON, SPLATS, TEXTURED
 from gs2d.report.html import macro, missing
 
 FILES = {  # in the order in which people want them
@@ -19,6 +19,7 @@ FILES = {  # in the order in which people want them
     EVENTS: "the log of the training",
     EXPOSURE: "the exposure of each photograph",
     POSES: "the corrected cameras",
+    PHOTOMETRY: "the vignetting and the response of each camera",
 }
 
 

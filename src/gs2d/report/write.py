@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from gs2d.core.camera import Camera
 from gs2d.core.files import atomic_write
-from gs2d.io.run_dir import EXPOSURE, LOSSES, MESH, POSES, RENDERS, REPORT, VERDICT, open_run
+from gs2d.io.run_dir import EXPOSURE, LOSSES, MESH, PHOTOMETRY, POSES, RENDERS, REPORT, VERDICT, open_run
 from gs2d.report.guard import Guard, OnFailure
 from gs2d.report.html import macro, missing, page, render
 from gs2d.report.links import links
@@ -28,6 +28,7 @@ from gs2d.report.sections.capture import capture_section
 from gs2d.report.sections.exposure import exposure_section
 from gs2d.report.sections.georeference import georeference_section
 from gs2d.report.sections.losses import loss_section, loss_titles
+from gs2d.report.sections.photometry import photometry_section
 from gs2d.report.sections.pictures import hero, mesh_section, view_sections
 from gs2d.report.sections.poses import poses_section
 from gs2d.report.sections.subject import subject_section
@@ -155,6 +156,7 @@ def _parts(record: RunRecord, cameras: Sequence[Camera]) -> dict[str, Callable[[
         "place in the world": lambda: georeference_section(path),
         "exposures": lambda: exposure_section(path / EXPOSURE, last),
         "cameras": lambda: poses_section(path / POSES, last),
+        "light of the cameras": lambda: photometry_section(path / PHOTOMETRY),
         "facts of the run": lambda: macro("macros.html", "facts", definition_facts(record.definition)),
         **{_of_loss(name): partial(loss_section, renders / LOSSES, record.stages, name) for name in titles},
     }
@@ -166,6 +168,7 @@ def _of_views(record: RunRecord) -> list[tuple[str, str]]:
     learned: Mapping[str, Any] = recipe if isinstance(recipe, Mapping) else {}
     wanted = (
         ("Exposure of the photographs", "exposures", learned.get("exposure")),
+        ("Vignetting and response of the cameras", "light of the cameras", learned.get("photometry")),
         ("Where the photographs were taken", "cameras", learned.get("poses")),
     )
     of_losses = [(title, _of_loss(name)) for name, title in loss_titles(record.stages).items()]

@@ -18,11 +18,13 @@ from torch import Tensor
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Camera
 from gs2d.core.checks import check_shapes
+from gs2d.core.photometry import CameraPhotometry
 from gs2d.core.sh import rgb_to_sh0, sh_to_rgb
 from gs2d.core.splats import Splats
 from gs2d.errors import RunError
 from gs2d.render.backends import PLAIN, Backend
-from gs2d.render.exposure import expose, identity
+from gs2d.render.exposure import identity
+from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings
 
 
@@ -166,17 +168,32 @@ def uncount(exposures: Exposures, index: int, recipe: Recipe, stage: int, iterat
 
 
 def apply_exposure(
-    splats: Splats, camera: Camera, transform: Tensor, settings: RasterSettings
+    splats: Splats,
+    camera: Camera,
+    transform: Tensor,
+    settings: RasterSettings,
+    photometry: CameraPhotometry | None = None,
 ) -> tuple[Splats, RasterSettings]:
     """Return the splats in the colours that a photograph of this transform shows, and settings to draw them with.
 
-    Their colours towards the camera are worked out, transformed, and kept as constant ones (degree 0).
+    Their colours towards the camera are worked out, transformed, and kept as constant ones (degree 0). Vignetting is
+    that of the pixel of a splat's centre.
     """
     with torch.no_grad():
         center = torch.as_tensor(camera.center).to(splats.means)
         directions = torch.nn.functional.normalize(splats.means - center, dim=1)
         degree = min(settings.sh_degree, splats.sh_degree)
         rgb = sh_to_rgb(splats.sh0, splats.shN, directions, degree)  # [N, 3]
-        seen = expose(rgb[None], transform)[0]
+        shading = None if photometry is None else _shading_at(splats.means, camera, photometry)
+        seen = photograph(rgb[None], transform, shading=shading)[0]
         parts = dict(splats.items()) | {"sh0": rgb_to_sh0(seen)}
         return Splats(**parts), replace(settings, sh_degree=0)
+
+
+def _shading_at(means: Tensor, camera: Camera, photometry: CameraPhotometry) -> Shading:
+    """Return a camera's shading of points [N, 3], as a picture of one row; none beyond the reach of its corners."""
+    T = torch.as_tensor(camera.T_cam_world).to(means)
+    seen = means @ T[:3, :3].T + T[:3, 3]
+    tangents = (seen[:, :2] / seen[:, 2:].clamp(min=1e-6)).square().sum(dim=1)
+    numbers = torch.tensor([*photometry.falloff, photometry.shift]).to(means)
+    return Shading(numbers, (tangents / photometry.reach**2).clamp(max=1.0)[None])

@@ -22,8 +22,10 @@ from gs2d.losses.api import LossFunction, LossReport, LossView, compute_losses, 
 from gs2d.losses.multiview import Neighbour
 from gs2d.render.api import rasterize
 from gs2d.render.backends import Backend
-from gs2d.render.exposure import expose, identity
+from gs2d.render.exposure import identity
+from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.training.exposure import apply_exposure
 from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours, is_compared
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
@@ -66,7 +68,7 @@ class StepResult:
     gradients : mapping of attribute to Tensor
         Like the attributes; only of ``rows``, in their order, where those are given. Where exposures are learned also
         "exposure" [3, 4], of the photograph's transform; where poses are, "pose" [6], of the camera's motion; where
-        focal lengths are, "zoom" [3].
+        focal lengths are, "zoom" [3]; where vignetting and response are, "photometry" [4], of its camera.
     signal : Tensor [N, 2] or [N, 4], or None
     radii : Tensor [N] px or None
         None where nothing was projected.
@@ -195,12 +197,34 @@ class FullRender:
         camera, target = self.camera(state, index), self.targets[index]
         settings = replace(self.settings(stage, iteration), with_distortion=False)
         color = rasterize(self.drawn(state.splats), camera, settings, backend=self.backend).color
-        if state.exposures is not None:
-            clipped, transform = clipped_pixels(target), state.exposures.transform(index)
-            color = expose(color, transform, target.silhouette, self._background, clipped=clipped)
+        if state.exposures is not None or state.photometries is not None:
+            given = (self._transform(state, index, color), target.silhouette, self._background)
+            shading = self._shading(state, index, camera, color)
+            color = photograph(color, *given, clipped=clipped_pixels(target), shading=shading)
         error = (color - target.image).abs().mean(dim=2)
         error = error if target.mask is None else error * target.mask
         return ViewResidual(error, camera, settings, self.frozen)
+
+    def _transform(self, state: TrainState, index: int, like: Tensor) -> Tensor:
+        """Return the exposure of a view [3, 4]; the mean one where none are learned."""
+        return identity(like) if state.exposures is None else state.exposures.transform(index)
+
+    def _shading(
+        self, state: TrainState, index: int, camera: Camera, like: Tensor, *, learns: bool = False
+    ) -> Shading | None:
+        """Return the vignetting and the response of a view's camera, where they are learned."""
+        found = state.photometries
+        return None if found is None else found.shading(index, camera, like, learns=learns)
+
+    def photographed(
+        self, state: TrainState, index: int, splats: Splats, camera: Camera, settings: RasterSettings
+    ) -> tuple[Splats, RasterSettings]:
+        """Return the splats in the colours that training view ``index`` shows, and settings to draw them with."""
+        if state.exposures is None and state.photometries is None:
+            return splats, settings
+        transform = self._transform(state, index, splats.means)
+        photometry = None if state.photometries is None else state.photometries.photometry(index)
+        return apply_exposure(splats, camera, transform, settings, photometry)
 
     @torch.no_grad()
     def _neighbour_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Neighbour | None:
@@ -252,7 +276,8 @@ class FullRender:
     ) -> tuple[dict[str, float | Tensor], dict[str, Tensor]]:
         """Weighted loss terms of a rendered view, and the gradients of the leaves that the stage trains.
 
-        Where exposures are learned, colours are compared in that of the photograph, and "exposure" is among both; where
+        Where exposures are learned, colours are compared in that of the photograph, and "exposure" is among both; so is
+        "photometry" where vignetting and response are; where
         the camera that ``output`` was seen by learns, "pose" is among the gradients.
 
         Raises
@@ -263,9 +288,11 @@ class FullRender:
         """
         target = self.targets[index]
         transform = None if state.exposures is None else state.exposures.transform(index).requires_grad_()
-        if transform is not None:
-            clipped, background = clipped_pixels(target), self._background
-            color = expose(output.color, transform, target.silhouette, background, clipped=clipped)
+        shading = self._shading(state, index, camera, output.color, learns=True)
+        if transform is not None or shading is not None:
+            seen = self._transform(state, index, output.color) if transform is None else transform
+            given = (seen, target.silhouette, self._background)
+            color = photograph(output.color, *given, clipped=clipped_pixels(target), shading=shading)
             output = replace(output, color=color)
         terms = compute_losses(
             output,
@@ -286,6 +313,9 @@ class FullRender:
         if transform is not None:
             assert self.recipe.exposure is not None
             terms["exposure"] = self.recipe.exposure.prior * (transform - identity(transform)).square().sum()
+        if shading is not None:
+            assert self.recipe.photometry is not None
+            terms["photometry"] = self.recipe.photometry.prior * shading.numbers[:4].square().sum()
         loss = torch.stack(list(terms.values())).sum()
         watched = not is_async(loss.device)
         values: dict[str, float | Tensor] = {
@@ -299,6 +329,9 @@ class FullRender:
         if transform is not None:
             gradients["exposure"] = _gradient(transform)
         broken = first_not_finite(gradients, self.backend) if watched else None
+        if state.photometries is not None and shading is not None:
+            gradients["photometry"] = state.photometries.gradient(index, shading)  # in the host's memory, as a pose's
+            broken = broken if finite(gradients["photometry"]) else "the vignetting or the response of a camera"
         if state.poses is not None and camera.pose is not None:
             gradients["pose"] = state.poses.gradient(camera)  # in the host's memory, on a GPU too
             broken = broken if finite(gradients["pose"]) else "pose"

@@ -29,7 +29,8 @@ from gs2d.training.state import TrainState
 
 T = TypeVar("T")
 Statistics = Mapping[str, Tensor]
-OF_A_VIEW = {"exposure": (3, 4), "pose": (6,), "zoom": (3,)}  # gradients that are of one view, and are not averaged
+# Gradients that are of one view, and are not averaged.
+OF_A_VIEW = {"exposure": (3, 4), "pose": (6,), "zoom": (3,), "photometry": (4,)}
 FAILED = "gs2d/failed"  # key of the store: a process has said why it ended
 
 
@@ -111,7 +112,7 @@ class OneProcess:
         StepResult
             ``losses``, ``signal`` and ``radii`` are of this process's own view (:meth:`mean_losses`, :meth:`gather`).
         sequence of mapping
-            "exposure", "pose" and "zoom" of each view, where there are any.
+            "exposure", "pose", "zoom" and "photometry" of each view, where there are any.
         """
         result = one(turns[0])
         return result, (result.gradients,)
@@ -346,10 +347,9 @@ def _tensors(state: TrainState) -> Iterator[Tensor]:
             yield state.moments[name].square
     for named in (state.groups, state.statistics or {}):
         yield from (named[name] for name in sorted(named))
-    for learned in (state.exposures, state.poses, state.zooms):
-        if learned is not None:
-            yield learned.offsets
-            yield learned.square
+    for _, learned in state.of_views():
+        yield learned.offsets
+        yield learned.square
 
 
 def _checksum(tensor: Tensor) -> int:

@@ -8,11 +8,13 @@ from torch import Tensor
 
 from gs2d.config.recipe import Recipe
 from gs2d.core.camera import Zoom
+from gs2d.core.photometry import CameraPhotometry
 from gs2d.data.scene import Scene
 from gs2d.errors import RecipeError
 from gs2d.kernels.reference import finite
 from gs2d.render.backends import Backend
 from gs2d.training.exposure import Exposures, check_views, exposure_step, uncount
+from gs2d.training.photometry import Photometries, check_photometries, photometry_rate, photometry_step
 from gs2d.training.point_gains import point_gains
 from gs2d.training.poses import Poses, check_poses, pose_rate, pose_step
 from gs2d.training.state import TrainState
@@ -44,6 +46,8 @@ def start(state: TrainState, recipe: Recipe, scene: Scene, exposures: Tensor | N
         state.poses = Poses.start([view.camera for view in scene.train], scene.extent)
     if recipe.intrinsics is not None:
         state.zooms = Zooms.start(scene.train)
+    if recipe.photometry is not None:
+        state.photometries = Photometries.start(scene.train)
     return state
 
 
@@ -52,6 +56,7 @@ def check(state: TrainState, recipe: Recipe, views: int) -> None:
     check_views(state.exposures, views if recipe.exposure else 0)
     check_poses(state.poses, views if recipe.poses else 0)
     check_zooms(state.zooms, views if recipe.intrinsics else 0)
+    check_photometries(state.photometries, views if recipe.photometry else 0)
 
 
 def update(
@@ -70,6 +75,9 @@ def update(
         pose_step(state.poses, index, gradients["pose"], recipe, pose_rate(recipe, state.stage, iteration))
     if state.zooms is not None and "zoom" in gradients and backend.is_whole():
         zoom_step(state.zooms, index, gradients["zoom"], recipe, zoom_rate(recipe, state.stage, iteration))
+    if state.photometries is not None and "photometry" in gradients and backend.is_whole():
+        rate = photometry_rate(recipe, state.stage, iteration)
+        photometry_step(state.photometries, index, gradients["photometry"], recipe, rate)
 
 
 def rollback(state: TrainState, recipe: Recipe, iteration: int, index: int) -> None:
@@ -84,20 +92,32 @@ def find_nonfinite(state: TrainState) -> str:
         return "an exposure"
     if state.zooms is not None and not finite(state.zooms.offsets):
         return "a focal length"
+    if state.photometries is not None and not finite(state.photometries.offsets):
+        return "the vignetting or the response of a camera"
     return "a pose" if state.poses is not None and not finite(state.poses.offsets) else ""
 
 
 def scene_now(state: TrainState, scene: Scene) -> Scene:
-    """Return the scene with its training cameras where they are now.
+    """Return the scene with its training cameras where they are now, and what is known of their light.
 
     Focal lengths are those of a camera: test photographs that share one with training photographs have its new one.
     """
-    poses = state.poses
+    poses, cameras = state.poses, photometries_now(state, scene)
+    scene = scene.with_photometries(cameras) if cameras else scene
     if poses is None:
         return scene
     return scene.with_poses(
         {view.name: poses.pose(index).numpy() for index, view in enumerate(scene.train)}, zooms_now(state, scene)
     )
+
+
+def photometries_now(state: TrainState, scene: Scene) -> dict[str, CameraPhotometry]:
+    """Return what is known of the cameras of views, by their names; empty where nothing is learned of them."""
+    found = state.photometries
+    if found is None:
+        return {}
+    of_camera = {view.file_intrinsics(): found.photometry(index) for index, view in enumerate(scene.train)}
+    return {view.name: of_camera[view.file_intrinsics()] for view in scene.views if view.file_intrinsics() in of_camera}
 
 
 def zooms_now(state: TrainState, scene: Scene) -> dict[str, Zoom]:

@@ -13,6 +13,7 @@ from gs2d.core.checks import check_shapes
 from gs2d.core.splats import ATTRIBUTES, Splats
 from gs2d.errors import RunError, ShapeError
 from gs2d.training.exposure import Exposures
+from gs2d.training.photometry import Photometries
 from gs2d.training.poses import Poses
 from gs2d.training.zooms import Zooms
 
@@ -73,6 +74,8 @@ class TrainState:
         From where on so many processes trained; empty: one, all the time.
     zooms : Zooms or None
         Their focal lengths, where the recipe learns them.
+    photometries : Photometries or None
+        Their vignetting and response, where the recipe learns them.
     """
 
     splats: Splats
@@ -88,6 +91,17 @@ class TrainState:
     poses: Poses | None = None
     processes: list[tuple[int, int, int]] = field(default_factory=list)
     zooms: Zooms | None = None
+    photometries: Photometries | None = None
+
+    def of_views(self) -> list[tuple[str, Exposures | Poses | Zooms | Photometries]]:
+        """Return what is learned of photographs and cameras, by name; empty where the recipe learns nothing of them."""
+        learned = {
+            "exposures": self.exposures,
+            "poses": self.poses,
+            "zooms": self.zooms,
+            "photometries": self.photometries,
+        }
+        return [(name, it) for name, it in learned.items() if it is not None]
 
     def trained_by(self, count: int) -> None:
         """Note that so many processes train from here on: the result depends on it."""
@@ -122,6 +136,7 @@ class TrainState:
             **({} if self.poses is None else {"poses": self.poses.state_dict()}),
             **({} if not self.processes else {"processes": [list(since) for since in self.processes]}),
             **({} if self.zooms is None else {"zooms": self.zooms.state_dict()}),
+            **({} if self.photometries is None else {"photometries": self.photometries.state_dict()}),
         }
 
     @classmethod
@@ -158,10 +173,10 @@ class TrainState:
                 Poses.from_state_dict(data["poses"]) if "poses" in data else None,
                 [(int(stage), int(step), int(count)) for stage, step, count in data.get("processes", ())],
                 Zooms.from_state_dict(data["zooms"]) if "zooms" in data else None,
+                Photometries.from_state_dict(data["photometries"]) if "photometries" in data else None,
             )
             state.check()
-            learned = {"exposures": state.exposures, "poses": state.poses, "zooms": state.zooms}
-            numbers = dict(state.splats.items()) | {name: it.offsets for name, it in learned.items() if it is not None}
+            numbers = dict(state.splats.items()) | {name: it.offsets for name, it in state.of_views()}
             for name, tensor in numbers.items():
                 if not bool(tensor.isfinite().all()):
                     raise RunError(f"checkpoint is broken ({name} hold NaN or infinity); train again")
@@ -211,15 +226,14 @@ class TrainState:
             expected = torch.bool if name in groups else tensor.dtype if name in statistics else dtype
             if tensor.dtype != expected or not dtype.is_floating_point:
                 raise ShapeError(f"{name} must be {expected}, got {tensor.dtype}")
-        for learned in (self.exposures, self.poses, self.zooms):
-            if learned is not None:
-                learned.check()
+        for _, learned in self.of_views():
+            learned.check()
         self._check_counts()
 
     def _check_counts(self) -> None:
         """Raise RunError for a count below zero."""
         steps = [moments.steps for moments in self.moments.values()]
-        learned = [learned.steps for learned in (self.exposures, self.poses, self.zooms) if learned is not None]
+        learned = [learned.steps for _, learned in self.of_views()]
         least = min([self.stage, self.step, *steps, *self.queue, *(count for counts in learned for count in counts)])
         if least < 0:
             raise RunError(f"counts of iterations and views must be 0 or more, got {least}; train again")

@@ -29,7 +29,6 @@ from gs2d.training import events, per_image
 from gs2d.training.adam import adam_step, begin_stage, lr_at
 from gs2d.training.cached_objective import choose_objective
 from gs2d.training.densify.densifier import Densifier, Surroundings, densifier_of
-from gs2d.training.exposure import apply_exposure
 from gs2d.training.initialize import initial_splats, splats_as_start
 from gs2d.training.objective import (
     FullRender,
@@ -310,7 +309,7 @@ class Trainer:
             lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
             lambda: no_view(state, stage, probe),
             rows=objective.rows,
-            of_views=state.exposures is not None or state.poses is not None,
+            of_views=bool(state.of_views()),
         )
         happened = [] if densifier is None else list(densifier.after_backward(state, result, due))
         if not any(isinstance(event, events.Densified) for event in happened):
@@ -410,6 +409,7 @@ class Trainer:
             use_masks=use_masks,
             maps=partial(target_maps, backend=self.backend) if keeps else None,
             with_silhouettes=self.recipe.exposure is not None
+            or self.recipe.photometry is not None
             or any(t.kind == "silhouette" or t.where == "object" for s in self.recipe.stages for t in s.losses),
             dtype=dtype,
             device=device,
@@ -458,9 +458,7 @@ class Trainer:
         for index in self.processes.part(range(len(self.scene.train))):
             target, splats, settings = self._targets[index], self.drawn, self.settings
             camera = self._whole.camera(self.state, index)
-            if self.state.exposures is not None:
-                transform = self.state.exposures.transform(index)
-                splats, settings = apply_exposure(splats, camera, transform, settings)
+            splats, settings = self._whole.photographed(self.state, index, splats, camera, settings)
             yield splat_errors(
                 splats,
                 camera,

@@ -3,10 +3,9 @@
 #include "core/exposure.h"
 
 #include <cstdlib>
-#include <cstring>
 
 #include "cpu/export.h"
-#include "cpu/simd.h"
+#include "cpu/pixels.h"
 #include "cpu/threads.h"
 
 namespace gs2d {
@@ -33,23 +32,8 @@ Exposure<V> exposure_of(const Picture& p) {
     return e;
 }
 
-// LANES pixels, zeros behind the last one of the picture.
-void load_pixels(const real* image, int64_t first, int64_t pixels, V* planes) {
-    if (pixels - first >= LANES) return load_packed<3>(image + 3 * first, planes);
-    real rest[3 * LANES] = {};
-    std::memcpy(rest, image + 3 * first, static_cast<size_t>(3 * (pixels - first)) * sizeof(real));
-    load_packed<3>(rest, planes);
-}
-void store_pixels(real* image, int64_t first, int64_t pixels, const V* planes) {
-    if (pixels - first >= LANES) return store_packed<3>(image + 3 * first, planes);
-    real rest[3 * LANES];
-    store_packed<3>(rest, planes);
-    std::memcpy(image + 3 * first, rest, static_cast<size_t>(3 * (pixels - first)) * sizeof(real));
-}
 V coverage_at(const Picture& p, int64_t first) {
-    if (!p.coverage) return V(real(1));
-    const int64_t left = p.pixels - first;
-    return left >= LANES ? load(p.coverage + first) : load_first(p.coverage + first, static_cast<int>(left));
+    return p.coverage ? load_plane(p.coverage, first, p.pixels) : V(real(1));
 }
 
 }  // namespace

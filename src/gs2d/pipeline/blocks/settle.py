@@ -96,6 +96,11 @@ def settle(options: TrainOptions, on_event: OnEvent) -> Settled:
             "blocks need cameras that stay where they are, got a recipe that refines poses; refine them in a run of "
             "its own, or leave --refine-poses out"
         )
+    if recipe.photometry is not None:
+        raise RecipeError(
+            "blocks need cameras whose light is known, got a recipe that learns vignetting or response; leave "
+            "--vignetting and --response out"
+        )
     return replace(found, recipe=recipe, protocol=replace(protocol, near=protocol.near_for(scene.extent)))
 
 

@@ -1,0 +1,190 @@
+"""A rendering as a camera shows it: vignetting and response around the exposure of the photograph.
+
+Formulas: docs/math.md, "Vignetting and response". In the mean exposure, at the principal point, a camera of the mean
+response shows the scene's own colours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gs2d.core.camera import Camera
+from gs2d.core.checks import check_shapes
+from gs2d.core.photometry import CameraPhotometry, squared_radii
+from gs2d.kernels.library import library_for
+from gs2d.render import photometry_native as native
+from gs2d.render.exposure import expose, remove_exposure
+
+
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """A camera's vignetting and response, for one picture.
+
+    Attributes
+    ----------
+    numbers : Tensor [4]
+        a, b and c of the falloff, and s of the response.
+    squares : Tensor [H, W]
+        Squared radii.
+    """
+
+    numbers: Tensor
+    squares: Tensor
+
+    @classmethod
+    def of(cls, photometry: CameraPhotometry, camera: Camera, like: Tensor) -> Shading:
+        """Return that of a camera's picture, of the type and on the device of ``like``."""
+        numbers = torch.tensor([*photometry.falloff, photometry.shift]).to(like)
+        return cls(numbers, squares_of(camera, photometry.reach, like))
+
+
+def squares_of(camera: Camera, reach: float, like: Tensor) -> Tensor:
+    """Return the squared radii of a camera's pixels [H, W]; those of the last cameras are kept."""
+    size = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return _squares(size, reach, like.device, like.dtype)
+
+
+@lru_cache(maxsize=8)
+def _squares(size: tuple[Any, ...], reach: float, device: torch.device, dtype: torch.dtype) -> Tensor:
+    width, height, fx, fy, cx, cy = size
+    return torch.from_numpy(squared_radii(Camera(width, height, fx, fy, cx, cy, np.eye(4)), reach)).to(device, dtype)
+
+
+def photograph(
+    color: Tensor,
+    transform: Tensor,
+    coverage: Tensor | None = None,
+    background: Tensor | None = None,
+    *,
+    clipped: Tensor | None = None,
+    shading: Shading | None = None,
+) -> Tensor:
+    """Return a rendered picture as a camera took it: :func:`gs2d.render.exposure.expose` with a camera's shading.
+
+    A colour times what vignetting leaves of it, in the exposure of the photograph, by the camera's response. Without
+    ``shading`` these are the bits of ``expose``. Where the photograph has an alpha channel the response acts where it
+    is opaque: of an edge nobody knows the two colours.
+
+    Returns
+    -------
+    Tensor [H, W, 3]
+        Differentiable in ``color``, ``transform`` and the numbers of ``shading``.
+    """
+    if shading is None:
+        return expose(color, transform, coverage, background, clipped=clipped)
+    check_shapes({"color": (color, "H W 3"), "squares": (shading.squares, "H W"), "numbers": (shading.numbers, "4")})
+    falloff, shift = shading.numbers[:3], shading.numbers[3:]
+    arriving = show(color, torch.cat([falloff, torch.zeros_like(shift)]), shading.squares, coverage, background)
+    # The curve takes 1 to 1 and never turns, so a ceiling before it is one behind it.
+    exposed = expose(arriving, transform, coverage, background, clipped=clipped)
+    return show(exposed, torch.cat([torch.zeros_like(falloff), shift]), None, coverage, background)
+
+
+def show(
+    color: Tensor,
+    numbers: Tensor,
+    squares: Tensor | None,
+    coverage: Tensor | None = None,
+    background: Tensor | None = None,
+) -> Tensor:
+    """Return a picture through a curve, then through vignetting.
+
+    On a CPU, in float32, the bits of picture and gradients do not depend on the number of threads.
+
+    Parameters
+    ----------
+    color : Tensor [H, W, 3]
+    numbers : Tensor [4]
+        a, b, c of the falloff, and s of the curve.
+    squares : Tensor [H, W], optional
+        Squared radii; without them there is no vignetting.
+    coverage, background
+        As for :func:`gs2d.render.exposure.expose`.
+
+    Returns
+    -------
+    Tensor [H, W, 3]
+        Differentiable in ``color`` and ``numbers``.
+    """
+    if library_for(color) is None:
+        return _shown(color, numbers, squares, coverage, background)
+    picture: Tensor = _Show.apply(color, numbers, squares, coverage, background)
+    return picture
+
+
+class _Show(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        color: Tensor,
+        numbers: Tensor,
+        squares: Tensor | None,
+        coverage: Tensor | None,
+        background: Tensor | None,
+    ) -> Tensor:
+        ctx.library = library_for(color)
+        ctx.save_for_backward(color, numbers, squares, coverage, background)
+        return native.shown(ctx.library, color, numbers, squares, coverage, background)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        to_color, to_numbers = native.gradients(ctx.library, upstream, *ctx.saved_tensors)
+        return to_color, to_numbers, None, None, None
+
+
+def _shown(
+    color: Tensor, numbers: Tensor, squares: Tensor | None, coverage: Tensor | None, background: Tensor | None
+) -> Tensor:
+    """Return the picture; by torch."""
+    behind = 0.0 if coverage is None or background is None else (1 - coverage[..., None]) * background.to(color.dtype)
+    light = color - behind
+    bent = bend(light, numbers[3])
+    bent = bent if coverage is None else torch.where(coverage[..., None] >= 1, bent, light)
+    if squares is not None:
+        bent = bent * vignetting(squares, numbers[:3])[..., None]
+    return bent + behind
+
+
+def bend(values: Tensor, shift: Tensor) -> Tensor:
+    """Return f(x) = k x / (1 + (k - 1) x), k = e^s, straight on below 0 and above 1; f of -s is its inverse."""
+    growth = shift.exp()
+    inside, below, above = values.clamp(0, 1), values.clamp(max=0), values.clamp(min=1) - 1
+    return growth * below + growth * inside / (1 + (growth - 1) * inside) + above / growth
+
+
+def vignetting(squares: Tensor, falloff: Tensor) -> Tensor:
+    """Return what is left of the light at squared radii."""
+    return (-squares * (falloff[0] + squares * (falloff[1] + squares * falloff[2]))).exp()
+
+
+def remove_photometry(
+    image: np.ndarray, transform: np.ndarray | None, photometry: CameraPhotometry | None, camera: Camera
+) -> np.ndarray:
+    """Return a photograph uint8 [H, W, 3 or 4] in the colours of the scene, rounded; alpha stays.
+
+    Parameters
+    ----------
+    transform : ndarray [3, 4], optional
+        Of its exposure; without it the mean one.
+    photometry : CameraPhotometry, optional
+    camera : Camera
+        At the size of the picture.
+    """
+    if photometry is None:
+        return image if transform is None else remove_exposure(image, transform)
+    transform = np.eye(3, 4) if transform is None else transform.astype(np.float64)
+    seen, result = torch.from_numpy(image[..., :3] / 255.0), image.copy()
+    light = bend(seen, torch.tensor(-photometry.shift, dtype=torch.float64)).numpy()
+    light = (light - transform[:, 3]) @ np.linalg.inv(transform[:, :3]).T
+    squares = squares_of(camera, photometry.reach, seen)
+    left = vignetting(squares, torch.tensor(photometry.falloff, dtype=torch.float64)).numpy()[..., None]
+    result[..., :3] = np.rint(255 * np.clip(light / left, 0, 1))
+    return result

@@ -1,0 +1,116 @@
+"""Vignetting and response through a whole run: its file, its report, its resumption, and who uses them afterwards."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ball_runs import SMALL, options
+from gs2d.config.presets import get_recipe
+from gs2d.core.photometry import CameraPhotometry
+from gs2d.errors import RecipeError, RunError
+from gs2d.io.run_dir import PHOTOMETRY, REPORT, SPLATS, RunFolder
+from gs2d.pipeline.evaluate import evaluate_run
+from gs2d.pipeline.events import Event, Notice, ignore
+from gs2d.pipeline.exposure import as_scene, photographed
+from gs2d.pipeline.job import build_recipe, reload_job
+from gs2d.pipeline.train import train
+
+EARLY = (*SMALL, "photometry.start=5", "photometry.rate=0.02")
+
+
+@pytest.fixture(scope="module")
+def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    notices: list[str] = []
+
+    def listen(event: Event) -> None:
+        notices.extend([event.text] if isinstance(event, Notice) else [])
+
+    folder = tmp_path_factory.mktemp("runs") / "photometry"
+    made = train(options(capture, folder, vignetting=True, response=True, overrides=EARLY), listen)
+    assert any(text.startswith("corners have ") and text.endswith(PHOTOMETRY) for text in notices)
+    return made
+
+
+def test_every_view_has_the_light_of_its_camera_and_the_report_says_it(run: RunFolder) -> None:
+    (camera,) = json.loads(run.file(PHOTOMETRY).read_text())["cameras"]
+    job = reload_job(run, ignore)
+    assert camera["photographs"] == [view.name for view in job.scene.views]
+    for view in job.scene.views:
+        assert view.photometry == CameraPhotometry(tuple(camera["falloff"]), camera["reach"], 0.0)
+    assert max(map(abs, camera["falloff"])) > 0.005
+    assert "Vignetting and response of the cameras" in run.file(REPORT).read_text()
+    assert run.definition()["recipe"]["name"] == "2dgs-r-photometry"
+
+
+def test_test_views_are_scored_as_their_camera_shows_them_and_the_same_once_more(run: RunFolder) -> None:
+    before = run.metrics()["stages"][-1]
+    again = evaluate_run(run.path)
+    for split in ("train", "test"):
+        assert again[split]["psnr"] == pytest.approx(before[split]["psnr"], abs=1e-6)
+
+
+def test_what_is_rendered_and_taken_back_are_each_other_s_inverse(run: RunFolder) -> None:
+    view = reload_job(run, ignore).scene.train[0]
+    view = view.through(CameraPhotometry((0.4, 0.0, 0.0), view.photometry.reach))  # type: ignore[union-attr]
+    color = torch.full((view.camera.height, view.camera.width, 3), 0.5)
+    seen = photographed(replace(view), color, {}, (0.0, 0.0, 0.0))
+    alpha = torch.from_numpy(view.alpha())
+    corner, middle = seen[0, 0, 0], seen[view.camera.height // 2, view.camera.width // 2, 0]
+    assert float(corner) < 0.36  # 0.5 exp(-0.4) and a little
+    assert float(middle) == pytest.approx(0.5, abs=0.01)
+    assert alpha.shape == seen.shape[:2]
+    back, given = as_scene(view, {}), view.image()
+    assert np.array_equal(back[..., 3], given[..., 3])
+    assert (back[..., :3] >= given[..., :3]).all()
+    assert back[0, :, :3].sum() >= given[0, :, :3].sum()
+
+
+def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
+    for name in (SPLATS, PHOTOMETRY):
+        copy.file(name).unlink()
+    capture = Path(run.definition()["scene"]["path"])
+    for last in copy.checkpoints()[1:]:
+        last.path.unlink()
+    changes = {"vignetting": True, "response": True, "overrides": EARLY, "resume": True}
+    resumed = train(options(capture, copy.path, **changes))
+    assert resumed.file(SPLATS).read_bytes() == run.file(SPLATS).read_bytes()
+    assert resumed.file(PHOTOMETRY).read_bytes() == run.file(PHOTOMETRY).read_bytes()
+    with pytest.raises(RunError, match="was made with another recipe"):
+        train(options(capture, copy.path, vignetting=True, overrides=EARLY, resume=True))
+
+
+def test_a_damaged_file_is_one_line_that_says_what_to_do(run: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(Path(shutil.copytree(run.path, tmp_path / "run")))
+    whole = copy.file(PHOTOMETRY).read_text()
+    damages = {
+        whole.replace('"reach": ', '"reach": -'): "reach -",
+        whole.replace('"falloff"', '"fall"'): "must hold vignetting and response",
+        whole.replace("r_0.png", "r_99.png"): "must name each training photograph, got none of",
+        "{": "must hold vignetting and response",
+    }
+    for text, words in damages.items():
+        copy.file(PHOTOMETRY).write_text(text)
+        with pytest.raises(RunError, match=words) as caught:
+            reload_job(copy, ignore)
+        assert "--resume" in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_options_and_overrides_that_contradict_each_other_are_refused() -> None:
+    recipe = get_recipe("2dgs")
+    given = {"schedule_scale": 1.0, "seed": 0}
+    with pytest.raises(RecipeError, match="--vignetting and --set photometry=null contradict each other"):
+        build_recipe(recipe, overrides=("photometry=null",), vignetting=True, **given)  # type: ignore[arg-type]
+    with pytest.raises(RecipeError, match=r"photometry\.rate must be at most 1"):
+        build_recipe(recipe, overrides=("photometry.rate=2",), response=True, **given)  # type: ignore[arg-type]
+    only = build_recipe(recipe, overrides=(), response=True, **given).photometry  # type: ignore[arg-type]
+    assert only is not None
+    assert (only.vignetting, only.response) == (False, True)

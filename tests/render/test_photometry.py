@@ -1,0 +1,107 @@
+"""Vignetting and response around the exposure of a photograph: formulas, gauge, inverse."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gs2d.core.camera import Camera
+from gs2d.core.photometry import CameraPhotometry, reach_of, squared_radii
+from gs2d.render.exposure import expose, identity
+from gs2d.render.photometry import Shading, bend, photograph, remove_photometry, vignetting
+
+CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, np.eye(4))
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def test_the_curve_keeps_its_ends_never_turns_and_has_its_inverse_at_the_other_shift() -> None:
+    # k = e^s = 3: f(0.5) = 1.5 / 2 = 0.75; slopes 3 below 0 and 1/3 above 1.
+    x = torch.tensor([-0.2, 0.0, 0.5, 1.0, 1.6], dtype=torch.float64)
+    found = bend(x, number(math.log(3)))
+    assert torch.allclose(found, torch.tensor([-0.6, 0.0, 0.75, 1.0, 1.2], dtype=torch.float64))
+    every = torch.linspace(-1, 2, 301, dtype=torch.float64)
+    for shift in (-1.5, 0.4, 2.0):
+        bent = bend(every, number(shift))
+        assert (bent.diff() > 0).all()
+        assert torch.allclose(bend(bent, number(-shift)), every)
+
+
+def test_light_is_whole_at_the_principal_point_and_falls_off_to_the_reach() -> None:
+    reach = reach_of([CAMERA])
+    assert reach == pytest.approx(0.5)  # hypot(4, 3) / 10
+    squares = torch.from_numpy(squared_radii(CAMERA, reach))
+    assert squares[0, 0] == pytest.approx((0.35**2 + 0.25**2) / 0.25)  # the middle of the corner's pixel
+    a = torch.tensor([0.3, 0.1, 0.2])
+    assert vignetting(torch.tensor([0.0, 1.0]), a).tolist() == pytest.approx([1.0, math.exp(-0.6)])
+    assert CameraPhotometry((0.3, 0.1, 0.2)).corner() == pytest.approx(math.exp(-0.6))
+
+
+def test_a_picture_of_half_the_size_has_the_same_light() -> None:
+    reach = reach_of([CAMERA])
+    small = squared_radii(CAMERA.downscaled(2), reach)
+    # Four pixels lie half a pixel from their middle along each axis: their mean square is its square and 2 x 0.25 px^2.
+    large = squared_radii(CAMERA, reach).reshape(3, 2, 4, 2).mean(axis=(1, 3))
+    assert np.allclose(small, large - 2 * 0.25 / (10 * reach) ** 2, atol=1e-6)
+
+
+def test_in_the_mean_exposure_and_response_a_picture_keeps_its_colours_at_the_principal_point() -> None:
+    color = random(6, 8, 3) * 1.4 - 0.2
+    photometry = CameraPhotometry((0.4, 0.0, 0.1), 0.5)
+    shading = Shading.of(photometry, CAMERA, color)
+    level = Shading(shading.numbers, torch.zeros_like(shading.squares))
+    assert torch.allclose(photograph(color, identity(color), shading=level), color)
+    seen = photograph(color, identity(color), shading=shading)
+    assert (seen[0, 0] < color.clamp(min=0)[0, 0] + 1e-12).all()
+
+
+def test_without_a_camera_s_light_it_is_the_exposure_to_the_bit() -> None:
+    color, transform = random(5, 4, 3).float(), identity(random(1).float()) * 1.2
+    assert torch.equal(photograph(color, transform), expose(color, transform))
+
+
+def test_gradients_are_those_of_differences() -> None:
+    color = (random(6, 8, 3, seed=1) * 1.2 - 0.1).requires_grad_()
+    transform = (identity(color) + 0.1 * random(3, 4, seed=2)).detach().requires_grad_()
+    numbers = torch.tensor([0.3, -0.2, 0.1, 0.6], dtype=torch.float64, requires_grad=True)
+    squares = torch.from_numpy(squared_radii(CAMERA, 0.5)).double()
+
+    def seen(c: Tensor, t: Tensor, n: Tensor) -> Tensor:
+        return photograph(c, t, shading=Shading(n, squares))
+
+    assert torch.autograd.gradcheck(seen, (color, transform, numbers))
+
+
+def test_a_ceiling_is_one_behind_the_curve_and_the_background_stays() -> None:
+    color, background = random(6, 8, 3, seed=3), torch.ones(3, dtype=torch.float64)
+    coverage = torch.ones(6, 8, dtype=torch.float64)
+    coverage[:, 4:] = 0
+    shown = color * coverage[..., None] + (1 - coverage[..., None])  # over white
+    shading = Shading.of(CameraPhotometry((0.2, 0.0, 0.0), 0.5, 1.0), CAMERA, color)
+    clipped = torch.ones(6, 8, 3, dtype=torch.bool)
+    seen = photograph(shown, 3 * identity(color), coverage, background, clipped=clipped, shading=shading)
+    assert float(seen.max()) <= 1 + 1e-12
+    assert torch.allclose(seen[:, 4:], torch.ones(6, 4, 3, dtype=torch.float64))
+
+
+def test_a_photograph_is_taken_back_to_the_colours_of_the_scene() -> None:
+    scene = 0.2 + 0.5 * random(6, 8, 3, seed=4)
+    transform = identity(scene) + torch.tensor([[0.1, 0.02, 0.0, 0.03]] * 3, dtype=torch.float64)
+    photometry = CameraPhotometry((0.3, 0.1, 0.0), 0.5, 0.5)
+    taken = photograph(scene, transform, shading=Shading.of(photometry, CAMERA, scene))
+    image = np.rint(255 * taken.numpy()).astype(np.uint8)
+    back = remove_photometry(image, transform.numpy(), photometry, CAMERA)
+    assert np.abs(back / 255.0 - scene.numpy()).max() < 4 / 255  # one step of the photograph, through steep curves
+    with_alpha = np.concatenate([image, np.full((6, 8, 1), 7, np.uint8)], axis=2)
+    assert (remove_photometry(with_alpha, None, photometry, CAMERA)[..., 3] == 7).all()
+    assert remove_photometry(image, None, None, CAMERA) is image

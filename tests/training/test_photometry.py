@@ -1,0 +1,274 @@
+"""Vignetting and response that are learned: updates by hand, the whole loss, resuming, what they are worth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from fake_backends import lacking
+from gs2d.config.presets import surface, with_photometry
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Exposure, LearningRates, Photometry, Recipe
+from gs2d.config.serialize import from_json, to_json
+from gs2d.core.camera import look_at
+from gs2d.core.photometry import CameraPhotometry, reach_of
+from gs2d.core.splats import Splats
+from gs2d.core.transforms import camera_extent
+from gs2d.data.scene import PointCloud, Scene, View
+from gs2d.data.undistort import Intrinsics, Lens
+from gs2d.errors import RecipeError, RunError
+from gs2d.render.api import rasterize, splat_errors
+from gs2d.render.exposure import identity
+from gs2d.render.photometry import Shading, photograph
+from gs2d.render.types import RasterSettings
+from gs2d.synthetic.perturb_exposure import random_gains
+from gs2d.training import per_image
+from gs2d.training.exposure import apply_exposure
+from gs2d.training.photometry import Photometries, photometry_step
+from gs2d.training.state import TrainState
+from gs2d.training.trainer import Trainer
+from train_toys import SIZE, VIEWS, backends, random_splats, same, short
+
+needs_cpu = pytest.mark.skipif("cpu" not in backends(), reason="the native library is not built")
+
+
+def quick() -> Recipe:
+    """``short`` with everything of photographs and cameras from its third iteration on."""
+    learned = Photometry(start=2, decay_steps=10, rate=0.02)
+    return replace(short(), exposure=Exposure(start=2, decay_steps=10), photometry=learned)
+
+
+def seen_through(views: tuple[View, ...], cameras: int) -> list[View]:
+    """Views whose files have one of so many intrinsics, by turns."""
+    known = [Intrinsics(64, 64, 60.0 + i, 60.0, 32.0, 32.0, Lens("fov", (0.9,))) for i in range(cameras)]
+    return [replace(view, intrinsics=known[index % cameras]) for index, view in enumerate(views)]
+
+
+# -- one update ---------------------------------------------------------------------------------------------------
+def test_photographs_of_one_camera_share_its_light_and_the_first_step_is_the_rate(scene: Scene) -> None:
+    made = Photometries.start(seen_through(scene.train, 2))
+    assert made.group == [0, 1, 0, 1, 0, 1]
+    recipe = replace(short(), photometry=Photometry())
+    photometry_step(made, 2, torch.tensor([5.0, -5.0, 1.0, -1.0], dtype=torch.float64), recipe, 0.01)
+    found = made.photometry(0)
+    assert found == made.photometry(4)
+    assert found.falloff == pytest.approx((-0.01, 0.01, -0.01))
+    assert found.shift == pytest.approx(0.005)  # half of the photographs are its own, and the mean is taken off
+    assert made.photometry(1).falloff == (0, 0, 0)
+    assert made.photometry(1).shift == pytest.approx(-0.005)
+    assert made.steps == [1, 0]
+
+
+def test_only_what_the_recipe_learns_moves_and_within_limits(scene: Scene) -> None:
+    made = Photometries.start(scene.train)
+    recipe = replace(short(), photometry=Photometry(response=False))
+    for _ in range(30):
+        photometry_step(made, 0, torch.full((4,), -1.0, dtype=torch.float64), recipe, 0.1)
+    assert made.offsets[0].tolist() == [1.0, 1.0, 1.0, 0.0]
+    photometry_step(made, 0, torch.full((4,), -1.0, dtype=torch.float64), recipe, 0.0)
+    assert made.steps[0] == 30
+
+
+def test_a_recipe_says_what_is_learned_and_is_written_as_before_without_it() -> None:
+    assert "photometry" not in to_json(short())
+    recipe = with_photometry(short(), response=False)
+    assert from_json(to_json(recipe)) == recipe
+    with pytest.raises(RecipeError, match="must learn vignetting, response or both, got neither"):
+        from_json(to_json(replace(recipe, photometry=Photometry(vignetting=False, response=False))))
+    with pytest.raises(RecipeError, match=r"photometry\.rate must be positive, got 0"):
+        from_json(to_json(replace(recipe, photometry=Photometry(rate=0.0))))
+
+
+# -- the loss -----------------------------------------------------------------------------------------------------
+def test_the_gradient_of_a_camera_s_numbers_is_that_of_the_whole_loss(scene: Scene) -> None:
+    recipe = Recipe("one", (replace(surface(), iterations=5),), photometry=Photometry(), exposure=Exposure())
+    views = replace(scene, train=tuple(seen_through(scene.train, 2)))
+    trainer = Trainer(views, recipe, GENERIC, backend="reference", dtype=torch.float64)
+    trainer.enter(0)
+    state, stage = trainer.state, recipe.stages[0]
+    assert state.photometries is not None
+    assert state.exposures is not None
+    state.exposures.offsets += 0.1 * torch.randn(VIEWS, 3, 4, generator=state.generator, dtype=torch.float64)
+    state.photometries.offsets += torch.tensor([[0.3, -0.1, 0.1, 0.5], [0.1, 0.1, 0.0, -0.2]], dtype=torch.float64)
+    found = trainer._whole.evaluate(state, stage, 1, 2)
+    assert found.losses["photometry"] == pytest.approx(0.001 * (0.09 + 0.01 + 0.01 + 0.35**2))  # (0.5 + 0.2) / 2
+    for column in range(4):
+        values = []
+        for step in (1e-6, -1e-6):
+            state.photometries.offsets[0, column] += step
+            values.append(sum(float(v) for v in trainer._whole.evaluate(state, stage, 1, 2).losses.values()))
+            state.photometries.offsets[0, column] -= step
+        slope = (values[0] - values[1]) / 2e-6
+        assert float(found.gradients["photometry"][column]) == pytest.approx(slope, rel=1e-3, abs=1e-9), column
+
+
+def test_cameras_that_stay_as_they_are_leave_splats_the_same_but_for_rounding(scene: Scene, backend: str) -> None:
+    still = Photometry(rate=1e-30, rate_final=1e-30, start=0)
+    plain, learned = (Trainer(scene, replace(short(), photometry=p), GENERIC, backend=backend) for p in (None, still))
+    before, after = plain.run(), learned.run()
+    assert "photometries" not in plain.state.state_dict()
+    assert learned.state.photometries is not None
+    assert sum(learned.state.photometries.steps) == 10 + 4 + 5
+    assert len(before) == len(after)
+    assert torch.allclose(before.means, after.means, atol=1e-3)
+
+
+def test_errors_are_ranked_as_the_camera_shows_the_splats(scene: Scene) -> None:
+    # A falloff that is even over the whole picture is a gain.
+    splats, view = random_splats(40, seed=1), scene.train[0]
+    image, settings = torch.from_numpy(view.target((0.0, 0.0, 0.0))), RasterSettings()
+    plain = splat_errors(splats, view.camera, image, settings, backend="reference")
+    dim, changed = apply_exposure(splats, view.camera, 0.5 * torch.eye(3, 4), settings, CameraPhotometry())
+    found = splat_errors(dim, view.camera, image / 2, changed, backend="reference")
+    assert torch.allclose(found, plain / 2, rtol=1e-4, atol=1e-4)
+    dark = CameraPhotometry((1.0, 0.0, 0.0), reach_of([view.camera]))
+    darker, _ = apply_exposure(splats, view.camera, torch.eye(3, 4), settings, dark)
+    even, _ = apply_exposure(splats, view.camera, torch.eye(3, 4), settings)
+    assert (darker.sh0 <= even.sh0 + 1e-6).all()
+    assert (darker.sh0 < even.sh0 - 0.01).any()
+
+
+# -- resuming -----------------------------------------------------------------------------------------------------
+def test_resuming_from_any_event_gives_the_same_splats_and_cameras(scene: Scene) -> None:
+    kept: list[dict[str, object]] = []
+    backend = backends()[-1]
+    trainer = Trainer(
+        scene,
+        quick(),
+        GENERIC,
+        backend=backend,
+        progress_every=1,
+        on_event=lambda _: kept.append(trainer.state.state_dict()),
+    )
+    end = trainer.run()
+    assert trainer.state.photometries is not None
+    found = trainer.state.photometries.offsets
+    assert found.abs().max() > 0.001
+    for data in kept[:: 3 if backend == "cpu" else 7]:
+        resumed = Trainer(scene, quick(), GENERIC, backend=backend, state=TrainState.from_state_dict(data))
+        assert same(resumed.run(), end)
+        assert resumed.state.photometries is not None
+        assert torch.equal(resumed.state.photometries.offsets, found)
+
+
+def test_a_state_with_the_cameras_of_other_views_or_broken_ones_is_refused(scene: Scene) -> None:
+    recipe = replace(short(), photometry=Photometry())
+    state = TrainState(random_splats(5), torch.Generator())
+    with pytest.raises(RunError, match="vignetting and response of 6 views, as recipe and scene say, got 0"):
+        Trainer(scene, recipe, GENERIC, backend="reference", state=state)
+    state = per_image.start(state, recipe, scene)
+    assert state.photometries is not None
+    assert state.photometries.reach == [reach_of([view.camera for view in scene.train])]
+    state.photometries.offsets[0, 0] = math.nan
+    with pytest.raises(RunError, match="photometries hold NaN or infinity"):
+        TrainState.from_state_dict(state.state_dict())
+    state.photometries.offsets[0, 0] = 0
+    state.photometries.group[0] = 3
+    with pytest.raises(RunError, match="must number its cameras from 0"):
+        TrainState.from_state_dict(state.state_dict())
+
+
+def test_an_update_that_a_device_cancelled_is_none(scene: Scene) -> None:
+    recipe = replace(short(), photometry=Photometry(start=0))
+    state = per_image.start(TrainState(random_splats(5), torch.Generator()), recipe, scene)
+    gradients = {"photometry": torch.ones(4, dtype=torch.float64)}
+    per_image.update(state, recipe, 1, 0, gradients, lacking(1))
+    assert state.photometries is not None
+    assert state.photometries.steps == [0]
+    per_image.update(state, recipe, 1, 0, gradients, lacking(0))
+    assert state.photometries.steps == [1]
+
+
+# -- what it is worth ---------------------------------------------------------------------------------------------
+TRAIN, TEST = 24, 4
+FALLOFF = (0.35, 0.15, 0.0)
+
+
+def taken(lights: tuple[CameraPhotometry, ...], gains: np.ndarray) -> tuple[Scene, Splats]:
+    """Matt splats in photographs of these gains, by cameras of these lights by turns, whose intrinsics differ."""
+    truth = random_splats(120, seed=3)
+    truth.shN.zero_()
+    truth.sh0.mul_(0.5)
+    angles = 2.4 * np.arange(TRAIN + TEST)
+    heights = np.linspace(-1.5, 1.5, TRAIN + TEST)[np.argsort(np.sin(7 * angles))]
+    up, views = np.array([0.0, 0.0, 1.0]), []
+    for i, (a, z) in enumerate(zip(angles, heights, strict=True)):
+        aside = 0.4 * np.array([np.sin(3 * a), np.cos(5 * a), np.sin(11 * a)])  # so that a splat wanders in the picture
+        place, number = np.array([3 * np.cos(a), 3 * np.sin(a), z]), i % len(lights)
+        camera = look_at(place, aside, up, width=SIZE, height=SIZE, fx=30.0)
+        with torch.no_grad():
+            color = rasterize(truth, camera, RasterSettings(), backend="reference").color
+            transform = identity(color) * torch.from_numpy(gains[i]).float()[:, None]
+            color = photograph(color, transform, shading=Shading.of(lights[number], camera, color))
+        view = View.from_arrays(f"{i:03d}.png", camera, np.rint(255 * color.clamp(0, 1).numpy()).astype(np.uint8))
+        views.append(replace(view, intrinsics=Intrinsics(SIZE, SIZE, 30.0 + number, 30.0, SIZE / 2, SIZE / 2)))
+    scene = Scene(
+        name="taken",
+        format="colmap",
+        train=tuple(views[:TRAIN]),
+        test=tuple(views[TRAIN:]),
+        points=PointCloud(truth.means.numpy().astype(np.float64), None),
+        extent=camera_extent([view.camera for view in views]),
+        bounds=np.array([[-1.0] * 3, [1.0] * 3]),
+    )
+    return scene, truth
+
+
+def learned(scene: Scene, truth: Splats, recipe: Recipe) -> tuple[float, list[CameraPhotometry | None]]:
+    """PSNR of the test photographs after a training from the true splats, and what was found of the cameras."""
+    state = per_image.start(TrainState(truth.clone(), torch.Generator().manual_seed(0)), recipe, scene)
+    trainer = Trainer(scene, recipe, GENERIC, backend="cpu", state=state)
+    trainer.run()
+    now = per_image.scene_now(trainer.state, scene)
+    return held_out_psnr(now, trainer), [view.photometry for view in now.test]
+
+
+def short_stage(iterations: int) -> Recipe:
+    rates = LearningRates(means_decay_steps=iterations)
+    stage = replace(surface(), iterations=iterations, densify=None, sh_interval=iterations, lr=rates)
+    return Recipe("plain", (stage,))
+
+
+@needs_cpu
+def test_the_falloff_is_found_beside_exposures_and_new_views_gain_by_it() -> None:
+    gains = np.concatenate([random_gains(TRAIN, 0), np.ones((TEST, 3))])
+    light = CameraPhotometry(FALLOFF, math.hypot(SIZE, SIZE) / 2 / 30)
+    scene, truth = taken((light,), gains)
+    plain = replace(short_stage(600), exposure=Exposure(decay_steps=600, start=0))
+    light = Photometry(response=False, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
+    without, _ = learned(scene, truth, plain)
+    score, (found, *_) = learned(scene, truth, replace(plain, photometry=light))
+    assert found is not None
+    assert score > without + 8  # measured: 35.4 and 51.7 dB
+    assert found.corner() == pytest.approx(math.exp(-0.5), rel=0.08)  # measured: 0.583 for 0.607
+
+
+@needs_cpu
+def test_the_curves_of_two_cameras_are_found_and_new_views_gain_by_it() -> None:
+    reach = math.hypot(SIZE, SIZE) / 2 / 30
+    lights = CameraPhotometry(reach=reach, shift=0.5), CameraPhotometry(reach=reach, shift=-0.5)
+    scene, truth = taken(lights, np.ones((TRAIN + TEST, 3)))
+    light = Photometry(vignetting=False, rate=0.01, rate_final=1e-3, decay_steps=600, start=0)
+    without, _ = learned(scene, truth, short_stage(600))
+    score, (first, second, *_) = learned(scene, truth, replace(short_stage(600), photometry=light))
+    assert first is not None
+    assert second is not None
+    assert score > without + 20  # measured: 21.2 and 55.6 dB
+    assert (first.shift, second.shift) == pytest.approx((0.5, -0.5), abs=0.03)  # measured: within 0.002
+
+
+def held_out_psnr(scene: Scene, trainer: Trainer) -> float:
+    """PSNR of the test photographs, in the mean exposure and as their camera shows the scene."""
+    errors = []
+    for view in scene.test:
+        with torch.no_grad():
+            color = rasterize(trainer.splats, view.camera, trainer.settings, backend="cpu").color
+            shading = None if view.photometry is None else Shading.of(view.photometry, view.camera, color)
+            color = photograph(color, identity(color), shading=shading)
+        target = torch.from_numpy(view.target(GENERIC.background))
+        errors.append(float((color.clamp(0, 1) - target).square().mean()))
+    return float(-10 * np.log10(np.mean(errors)))
