@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from PIL import Image
 
 from capture_writers import ColmapModel, opengl_camera_to_world, ring
-from foreign_writers import opensfm_reconstruction, poses
+from foreign_writers import metashape_document, metashape_transform, opensfm_reconstruction, poses
 from gs2d.core.camera import Camera
 from gs2d.data import Scene, load_scene
 from gs2d.data.faces import FACES, Face, face_name, faces_of, field_of_view, panorama, project_rays
@@ -140,6 +141,56 @@ def test_panoramas_of_opensfm_are_cut_too(tmp_path: Path) -> None:
     assert_faces_agree(scene, 12.0)  # JPEG
 
 
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_panoramas_of_a_colmap_model_are_cut_too(tmp_path: Path, kind: str) -> None:
+    model = ColmapModel(cameras={1: ("EQUIRECTANGULAR", WIDTH, WIDTH // 2, (WIDTH, WIDTH // 2))})
+    for index, camera in enumerate(ring(4)):
+        write_panorama(tmp_path / "images" / f"{index}.png", camera)
+        model.images.append((index + 1, camera.T_cam_world, 1, f"{index}.png", []))
+    model.write(tmp_path / "sparse/0", kind)
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 24
+    assert_faces_agree(scene, 4.0)
+    for size, words in (((WIDTH, 9.0), "must have the size"), ((0, 0), "twice as wide as high, got 0x0")):
+        width, height = (WIDTH, WIDTH // 2) if size[0] else (0, 0)
+        model.cameras[1] = ("EQUIRECTANGULAR", width, height, size)
+        model.write(tmp_path / "sparse/0", kind)
+        with pytest.raises(DataError, match=words):
+            load_scene(tmp_path)
+
+
+def test_a_panorama_is_projected_as_colmap_does() -> None:
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("no pycolmap")
+    import pycolmap
+
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=WIDTH, height=WIDTH // 2, params=[WIDTH, WIDTH // 2])
+    rays = np.random.default_rng(0).normal(size=(200, 3))
+    ours, shown = project_rays(panorama(WIDTH, WIDTH // 2, "it"), rays)
+    assert shown.all()
+    np.testing.assert_allclose(ours, camera.img_from_cam(rays), atol=1e-6)
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_spherical_cameras_of_metashape_are_cut_too(tmp_path: Path, calibrated: bool) -> None:
+    shots, size = poses(4), f"<resolution width='{WIDTH}' height='{WIDTH // 2}'/>"
+    cameras = ""
+    for i, (name, T) in enumerate(shots.items()):
+        write_panorama(tmp_path / "images" / name, Camera(8, 8, 8.0, 8.0, 4.0, 4.0, T))
+        pose = f"<transform>{metashape_transform(T)}</transform>"
+        cameras += f"<camera id='{i}' sensor_id='0' label='{name[:-4]}'>{pose}</camera>"
+    stated = f"<calibration type='spherical' class='adjusted'>{size}</calibration>" if calibrated else ""
+    text = metashape_document(stated, cameras, kind="spherical")
+    path = tmp_path / "cameras.xml"
+    path.write_text(text if calibrated else re.sub("<resolution[^>]*>", size, text, count=1))
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 24
+    assert_faces_agree(scene, 12.0)  # JPEG
+    path.write_text(re.sub("<resolution[^>]*>", "", text))
+    with pytest.raises(DataError, match=r"sensor 0 must have a resolution, got none"):
+        load_scene(tmp_path)
+
+
 def write_fisheyes(root: Path, k: Intrinsics, params: tuple[float, ...], model: str = "OPENCV_FISHEYE") -> None:
     """A COLMAP model of fisheyes of the sky; what no ray reaches is black."""
     found = ColmapModel(cameras={1: (model, k.width, k.height, (k.fx, k.fy, k.cx, k.cy, *params))})
@@ -190,6 +241,8 @@ def test_rays_are_seen_where_colmap_says(tmp_path: Path) -> None:
     points = rng.uniform(-1.2, 1.2, (200, 2))
     for model, params in (
         ("OPENCV_FISHEYE", (90.0, 91.0, 100.0, 101.0, 0.02, -0.003, 0.0005, 0.0001)),
+        ("SIMPLE_FISHEYE", (90.0, 100.0, 101.0)),
+        ("FISHEYE", (90.0, 91.0, 100.0, 101.0)),
         ("THIN_PRISM_FISHEYE", (90.0, 91.0, 100.0, 101.0, 0.02, -0.003, 0.004, -0.002, 0.0005, 0.0001, 0.003, -0.004)),
     ):
         camera = pycolmap.Camera(model=model, width=200, height=200, params=list(params))

@@ -66,7 +66,7 @@ def panorama(width: int, height: int, where: str) -> Intrinsics:
     DataError
         It is not twice as wide as high.
     """
-    if abs(width / (2 * height) - 1) > _ASPECT:
+    if min(width, height) < 1 or abs(width / (2 * height) - 1) > _ASPECT:
         raise DataError(
             f"{where}: an equirectangular panorama must be twice as wide as high, got {width}x{height}; was it cropped?"
         )

@@ -37,6 +37,8 @@ _COLMAP_LENSES = {
     "RADIAL_FISHEYE": ("fisheye", "n1 n2"),
     "OPENCV_FISHEYE": ("fisheye", "n1 n2 n3 n4"),
     "THIN_PRISM_FISHEYE": ("fisheye", "n1 n2 p1 p2 n3 n4 s1 s2"),
+    "SIMPLE_FISHEYE": ("fisheye", ""),
+    "FISHEYE": ("fisheye", ""),
     "FOV": ("fov", "w"),
 }
 

@@ -98,7 +98,10 @@ def without_images(writer: Callable[[Path], Any]) -> Callable[[Path], None]:
         (metashape_with("chunk", "chunky"), "must be XML, got: mismatched tag"),
         (metashape_with("<f>36.0</f>", ""), "positive size and focal length f, got 40x30, 0; export the cameras with"),
         (metashape_with("<f>36.0</f>", "<f>nan</f>"), "sensor 0: f must be a finite number, got 'nan'"),
-        (metashape_with("<calibration type='frame'", "<calibration type='spherical'"), "is of type spherical, which"),
+        (
+            metashape_with("<calibration type='frame'", "<calibration type='cylindrical'"),
+            "is of type cylindrical, which",
+        ),
         (metashape_with("<f>", "<p3>0.1</p3><f>"), "has the coefficients p3 and p4, which cannot be undistorted"),
         (metashape_with("sensor_id='0'", "sensor_id='5'"), "must hold sensor '5' of camera a_0, got"),
         (metashape_with("<transform>", "<transform>1 "), "camera a_0: transform must be 16 numbers, got 17"),

@@ -15,6 +15,7 @@ import torch
 from gs2d.core.images import image_size
 from gs2d.core.transforms import quats_to_matrices
 from gs2d.data.build import Capture, PosedImage
+from gs2d.data.faces import panorama
 from gs2d.data.priors import ObservedPoints
 from gs2d.data.scene import PointCloud
 from gs2d.data.undistort import Intrinsics, colmap_intrinsics
@@ -37,7 +38,15 @@ CAMERA_MODELS = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }
+
+PANORAMA = "EQUIRECTANGULAR"
 
 
 @dataclass(frozen=True)
@@ -171,7 +180,7 @@ class _Bytes:
 
 def _cameras_bin(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     file = _Bytes(path)
-    count = file.count("cameras", 24 + 3 * 8)
+    count = file.count("cameras", 24 + 2 * 8)  # of the model with fewest parameters
     for number in range(1, count + 1):
         what = f"camera {number} of {count}"
         camera_id, model_id, width, height = map(int, file.unpack("IiQQ", what))
@@ -438,9 +447,15 @@ def _intrinsics(path: Path, cameras: dict[int, ColmapCamera], image: ColmapImage
     camera = cameras.get(image.camera_id)
     if camera is None:
         raise DataError(f"{path} must hold camera {image.camera_id} of image {image.name}, got {sorted(cameras)[:9]}")
-    return colmap_intrinsics(
-        f"{path}: camera {image.camera_id}", camera.model, camera.width, camera.height, camera.params
-    )
+    where = f"{path}: camera {image.camera_id}"
+    if camera.model == PANORAMA:
+        size = (camera.width, camera.height)
+        if camera.params != size:
+            raise DataError(
+                f"{where}: the model {PANORAMA} must have the size {size} as parameters, got {camera.params}"
+            )
+        return panorama(*size, where)
+    return colmap_intrinsics(where, camera.model, camera.width, camera.height, camera.params)
 
 
 def _image_folder(root: Path, model: Path, images: list[ColmapImage]) -> tuple[Path, Path]:

@@ -8,6 +8,8 @@ for a fisheye (x, y) t / r with t = atan(r):
 x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y     (p1 and p2 are OpenCV's p2 and p1)
 y' = y (1 + ...)                               + p2 (r^2 + 2 y^2) + 2 p1 x y
 u = w / 2 + cx + x' (f + b1) + y' b2,   v = h / 2 + cy + y' f
+
+A spherical camera has an equirectangular panorama (``gs2d.data.faces``), and no parameters but its size.
 """
 
 from __future__ import annotations
@@ -21,11 +23,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from gs2d.data.build import Capture, PosedImage, pose_from_camera_to_world
+from gs2d.data.faces import panorama
 from gs2d.data.readers.common import ImageFiles, head, points_beside, real, reals, whole
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 
 _KINDS = {"frame": "perspective", "fisheye": "fisheye"}
+_PANORAMA = "spherical"
 _EARTH = (6.2e6, 6.5e6)  # m from the centre of the Earth: cameras there are in geocentric coordinates
 _AXES = (6378137.0, 6378137.0, 6356752.314245)  # m, WGS 84
 
@@ -194,19 +198,17 @@ def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
     """Return the adjusted calibration of a sensor, else its first."""
     every = sensor.findall("calibration")
     calibration = next((c for c in every if c.get("class") == "adjusted"), every[0] if every else None)
+    kind = (None if calibration is None else calibration.get("type")) or sensor.get("type") or "frame"
+    if kind == _PANORAMA:
+        return panorama(*_size(calibration, sensor, where), where)
     if calibration is None:
         raise DataError(f"{where} must have a calibration, got none; align the photographs, then export again")
-    kind = calibration.get("type") or sensor.get("type") or "frame"
     if kind not in _KINDS:
         raise DataError(
-            f"{where} is of type {kind}, which no pinhole image holds (known: {', '.join(_KINDS)}); "
+            f"{where} is of type {kind}, which no pinhole image holds (known: {', '.join((*_KINDS, _PANORAMA))}); "
             "export undistorted photographs from Metashape and their cameras"
         )
-    size = calibration.find("resolution")
-    size = sensor.find("resolution") if size is None else size
-    if size is None:
-        raise DataError(f"{where} must have a resolution, got none; export the cameras again")
-    width, height = (whole(size.get(side), f"{where}: {side}") for side in ("width", "height"))
+    width, height = _size(calibration, sensor, where)
     names = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
     value: Mapping[str, float] = {
         name: real(calibration.findtext(name, "0").strip(), f"{where}: {name}") for name in names
@@ -226,3 +228,13 @@ def _intrinsics(sensor: ElementTree.Element, where: str) -> Intrinsics:
     lens = Lens(_KINDS[kind], radial, (), (value["p2"], value["p1"]), value["b2"] / fx)
     center = (width / 2 + value["cx"], height / 2 + value["cy"])
     return Intrinsics(width, height, fx, fy, *center, None if lens.is_identity else lens)
+
+
+def _size(calibration: ElementTree.Element | None, sensor: ElementTree.Element, where: str) -> tuple[int, int]:
+    """Return width and height of a sensor's photographs, as its calibration or itself says, px."""
+    stated = (entry.find("resolution") for entry in (calibration, sensor) if entry is not None)
+    size = next((found for found in stated if found is not None), None)
+    if size is None:
+        raise DataError(f"{where} must have a resolution, got none; export the cameras again")
+    width, height = (whole(size.get(side), f"{where}: {side}") for side in ("width", "height"))
+    return width, height
