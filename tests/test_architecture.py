@@ -45,7 +45,7 @@ TOP = {"__init__.py", "__main__.py", "errors.py"}  # nothing else lies loose
 INSIDE = {
     "core": {
         "checks growth locks extras memory memory_limit processes spill text": 0,
-        "files georeference similarity": 1,
+        "exr files georeference similarity": 1,
         "arrays json_files camera images mesh sh splats": 2,
         "exif photometry transforms": 3,
     },

@@ -43,7 +43,7 @@ def test_the_doctor_looks_for_all_that_single_commands_need(
     assert run(["doctor", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["extras"] == {
-        "sfm": True, "geo": True, "markers": True, "ffmpeg": False, "heic": True, "texture": True,
+        "sfm": True, "geo": True, "exr": True, "markers": True, "ffmpeg": False, "heic": True, "texture": True,
         "spz4": True, "usd": True, "view": False, "cluster": True
     }  # fmt: skip
     assert report["optional"]["heic"]["details"] == "pillow-heif 1.2.3"

@@ -15,6 +15,7 @@ from typing import IO
 import numpy as np
 from PIL import Image
 
+from gs2d.core import exr
 from gs2d.core.checks import check_shapes
 from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_growth
@@ -97,6 +98,9 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     DataError
         Missing, or not an image.
     """
+    if exr.is_exr(path):
+        header = exr.read_header(path)
+        return header.width, header.height
     with _opened(path, "{path} must be an image, got: {error}") as file:
         return file.size
 
@@ -108,8 +112,8 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """Decode an image.
 
     EXIF orientation is **not** applied: COLMAP does not apply it either, so poses belong to the stored pixels.
-    Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit. Images of floats are refused: what is
-    white in them is not known.
+    Grey images become RGB, palettes are resolved, 16-bit grey becomes 8-bit. OpenEXR's linear floats become sRGB values
+    (:func:`gs2d.core.exr.display_image`). Other images of floats are refused: what is white in them is not known.
 
     Returns
     -------
@@ -120,6 +124,8 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     DataError
         Missing, not an image of ``FORMATS``, cut short, or of far more pixels than its bytes can hold; names the file.
     """
+    if exr.is_exr(path):
+        return exr.display_image(path)
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
         if file.mode == "F":
@@ -140,6 +146,8 @@ def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, str]:
     DataError
         As :func:`read_image`.
     """
+    if exr.is_exr(path):
+        return exr.grey_values(path), "F"
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
         return np.asarray(file), file.mode

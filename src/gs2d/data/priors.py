@@ -21,7 +21,7 @@ from gs2d.data.undistort import Intrinsics
 from gs2d.errors import DataError
 
 DEPTHS, NORMALS = "depths", "normals"
-DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff")
+DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 NORMAL_SUFFIXES = (".npy", ".png", ".jpg", ".jpeg", ".webp")
 AGREE = 0.05  # neighbours that differ by more, as a share of the largest, are an edge
 UNIT_LENGTH = (0.8, 1.2)  # a normal of another length is none

@@ -98,7 +98,7 @@ def required(entry: Mapping[str, Any], key: str, where: str) -> Any:
 
 
 # -- images by their names ---------------------------------------------------------------------------------------------
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".exr")
 _NO_IMAGES = {"mask", "masks", "depths", "normals", "depthmaps", "undistorted", "thumbnails"}  # of the same names
 
 

@@ -1,0 +1,145 @@
+"""OpenEXR files: linear light as display values, depths as they are, headers that announce too much."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gs2d.core import exr
+from gs2d.core.images import image_size, read_grey, read_image
+from gs2d.data import load_scene
+from gs2d.data.priors import read_depth
+from gs2d.errors import DataError
+
+OpenEXR = pytest.importorskip("OpenEXR")
+
+
+def write(path: Path, channels: dict[str, np.ndarray], **header: object) -> Path:
+    facts = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    OpenEXR.File(facts, {name: np.ascontiguousarray(a) for name, a in channels.items()}).write(str(path))
+    return path
+
+
+def colors(*values: float, alpha: float | None = None) -> dict[str, np.ndarray]:
+    """A row of grey pixels of these linear values."""
+    row = np.array([values], dtype=np.float32)
+    found = {name: row for name in "RGB"}
+    return found if alpha is None else {**found, "A": np.full_like(row, alpha)}
+
+
+def test_linear_light_becomes_srgb_values_and_what_is_brighter_than_white_is_white(tmp_path: Path) -> None:
+    # sRGB: 0.18 -> 0.4614, 0.002 -> 12.92 * 0.002 = 0.0258, 1 -> 1; below 0 and no number: black.
+    path = write(tmp_path / "a.exr", colors(0.18, 0.002, 1.0, 7.5, -1.0, np.nan))
+    image = read_image(path)
+    assert (image.dtype, image.shape) == (np.uint8, (1, 6, 3))
+    assert image[0, :, 0].tolist() == [118, 7, 255, 255, 0, 0]
+    assert image_size(path) == (6, 1)
+
+
+def test_halves_tiles_of_one_channel_and_compressions_are_read_too(tmp_path: Path) -> None:
+    grey = np.linspace(0, 1, 40, dtype=np.float16).reshape(5, 8)
+    for compression in ("NO", "RLE", "ZIPS", "ZIP", "PIZ"):
+        path = write(
+            tmp_path / f"{compression}.exr", {"Y": grey}, compression=getattr(OpenEXR, f"{compression}_COMPRESSION")
+        )
+        image = read_image(path)
+        assert (image == image[..., :1]).all()
+        assert np.array_equal(image[..., 0], np.rint(255 * exr.encode_srgb(grey.astype(np.float32))))
+
+
+def test_alpha_is_taken_out_of_the_colours(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.exr", colors(0.09, 0.0, alpha=0.5))
+    assert read_image(path)[0].tolist() == [[118, 118, 118, 128], [0, 0, 0, 128]]
+    empty = write(tmp_path / "b.exr", colors(0.0, alpha=0.0))
+    assert read_image(empty)[0, 0].tolist() == [0, 0, 0, 0]
+
+
+def test_depths_are_what_they_are(tmp_path: Path) -> None:
+    depth = np.array([[1.5, 0.0], [250.25, 3.0]], dtype=np.float32)
+    for channels in ({"Z": depth}, {"V": depth}, {"Z": depth, "A": np.ones_like(depth)}):
+        values = read_depth(write(tmp_path / "d.exr", channels))
+        assert np.array_equal(values, depth)
+    with pytest.raises(DataError, match=r"must have a channel Z or Y, or a single one, got B, G, R; export depths"):
+        read_grey(write(tmp_path / "c.exr", colors(0.5)))
+    with pytest.raises(DataError, match="must hold depths above 0"):
+        read_depth(write(tmp_path / "n.exr", {"Z": np.zeros((2, 2), np.float32)}))
+
+
+def test_a_capture_may_have_photographs_of_floats(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for index in range(3):
+        light = rng.uniform(0, 1, (12, 16, 3)).astype(np.float32)
+        write(tmp_path / f"images/{index}.exr", {name: light[..., i] for i, name in enumerate("RGB")})
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/cameras.txt").write_text("1 PINHOLE 16 12 20 20 8 6\n")
+    poses = "".join(f"{i + 1} 1 0 0 0 {i} 0 3 1 {i}.exr\n\n" for i in range(3))
+    (tmp_path / "sparse/images.txt").write_text(poses)
+    (tmp_path / "sparse/points3D.txt").write_text("1 0 0 0 9 9 9 0.5 1 0\n")
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.views] == ["1.exr", "2.exr", "0.exr"]
+    assert np.array_equal(scene.views[2].image(), exr.display_image(tmp_path / "images/0.exr"))
+
+
+def test_a_header_that_announces_more_than_its_file_can_hold_is_refused_before_decoding(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.exr", colors(0.1, 0.2))
+    data = path.read_bytes()
+    huge = struct.pack("<4i", 0, 0, 99_999, 99_999)
+    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+        at = data.index(name) + len(name) + 4
+        data = data[:at] + huge + data[at + 16 :]
+    path.write_bytes(data)
+    for reader in (read_image, image_size, read_grey):
+        with pytest.raises(DataError, match=r"an image \(100000x100000, 3 channels\) of at most 400 times"):
+            reader(path)
+
+
+def test_broken_files_are_one_line(tmp_path: Path) -> None:
+    whole = write(tmp_path / "a.exr", {"Y": np.random.default_rng(0).random((40, 40), dtype=np.float32)}).read_bytes()
+    several = whole[:4] + struct.pack("<I", 2 | 0x1000) + whole[8:]
+    cases = (
+        (b"", "must be an OpenEXR file, got: other first bytes"),
+        (whole[:30], "must be an OpenEXR file"),
+        (whole[: len(whole) // 2], "does not decode"),
+        (whole.replace(b"channels", b"channelz"), "no channels in its header"),
+        (several, "must be one part of plain pixels"),
+        (whole.replace(b"displayWindow\0box2i\0\x10\0\0\0\0", b"displayWindow\0box2i\0\x10\0\0\0\1"), "uncropped"),
+    )
+    for data, words in cases:
+        (tmp_path / "b.exr").write_bytes(data)
+        with pytest.raises(DataError, match=words) as caught:
+            read_image(tmp_path / "b.exr")
+        assert "\n" not in str(caught.value)
+    with pytest.raises(DataError, match="does not exist"):
+        image_size(tmp_path / "none.exr")
+    with pytest.raises(DataError, match=r"must have the channels R, G and B, or Y, got Z"):
+        read_image(write(tmp_path / "z.exr", {"Z": np.ones((2, 2), np.float32)}))
+
+
+def test_damage_anywhere_gives_a_picture_or_a_plain_error(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    noise = {name: rng.random((16, 16), dtype=np.float32) for name in "RGB"}
+    whole = bytearray(write(tmp_path / "a.exr", noise).read_bytes())
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, len(damaged) if rng.random() < 0.5 else 400, 4):
+            damaged[at] = rng.integers(0, 256)
+        (tmp_path / "b.exr").write_bytes(damaged)
+        with contextlib.suppress(DataError):
+            assert read_image(tmp_path / "b.exr").dtype == np.uint8
+
+
+def test_without_the_library_the_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "a.exr", colors(0.5))
+
+    def missing(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(exr.importlib, "import_module", missing)
+    assert image_size(path) == (1, 1)  # its header needs none
+    with pytest.raises(DataError, match=r"needs OpenEXR, which is not installed; pip install 'OpenEXR>=3.3'"):
+        read_image(path)
