@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from gs2d.sfm import second_round
 from gs2d.sfm.second_round import MIN_SEEN, NEXT, PARTNERS, partners, refuse_unsupported
 from synthetic_model import synthetic_model
 
@@ -90,3 +92,27 @@ def test_one_that_passed_supports_the_next(pycolmap: Any) -> None:
     assert refuse_unsupported(lonely(), ["011.jpg"]) == {}
     assert refuse_unsupported(lonely(), ["010.jpg", "011.jpg"]) == {}
     assert refuse_unsupported(lonely(), ["009.jpg", "010.jpg", "011.jpg"]) == {}
+
+
+def test_photographs_with_very_many_features_are_compared_without_guidance(
+    pycolmap: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP's guided matching lays each feature of one photograph beside each of the other: 5 GB for 27,000."""
+    path = tmp_path / "database.db"
+    database = pycolmap.Database.open(str(path))
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 100.0, 100, 100)
+    camera_id = database.write_camera(camera)
+    for name, features in (("a", 10), ("b", 400), ("c", 500)):
+        image = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+        database.write_keypoints(image, np.zeros((features, 2), np.float32))
+    database.close()
+    asked: list[tuple[bool, list[str]]] = []
+
+    def match(_path: str, matching: Any, chosen: Any, *_: Any) -> None:
+        asked.append((matching.guided_matching, Path(chosen.match_list_path).read_text().splitlines()))
+
+    monkeypatch.setattr(pycolmap, "match_image_pairs", match)
+    monkeypatch.setattr(second_round, "GUIDED_BYTES", 2 * 8 * 10 * 500)
+    request = {"database": str(path), "threads": 2, "seed": 0}
+    second_round.match_again(pycolmap, request, [("a", "b"), ("b", "c"), ("a", "c")])
+    assert asked == [(True, ["a b", "a c"]), (False, ["b c"])]
