@@ -46,7 +46,7 @@ _FARTHEST = 1e12  # world units from the origin: cubes of it are float32 numbers
 LensMaps = Callable[[Intrinsics], tuple[np.ndarray, np.ndarray]]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class PosedImage:
     """What a data set says about one photograph that exists.
 

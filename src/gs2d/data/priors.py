@@ -65,7 +65,7 @@ class ObservedPoints:
         Mean reprojection error.
     track : ndarray [P] int64
         Photographs in which it was found.
-    seen : mapping of view name to ndarray [M] int64
+    seen : mapping of view name to ndarray [M] int32 or int64
         Rows of the points found in a view.
     """
 

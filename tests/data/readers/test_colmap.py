@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 from capture_writers import ColmapModel, ring, small_colmap, write_image_of
 from gs2d.core.images import read_image
 from gs2d.data import load_scene
+from gs2d.data.readers import colmap
 from gs2d.data.readers.colmap import read_cameras, read_images, read_points
 from gs2d.errors import DataError
 
@@ -189,6 +191,52 @@ def test_a_binary_file_cut_anywhere_is_an_error_that_names_it_and_its_size(tmp_p
     (folder / f"{name}.bin").write_bytes(whole + b"\0")
     with pytest.raises(DataError, match="must end after its last"):
         read(folder, "bin")
+
+
+@pytest.mark.parametrize("chunk", [1, 60, 200])
+def test_points_read_a_few_bytes_at_a_time_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int
+) -> None:
+    small_colmap(tmp_path)
+    whole = read_points(tmp_path / "sparse/0", "bin")
+    monkeypatch.setattr(colmap, "_CHUNK", chunk)  # smaller than a point, about one, several
+    parts = read_points(tmp_path / "sparse/0", "bin")
+    assert whole is not None
+    assert parts is not None
+    assert len(whole.ids) > 1
+    for name in ("ids", "xyz", "rgb", "error"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+
+
+def test_a_name_longer_than_what_is_read_at_once_is_whole(tmp_path: Path) -> None:
+    name = "a" * 70 + "/" + "b" * 130 + ".png"
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 0))
+    record = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 1) + name.encode() + b"\0" + struct.pack("<Q", 0)
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 2) + 2 * record)
+    assert [image.name for image in read_images(tmp_path, "bin")] == [name, name]
+
+
+def test_to_know_which_points_are_seen_takes_a_small_part_of_the_models_memory(tmp_path: Path) -> None:
+    views, points = 200, 2000  # 24 bytes for each observation: 9.6 MB
+    rows = np.zeros(points, dtype=[("xy", "<f8", 2), ("id", "<i8")])
+    rows["id"] = np.arange(points) + 1
+    pose = struct.pack("<7dI", 1, 0, 0, 0, 0, 0, 0, 1)
+    images = (
+        struct.pack("<I", k) + pose + f"{k}.png".encode() + b"\0" + struct.pack("<Q", points) + rows.tobytes()
+        for k in range(views)
+    )
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", views) + b"".join(images))
+    one = (struct.pack("<Q3d3BdQ", k + 1, 0, 0, 0, 0, 0, 0, 0, 0) for k in range(points))
+    (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", points) + b"".join(one))
+    tracemalloc.start()
+    try:
+        found = colmap.observed_points(tmp_path, "bin")
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(found.seen) == views
+    np.testing.assert_array_equal(found.track, np.full(points, views))
+    assert most < 0.3 * (tmp_path / "images.bin").stat().st_size  # 4 bytes of 24 are kept
 
 
 def test_an_absurd_count_is_an_error_and_not_a_huge_allocation(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -112,8 +113,13 @@ def read_images(folder: Path, kind: str, *, observations: bool = False) -> list[
     DataError
         A file that is cut short or not an image list, or a pose that is not a pose.
     """
+    return list(_each_image(folder, kind, observations))
+
+
+def _each_image(folder: Path, kind: str, observations: bool) -> Iterator[ColmapImage]:
+    """Yield the images of ``read_images`` one by one."""
     path = folder / f"images.{kind}"
-    return list(_images_bin(path, observations) if kind == "bin" else _images_txt(path, observations))
+    return _images_bin(path, observations) if kind == "bin" else _images_txt(path, observations)
 
 
 def read_points(folder: Path, kind: str) -> ColmapPoints | None:
@@ -124,122 +130,162 @@ def read_points(folder: Path, kind: str) -> ColmapPoints | None:
     return _points_bin(path) if kind == "bin" else _points_txt(path)
 
 
-_CHUNK = 1 << 16  # points at a time
+_CHUNK = 1 << 22  # bytes of points at a time
 
 
 class _Bytes:
-    """A binary file that says where it was cut."""
+    """A binary file, read piece by piece, that says where it was cut: models are larger than what is kept of them."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.at = 0
         try:
-            self.data = path.read_bytes()
+            self._file = path.open("rb")
+            self.size = os.fstat(self._file.fileno()).st_size
         except OSError as error:
-            raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+            raise self._unreadable(error) from error
 
-    def need(self, count: int, what: str) -> int:
-        """Move over ``count`` bytes and return where they start."""
-        start = self.at
-        if start + count > len(self.data):
+    def __enter__(self) -> _Bytes:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._file.close()
+
+    def _unreadable(self, error: OSError) -> DataError:
+        return DataError(f"cannot read {self.path}: {error.strerror or error}")
+
+    def need(self, count: int, what: str) -> None:
+        """Raise DataError where the file ends before ``count`` more bytes."""
+        if self.at + count > self.size:
             raise DataError(
-                f"{self.path} is truncated or not a COLMAP file: {what} needs bytes {start} to {start + count}, "
-                f"got a file of {len(self.data)} bytes; copy it again"
+                f"{self.path} is truncated or not a COLMAP file: {what} needs bytes {self.at} to {self.at + count}, "
+                f"got a file of {self.size} bytes; copy it again"
             )
-        self.at = start + count
-        return start
+
+    def read(self, count: int, what: str) -> bytes:
+        """Return the next ``count`` bytes."""
+        self.need(count, what)
+        try:
+            data = self._file.read(count)
+        except OSError as error:
+            raise self._unreadable(error) from error
+        if len(data) < count:  # it became shorter meanwhile
+            self.size = self.at + len(data)
+            self.need(count, what)
+        self.at += count
+        return data
+
+    def skip(self, count: int, what: str) -> None:
+        """Move over ``count`` bytes."""
+        self.need(count, what)
+        self.at += count
+        self._file.seek(self.at)
 
     def unpack(self, layout: str, what: str) -> tuple[int | float, ...]:
-        return struct.unpack_from("<" + layout, self.data, self.need(struct.calcsize("<" + layout), what))
+        return struct.unpack("<" + layout, self.read(struct.calcsize("<" + layout), what))
 
     def count(self, what: str, smallest: int) -> int:
         """Return the number of records that follow, each of at least ``smallest`` bytes."""
         count = int(self.unpack("Q", f"the number of {what}")[0])
-        if self.at + count * smallest > len(self.data):
+        if self.at + count * smallest > self.size:
             raise DataError(
                 f"{self.path} is truncated or not a COLMAP file: {count} {what} need at least "
-                f"{self.at + count * smallest} bytes, got {len(self.data)}; copy it again"
+                f"{self.at + count * smallest} bytes, got {self.size}; copy it again"
             )
         return count
 
     def name(self, what: str) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            self.need(len(self.data) - self.at + 1, what)
-        raw = self.data[self.at : end]
-        self.at = end + 1
+        """Return the text up to the next byte 0."""
+        start, raw = self.at, b""
+        while b"\0" not in raw:
+            rest = self.size - self.at
+            raw += self.read(min(64, rest) if rest else 1, what)  # 1 is more than there is
+        raw = raw[: raw.index(b"\0")]
+        self.at = start + len(raw) + 1
+        self._file.seek(self.at)
         return raw.decode("utf-8", "surrogateescape")  # as the file system has it
 
     def finish(self, what: str) -> None:
-        if self.at != len(self.data):
+        if self.at != self.size:
             raise DataError(
-                f"{self.path} must end after its last {what} at byte {self.at}, got {len(self.data)} bytes; "
+                f"{self.path} must end after its last {what} at byte {self.at}, got {self.size} bytes; "
                 "is this a COLMAP file?"
             )
 
 
 def _cameras_bin(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    file = _Bytes(path)
-    count = file.count("cameras", 24 + 2 * 8)  # of the model with fewest parameters
-    for number in range(1, count + 1):
-        what = f"camera {number} of {count}"
-        camera_id, model_id, width, height = map(int, file.unpack("IiQQ", what))
-        if model_id not in CAMERA_MODELS:
-            raise DataError(
-                f"{path}: camera {camera_id} has the model id {model_id}, which is not known here (0 to "
-                f"{max(CAMERA_MODELS)}); run `colmap image_undistorter` and load its output"
-            )
-        model, num_params = CAMERA_MODELS[model_id]
-        yield camera_id, ColmapCamera(model, width, height, file.unpack(f"{num_params}d", what))
-    file.finish("camera")
+    with _Bytes(path) as file:
+        count = file.count("cameras", 24 + 2 * 8)  # of the model with fewest parameters
+        for number in range(1, count + 1):
+            what = f"camera {number} of {count}"
+            camera_id, model_id, width, height = map(int, file.unpack("IiQQ", what))
+            if model_id not in CAMERA_MODELS:
+                raise DataError(
+                    f"{path}: camera {camera_id} has the model id {model_id}, which is not known here (0 to "
+                    f"{max(CAMERA_MODELS)}); run `colmap image_undistorter` and load its output"
+                )
+            model, num_params = CAMERA_MODELS[model_id]
+            yield camera_id, ColmapCamera(model, width, height, file.unpack(f"{num_params}d", what))
+        file.finish("camera")
 
 
 def _images_bin(path: Path, observations: bool) -> Iterator[ColmapImage]:
-    file = _Bytes(path)
-    count = file.count("images", 64 + 1 + 8)
-    for number in range(1, count + 1):
-        what = f"image {number} of {count}"
-        image_id, *pose, camera_id = file.unpack("I7dI", what)
-        name = file.name(f"the name of {what}")
-        (num_points,) = map(int, file.unpack("Q", what))
-        start = file.need(24 * num_points, f"the {num_points} 2-D points of {what}")
-        T = pose_matrix(pose[:4], pose[4:], f"{path}: image {name}")
-        xys = ids = None
-        if observations:
-            table = np.frombuffer(file.data, dtype="<f8, <f8, <i8", count=num_points, offset=start)
-            xys, ids = np.stack([table["f0"], table["f1"]], axis=1), table["f2"].astype(np.int64)
-        yield ColmapImage(int(image_id), int(camera_id), name, T, xys, ids)
-    file.finish("image")
+    with _Bytes(path) as file:
+        count = file.count("images", 64 + 1 + 8)
+        for number in range(1, count + 1):
+            what = f"image {number} of {count}"
+            image_id, *pose, camera_id = file.unpack("I7dI", what)
+            name = file.name(f"the name of {what}")
+            (num_points,) = map(int, file.unpack("Q", what))
+            points = f"the {num_points} 2-D points of {what}"
+            xys = ids = None
+            if observations:
+                table = np.frombuffer(file.read(24 * num_points, points), dtype="<f8, <f8, <i8")
+                xys, ids = np.stack([table["f0"], table["f1"]], axis=1), table["f2"].astype(np.int64)
+            else:
+                file.skip(24 * num_points, points)
+            T = pose_matrix(pose[:4], pose[4:], f"{path}: image {name}")
+            yield ColmapImage(int(image_id), int(camera_id), name, T, xys, ids)
+        file.finish("image")
 
 
 def _points_bin(path: Path) -> ColmapPoints:
-    file = _Bytes(path)
-    count = file.count("points", 43 + 8)
-    offsets = np.empty(count, dtype=np.int64)
-    data, at, size, track_length = file.data, file.at, len(file.data), struct.Struct("<Q").unpack_from
-    for row in range(count):
-        # Written out for speed: a million points take a second.
-        end = at + 51
-        if end <= size:
-            offsets[row] = at
-            end += 8 * track_length(data, at + 43)[0]
-        if end > size:
-            file.at = at
-            file.need(end - at, f"point {row + 1} of {count}")
-        at = end
-    file.at = at
-    file.finish("point")
-    raw = np.frombuffer(data, dtype=np.uint8)
-    records = np.empty((count, 43), dtype=np.uint8)
-    for start in range(0, count, _CHUNK):  # of indices, which are eight times as large
-        part = slice(start, start + _CHUNK)
-        records[part] = raw[offsets[part, None] + np.arange(43)]
+    with _Bytes(path) as file:
+        count = file.count("points", 43 + 8)
+        records = np.empty((count, 43), dtype=np.uint8)
+        done, rest = 0, b""
+        while done < count:
+            data = rest + file.read(min(_CHUNK, file.size - file.at), "points")
+            offsets, used, needed = _point_offsets(data, count - done)
+            if needed and (start := file.at - len(data) + used) + needed > file.size:
+                file.at = start
+                file.need(needed, f"point {done + len(offsets) + 1} of {count}")
+            raw = np.frombuffer(data, dtype=np.uint8)
+            records[done : done + len(offsets)] = raw[offsets[:, None] + np.arange(43, dtype=np.int32)]
+            done, rest = done + len(offsets), data[used:]
+        file.at -= len(rest)
+        file.finish("point")
     return ColmapPoints(
         ids=records[:, :8].copy().view("<u8")[:, 0].astype(np.int64),
         xyz=records[:, 8:32].copy().view("<f8").astype(np.float64),
         rgb=records[:, 32:35].copy(),
         error=records[:, 35:43].copy().view("<f8")[:, 0].astype(np.float64),
     )
+
+
+def _point_offsets(data: bytes, most: int) -> tuple[np.ndarray, int, int]:
+    """Return where points begin in ``data``, what they take of it, and what one that is cut needs (0: none is)."""
+    found: list[int] = []
+    at, size, track_length = 0, len(data), struct.Struct("<Q").unpack_from
+    while len(found) < most:
+        end = at + 51
+        if end <= size:
+            end += 8 * track_length(data, at + 43)[0]
+        if end > size:
+            return np.array(found, dtype=np.int32), at, end - at
+        found.append(at)
+        at = end
+    return np.array(found, dtype=np.int32), at, 0
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -427,12 +473,12 @@ def observed_points(folder: Path, kind: str) -> ObservedPoints:
     order = np.argsort(points.ids)
     track = np.zeros(len(order), dtype=np.int64)
     seen = {}
-    for image in read_images(folder, kind, observations=True):
+    for image in _each_image(folder, kind, observations=True):  # their observations are most of a model
         assert image.point_ids is not None
         ids = np.unique(image.point_ids[image.point_ids >= 0])
         at = order[np.searchsorted(points.ids, ids, sorter=order).clip(max=len(order) - 1)]
         rows = at[points.ids[at] == ids]
-        seen[image.name.replace("\\", "/")] = rows
+        seen[image.name.replace("\\", "/")] = rows.astype(np.int32)
         track[rows] += 1
     return ObservedPoints(points.xyz, points.error, track, seen)
 
