@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +11,21 @@ import pytest
 from cascade_scenes import BALL, GROUND, cascade_of, outdoor_frames, volumes_of
 from gs2d.core.camera import look_at
 from gs2d.errors import ProtocolError
+from gs2d.meshing import unbounded
 from gs2d.meshing.bounds import sample_depths
 from gs2d.meshing.depth_maps import RenderedView, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.meshing.marching_cubes import components
-from gs2d.meshing.tsdf import BLOCK, VOXELS, block_bytes
-from gs2d.meshing.unbounded import STEP, cascade_marching_cubes, derive_cascade, fuse_cascade, valid_depth
+from gs2d.meshing.tsdf import BLOCK, VOXELS, Volume, block_bytes
+from gs2d.meshing.unbounded import (
+    STEP,
+    cascade_marching_cubes,
+    derive_cascade,
+    find_cascade_blocks,
+    fuse_cascade,
+    fused_cascade_surface,
+    valid_depth,
+)
 from surface_shapes import edge_uses, is_closed_manifold, orbit, rays, signed_volume, sphere_depth
 
 
@@ -185,6 +195,45 @@ def test_memory_of_all_levels_together_is_bounded_and_the_error_names_a_voxel_th
         extract_unbounded(frames, voxel=0.03, threads=1, max_bytes=bound)
     named = float(str(caught.value).split("use a voxel of about ")[1].split(" ")[0])
     assert extract_unbounded(frames, voxel=named, threads=1, max_bytes=bound).volume_bytes <= bound
+
+
+@pytest.mark.parametrize("colored", [True, False])
+@pytest.mark.parametrize(("levels", "slab_bytes"), [(4, 1), (4, 300_000), (9, 300_000)])
+def test_slabs_of_any_size_give_the_bytes_of_the_mesh_of_whole_levels(
+    levels: int, slab_bytes: int, colored: bool
+) -> None:
+    maps = [depth_map(f) for f in outdoor_frames("unseen", views=6, size=48)]
+    maps = maps if colored else [replace(item, color=None) for item in maps]
+    cascade = cascade_of(levels, depth_limit=6.0)  # of nine levels some have no blocks
+    volumes = fuse_cascade(maps, cascade, threads=1)
+    whole = cascade_marching_cubes(volumes, cascade, far_weight=1.0)
+    blocks = find_cascade_blocks(maps, cascade, threads=1)
+    assert [len(part.keys) for part in blocks] == [len(volume.keys) for volume in volumes]
+    assert sum(part.nbytes for part in blocks) > 2 * slab_bytes  # several
+    parts = fused_cascade_surface(maps, cascade, blocks, far_weight=1.0, slab_bytes=slab_bytes, threads=1)
+    assert len(whole.faces) > 1000
+    np.testing.assert_array_equal(parts.vertices, whole.vertices)
+    np.testing.assert_array_equal(parts.faces, whole.faces)
+    assert (parts.colors is not None) == colored
+    if colored:
+        np.testing.assert_array_equal(parts.colors, whole.colors)
+
+
+def test_of_a_large_unbounded_volume_only_slabs_are_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = outdoor_frames("unseen", views=6, size=48)
+    largest = 0
+    make = unbounded.invalid_volume
+
+    def watched(*given: Any, **named: Any) -> Volume:
+        nonlocal largest
+        volume = make(*given, **named)
+        largest = max(largest, volume.nbytes)
+        return volume
+
+    monkeypatch.setattr(unbounded, "invalid_volume", watched)
+    found = extract_unbounded(frames, voxel=0.03, threads=1, slab_bytes=4_000_000)
+    assert found.volume_bytes > 20_000_000
+    assert 0 < largest <= 4_000_000
 
 
 def test_the_result_does_not_depend_on_threads_or_on_levels_without_blocks() -> None:

@@ -15,8 +15,8 @@ from gs2d.meshing.depth_maps import RenderedView, Spool
 from gs2d.meshing.evidence import Cleaned, clean
 from gs2d.meshing.marching_cubes import components, inside_box, keep_components
 from gs2d.meshing.slabs import SLAB_BYTES, fused_surface
-from gs2d.meshing.tsdf import Volume, find_blocks, fusion_backend
-from gs2d.meshing.unbounded import FAR_VIEWS, cascade_marching_cubes, derive_cascade, fuse_cascade
+from gs2d.meshing.tsdf import Blocks, find_blocks, fusion_backend
+from gs2d.meshing.unbounded import FAR_VIEWS, derive_cascade, find_cascade_blocks, fused_cascade_surface
 from gs2d.render.backends import Backend
 
 SAMPLES_A_MAP, FEWEST_SAMPLES = 4096, 16  # pixels of a depth map by which limits are derived
@@ -156,6 +156,7 @@ def extract_unbounded(
     threads: int | None = None,
     backend: str | Backend = "auto",
     folder: str | os.PathLike[str] | None = None,
+    slab_bytes: int = SLAB_BYTES,
 ) -> Extraction:
     """Fuse frames of a scene without bounds into a mesh, in voxels that grow with the distance from its centre.
 
@@ -170,7 +171,7 @@ def extract_unbounded(
         See ``marching_cubes``.
     far_views : float
         The same outside the innermost level, at most half as many as there are views.
-    min_faces, keep, max_bytes, threads, backend, folder
+    min_faces, keep, max_bytes, threads, backend, folder, slab_bytes
         As for ``extract``.
 
     Returns
@@ -200,11 +201,18 @@ def extract_unbounded(
             # far depths contradict each other more, but their levels have wider bands
             noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
             cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
-        volumes = fuse_cascade(spool, cascade, max_bytes=max_bytes, threads=threads, backend=backend)
-    far_weight = min(far_views, volumes[0].frames / 2)
-    fused = _Fused.of(volumes)
-    whole = cascade_marching_cubes(volumes, cascade, min_weight=min_weight, far_weight=far_weight)
-    del volumes
+        blocks = find_cascade_blocks(spool, cascade, max_bytes=max_bytes, threads=threads, backend=backend)
+        whole = fused_cascade_surface(
+            spool,
+            cascade,
+            blocks,
+            min_weight=min_weight,
+            far_weight=min(far_views, blocks[0].frames / 2),
+            slab_bytes=slab_bytes,
+            threads=threads,
+            backend=backend,
+        )
+    fused = _Fused.of(blocks)
     limits = replace(cascade.levels[0], lower=cascade.levels[-1].lower, upper=cascade.levels[-1].upper)
     return _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
 
@@ -225,9 +233,9 @@ class _Fused:
     levels: int
 
     @classmethod
-    def of(cls, volumes: Sequence[Volume]) -> _Fused:
-        blocks, nbytes = sum(len(volume.keys) for volume in volumes), sum(volume.nbytes for volume in volumes)
-        return cls(volumes[0].frames, blocks, nbytes, len(volumes))
+    def of(cls, levels: Sequence[Blocks]) -> _Fused:
+        blocks, nbytes = sum(len(level.keys) for level in levels), sum(level.nbytes for level in levels)
+        return cls(levels[0].frames, blocks, nbytes, len(levels))
 
 
 def _extraction(

@@ -9,7 +9,7 @@ is as closed as within a level. (Dual marching cubes on an octree: Schaefer and 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -32,9 +32,11 @@ from gs2d.meshing.bounds import (
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import CORNERS, EDGES, case_table, cell_surface, mixed_colors, near_plane_policy
 from gs2d.meshing.sampling import make_sampler
+from gs2d.meshing.slabs import SLAB_BYTES, slabs
 from gs2d.meshing.tsdf import (
     BLOCK,
     VOXELS,
+    Blocks,
     Budget,
     Volume,
     block_finder,
@@ -232,6 +234,21 @@ def fuse_cascade(
     ProtocolError, BackendError
         As for ``fuse``.
     """
+    blocks = find_cascade_blocks(frames, cascade, max_bytes=max_bytes, threads=threads, backend=backend)
+    volumes = tuple(_empty(part, limits) for part, limits in zip(blocks, cascade.levels, strict=True))
+    _fuse_into(volumes, frames, cascade, threads, backend)
+    return volumes
+
+
+def find_cascade_blocks(
+    frames: Iterable[DepthMap],
+    cascade: TsdfCascade,
+    *,
+    max_bytes: int = 4 << 30,
+    threads: int | None = None,
+    backend: str | Backend = "auto",
+) -> tuple[Blocks, ...]:
+    """Find the blocks that are fused, of each level; parameters and errors as of ``fuse_cascade``."""
     if iter(frames) is frames:
         raise TypeError("frames are read twice: pass a list or a Spool, not an iterator")
     check_truncation(cascade.levels[0])
@@ -247,14 +264,24 @@ def fuse_cascade(
     budget.check(sum(map(len, keys)), colored, partial=False)
     if not any(map(len, keys)):
         raise ProtocolError("depth inside the fusion limits was expected, got none; widen bbox or depth_limit")
-    volumes = tuple(
-        invalid_volume(limits, cascade.dims, found, colored=colored, frames=count)
-        for limits, found in zip(cascade.levels, keys, strict=True)
-    )
+    return tuple(Blocks(cascade.dims, found, colored, count) for found in keys)
+
+
+def _empty(blocks: Blocks, limits: FusionBounds) -> Volume:
+    return invalid_volume(limits, blocks.dims, blocks.keys, colored=blocks.colored, frames=blocks.frames)
+
+
+def _fuse_into(
+    volumes: Sequence[Volume],
+    frames: Iterable[DepthMap],
+    cascade: TsdfCascade,
+    threads: int | None,
+    backend: str | Backend,
+) -> None:
+    """Add all views to volumes of any levels."""
     with integrator(volumes, backend, threads) as add:
         for item in frames:
             add(make_sampler(item, cascade.levels[0], truncation=_truncations(item, cascade)))
-    return volumes
 
 
 def _distances(item: DepthMap, cascade: TsdfCascade) -> np.ndarray:
@@ -357,7 +384,7 @@ def cascade_marching_cubes(
     ----------
     volumes : sequence of Volume
         Of ``fuse_cascade``.
-    nest : Nest
+    cascade : TsdfCascade
     min_weight, far_weight : float
         A voxel of the innermost level, and of all others, is known from this weight on.
 
@@ -366,29 +393,161 @@ def cascade_marching_cubes(
     Mesh
         As of ``surface.marching_cubes``.
     """
-    known_from = [min_weight if k == 0 else max(min_weight, far_weight) for k in range(len(volumes))]
-    nodes = _Nodes(volumes, known_from)
-    offsets = nodes.offsets
-    pairs, triangles, count = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3), np.int64)], 0
-    for k, volume in enumerate(volumes):
-        edges, faces, ends = cell_surface(volume, known_from[k])
-        pairs.append(np.stack([edges // 3, ends], axis=1) + offsets[k])
-        triangles.append(faces + count)
-        count += len(edges)
-    for k in range(len(volumes) - 1):
-        ends = _join_triangles(nodes, _join_cells(volumes[k], volumes[k + 1], cascade, offsets[k], offsets[k + 1]))
-        pairs.append(ends.reshape(-1, 2))
-        triangles.append(count + np.arange(3 * len(ends)).reshape(-1, 3))
-        count += 3 * len(ends)
-    both = np.concatenate(pairs)
-    # a vertex is a pair of nodes, the same from whichever cell it is seen
-    flat, number = np.unique(both[:, 0] * int(offsets[-1] + 1) + both[:, 1], return_inverse=True)
-    low, high = flat // int(offsets[-1] + 1), flat % int(offsets[-1] + 1)
-    faces = number.reshape(-1)[np.concatenate(triangles)]
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]  # edges of no length in the cells of a join
-    vertices, colors = _vertices(nodes, low, high)
-    return Mesh(vertices, faces.astype(np.int32), colors)
+    surface = _CascadeSurface(cascade, [len(volume.keys) for volume in volumes], min_weight, far_weight)
+    for level, volume in enumerate(volumes):
+        surface.add(volume, level, 0, len(volume.keys))
+    return surface.mesh()
+
+
+def fused_cascade_surface(
+    frames: Iterable[DepthMap],
+    cascade: TsdfCascade,
+    blocks: Sequence[Blocks],
+    *,
+    min_weight: float = 1.0,
+    far_weight: float,
+    slab_bytes: int = SLAB_BYTES,
+    threads: int | None = None,
+    backend: str | Backend = "auto",
+) -> Mesh:
+    """Return what ``cascade_marching_cubes(fuse_cascade(...))`` returns, byte for byte, without all of it in memory.
+
+    Levels are fused slab by slab (``slabs``), several small ones at a time; the blocks at the border between two levels
+    stay in memory until both are done.
+
+    Parameters
+    ----------
+    frames : iterable of DepthMap
+        Read once for each slab: a sequence or a ``Spool``.
+    cascade : TsdfCascade
+    blocks : sequence of Blocks
+        Of each level, as ``find_cascade_blocks`` finds them.
+    min_weight, far_weight : float
+        See ``cascade_marching_cubes``.
+    slab_bytes : int
+        See ``fused_surface``.
+    threads, backend
+        As for ``fuse``.
+    """
+    surface = _CascadeSurface(cascade, [len(part.keys) for part in blocks], min_weight, far_weight)
+    for level, part in enumerate(blocks):
+        if not len(part.keys):
+            surface.add(_empty(part, cascade.levels[level]), level, 0, 0)
+    for slabs_at_once in _batches(blocks, slab_bytes):
+        volumes = [_empty(blocks[k].part(start, stop), cascade.levels[k]) for k, start, _, stop in slabs_at_once]
+        _fuse_into(volumes, frames, cascade, threads, backend)
+        for (level, start, own, _), volume in zip(slabs_at_once, volumes, strict=True):
+            surface.add(volume, level, start, own - start)
+        volumes.clear()
+        del volume
+    return surface.mesh()
+
+
+def _batches(blocks: Sequence[Blocks], slab_bytes: int) -> Iterator[list[tuple[int, int, int, int]]]:
+    """Yield slabs (level, start, own, stop; as of ``slabs``) in order, as many at a time as fit."""
+    batch: list[tuple[int, int, int, int]] = []
+    held = 0
+    for level, part in enumerate(blocks):
+        for start, own, stop in slabs(part, slab_bytes):
+            size = part.part(start, stop).nbytes
+            if batch and held + size > slab_bytes:
+                yield batch
+                batch, held = [], 0
+            batch.append((level, start, own, stop))
+            held += size
+    if batch:
+        yield batch
+
+
+class _CascadeSurface:
+    """The surface of levels that come in parts. Nodes have one numbering over all levels, as in ``_Nodes``."""
+
+    def __init__(self, cascade: TsdfCascade, counts: Sequence[int], min_weight: float, far_weight: float) -> None:
+        self._cascade = cascade
+        self._known_from = [min_weight if k == 0 else max(min_weight, far_weight) for k in range(len(counts))]
+        self._offsets = np.concatenate([[0], np.cumsum([count * VOXELS for count in counts])])
+        self._kept: list[list[tuple[Volume, np.ndarray]]] = [[] for _ in counts]  # at joins, and their rows
+        self._pairs = [np.zeros((0, 2), np.int64)]
+        self._triangles = [np.zeros((0, 3), np.int64)]
+        self._vertices = [np.zeros((0, 3), np.float32)]
+        self._colors: list[np.ndarray] = []
+        self._count = 0
+
+    def add(self, volume: Volume, level: int, start: int, own: int) -> None:
+        """Take the cells of the first ``own`` blocks of a part, which begins at block ``start`` of its level."""
+        edges, faces, ends = cell_surface(volume, self._known_from[level], own)
+        pairs = np.stack([edges // 3, ends], axis=1)
+        nodes = _Nodes([volume], [self._known_from[level]])
+        self._append(nodes, pairs, pairs + (self._offsets[level] + start * VOXELS), faces)
+        rows = np.flatnonzero(self._at_joins(volume.blocks[:own]))
+        self._kept[level].append((_rows_of(volume, rows), rows + start))
+
+    def _append(self, nodes: _Nodes, local: np.ndarray, pairs: np.ndarray, faces: np.ndarray) -> None:
+        vertices, colors = _vertices(nodes, local[:, 0], local[:, 1])
+        self._pairs.append(pairs)
+        self._triangles.append(faces + self._count)
+        self._vertices.append(vertices)
+        self._colors += [] if colors is None else [colors]
+        self._count += len(pairs)
+
+    def _at_joins(self, blocks: np.ndarray) -> np.ndarray:
+        """Blocks [M] at the outer border of a level, or around the hole in it."""
+        first, last = self._cascade.hole
+        outermost = ((blocks == 0) | (blocks == np.asarray(self._cascade.dims) - 1)).any(axis=1)
+        return np.asarray(outermost | ((blocks >= first - 1) & (blocks <= last)).all(axis=1))
+
+    def mesh(self) -> Mesh:
+        """Join the levels."""
+        levels = [_kept_level(parts) for parts in self._kept]
+        for k in range(len(levels) - 1):
+            volumes, rows = [volume for volume, _ in levels[k : k + 2]], [kept for _, kept in levels[k : k + 2]]
+            nodes = _Nodes(volumes, self._known_from[k : k + 2])
+            inner, outer = nodes.offsets[:2]
+            cells = _join_cells(volumes[0], volumes[1], self._cascade, inner, outer)
+            local = _join_triangles(nodes, cells).reshape(-1, 2)
+            numbers = [
+                (self._offsets[k + i] + kept[:, None] * VOXELS + np.arange(VOXELS)).reshape(-1)
+                for i, kept in enumerate(rows)
+            ]
+            corners = np.arange(len(local)).reshape(-1, 3)
+            self._append(nodes, local, np.concatenate(numbers)[local], corners)
+        both = np.concatenate(self._pairs)
+        # a vertex is a pair of nodes, the same from whichever cell it is seen
+        flat = both[:, 0] * int(self._offsets[-1] + 1) + both[:, 1]
+        _, first, number = np.unique(flat, return_index=True, return_inverse=True)
+        faces = number.reshape(-1)[np.concatenate(self._triangles)]
+        a, b, c = faces.T
+        faces = faces[(a != b) & (b != c) & (c != a)]  # edges of no length in the cells of a join
+        colors = np.concatenate(self._colors)[first] if self._colors else None
+        return Mesh(np.concatenate(self._vertices)[first], faces.astype(np.int32), colors)
+
+
+def _rows_of(volume: Volume, rows: np.ndarray) -> Volume:
+    """Return some blocks of a volume."""
+    return replace(
+        volume,
+        keys=volume.keys[rows],
+        tsdf=volume.tsdf[rows],
+        weight=volume.weight[rows],
+        color=None if volume.color is None else volume.color[rows],
+        color_weight=None if volume.color_weight is None else volume.color_weight[rows],
+    )
+
+
+def _kept_level(parts: Sequence[tuple[Volume, np.ndarray]]) -> tuple[Volume, np.ndarray]:
+    """Return the blocks that were kept of a level as one volume, and their rows in the level."""
+    volumes = [volume for volume, _ in parts]
+    colors = [volume.color for volume in volumes if volume.color is not None]
+    weights = [volume.color_weight for volume in volumes if volume.color_weight is not None]
+    whole = replace(
+        volumes[0],
+        keys=np.concatenate([volume.keys for volume in volumes]),
+        tsdf=np.concatenate([volume.tsdf for volume in volumes]),
+        weight=np.concatenate([volume.weight for volume in volumes]),
+        color=np.concatenate(colors) if colors else None,
+        color_weight=np.concatenate(weights) if weights else None,
+    )
+    return whole, np.concatenate([rows for _, rows in parts])
 
 
 def _vertices(nodes: _Nodes, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -261,7 +261,7 @@ def _extract(
     own = bbox is not None or options.unbounded
     subject_only = fusion.subject and not options.unbounded
     bare = not subject_only or options.whole_scene or bbox is None  # in a room bare walls are most of what there is
-    bounded = partial(extract, by_evidence=subject_only, with_bare=bare, slab_bytes=_slab_bytes())
+    bounded = partial(extract, by_evidence=subject_only, with_bare=bare)
     fuse_frames = extract_unbounded if options.unbounded else bounded
     if isinstance(frames, Spool):
         on_event(Phase("fusing", 0))
@@ -273,6 +273,7 @@ def _extract(
         depth_limit=options.depth_limit if own else options.depth_limit or fusion.depth_limit,
         keep=keep or None,
         max_bytes=_volume_bytes(options),
+        slab_bytes=_slab_bytes(),
         threads=torch.get_num_threads(),
         backend=job.backend,
     )
@@ -284,13 +285,13 @@ def _extract(
 def _volume_bytes(options: MeshOptions) -> int:
     """Return how large the volume may be.
 
-    Bounded ones are fused a slab at a time, but their surface is in memory: while it is joined and cleaned it takes
-    about half of what the whole volume would. Unbounded ones are in memory whole.
+    It is fused a slab at a time, but the surface is in memory: while it is joined and cleaned it takes about half of
+    what the whole volume would.
     """
     if options.max_gib is not None:
         return int(options.max_gib * 2**30)
     budget = memory_budget()
-    return VOLUME_BYTES if budget is None else budget // 2 if options.unbounded else budget
+    return VOLUME_BYTES if budget is None else budget
 
 
 def _slab_bytes() -> int:
