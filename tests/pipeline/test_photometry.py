@@ -35,6 +35,7 @@ def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = tmp_path_factory.mktemp("runs") / "photometry"
     made = train(options(capture, folder, vignetting=True, response=True, overrides=EARLY), listen)
     assert any(text.startswith("corners have ") and text.endswith(PHOTOMETRY) for text in notices)
+    assert any("of one camera, as here, it learns nothing" in text for text in notices)
     return made
 
 

@@ -52,6 +52,7 @@ from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.backdrop import find_backdrop
 from gs2d.training.cached_objective import is_cacheable
+from gs2d.training.photometry import Photometries
 from gs2d.training.point_gains import point_gains
 from gs2d.training.trainer import raster_settings
 
@@ -315,6 +316,8 @@ def fit_recipe(options: TrainOptions, scene: Scene, protocol: Protocol, on_event
         least, most = found.gains.mean(axis=1).min(), found.gains.mean(axis=1).max()
         what = "learned for each" if exposure else "taken to be one (--exposure learns them)"
         on_event(Notice(f"exposures of the photographs: {least:.2f} to {most:.2f} times their mean; {what}"))
+    if options.response and len(Photometries.start(scene.train).reach) == 1:
+        on_event(Notice("--response learns by what cameras differ: of one camera, as here, it learns nothing"))
     return _recipe_of(options, robust=robust, exposure=exposure)
 
 
