@@ -1,4 +1,4 @@
-"""How cameras are placed first: by COLMAP's own demands, by easier ones, all at once."""
+"""How cameras are placed first: by COLMAP's own demands, by easier ones, or all at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gs2d.cli import run
 from gs2d.data.readers.colmap import read_images
 from gs2d.sfm import colmap_worker
 from gs2d.sfm.steps import Steps
-from room_photos import write_walk
+from room_photos import write_turn, write_walk
 
 
 class _Piece(SimpleNamespace):
@@ -72,10 +72,17 @@ def test_where_most_photographs_have_a_place_no_other_way_is_tried(
 def test_easier_demands_are_believed_where_they_place_clearly_more(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    placing = _Placing(monkeypatch, tmp_path, strictly=(4,), as_on_a_walk=(6,), all_at_once=(10,))
-    assert placing.run(20) == ["all at once-0"]
-    assert placing.tried == ["strictly", "as on a walk", "all at once"]
-    assert placing.said == ["cameras were placed all at once: 10 photographs, 4 by stricter rules"]
+    placing = _Placing(monkeypatch, tmp_path, strictly=(4,), as_on_a_walk=(8,))
+    assert placing.run(20) == ["as on a walk-0"]
+    assert placing.tried == ["strictly", "as on a walk"]
+    assert placing.said == ["cameras were placed as on a walk: 8 photographs, 4 by stricter rules"]
+
+
+def test_one_more_photograph_is_no_reason_to_believe_easier_demands(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    placing = _Placing(monkeypatch, tmp_path, strictly=(4,), as_on_a_walk=(5,))
+    assert (placing.run(20), placing.said) == (["strictly-0"], [])
 
 
 def test_a_way_that_was_tried_is_not_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -104,3 +111,13 @@ def test_a_walk_straight_ahead_has_cameras(colmap: None, tmp_path: Path, capsys:
     assert np.linalg.norm(steps, axis=1) == pytest.approx(np.linalg.norm(steps, axis=1).mean(), rel=0.15)
     assert (ahead[:-1] * steps / np.linalg.norm(steps, axis=1, keepdims=True)).sum(axis=1) == pytest.approx(1, abs=0.02)
     assert "cameras were placed as on a walk: " in capsys.readouterr().err
+
+
+def test_a_camera_that_only_turned_has_no_place_by_easier_demands_either(
+    colmap: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The global mapper gives it eight, between rays of several degrees: nothing would doubt them."""
+    write_turn(tmp_path / "photos")
+    assert run(["poses", str(tmp_path / "photos"), "--out", str(tmp_path / "capture"), "--threads", "1"]) == 2
+    assert "do not turn on the spot" in capsys.readouterr().err
+    assert not (tmp_path / "capture").exists()

@@ -34,11 +34,9 @@ from gs2d.sfm.upright import up_direction
 Say = Callable[..., None]
 REPEATABLE = 50  # photographs: up to so many, one thread places them, and the same seed gives the same bytes
 SMALLEST_MODEL = 3  # photographs: smaller pieces are nothing that could be trained
-ATTEMPTS = (
-    "strictly",
-    "as on a walk",
-    "all at once",
-)  # ways of placing cameras, each where the one before placed too few
+# Ways of placing cameras one by one, each where the one before placed too few.
+ATTEMPTS = ("strictly", "as on a walk")
+AT_ONCE = "all at once"  # the global mapper, which also places a camera that only turned
 ENOUGH = 0.5  # of the photographs in one model: no other way is tried
 CLEARLY = 1.5  # times as many photographs must an easier way place, or the stricter one is believed
 WALKED_ANGLE = 4.0  # degrees between the first two cameras, which may stand one before the other; COLMAP's are 16
@@ -114,13 +112,12 @@ def _names(piece: Any) -> set[str]:
 def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say) -> None:
     """Models from nothing: step "first" names them, the largest first.
 
-    Where COLMAP's own demands on the first two cameras leave most photographs without a place, easier ones are tried,
-    and then all cameras at once.
+    Where COLMAP's own demands on the first two cameras leave most photographs without a place, easier ones are tried.
     """
     total = len(request["in_order"])
     say(phase="cameras", total=total)
     names, most = [], 0
-    attempts = ATTEMPTS[-1:] if request["mapper"] == "global" else ATTEMPTS
+    attempts = (AT_ONCE,) if request["mapper"] == "global" else ATTEMPTS
     for attempt in attempts:
         if (sizes := steps.facts(f"tried {attempt}")) is None:
             sizes = _attempt(pycolmap, request, steps, say, attempt)
@@ -144,7 +141,7 @@ def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, att
         say(done=min(placed, total))
 
     say(done=0)
-    if attempt == "all at once":
+    if attempt == AT_ONCE:
         place_all(pycolmap, request, steps, attempt, threads=_threads(request))
     else:
         options, often = _options(pycolmap, request), total > REPEATABLE
