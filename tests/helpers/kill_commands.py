@@ -16,6 +16,7 @@ import pickle
 import shutil
 import sys
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,7 @@ def without_seconds(value: Any) -> Any:
     return [without_seconds(inner) for inner in value] if isinstance(value, list) else value
 
 
-class Command:
+class Command(ABC):
     """One command: how it is begun on a fresh folder, gone on with after a kill, and what it leaves."""
 
     name = ""
@@ -141,9 +142,9 @@ class Command:
             draw_little()
         self.act(folder)
 
+    @abstractmethod
     def act(self, folder: Path) -> None:
         """Do it."""
-        raise NotImplementedError
 
     def leaves(self, folder: Path) -> dict[str, Any]:
         """Return what may not depend on how often the command was killed: all names, and bytes without times."""

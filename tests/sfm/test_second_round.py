@@ -112,7 +112,7 @@ def test_photographs_with_very_many_features_are_compared_without_guidance(
         asked.append((matching.guided_matching, Path(chosen.match_list_path).read_text().splitlines()))
 
     monkeypatch.setattr(pycolmap, "match_image_pairs", match)
-    monkeypatch.setattr(second_round, "GUIDED_BYTES", 2 * 8 * 10 * 500)
+    monkeypatch.setattr(second_round, "GUIDED_BYTES", 2 * second_round.BYTES_A_PAIR * 10 * 500)
     request = {"database": str(path), "threads": 2, "seed": 0}
     second_round.match_again(pycolmap, request, [("a", "b"), ("b", "c"), ("a", "c")])
     assert asked == [(True, ["a b", "a c"]), (False, ["b c"])]

@@ -44,8 +44,21 @@ class Exposure:
         return _decayed(self.rate, self.rate_final, iteration / self.decay_steps)
 
 
+class _OfCameras:
+    """What is learned of cameras: its rate. The fields are those of the dataclasses below."""
+
+    rate: float
+    rate_final: float
+    decay_steps: int
+    start: int
+
+    def rate_at(self, iteration: int) -> float:
+        """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
+        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
+
+
 @dataclass(frozen=True)
-class PoseRefinement:
+class PoseRefinement(_OfCameras):
     """One rigid motion for each training camera, learned with the splats (``training/poses.py``).
 
     It learns in stages that train the means of all splats: elsewhere nothing could follow.
@@ -70,13 +83,9 @@ class PoseRefinement:
     beta2: float = 0.99
     eps: float = 1e-15
 
-    def rate_at(self, iteration: int) -> float:
-        """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
-        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
-
 
 @dataclass(frozen=True)
-class IntrinsicsRefinement:
+class IntrinsicsRefinement(_OfCameras):
     """The focal length of each camera, learned with the splats and the poses (``training/zooms.py``).
 
     It learns in the stages in which poses do. Photographs whose files have the same intrinsics share a camera.
@@ -103,13 +112,9 @@ class IntrinsicsRefinement:
     beta2: float = 0.999
     eps: float = 1e-15
 
-    def rate_at(self, iteration: int) -> float:
-        """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
-        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
-
 
 @dataclass(frozen=True)
-class Photometry:
+class Photometry(_OfCameras):
     """Vignetting and response of each camera, learned with the splats (``training/photometry.py``).
 
     Photographs whose files have the same intrinsics share a camera. Stands beside ``exposure``, or by itself.
@@ -141,10 +146,6 @@ class Photometry:
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
-
-    def rate_at(self, iteration: int) -> float:
-        """Rate at an iteration of the run (1-based): log-linear, then constant; 0 before the start."""
-        return _decayed(self.rate, self.rate_final, iteration / self.decay_steps) if iteration > self.start else 0.0
 
 
 def _decayed(first: float, last: float, fraction: float) -> float:

@@ -34,12 +34,15 @@ from gs2d.sfm.upright import up_direction
 Say = Callable[..., None]
 REPEATABLE = 50  # photographs: up to so many, one thread places them, and the same seed gives the same bytes
 SMALLEST_MODEL = 3  # photographs: smaller pieces are nothing that could be trained
-# Ways of placing cameras one by one, each where the one before placed too few.
-ATTEMPTS = ("strictly", "as on a walk")
+# Ways of placing cameras one by one, each where the one before placed too few, and what they ask of the first two: COLMAP
+# wants 16 degrees between them (4 when relaxed), and not one before the other, as they are on a walk (4, and 1).
+ATTEMPTS: dict[str, dict[str, float]] = {
+    "strictly": {},
+    "as on a walk": {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0},
+}
 AT_ONCE = "all at once"  # the global mapper, which also places a camera that only turned
 ENOUGH = 0.5  # of the photographs in one model: no other way is tried
 CLEARLY = 1.5  # times as many photographs must an easier way place, or the stricter one is believed
-WALKED_ANGLE = 4.0  # degrees between the first two cameras, which may stand one before the other; COLMAP's are 16
 
 
 def main(request_path: str) -> None:
@@ -117,7 +120,7 @@ def _first_round(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say)
     total = len(request["in_order"])
     say(phase="cameras", total=total)
     names, most = [], 0
-    attempts = (AT_ONCE,) if request["mapper"] == "global" else ATTEMPTS
+    attempts = (AT_ONCE,) if request["mapper"] == "global" else tuple(ATTEMPTS)
     for attempt in attempts:
         if (sizes := steps.facts(f"tried {attempt}")) is None:
             sizes = _attempt(pycolmap, request, steps, say, attempt)
@@ -145,9 +148,8 @@ def _attempt(pycolmap: Any, request: dict[str, Any], steps: Steps, say: Say, att
         place_all(pycolmap, request, steps, attempt, threads=_threads(request))
     else:
         options, often = _options(pycolmap, request), total > REPEATABLE
-        if attempt == "as on a walk":
-            options.mapper.init_max_forward_motion = 1.0
-            options.mapper.init_min_tri_angle = WALKED_ANGLE
+        for name, value in ATTEMPTS[attempt].items():
+            setattr(options.mapper, name, value)
         grow_all(pycolmap, request["database"], options, steps, attempt, count, often=often)
     found = [f"{attempt}-{i}" for i in itertools.takewhile(lambda i: steps.has(f"{attempt}-{i}"), itertools.count())]
     pieces = {name: steps.read(pycolmap, name) for name in found}
