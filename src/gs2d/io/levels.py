@@ -1,7 +1,8 @@
 """Levels of detail: the same scene in half as many splats, and half again, by merging pairs of neighbours.
 
 A level is made of the one before. Of all pairs of near splats those whose merging is seen least are merged: each into
-one disk with the mass, centre, covariance and mean colour of the two. What a pair costs is weighed by its mass (opacity
+one disk with the centre, covariance and mean colour of the two, weighed by their masses, that covers as much as both
+blended; where that asks for more than full opacity it is larger. What a pair costs is weighed by its mass (opacity
 times area), so that small and faint splats go first, and large differences of colour, place and orientation last.
 """
 
@@ -122,6 +123,19 @@ def _matching(pairs: np.ndarray, cost: np.ndarray, count: int) -> np.ndarray:
     return whole[np.argsort(cost[np.concatenate([some for some, _ in found])], kind="stable")]
 
 
+def _overlap(g: Gaussians, pairs: np.ndarray, mass: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Return what blending takes of the masses of pairs: the integral of both opacities over a plane [P, 3, 2]."""
+    i, j = pairs.T
+    covariance = _covariances(g)
+    both = plane.transpose(0, 2, 1) @ (covariance[i] + covariance[j]) @ plane
+    determinant = np.maximum(both[:, 0, 0] * both[:, 1, 1] - both[:, 0, 1] ** 2, 1e-60)
+    x, y = ((g.means[j] - g.means[i]).astype(np.float64)[:, None, :] @ plane)[:, 0].T
+    distance = (both[:, 1, 1] * x * x - 2 * both[:, 0, 1] * x * y + both[:, 0, 0] * y * y) / determinant
+    # Of opacities o exp(-d^2 / 2) with areas 2 pi s_u s_v, in units of 2 pi.
+    both_areas = mass[i] * mass[j] * np.exp(-0.5 * distance) / np.sqrt(determinant)
+    return np.asarray(np.minimum(both_areas, np.minimum(mass[i], mass[j])))
+
+
 def _merged(g: Gaussians, pairs: np.ndarray) -> Gaussians:
     """Return one disk for each pair."""
     i, j = pairs.T
@@ -131,7 +145,10 @@ def _merged(g: Gaussians, pairs: np.ndarray) -> Gaussians:
     axes = axes[:, :, ::-1].copy()
     axes[:, :, 2] = np.cross(axes[:, :, 0], axes[:, :, 1])
     scales = np.sqrt(np.maximum(values[:, :0:-1], 1e-24))
-    opacity = np.clip((mass[i] + mass[j]) / scales.prod(axis=1), 0.0, _OPAQUE)
+    covered = mass[i] + mass[j] - _overlap(g, pairs, mass, axes[:, :, :2])
+    opacity = covered / scales.prod(axis=1)
+    scales *= np.sqrt(np.maximum(opacity / _OPAQUE, 1.0))[:, None]  # what no opacity can hold is held by area
+    opacity = np.minimum(opacity, _OPAQUE)
     quats = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]
     share = first.astype(np.float32)[:, None]
     return Gaussians(
