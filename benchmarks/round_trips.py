@@ -8,15 +8,17 @@ Writes the splats of a finished run in every layout into a temporary folder, rea
 split (the training views where it has none; every so many of them) and prints a row of Markdown for each: bytes a
 splat, PSNR against the run's own renderings and against the photographs (mean over views, colours in [0, 1] without
 rounding), seconds to write and to read. "the same" is a rendering that does not differ in any pixel by more than
-1e-4.
+1e-4. Of a stream with levels of detail a second table has each level against the splats themselves, in pictures of full
+size and of a half, a quarter and an eighth (means of pixels), which is where coarse levels are shown.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,7 +28,8 @@ import torch
 from gs2d.core.splats import Splats
 from gs2d.data import View
 from gs2d.errors import BackendError
-from gs2d.io.formats.registry import LAYOUTS, read_disks, write_layout
+from gs2d.io.formats.registry import LAYOUTS, read_disks, write_layout, written_bytes
+from gs2d.io.formats.sog import read_level
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline.finished import finished_splats
 from gs2d.pipeline.job import Job, reload_job
@@ -73,8 +76,32 @@ def row(layout: str, splats: Splats, draw: Draw, own: list[np.ndarray], real: li
     drawn = draw(back)
     furthest = max(float(np.abs(a - b).max()) for a, b in zip(drawn, own, strict=True))
     against = "the same" if furthest <= SAME else f"{psnr(drawn, own):.1f}"
-    size = path.stat().st_size / max(len(splats), 1)
+    size = written_bytes(path, layout) / max(len(splats), 1)
     return f"| `{layout}` | {size:.1f} | {against} | {psnr(drawn, real):.2f} | {written:.1f} | {read:.1f} |"
+
+
+def smaller(image: np.ndarray) -> np.ndarray:
+    """Half of a picture's size: means of four pixels; an odd last row or column is left out."""
+    h, w = (side // 2 * 2 for side in image.shape[:2])
+    return image[:h, :w].reshape(h // 2, 2, w // 2, 2, -1).mean(axis=(1, 3))
+
+
+def levels(draw: Draw, own: list[np.ndarray], path: Path) -> Iterator[str]:
+    """The rows of the table of levels of a stream."""
+    index = json.loads(path.read_text(encoding="utf-8"))
+    for level, count in enumerate(index["counts"]):
+        found, theirs = draw(read_level(path, level).to_surfels(path)), own
+        cells = []
+        for _ in range(4):
+            cells.append(f"{psnr(found, theirs):.1f}")
+            found, theirs = [smaller(image) for image in found], [smaller(image) for image in theirs]
+        size = sum(
+            file.stat().st_size
+            for name in index["filenames"]
+            if name.startswith(f"{level}_")
+            for file in (path.parent / name).parent.iterdir()
+        )
+        yield f"| {level} | {count:,} | {size / 1e6:.2f} | {' | '.join(cells)} |"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -89,16 +116,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     splats, job = finished_splats(run), reload_job(run, lambda event: None)
     views = job.scene.test if options.split == "test" and job.scene.test else job.scene.train
     views = views[:: options.every]
-    own, real = pictures(splats, job, views), photographs(job, views)
+
+    def draw(some: Splats) -> list[np.ndarray]:
+        return pictures(some, job, views)
+
+    own, real = draw(splats), photographs(job, views)
     print(f"{len(splats):,} splats, SH degree {splats.sh_degree}, {len(views)} views: {psnr(own, real):.2f} dB\n")
     print("| layout | bytes a splat | renderings, dB | photographs, dB | written, s | read, s |")
     print("|---|---|---|---|---|---|")
     with TemporaryDirectory(prefix="gs2d-round-trips-") as home:
         for layout in options.layouts:
             try:
-                print(row(layout, splats, lambda s: pictures(s, job, views), own, real, Path(home)), flush=True)
+                print(row(layout, splats, draw, own, real, Path(home)), flush=True)
             except BackendError as error:
                 print(f"| `{layout}` | {error} | | | | |")
+        stream = Path(home) / f"a{LAYOUTS.get('streamed').ending}"
+        if stream.exists():
+            print("\n| level | splats | MB | full size, dB | 1/2 | 1/4 | 1/8 |\n|---|---|---|---|---|---|---|")
+            for line in levels(draw, own, stream):
+                print(line, flush=True)
     return 0
 
 

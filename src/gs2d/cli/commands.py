@@ -161,12 +161,12 @@ class Export(Common):
     """Run folder, or a file of flat splats: PLY (compressed too), .spz, .splat, .usd, .glb or .sog."""
     out: Annotated[Path, arg(metavar="FILE")]
     """File to write; by its ending .ply is 3dgs, .compressed.ply compressed, .spz spz, .splat splat, .usd usd, .glb
-    gltf, .sog sog."""
+    gltf, .sog sog, lod-meta.json streamed (in a folder of its own)."""
     layout: str | None = None
     """2dgs: two scales, the official 2DGS layout; 3dgs: a third, tiny scale, which common viewers open; compressed:
     PlayCanvas's and SuperSplat's PLY; spz: Niantic's, the smallest; splat: antimatter15's, one colour a splat;
     usd: OpenUSD, to the bit; gltf: Khronos' KHR_gaussian_splatting, as flat 3D Gaussians;
-    sog: PlayCanvas's pictures, for the web."""
+    sog: PlayCanvas's pictures, for the web; streamed: the same in levels of detail, for large scenes."""
     bbox: BoxOption = None
     """Only the splats with their centres in this box (`gs2d view` and subject.json have numbers)."""
     georeferenced: bool = False

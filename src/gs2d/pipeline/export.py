@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gs2d.errors import RunError
-from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout
+from gs2d.io.formats.registry import ENDINGS, LAYOUTS, layout_of, read_disks, write_layout, written_bytes
 from gs2d.io.run_dir import (
     MESH,
     open_run,
@@ -37,7 +37,7 @@ def export_run(
     """
     layout = layout or layout_of(Path(out))
     if layout is None:
-        raise RunError(f"--out must end in {', '.join(ENDINGS)}, which say what is written, got {out}")
+        raise RunError(f"--out must end in {', '.join(ENDINGS).replace('/', '')}, which say what is written, got {out}")
     if layout not in LAYOUTS:
         raise RunError(LAYOUTS.unknown(layout))
     path, out = Path(path), checked_output(path, out, LAYOUTS.get(layout).ending, f"layout {layout} is")
@@ -55,5 +55,5 @@ def export_run(
     place = place_of(path, asked=georeferenced)
     notes = write_layout(out, splats if place is None else placed_splats(splats, place), layout)
     told = {} if place is None else say_where(out, place)
-    size = out.stat().st_size
+    size = written_bytes(out, layout)
     return {"file": str(out), "splats": len(splats), "bytes": size, "layout": layout, "notes": list(notes), **told}

@@ -91,8 +91,10 @@ def checked_output(path: Path, out: Path, ending: str = ".ply", what: str = "") 
     RunError
     """
     path, out = Path(path), Path(out)
-    if out.suffix.lower() != ending:
-        raise RunError(f"--out must name a {ending} file, which is what {what or 'is written'}, got {out}")
+    if not f"/{out.name}".lower().endswith(ending):
+        raise RunError(
+            f"--out must name a {ending.removeprefix('/')} file, which is what {what or 'is written'}, got {out}"
+        )
     if out.resolve() == (path / SPLATS).resolve():
         raise RunError(f"--out {out} is the splats of the run, which stay as they are; choose another name")
     return out

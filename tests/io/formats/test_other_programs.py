@@ -143,6 +143,34 @@ def test_the_finest_level_of_the_converter_s_stream_is_all_of_the_splats(tmp_pat
     assert (found.kind, len(found.gaussians)) == ("streamed SOG, its finest level", 700)
 
 
+def test_the_field_s_converter_reads_our_streams_and_writes_the_same_kind_of_index(tmp_path: Path) -> None:
+    """It reads no index, but every data set that one refers to."""
+    splats = a_scene(900, 1)
+    path = tmp_path / "ours" / "lod-meta.json"
+    write_layout(path, splats, "streamed")
+    ours = json.loads(path.read_text())
+    assert len(ours["filenames"]) == 4
+    for number, name in enumerate(ours["filenames"]):
+        splat_transform(path.parent / name, tmp_path / "back.ply")
+        back = read_splat_file(tmp_path / "back.ply").gaussians
+        same = read_splat_file(path.parent / name).gaussians
+        assert len(back) == ours["counts"][number]
+        for what in ("means", "log_scales", "sh0", "shN"):
+            np.testing.assert_allclose(getattr(back, what), getattr(same, what), atol=1e-6, err_msg=what)
+        (tmp_path / "back.ply").unlink()
+    write_layout(tmp_path / "a.ply", splats, "3dgs")
+    (tmp_path / "theirs").mkdir()
+    splat_transform(
+        tmp_path / "a.ply", "-l", "0", tmp_path / "a.ply", "-F", "50%", "-l", "1", tmp_path / "theirs" / "lod-meta.json"
+    )
+    theirs = json.loads((tmp_path / "theirs" / "lod-meta.json").read_text())
+    assert set(ours) == set(theirs)
+    leaf, other = ours["tree"], theirs["tree"]
+    assert set(leaf) == set(other) == {"bound", "lods"}
+    assert set(leaf["bound"]) == set(other["bound"])
+    assert set(leaf["lods"]["0"]) == set(other["lods"]["0"])
+
+
 _PAGE = """<!doctype html><html><body style="margin:0;overflow:hidden">
 <canvas id="c" width="WIDTH" height="HEIGHT" style="width:WIDTHpx;height:HEIGHTpx"></canvas>
 <script src="node_modules/babylonjs/babylon.js"></script>

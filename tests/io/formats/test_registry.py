@@ -253,7 +253,9 @@ def test_every_layout_is_read_back_as_flat_splats(tmp_path: Path, layout: str, n
     file = read_splat_file(path)
     assert len(file.gaussians) == n
     assert file.surfels is not None
-    assert file.gaussians.sh_degree == (0 if layout == "splat" or (layout in ("gltf", "sog") and n == 0) else 2)
+    assert file.gaussians.sh_degree == (
+        0 if layout == "splat" or (layout in ("gltf", "sog", "streamed") and n == 0) else 2
+    )
 
 
 def test_three_dimensional_gaussians_are_told_from_disks(tmp_path: Path, shared: Callable[[str], Path]) -> None:

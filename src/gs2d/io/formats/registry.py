@@ -15,6 +15,7 @@ from gs2d.errors import DataError
 from gs2d.io.formats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gs2d.io.formats.gltf import read_gltf, write_gltf
 from gs2d.io.formats.sog import read_sog, write_sog
+from gs2d.io.formats.sog_streamed import INDEX, streamed_bytes, write_streamed_sog
 from gs2d.io.formats.splat import read_splat, write_splat
 from gs2d.io.formats.spz import read_spz, write_spz
 from gs2d.io.formats.usd import ENDINGS as USD_ENDINGS
@@ -28,16 +29,20 @@ Reader = Callable[[str | os.PathLike[str]], tuple[Gaussians, str]]
 
 @dataclass(frozen=True)
 class Layout:
-    """A format of splats: its name's ending, and a writer that says what the format could not hold."""
+    """A format of splats: its name's ending, and a writer that says what the format could not hold.
+
+    An ending that begins with / is a whole name, of a file with others beside it.
+    """
 
     ending: str
     write: Writer
 
 
+_NAMES = ("2dgs", "3dgs", "compressed", "spz", "spz4", "splat", "usd", "gltf", "sog", "streamed")
 LAYOUTS: Registry[Layout] = Registry(
     "layout",
     "gs2d.formats",
-    builtin=dict.fromkeys(("2dgs", "3dgs", "compressed", "spz", "spz4", "splat", "usd", "gltf", "sog"), __name__),
+    builtin=dict.fromkeys(_NAMES, __name__),
     error=DataError,
 )
 """Names of formats that splats are written in."""
@@ -101,6 +106,11 @@ def _write_sog(path: Path, splats: Splats) -> None:
     write_sog(path, Gaussians.of(splats))
 
 
+@register_format("streamed", ending=f"/{INDEX}")
+def _write_streamed(path: Path, splats: Splats) -> None:
+    write_streamed_sog(path, Gaussians.of(splats))
+
+
 _BY_ENDING = (
     (".compressed.ply", "compressed"),
     (".ply", "3dgs"),
@@ -109,6 +119,7 @@ _BY_ENDING = (
     (".usd", "usd"),
     (".glb", "gltf"),
     (".sog", "sog"),
+    (f"/{INDEX}", "streamed"),
 )
 ENDINGS = tuple(ending for ending, _ in _BY_ENDING)
 
@@ -124,7 +135,7 @@ class SplatFile:
 
 def layout_of(path: Path) -> str | None:
     """Return the layout that a file is written in by its name, gs2d's own first, or None."""
-    name = path.name.lower()
+    name = f"/{path.name}".lower()
     for ending, layout in _BY_ENDING:
         if name.endswith(ending):
             return layout
@@ -139,6 +150,11 @@ def write_layout(path: Path, splats: Splats, layout: str) -> tuple[str, ...]:
     DataError, DiskError
     """
     return LAYOUTS.get(layout).write(path, splats) or ()
+
+
+def written_bytes(path: Path, layout: str) -> int:
+    """Return the bytes of what was written, of all files that belong to it."""
+    return streamed_bytes(path) if layout == "streamed" else path.stat().st_size
 
 
 def _read_spz(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:

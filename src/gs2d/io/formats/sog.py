@@ -3,7 +3,7 @@
 After the format's page (developer.playcanvas.com, version 2). A pixel is a splat: positions in 16 bits of a logarithm
 in two pictures, scales and colours as places in codebooks of 256, rotations as the three smallest components, opacities
 in 8 bits, and the higher harmonics as one of at most 65,536 rows of a palette. Coordinates are those of a PLY. Of the
-streamed form (lod-meta.json) the finest level is read.
+streamed form (lod-meta.json) the finest level is read; sog_streamed.py writes it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,14 @@ def write_sog(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     DiskError
         If the file could not be written.
     """
-    g = gaussians.rows(morton_order(gaussians.means))
+    files = packed_sog(gaussians.rows(morton_order(gaussians.means)))
+    with atomic_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name), data)  # the time is 1980
+
+
+def packed_sog(g: Gaussians) -> dict[str, bytes]:
+    """Return the files of a data set of SOG by their names, meta.json the last; its splats stay in their order."""
     shape = _picture(len(g))
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "gs2d"}, "count": len(g)}
     pictures: dict[str, np.ndarray] = {}
@@ -69,10 +76,8 @@ def write_sog(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     if g.shN.shape[1] and len(g):
         meta["shN"], more = _packed_harmonics(g.shN, shape)
         whole |= more
-    with atomic_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, picture in whole.items():
-            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(picture))  # the time is 1980
-        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta, separators=(",", ":")))
+    files = {f"{name}.webp": _webp(picture) for name, picture in whole.items()}
+    return files | {"meta.json": json.dumps(meta, separators=(",", ":")).encode()}
 
 
 def _picture(count: int) -> tuple[int, int]:
@@ -137,7 +142,7 @@ def read_sog(path: str | os.PathLike[str]) -> tuple[Gaussians, str]:
     path = Path(path)
     try:
         if path.name.lower() == "lod-meta.json":
-            return _streamed(path), "streamed SOG, its finest level"
+            return read_level(path), "streamed SOG, its finest level"
         if path.suffix.lower() == ".json":
             return _Reader(path, _in_folder(path.parent, path), path.stat().st_size).read(path.name), "SOG, unpacked"
         with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
@@ -297,12 +302,19 @@ def _quats(packed: np.ndarray) -> np.ndarray:
     return q.astype(np.float32)
 
 
-def _streamed(path: Path) -> Gaussians:
-    """Return the finest level of all that a lod-meta.json refers to, and its surroundings."""
+def read_level(path: Path, level: int = 0) -> Gaussians:
+    """Return a level of all that a lod-meta.json refers to, and its surroundings; 0 is the finest.
+
+    Where a leaf has not that level, its next coarser one is taken, or else its coarsest.
+
+    Raises
+    ------
+    DataError, OSError
+    """
     index = parsed(path, path.read_bytes())
     fetch, parts = _in_folder(path.parent, path), []
     try:
-        names, wanted = index["filenames"], _finest(index["tree"])
+        names, wanted = index["filenames"], _places(index["tree"], level)
         files: dict[int, Gaussians] = {}
         for file, offset, count in wanted:
             if file not in files:
@@ -330,8 +342,8 @@ def _data_set(path: Path, fetch: Fetch, name: Any) -> Gaussians:
     return _Reader(path, lambda inner: fetch(f"{folder}/{inner}" if folder else inner), 0).read(name.rpartition("/")[2])
 
 
-def _finest(tree: Any) -> list[tuple[int, int, int]]:
-    """Return (file, offset, count) of the finest level of every leaf; no splat is asked for twice."""
+def _places(tree: Any, wanted: int) -> list[tuple[int, int, int]]:
+    """Return (file, offset, count) of one level of every leaf; no splat is asked for twice."""
     found: dict[tuple[int, int], int] = {}
     waiting = [tree]
     while waiting:
@@ -339,7 +351,7 @@ def _finest(tree: Any) -> list[tuple[int, int, int]]:
         waiting += node.get("children") or []
         if "lods" in node:
             levels = {int(level): place for level, place in node["lods"].items()}
-            place = levels[min(levels)]
+            place = levels[min((level for level in levels if level >= wanted), default=max(levels))]
             file, offset, count = (int(place[key]) for key in ("file", "offset", "count"))
             if file < 0 or found.setdefault((file, offset), count) != count:
                 raise ValueError("splats of one level once were expected")
