@@ -163,5 +163,5 @@ class ReconstructAnywhereOptions(ReconstructOptions):
     """From photographs to a mesh, here or on a cluster."""
 
     cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Let a machine of a Ray cluster work, which shares the disk of PHOTOS and --out: HOST:PORT, or auto, the one that
-    this machine is of."""
+    """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
+    machine is of."""
