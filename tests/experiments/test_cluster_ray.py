@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 
 from flown import WORDS, digest, tiny_blocks, write_tiny_flight
 from gs2d.experiments.blocks import blocks
+from room_photos import Room
 
 pytestmark = [
     pytest.mark.slow,
@@ -137,3 +139,29 @@ def test_an_address_without_a_cluster_is_one_line(capture: Path, tmp_path: Path)
     assert process.returncode == 2, said
     assert len(said.splitlines()) == 1
     assert said.startswith("error: no Ray cluster at 127.0.0.1:1 (Connection refused); start one with")
+
+
+def test_photographs_become_a_run_though_the_machine_of_the_training_is_lost(
+    nodes: tuple[subprocess.Popen[str], str], room: Room, tmp_path: Path
+) -> None:
+    cluster, address = nodes
+    assert cluster.stdin is not None
+    assert cluster.stdout is not None
+    words = ["reconstruct", str(room.photos), "--threads", "1", "--downscale", "4", "--recipe", "2dgs", "--robust"]
+    words += ["off", "--schedule-scale", "0.02", "--checkpoint-every", "20", "--no-page"]
+    words += ["--set", "init_points=100", "--set", "surface.densify.max_splats=150"]
+    with begin([*words, "--out", str(tmp_path / "run"), "--cluster", address]) as process:
+        said = read_until(process, "training begins on")
+        said += read_until(process, "training: starting from")
+        cluster.stdin.write("lose\n")
+        cluster.stdin.flush()
+        said += process.communicate()[1]
+    assert cluster.stdout.readline() == "lost\n"
+    assert process.returncode == 0, said
+    assert "cameras: 12 of 12 photographs have a place" in said
+    assert "training: its process or its machine" in said
+    shutil.copytree(tmp_path / "run/capture", tmp_path / "here/capture")
+    with begin([*words, "--out", str(tmp_path / "here"), "--resume"]) as process:
+        said = process.communicate()[1]
+    assert process.returncode == 0, said
+    assert digest(tmp_path / "here/splats.ply") == digest(tmp_path / "run/splats.ply")

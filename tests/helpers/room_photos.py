@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags, Image
 
+from gs2d.cli import run
 from gs2d.core.camera import Camera, look_at
 
 SIZE, FOCAL = 200, 203.0  # px
@@ -108,3 +112,16 @@ class Room:
     capture: Path
     printed: dict[str, Any]
     cameras: dict[str, Camera]
+
+
+def found_room(root: Path) -> Room:
+    """Return twelve photographs, three stored turned, beside a file that is none, with what `gs2d poses` finds."""
+    cameras = write_room(root / "photos", 12)
+    for i, orientation in ((2, 6), (5, 8), (9, 3)):
+        turn_file(root / "photos" / f"{i:03}.jpg", orientation)
+    (root / "photos" / "notes.txt").write_text("corner, noon")
+    out = root / "captures" / "room"  # its folder is made too
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert run(["poses", str(root / "photos"), "--out", str(out), "--json", "--threads", "2"]) == 0
+    names = {f"{i:03}.jpg": camera for i, camera in enumerate(cameras)}
+    return Room(root / "photos", out, json.loads(printed.getvalue()), names)

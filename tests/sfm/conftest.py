@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import io
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from gs2d.cli import run
-from room_photos import Room, turn_file, write_room
+from room_photos import Room, found_room, write_room
 
 
 @pytest.fixture(scope="session")
@@ -26,16 +22,7 @@ def colmap() -> None:
 @pytest.fixture(scope="session")
 def room(colmap: None, tmp_path_factory: pytest.TempPathFactory) -> Room:
     """Twelve photographs, of which three are stored turned; one file is no photograph."""
-    root = tmp_path_factory.mktemp("sfm")
-    cameras = write_room(root / "photos", 12)
-    for i, orientation in ((2, 6), (5, 8), (9, 3)):
-        turn_file(root / "photos" / f"{i:03}.jpg", orientation)
-    (root / "photos" / "notes.txt").write_text("corner, noon")
-    out = root / "captures" / "room"  # its folder is made too
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        assert run(["poses", str(root / "photos"), "--out", str(out), "--json", "--threads", "2"]) == 0
-    names = {f"{i:03}.jpg": camera for i, camera in enumerate(cameras)}
-    return Room(root / "photos", out, json.loads(printed.getvalue()), names)
+    return found_room(tmp_path_factory.mktemp("sfm"))
 
 
 @pytest.fixture(scope="session")

@@ -120,6 +120,17 @@ def test_a_sweep_that_has_nothing_to_go_by_says_so_in_one_line(scene: Scene, set
     assert "\n" not in str(raised.value)
 
 
+def test_of_many_views_those_are_swept_too_with_which_the_chosen_are_compared() -> None:
+    sweep = sweep_views(ball(), replace(BALL, max_views=4))  # 90 degrees apart: none agrees with another of them
+    swept = {index for index, others in enumerate(sweep.neighbours) if others}
+    chosen = {0, 10, 19, 29}
+    assert chosen < swept
+    assert swept == chosen | {other for index in chosen for other in sweep.neighbours[index]}
+    assert sum(int((sweep.agreeing(index, BALL.agree) >= 2).sum()) for index in chosen) > 100
+    assert all((depth > 0).any() == (index in swept) for index, depth in enumerate(sweep.depths))
+    assert len(start_points(ball(), sweep, replace(BALL, max_views=4))) > 100
+
+
 def test_sparse_points_are_a_start_where_no_photographs_can_be_compared() -> None:
     points = PointCloud(np.random.default_rng(0).normal(size=(30, 3)) * 0.3)
     alone = replace(BALL, min_angle=1.0, max_angle=1.1)

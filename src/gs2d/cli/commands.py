@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from gs2d.experiments.options import BlocksOptions, PaperOptions, SweepOptions
+from gs2d.experiments.options import BlocksOptions, PaperOptions, ReconstructAnywhereOptions, SweepOptions
 from gs2d.pipeline.options import (
     BoxOption,
     DemoOptions,
@@ -19,7 +19,6 @@ from gs2d.pipeline.options import (
     Overrides,
     PlanOptions,
     PosesOptions,
-    ReconstructOptions,
     TextureOptions,
     TrainOptions,
     ViewOptions,
@@ -47,7 +46,7 @@ class Demo(DemoOptions, Common):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reconstruct(ReconstructOptions, Common):
+class Reconstruct(ReconstructAnywhereOptions, Common):
     """A folder of photographs to cameras, splats, a mesh and a report: `gs2d poses` and `gs2d train` in one."""
 
 

@@ -307,9 +307,9 @@ def table(command: c.Paper | c.Sweep, console: Console) -> None:
 def reconstruct(command: c.Reconstruct, console: Console) -> None:
     """``gs2d reconstruct``: then the figures, the files and the next command."""
     from gs2d.core.json_files import read_json
+    from gs2d.experiments.reconstruct import reconstruct as run_all
     from gs2d.io.run_dir import PAGE
     from gs2d.pipeline.reconstruct import CAPTURE
-    from gs2d.pipeline.reconstruct import reconstruct as run_all
     from gs2d.sfm.workspace import POSES_JSON
 
     run = run_all(command, console.on_event)

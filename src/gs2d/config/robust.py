@@ -68,7 +68,7 @@ class DenseStart:
     cell : float, px
         One splat starts in each cell of so many pixels of the shrunk photographs.
     max_views : int
-        Photographs that are swept, evenly chosen.
+        Photographs that are swept, evenly chosen, beside those that they are compared with.
     fit : StartFit or None
         How splats are fitted to the photographs; None: grey-opaque beginnings as from sparse points, in the colour of
         one photograph.

@@ -146,7 +146,8 @@ class Shares:
 
     def of(self, task: Task) -> dict[str, Any]:
         """Return the resources of a task as Ray names them."""
-        found: dict[str, Any] = {"num_cpus": self.alone if task.alone else self.cores, "num_gpus": self.gpus}
+        gpus = self.gpus if task.gpu else 0
+        found: dict[str, Any] = {"num_cpus": self.alone if task.alone else self.cores, "num_gpus": gpus}
         return found if task.memory is None else {**found, "memory": int(task.memory * 2**30)}
 
 

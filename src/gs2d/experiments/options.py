@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from gs2d.errors import RecipeError
-from gs2d.pipeline.options import Overrides, Resources, Training, paths_of
+from gs2d.pipeline.options import Overrides, ReconstructOptions, Resources, Training, paths_of
 
 SWEEP = "sweep"  # the name of a table of chosen recipes
 
@@ -156,3 +156,12 @@ class BlocksOptions(Training, Resources):
 
     def __post_init__(self) -> None:
         paths_of(self, "scene", "out", "masks", "start_from", "cache")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructAnywhereOptions(ReconstructOptions):
+    """From photographs to a mesh, here or on a cluster."""
+
+    cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Let the machines of a Ray cluster work, which share the disk of --out: HOST:PORT, or auto, the one that this
+    machine is of."""

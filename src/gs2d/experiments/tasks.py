@@ -41,6 +41,8 @@ class Task(ABC):
         Times that it is begun again by itself when its process dies; what it had saved is gone on with.
     memory : float or None, GiB
         That it keeps to.
+    gpu : bool
+        Whether it uses a GPU, where the backend does.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Task(ABC):
     alone: bool = False
     retries: int = 0
     memory: float | None = None
+    gpu: bool = True
 
     def outcome(self) -> dict[str, Any]:
         """Return what became of it: ``state`` (new, running, done, failed), ``reason``, and what it says of itself."""

@@ -17,6 +17,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.depth_maps import DepthMap
 from gs2d.meshing.marching_cubes import components, select_faces
+from gs2d.meshing.simplify import collapse
 
 VIEWS = 3.0  # that support a vertex
 FEW_VIEWS = 12  # in a capture, of which two are enough
@@ -217,14 +218,12 @@ def simplified_to(mesh: Mesh, faces: int) -> Mesh:
     """Return a mesh of about so many faces, by quadric edge collapse; vertices have the colour nearest to them."""
     if len(mesh.faces) <= max(faces, 4):
         return mesh
-    import fast_simplification  # type: ignore[import-untyped]  # here: it is slow to import
-
     vertices = mesh.vertices.astype(np.float64)
     middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0
     scaled = np.ascontiguousarray((vertices - middle) / size, np.float32)
     del vertices
     triangles = np.ascontiguousarray(mesh.faces, np.int32)
-    points, left = fast_simplification.simplify(scaled, triangles, target_count=max(faces, 4))
+    points, left = collapse(scaled, triangles, max(faces, 4))
     del scaled, triangles
     points = points * size + middle
     colors = None if mesh.colors is None else mesh.colors[cKDTree(mesh.vertices.astype(np.float64)).query(points)[1]]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gs2d.core.memory import trim
 from gs2d.core.mesh import Mesh
 from gs2d.meshing.bounds import DepthSample, FusionBounds, derive_limits, sample_depths, widen_truncation
 from gs2d.meshing.consistency import depth_noise
@@ -120,6 +121,8 @@ def extract(
             )
             if truncation is None:
                 limits = widen_truncation(limits, depth_noise(spool, samples, limits))
+            del samples
+            trim()  # 20 to 60 MB, before the volume
         blocks = find_blocks(spool, limits, max_bytes=max_bytes, threads=threads, backend=backend)
         fused = _Fused(blocks.frames, len(blocks.keys), blocks.nbytes, 1)
         whole = fused_surface(
@@ -132,6 +135,7 @@ def extract(
             backend=backend,
         )
         whole = whole if bbox is None else inside_box(whole, bbox)
+        trim()  # the volume of the last slab
         found = _extraction(whole, limits, fused, min_faces=min_faces, keep=keep, backend=backend)
         if not by_evidence:
             return found
@@ -201,6 +205,8 @@ def extract_unbounded(
             # far depths contradict each other more, but their levels have wider bands
             noise = depth_noise(spool, samples, replace(inner, depth_limit=min(inner.depth_median, inner.depth_limit)))
             cascade = cascade.with_truncation(widen_truncation(inner, noise).truncation, noise)
+        del samples
+        trim()
         blocks = find_cascade_blocks(spool, cascade, max_bytes=max_bytes, threads=threads, backend=backend)
         whole = fused_cascade_surface(
             spool,

@@ -28,6 +28,7 @@ from gs2d.core.extras import install
 from gs2d.core.mesh import Mesh, TexturedMesh
 from gs2d.errors import BackendError, ProtocolError
 from gs2d.meshing.raycast import cast_camera
+from gs2d.meshing.simplify import collapse
 
 # -- charts and texels -------------------------------------------------------------------------------------------------
 PADDING = 4  # texels between charts: two smaller copies of the texture do not mix them
@@ -120,11 +121,8 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
         return mesh
     vertices = mesh.vertices.astype(np.float64)
     middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) or 1.0  # the library works in floats
-    points, triangles = required("fast_simplification").simplify(
-        np.ascontiguousarray((vertices - middle) / size, np.float32),
-        np.ascontiguousarray(mesh.faces, np.int32),
-        target_count=faces,
-    )
+    required("fast_simplification")
+    points, triangles = collapse((vertices - middle) / size, mesh.faces, faces)
     return Mesh((points.astype(np.float64) * size + middle).astype(mesh.vertices.dtype), triangles.astype(np.int32))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,14 +18,16 @@ import torch
 from PIL import Image
 
 from gs2d.config.protocols import Protocol
-from gs2d.config.recipe import Recipe
+from gs2d.config.recipe import GradDensify, Recipe
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.data import Scene, View
 from gs2d.data.prepared import decoded_bytes
+from gs2d.data.scene import PointCloud
 from gs2d.errors import DataError, Gs2dError
 from gs2d.pipeline.estimate import full_iterations, seconds_of
 from gs2d.pipeline.events import duration
+from gs2d.pipeline.growth import Growth, densifications, extrapolated, moved_away, seen_fraction, try_growth
 from gs2d.pipeline.memory import DECODING_BYTES, ITERATION_BYTES, MAX_DOWNSCALE
 from gs2d.pipeline.photographs import fits
 from gs2d.render.backends import Backend
@@ -32,12 +35,14 @@ from gs2d.training.plane_sweep import start_points, sweep_views
 from gs2d.training.trainer import Trainer
 
 PROBED_VIEWS, DECODED_VIEWS = 12, 4
+CROWD = 4  # times as many splats, by which it is tried what one more takes
+FAR = 1000.0  # extents, where no photograph shows a splat
 PROGRAM_BYTES = 400 << 20  # torch, the kernels, the scene
 SPLAT_BYTES = 1200  # parameters, moments, gradients and what the rasterizer holds of a splat (docs/performance.md)
 FUSION_BYTES = 270 << 20  # a slab, the surface of a default mesh and what cleans it
 CHECKPOINT_BYTES = 59 * 3 * 4  # of a splat; two checkpoints are kept
 FILE_BYTES = 4 * 61 + 80 + 40  # of a splat: splats.ply, scene.html, the mesh
-GROWTH = (1.0, 4.0, 9.0)  # splats at the end over those at the start: least, expected, most of finished runs
+GROWTH = Growth(1.0, 4.0, 9.0)  # of splats in finished runs, where it cannot be tried
 FIXED_SECONDS = 15  # to start, find the subject, write the page and the report
 DOUBT = 1.5  # by which hours are known where the splats are
 
@@ -141,31 +146,68 @@ class Probe:
 
     Attributes
     ----------
-    start_per_view : float or None
-        Splats that a swept photograph starts; None: training starts from the sparse points.
+    start : int or None
+        Splats that training starts from; None: from the sparse points.
     sweep, decode : float
         Seconds of a photograph.
     packed : float
         Bytes of a prepared pixel.
-    base, slope : float
-        Seconds of an iteration without splats, and of each splat of the capture more.
+    base, seen, unseen : float
+        Seconds of an iteration without splats, and of each splat more that the photograph shows, and does not show.
+    shown : float
+        How much less often the whole capture shows a splat than the photographs that were tried do.
+    growth : Growth or None
+        Splats at the end over those at the start; None: it was not to be tried.
     """
 
-    start_per_view: float | None
+    start: int | None
     sweep: float
     decode: float
     packed: float
     base: float
-    slope: float
+    seen: float
+    unseen: float
+    shown: float
+    growth: Growth | None
 
 
-def middle_views(scene: Scene, count: int) -> list[View]:
-    """Return so many training views that stand nearest to the one in the middle of all."""
-    centers = np.array([view.camera.center for view in scene.train])
+def middle_views(views: Sequence[View], count: int) -> list[View]:
+    """Return so many views that stand nearest to the one in the middle of all."""
+    centers = np.array([view.camera.center for view in views])
     middle = centers[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))]
-    return [
-        scene.train[i] for i in np.sort(np.argsort(np.linalg.norm(centers - middle, axis=1), kind="stable")[:count])
-    ]
+    return [views[i] for i in np.sort(np.argsort(np.linalg.norm(centers - middle, axis=1), kind="stable")[:count])]
+
+
+def swept_views(scene: Scene, recipe: Recipe) -> list[View]:
+    """Return the training views that a dense start chooses to sweep: all, or as many as it takes of many."""
+    views, most = list(scene.train), len(scene.train)
+    if recipe.dense_start is not None:
+        most = min(most, recipe.dense_start.max_views)
+    return [views[int(i)] for i in np.unique(np.linspace(0, len(views) - 1, most).round())]
+
+
+def dense_start_of(part: Scene, scene: Scene, recipe: Recipe) -> int | None:
+    """Return how many splats the dense start of a whole capture makes, from that of a part; None: none can be made.
+
+    The part's are taken as many times as the swept photographs show sparse points for one that the part shows; the
+    points that none of them shows come on top.
+    """
+    assert recipe.dense_start is not None
+    cloud, times, rest = None, len(scene.train) / len(part.train), 0
+    if scene.observe is not None and scene.points is not None:
+        observed = scene.observe()
+        here, swept, everywhere = (
+            np.unique(np.concatenate([observed.seen.get(view.name, np.zeros(0, np.int32)) for view in views]))
+            for views in (part.train, swept_views(scene, recipe), scene.train)
+        )
+        if len(here):
+            cloud, times = PointCloud(observed.points[here]), len(swept) / len(here)
+            rest = len(everywhere) - len(swept)
+    try:
+        sweep = sweep_views(part, recipe.dense_start)
+        return rest + round(times * len(start_points(replace(part, points=cloud), sweep, recipe.dense_start)))
+    except DataError:
+        return None  # training itself says what is done then
 
 
 def probe(scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend) -> Probe:
@@ -176,7 +218,7 @@ def probe(scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend) ->
     Gs2dError
         The recipe cannot begin on them.
     """
-    views = middle_views(scene, PROBED_VIEWS)
+    views = middle_views(scene.train, PROBED_VIEWS)
     begun = time.perf_counter()
     pictures = [view.image() for view in views[:DECODED_VIEWS]]
     decode = (time.perf_counter() - begun) / len(pictures)
@@ -189,20 +231,20 @@ def probe(scene: Scene, recipe: Recipe, protocol: Protocol, backend: Backend) ->
     start, sweep = None, 0.0
     if recipe.dense_start is not None:
         begun = time.perf_counter()
-        try:
-            start = len(
-                start_points(replace(part, points=None), sweep_views(part, recipe.dense_start), recipe.dense_start)
-            )
-        except DataError:
-            start = None  # training itself says what is done then
+        start = dense_start_of(part, scene, recipe)
         sweep = (time.perf_counter() - begun) / len(views)
-    base, slope = _iteration(part, recipe, protocol, backend, len(scene.train))
-    per_view = None if start is None else start / len(views)
-    return Probe(per_view, sweep, decode, float(np.mean(sizes)), base, slope)
+    splats, times = _iteration(part, recipe, protocol, backend)
+    shown = min(1.0, seen_fraction(splats, scene.train) / seen_fraction(splats, part.train))
+    growth, densify = None, recipe.stages[0].densify
+    if isinstance(densify, GradDensify):
+        growth = extrapolated(try_growth(part, recipe, protocol, backend, shown), densifications(densify))
+    return Probe(start, sweep, decode, float(np.mean(sizes)), *times, shown, growth)
 
 
-def _iteration(part: Scene, recipe: Recipe, protocol: Protocol, backend: Backend, views: int) -> tuple[float, float]:
-    """Seconds of an iteration by the splats of the whole capture, from two numbers of splats on a part of it."""
+def _iteration(
+    part: Scene, recipe: Recipe, protocol: Protocol, backend: Backend
+) -> tuple[Splats, tuple[float, float, float]]:
+    """Return splats on a part of a capture, and seconds of an iteration: of none, and of each one seen, and unseen."""
     first, *rest = recipe.stages
     bare = replace(
         recipe,
@@ -213,20 +255,21 @@ def _iteration(part: Scene, recipe: Recipe, protocol: Protocol, backend: Backend
     )
     trainer = Trainer(part, bare, protocol, backend=backend, progress_every=1)
     start = trainer.splats.to("cpu")
-    found: list[tuple[int, float]] = []
-    for splats in (start, crowded(start)):
+    found: list[float] = []
+    for splats in (start, crowded(start), moved_away(start, FAR * part.extent)):
         again = Trainer(part, bare, protocol, backend=backend, init=splats, progress_every=1)
         again.enter(0)
         seconds = seconds_of(again, first.iterations)
         if seconds is None:
             raise DataError("too few iterations to measure; plan a longer schedule")
-        found.append((len(splats), seconds))
-    (few, fast), (many, slow) = found
-    slope = max(slow - fast, 0.0) / max(many - few, 1)
-    return max(fast - slope * few, 0.2 * fast), slope
+        found.append(seconds)
+    count, (once, crowd, beside) = len(start), found
+    seen = max(crowd - once, 0.0) / (count * (CROWD - 1))
+    unseen = min(max(beside - once, 0.0) / count, seen)
+    return start, (max(once - seen * count, 0.2 * once), seen, unseen)
 
 
-def crowded(splats: Splats, times: int = 4) -> Splats:
+def crowded(splats: Splats, times: int = CROWD) -> Splats:
     """Return so many times the splats on the same surface: each has as much less area."""
     generator = torch.Generator().manual_seed(0)
     rows = splats.rows(torch.arange(len(splats)).repeat_interleave(times))
@@ -258,8 +301,8 @@ def plan_capture(
     trained = sum(view.camera.width * view.camera.height for view in scene.views) * shrink
     sparse = 0 if scene.points is None else len(scene.points)
     swept = 0 if recipe.dense_start is None else min(len(scene.train), recipe.dense_start.max_views)
-    start = max(2, sparse) if tried.start_per_view is None else int(swept * tried.start_per_view) + sparse // 4
-    splats, budget = expected_splats(recipe, start), None
+    start = max(2, sparse if tried.start is None else tried.start)
+    splats, budget = expected_splats(recipe, start, tried.growth), None
     prepared = prepare == "always" or (prepare == "auto" and not fits(scene))
     pictures = 0.0 if prepared else decoded_bytes(scene) * shrink
     fixed = PROGRAM_BYTES + pictures + largest / chosen**2 * ITERATION_BYTES * on_host + largest * DECODING_BYTES
@@ -313,10 +356,11 @@ def fitting_downscale(largest: int, downscale: int, allowed: int | None, *, on_h
     )
 
 
-def expected_splats(recipe: Recipe, start: int) -> Range:
-    """Return the splats at the end of a recipe that starts from so many."""
+def expected_splats(recipe: Recipe, start: int, growth: Growth | None = None) -> Range:
+    """Return the splats at the end of a recipe that starts from so many, with the growth that was tried."""
     densifiers = [stage.densify for stage in recipe.stages if stage.densify is not None]
-    grown = [start * factor for factor in (GROWTH if densifiers else (1.0, 1.0, 1.0))]
+    growth = (growth or GROWTH) if densifiers else Growth(1.0, 1.0, 1.0)
+    grown = [start * factor for factor in (growth.least, growth.expected, growth.most)]
     budgets = [getattr(densify, "max_splats", None) for densify in densifiers]
     most = max((budget for budget in budgets if budget is not None), default=None)
     least, expected, largest = (value if most is None else min(value, max(most, start)) for value in grown)
@@ -336,7 +380,8 @@ def _seconds(tried: Probe, recipe: Recipe, scene: Scene, start: int, splats: Ran
     found = []
     for count in asdict(splats).values():
         mean = (start + 3 * count) / 4  # most splats come in the first half
-        iteration = (tried.base + tried.slope * mean) * shrink
+        of_splat = tried.seen * tried.shown + tried.unseen * (1 - tried.shown)
+        iteration = (tried.base + of_splat * mean) * shrink
         found.append(fixed + iteration * (full_iterations(recipe) + 1.2 * len(scene.views)))  # scored, fused
     return Range(found[0] / DOUBT, found[1], found[2] * DOUBT)
 

@@ -16,7 +16,6 @@ import torch
 
 from gs2d.core.files import disk_error
 from gs2d.core.georeference import Georeference
-from gs2d.core.memory import trim
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.data import View
@@ -40,7 +39,7 @@ from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finished import checked_output, open_job
 from gs2d.pipeline.job import Job, RenderedScene
-from gs2d.pipeline.memory import release
+from gs2d.pipeline.memory import release, release_buffers
 from gs2d.pipeline.options import MeshOptions
 from gs2d.pipeline.page import page_run
 from gs2d.pipeline.placed import placed_mesh, placed_output, say_where
@@ -128,7 +127,7 @@ def extract_mesh(
     if not out.parent.is_dir():
         raise disk_error(out, FileNotFoundError(2, "No such file or directory"))
     result = fused(job, splats, options, on_event, subject=subject, seen=seen)
-    trim()
+    release_buffers()
     write_mesh(out, result.mesh if place is None else placed_mesh(result.mesh, place))
     told = {} if place is None else say_where(out, place)
     limits = asdict(result.limits)

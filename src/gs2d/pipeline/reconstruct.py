@@ -44,6 +44,7 @@ from gs2d.sfm.video_frames import is_video, look_into
 from gs2d.sfm.workspace import POSES_JSON, POSES_PNG, hidden_workspace, sweep_workspace
 
 CAPTURE = "capture"
+CLUSTER = "cluster"  # in the run folder: what became of its tasks on the machines of a cluster
 FEW = 24  # photographs, below which each is needed for the surface and none is held out
 NO_NAMES = ("images", "photos", "photographs", "pictures")  # of folders; the one above has a better one
 SHOWN_LOST = 3  # photographs without a place that are named; poses.json has all
@@ -94,7 +95,7 @@ def train_options(options: ReconstructOptions) -> TrainOptions:
         out=options.out,
         format="colmap",
         title=_title(options.photos.resolve()),
-        allowed=(CAPTURE, hidden_workspace(capture).name),
+        allowed=(CAPTURE, hidden_workspace(capture).name, CLUSTER),
         estimate=True,
         **values(Training, options.training),
         **values(HowItRuns, options),
@@ -112,8 +113,19 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
     ------
     Gs2dError
     """
-    quality = _check(options)
+    check_reconstruct(options)
     on_event(Plan((*PLACED, *(TEXTURED_TOO if options.texture else TRAINED))))
+    find_cameras(options, on_event)
+    return train_found(options, on_event)
+
+
+def find_cameras(options: ReconstructOptions, on_event: OnEvent) -> None:
+    """Put the photographs with their cameras into the run folder, or take those that ``resume`` finds there.
+
+    Raises
+    ------
+    Gs2dError
+    """
     capture = options.out / CAPTURE
     if options.resume and (capture / POSES_JSON).exists():
         poses = _same_poses(capture, options)
@@ -125,8 +137,17 @@ def reconstruct(options: ReconstructOptions, on_event: OnEvent = ignore) -> RunF
             if options.overwrite:  # its checkpoints are of other cameras
                 RunFolder(options.out).clear()
         _tell(poses, capture, on_event)
+
+
+def train_found(options: ReconstructOptions, on_event: OnEvent) -> RunFolder:
+    """Train on the cameras that were found; texture the mesh, if it is asked for.
+
+    Raises
+    ------
+    Gs2dError
+    """
     training = replace(train_options(options), overwrite=False)
-    run = train(_by_the_images(training, options, quality, on_event), on_event)
+    run = train(_by_the_images(training, options, on_event), on_event)
     if options.texture and not run.file(TEXTURED).exists():
         with attempted(TEXTURED, again("mesh", run.path, "--texture"), on_event):
             if not run.file(MESH).exists():
@@ -143,13 +164,22 @@ def _title(photos: Path) -> str:
     return photos.parent.name if photos.name.lower() in NO_NAMES and photos.parent.name else photos.name
 
 
-def _check(options: ReconstructOptions) -> Quality:
-    """Refuse what can be refused before anything is made; the schedule and the picture size that are meant."""
-    training, out = train_options(options), options.out
+def _quality(options: ReconstructOptions) -> Quality:
+    """Return the schedule and the picture size that are meant, on the device that this machine trains with."""
     if options.quality not in QUALITIES:
         raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {options.quality}")
-    device = get_backend(training.backend).device
-    quality = QUALITIES[options.quality][device]
+    return QUALITIES[options.quality][get_backend(options.backend).device]
+
+
+def check_reconstruct(options: ReconstructOptions) -> None:
+    """Refuse what can be refused before anything is made.
+
+    Raises
+    ------
+    Gs2dError
+    """
+    training, out = train_options(options), options.out
+    quality = _quality(options)
     downscale = 1 if options.downscale is None else options.downscale
     check_train_options(replace(training, schedule_scale=_scale(options, quality), downscale=downscale))
     check_claim(out, resume=options.resume, overwrite=options.overwrite, allowed=training.allowed)
@@ -162,7 +192,8 @@ def _check(options: ReconstructOptions) -> Quality:
     if training.cache is not None:
         remove_made(make_folder(training.cache))
     if options.resume and (out / CAPTURE / POSES_JSON).exists():
-        return quality
+        _same_poses(out / CAPTURE, options)
+        return
     if options.resume and is_run(out):
         raise RunError(
             f"{out} holds a run without the cameras of `gs2d reconstruct` in {CAPTURE}/; go on with gs2d train, choose "
@@ -175,7 +206,6 @@ def _check(options: ReconstructOptions) -> Quality:
         raise RunError(
             f"{out} holds the cameras of photographs, and no run: go on with --resume, or begin anew with --overwrite"
         )
-    return quality
 
 
 def _scale(options: ReconstructOptions, quality: Quality) -> float:
@@ -266,10 +296,9 @@ def _tell(poses: dict[str, Any], capture: Path, on_event: OnEvent) -> None:
         on_event(Notice(f"... and {len(lost) - SHOWN_LOST} more without a place, in {capture / POSES_JSON}"))
 
 
-def _by_the_images(
-    training: TrainOptions, options: ReconstructOptions, quality: Quality, on_event: OnEvent
-) -> TrainOptions:
+def _by_the_images(training: TrainOptions, options: ReconstructOptions, on_event: OnEvent) -> TrainOptions:
     """Set what depends on the photographs that were placed: image size, and whether some are held out."""
+    quality = _quality(options)
     cameras = [view.camera for view in load_scene(training.scene, format="colmap", test_every=0).views]
     largest = max(cameras, key=lambda camera: max(camera.width, camera.height))
     side = max(largest.width, largest.height)

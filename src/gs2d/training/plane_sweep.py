@@ -280,16 +280,20 @@ def _shrunk(view: View, known: SweepRange, factor: int) -> SmallView:
 def _neighbours(
     scene: Scene, views: Sequence[SmallView], observed: ObservedPoints, settings: DenseStart
 ) -> tuple[tuple[int, ...], ...]:
-    """Return the views that each is compared with: many shared points, and lines of sight some ten degrees apart."""
+    """Return the views that each is compared with: many shared points, and lines of sight some ten degrees apart.
+
+    Of many views those are swept that are chosen evenly, and those that these are compared with: a place counts where
+    depths of several agree.
+    """
     count = len(views)
     centers = np.stack([view.camera.center for view in scene.train])
     shared_points = _shared([observed.seen.get(view.name, np.zeros(0, dtype=np.int64)) for view in scene.train])
-    swept = set(np.unique(np.linspace(0, count - 1, min(count, settings.max_views)).round().astype(int)).tolist())
-    found: list[tuple[int, ...]] = []
-    for index, (view, small) in enumerate(zip(scene.train, views, strict=True)):
-        if small.far == 0 or index not in swept:
-            found.append(())
-            continue
+    chosen = np.unique(np.linspace(0, count - 1, min(count, settings.max_views)).round().astype(int)).tolist()
+
+    def compared(index: int) -> tuple[int, ...]:
+        view, small = scene.train[index], views[index]
+        if small.far == 0:
+            return ()
         target = view.camera.center + view.camera.forward * float(np.median(small.depth))
         mine, theirs = view.camera.center - target, centers - target
         lengths = np.maximum(np.linalg.norm(theirs, axis=1) * np.linalg.norm(mine), 1e-12)
@@ -300,8 +304,12 @@ def _neighbours(
         width = np.where(angle < BEST_ANGLE, NARROW, WIDE)
         worth = np.where(fits, shared * np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * width**2)), 0.0)
         order = np.argsort(-worth, kind="stable")[: settings.neighbours]
-        found.append(tuple(int(i) for i in order if worth[i] > 0))
-    return tuple(found)
+        return tuple(int(i) for i in order if worth[i] > 0)
+
+    found = {index: compared(index) for index in chosen}
+    for index in sorted({other for others in found.values() for other in others} - found.keys()):
+        found[index] = compared(index)
+    return tuple(found.get(index, ()) for index in range(count))
 
 
 def _shared(rows: Sequence[np.ndarray]) -> Any:
