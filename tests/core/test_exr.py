@@ -11,6 +11,7 @@ import pytest
 
 from gs2d.core import exr
 from gs2d.core.images import image_size, read_grey, read_image
+from gs2d.core.light import encode_srgb
 from gs2d.data import load_scene
 from gs2d.data.priors import read_depth
 from gs2d.errors import DataError
@@ -49,7 +50,7 @@ def test_halves_tiles_of_one_channel_and_compressions_are_read_too(tmp_path: Pat
         )
         image = read_image(path)
         assert (image == image[..., :1]).all()
-        assert np.array_equal(image[..., 0], np.rint(255 * exr.encode_srgb(grey.astype(np.float32))))
+        assert np.array_equal(image[..., 0], np.rint(255 * encode_srgb(grey.astype(np.float32))))
 
 
 def test_alpha_is_taken_out_of_the_colours(tmp_path: Path) -> None:

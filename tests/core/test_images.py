@@ -68,12 +68,6 @@ def test_a_picture_that_is_missing_broken_or_cut_is_an_error_that_names_it(tmp_p
         assert "\n" not in str(caught.value)
 
 
-def test_a_picture_of_floats_is_refused_because_nobody_knows_what_is_white_in_it(tmp_path: Path) -> None:
-    Image.fromarray(np.full((4, 5), 0.5, np.float32)).save(tmp_path / "f.tif")
-    with pytest.raises(DataError, match=r"f\.tif does not decode: its pixels are floats"):
-        read_image(tmp_path / "f.tif")
-
-
 def test_a_picture_of_far_too_many_pixels_is_told_to_be_shrunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Image.new("L", (40, 30)).save(tmp_path / "x.png")
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 500)  # Pillow refuses twice as many

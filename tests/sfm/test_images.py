@@ -265,6 +265,20 @@ def test_sixteen_bits_and_other_formats_become_png_of_eight(tmp_path: Path) -> N
         assert (file.format, file.mode, file.getpixel((0, 0))) == ("PNG", "RGB", (156,) * 3)  # 40000 / 257 = 155.6
 
 
+def test_floats_become_png_of_their_display_values(tmp_path: Path) -> None:
+    openexr, tifffile = pytest.importorskip("OpenEXR"), pytest.importorskip("tifffile")
+    root, light = tmp_path / "photos", np.linspace(0, 1.2, 24 * 16 * 3, dtype=np.float32).reshape(16, 24, 3)
+    image(root / "0.jpg")
+    facts = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    openexr.File(facts, {"RGB": light}).write(str(root / "1.exr"))
+    tifffile.imwrite(root / "2.tif", light, photometric="rgb")
+    assert find_photos(root)[1] == ()
+    assert stage(root, tmp_path / "images") == ["copied", "converted", "converted"]
+    for name in ("1.exr", "2.tif"):
+        np.testing.assert_array_equal(read_image(tmp_path / "images" / f"{name}.png"), read_image(root / name))
+    np.testing.assert_array_equal(read_image(root / "1.exr"), read_image(root / "2.tif"))
+
+
 @pytest.mark.skipif(not AVIF, reason="this Pillow has no AVIF")
 def test_avif_becomes_upright_png(tmp_path: Path) -> None:
     root = tmp_path / "photos"

@@ -69,7 +69,7 @@ OPTIONAL = (
         _programs(FFMPEG, "ffmpeg", "ffprobe"),
     ),
     Wanted("heic", "HEIC photographs, as of an iPhone", _heic),
-    Wanted("exr", "OpenEXR photographs and depth maps", _packages("exr", "OpenEXR")),
+    Wanted("exr", "photographs of floats, OpenEXR depth maps", _packages("exr", "OpenEXR", "tifffile")),
     Wanted("geo", "maps (gs2d georeference --gps, orthophoto)", _packages("geo", "pyproj", "tifffile")),
     Wanted(
         "markers",

@@ -46,12 +46,15 @@ class Taken:
         Latitude and longitude (degrees, WGS 84) and height (m); a height that is missing is NaN.
     seconds : float or None
         When, on the clock of the camera, which knows no time zone; comparable among photographs only.
+    panorama : str
+        "whole" or "part" of an equirectangular 360-degree panorama, as XMP says (GPano); empty where it does not.
     """
 
     orientation: int = _UPRIGHT
     made_by: tuple[str, ...] = ("",) * 5
     place: tuple[float, float, float] | None = None
     seconds: float | None = None
+    panorama: str = ""
 
 
 def read_taken(path: Path) -> Taken:
@@ -65,10 +68,10 @@ def read_taken(path: Path) -> Taken:
             tags = [exif.get(base.Make), exif.get(base.Model)]
             tags += [details.get(tag) for tag in (base.LensModel, base.FocalLength, base.FocalLengthIn35mmFilm)]
             made_by = tuple("" if tag is None else str(tag).strip("\0 ") for tag in tags)
-            place, seconds = _place(exif, xmp), _seconds(exif, details)
+            place, seconds, panorama = _place(exif, xmp), _seconds(exif, details), _panorama(xmp)
     except DAMAGED_EXIF:
         return Taken()
-    return Taken(orientation if orientation in _ORIENTATIONS else _UPRIGHT, made_by, place, seconds)
+    return Taken(orientation if orientation in _ORIENTATIONS else _UPRIGHT, made_by, place, seconds, panorama)
 
 
 def read_place(path: Path) -> np.ndarray | None:
@@ -81,6 +84,17 @@ def _xmp(file: Image.Image) -> str:
     """Return the XMP block as text: attributes and elements are looked for by name, so that no XML is parsed."""
     block = file.info.get("xmp") or file.info.get("XML:com.adobe.xmp") or b""
     return block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block)
+
+
+def _panorama(xmp: str) -> str:
+    """Return "whole", "part" or nothing: Google's Photo Sphere XMP, which 360-degree cameras and stitchers write."""
+    if _found(xmp, "ProjectionType").lower() != "equirectangular":
+        return ""
+    sides = [
+        (_found(xmp, f"CroppedAreaImage{side}Pixels"), _found(xmp, f"FullPano{side}Pixels"))
+        for side in ("Width", "Height")
+    ]
+    return "part" if any(shown != whole for shown, whole in sides if shown and whole) else "whole"
 
 
 # -- where -------------------------------------------------------------------------------------------------------------

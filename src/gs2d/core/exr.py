@@ -17,6 +17,7 @@ import numpy as np
 
 from gs2d.core.extras import install
 from gs2d.core.growth import check_growth
+from gs2d.core.light import display_values
 from gs2d.errors import DataError
 
 SUFFIX = ".exr"
@@ -161,22 +162,7 @@ def display_image(path: str | os.PathLike[str]) -> np.ndarray:
     if names[0] not in channels:
         have = ", ".join(sorted(channels)) or "none"
         raise DataError(f"{os.fspath(path)} must have the channels R, G and B, or Y, got {have}; export colours")
-    light = np.stack([np.nan_to_num(channels[name], nan=0.0, posinf=1.0, neginf=0.0) for name in names], axis=-1)
-    if "A" not in channels:
-        return _to_bytes(encode_srgb(light))
-    alpha = np.clip(np.nan_to_num(channels["A"], nan=0.0), 0.0, 1.0)[..., None]
-    straight = np.divide(light, alpha, out=np.zeros_like(light), where=alpha > 0)
-    return _to_bytes(np.concatenate([encode_srgb(straight), alpha], axis=-1))
-
-
-def encode_srgb(light: np.ndarray) -> np.ndarray:
-    """Return the display values in [0, 1] of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
-    light = np.clip(light, 0.0, 1.0)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-
-
-def _to_bytes(values: np.ndarray) -> np.ndarray:
-    return np.asarray(np.rint(255 * values).astype(np.uint8))
+    return display_values(np.stack([channels[name] for name in names], axis=-1), channels.get("A"), associated=True)
 
 
 def grey_values(path: str | os.PathLike[str]) -> np.ndarray:

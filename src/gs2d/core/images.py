@@ -15,7 +15,7 @@ from typing import IO
 import numpy as np
 from PIL import Image
 
-from gs2d.core import exr
+from gs2d.core import exr, float_tiff
 from gs2d.core.checks import check_shapes
 from gs2d.core.files import atomic_write
 from gs2d.core.growth import check_growth
@@ -35,6 +35,11 @@ def natural_key(name: str) -> tuple[list[str | int], str]:
     parts: list[str | int] = list(re.split("([0-9]+)", name))  # text, number, text ...: neighbours are of one kind
     parts[1::2] = [int(part) for part in parts[1::2]]
     return parts, name
+
+
+def is_twice_as_wide(width: int, height: int) -> bool:
+    """Whether an image has the shape of an equirectangular panorama, up to a hundredth."""
+    return min(width, height) >= 1 and abs(width / (2 * height) - 1) <= 0.01
 
 
 def is_number(text: str) -> bool:
@@ -101,8 +106,15 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     if exr.is_exr(path):
         header = exr.read_header(path)
         return header.width, header.height
+    if (floats := float_tiff.float_header(path)) is not None:
+        return floats.width, floats.height
     with _opened(path, "{path} must be an image, got: {error}") as file:
         return file.size
+
+
+def is_float(path: str | os.PathLike[str]) -> bool:
+    """Whether a photograph is of floats: linear light, of which display values are made."""
+    return exr.is_exr(path) or float_tiff.float_header(path) is not None
 
 
 _UNDECODED = "image {path} does not decode: {error}; replace or remove the file"
@@ -126,10 +138,10 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """
     if exr.is_exr(path):
         return exr.display_image(path)
+    if (floats := float_tiff.float_header(path)) is not None:
+        return float_tiff.display_image(path, floats)
     with _opened(path, _UNDECODED) as file:
         _check_pixels(path, file, 4)
-        if file.mode == "F":
-            raise ValueError("its pixels are floats of no known range, 8 or 16 bits are read; convert it")
         if file.mode.startswith("I;16") or file.mode == "I":
             grey = np.clip(np.asarray(file, dtype=np.float64) / 257.0, 0, 255)  # 65535 / 255 = 257
             return np.repeat(np.round(grey).astype(np.uint8)[:, :, None], 3, axis=2)

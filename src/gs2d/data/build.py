@@ -383,14 +383,18 @@ def _observed(capture: Capture, frames: Sequence[PosedImage]) -> Callable[[], Ob
         return None
     observe = functools.cache(capture.observe)  # asked for by view after view
     wholes = {frame.path: frame.name for frame in capture.frames}
-    parts = {frame.name: wholes[frame.path] for frame in frames if frame.face is not None}
+    parts = [frame for frame in frames if frame.face is not None]
     if not parts:
         return observe
 
     def by_face() -> ObservedPoints:
         found = observe()
-        seen = {name: found.seen[whole] for name, whole in parts.items() if whole in found.seen}
-        return replace(found, seen={**found.seen, **seen})
+        seen = dict(found.seen)
+        for part in parts:
+            if (rows := found.seen.get(wholes[part.path])) is not None:
+                x, y, z = part.T_cam_world[:3, :3] @ found.points[rows].T + part.T_cam_world[:3, 3:]
+                seen[part.name] = rows[np.maximum(abs(x), abs(y)) < z]
+        return replace(found, seen=seen)
 
     return functools.cache(by_face)
 

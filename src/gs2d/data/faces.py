@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gs2d.core.images import is_twice_as_wide
 from gs2d.data.undistort import Intrinsics, Lens
 from gs2d.errors import DataError
 
@@ -23,7 +24,6 @@ PANORAMA = "equirectangular"
 WIDEST = 120.0  # degrees: a wider fisheye is cut; in a pinhole image of it the rim would be stretched fourfold
 LEAST_SHOWN = 0.02  # of a face's pixels that the photograph must show; a sliver teaches nothing
 _GLANCE = 64  # px of a face, to see how much of it is shown
-_ASPECT = 0.01  # by which a panorama may differ from 2:1
 _TURNS = {  # degrees to the right, then up
     "front": (0, 0),
     "right": (90, 0),
@@ -66,7 +66,7 @@ def panorama(width: int, height: int, where: str) -> Intrinsics:
     DataError
         It is not twice as wide as high.
     """
-    if min(width, height) < 1 or abs(width / (2 * height) - 1) > _ASPECT:
+    if not is_twice_as_wide(width, height):
         raise DataError(
             f"{where}: an equirectangular panorama must be twice as wide as high, got {width}x{height}; was it cropped?"
         )

@@ -18,7 +18,9 @@ from gs2d.config.recipe import Recipe
 from gs2d.errors import RecipeError
 
 Robust = Literal["auto", "on", "off"]
-LensModel = Literal["auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+LensModel = Literal[
+    "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
+]
 Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1, world units
 KnownDistance = tuple[float, float, float, float, float, float, float]  # two points of the run, metres
 BoxOption = Annotated[Box | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1")]

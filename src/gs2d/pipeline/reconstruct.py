@@ -299,7 +299,8 @@ def _tell(poses: dict[str, Any], capture: Path, on_event: OnEvent) -> None:
 def _by_the_images(training: TrainOptions, options: ReconstructOptions, on_event: OnEvent) -> TrainOptions:
     """Set what depends on the photographs that were placed: image size, and whether some are held out."""
     quality = _quality(options)
-    cameras = [view.camera for view in load_scene(training.scene, format="colmap", test_every=0).views]
+    views = load_scene(training.scene, format="colmap", test_every=0).views
+    cameras, photographs = [view.camera for view in views], len({view.path for view in views})
     largest = max(cameras, key=lambda camera: max(camera.width, camera.height))
     side = max(largest.width, largest.height)
     downscale = options.downscale or max(1, math.floor(side / quality.side + 0.5))
@@ -312,7 +313,7 @@ def _by_the_images(training: TrainOptions, options: ReconstructOptions, on_event
             f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
         )
     )
-    if training.test_every is None and training.protocol == "auto" and len(cameras) < FEW:
+    if training.test_every is None and training.protocol == "auto" and photographs < FEW:
         on_event(Notice(f"all photographs train, because they are fewer than {FEW} (--test-every 8 holds some out)"))
         chosen = replace(chosen, test_every=0)
     return chosen

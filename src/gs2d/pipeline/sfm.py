@@ -29,10 +29,20 @@ from gs2d.pipeline.photo_places import Places, places_of
 from gs2d.pipeline.plan import PLACED
 from gs2d.sfm.colmap import Facts, Group, Request, Solved, check_installed, layers, read_facts, solve
 from gs2d.sfm.image_copies import copy_images
-from gs2d.sfm.images import FEWEST, Photo, camera_groups, find_photos, in_order_taken, read_photos, rig_folders
+from gs2d.sfm.images import (
+    FEWEST,
+    Photo,
+    camera_groups,
+    find_photos,
+    in_order_taken,
+    panorama_groups,
+    read_photos,
+    rig_folders,
+)
 from gs2d.sfm.lens import START, lens_line
 from gs2d.sfm.masks import copy_masks, masks_of
 from gs2d.sfm.model import SfmModel, camera_line, check_any, focal_length, read_model, why_not_placed
+from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.plot import write_image_of
 from gs2d.sfm.search import DATABASE, SEARCH, forget, go_on, is_of
 from gs2d.sfm.video_frames import MAX_FRAMES, Video, choose, is_video, look_into, sharpness_of, take
@@ -48,7 +58,7 @@ from gs2d.sfm.workspace import (
     workspace,
 )
 
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", PANORAMA)
 MATCHINGS = ("auto", "exhaustive", "sequential", "similar", "spatial")
 MAPPERS = ("auto", "incremental", "global")
 MANY = 500  # photographs, from which on "auto" places all at once (docs/decisions/sfm.md)
@@ -297,6 +307,10 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
         on_event(Notice(note))
     sizes = [photo.size_within(options.max_size) for photo in photos]
     groups = camera_groups(photos, sizes, options.cameras)
+    panoramas, lines = panorama_groups(photos, groups, options.camera_model)
+    for line in lines:
+        on_event(Notice(line))
+    lens = START if options.camera_model == "auto" else options.camera_model
     order, ordered_by = in_order_taken(photos)
     return Request(
         images=str(work / STAGED / IMAGES),
@@ -305,11 +319,11 @@ def _request(options: PosesOptions, work: Path, photos: Sequence[Photo], threads
         groups=tuple(
             Group(
                 tuple(photos[i].name for i in group),
-                START if options.camera_model == "auto" else options.camera_model,
+                PANORAMA if is_panorama else lens,
                 sizes[group[0]],
                 str(photos[group[0]].source.resolve()),
             )
-            for group in groups
+            for group, is_panorama in zip(groups, panoramas, strict=True)
         ),
         in_order=tuple(photos[i].name for i in order),
         ordered_by=ordered_by,

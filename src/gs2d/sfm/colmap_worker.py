@@ -26,6 +26,7 @@ from gs2d.sfm.assemble import merged, mount
 from gs2d.sfm.compare import find_features, likeness, match
 from gs2d.sfm.grow import grow_all, grow_on
 from gs2d.sfm.lens import START, adjust, apply, choose, doubts, drop_outliers, models_to_try, try_lenses
+from gs2d.sfm.panoramas import PANORAMA
 from gs2d.sfm.place_all import place_all
 from gs2d.sfm.search import MAPPING
 from gs2d.sfm.steps import Steps
@@ -195,6 +196,8 @@ def _settle_lens(pycolmap: Any, request: dict[str, Any], piece: Any, steps: Step
 def _lens_of(pycolmap: Any, request: dict[str, Any], piece: Any, say: Say) -> dict[str, Any]:
     """Compare lenses where none was asked for, or where the one that was is doubtful; the best is in the model then."""
     asked = request["asked_lens"]
+    if all(camera.model.name == PANORAMA for camera in piece.cameras.values()):
+        return {"chosen": PANORAMA, "asked": asked, "trials": []}
     if asked == "OPENCV_FISHEYE" or (asked and not any(map(doubts, piece.cameras.values()))):
         return {"chosen": asked, "asked": asked, "trials": []}
     say(phase="lenses", total=len(models_to_try(asked)))

@@ -17,6 +17,7 @@ import numpy as np
 
 from gs2d.core.files import atomic_write
 from gs2d.sfm.pairs import Chosen, chosen, near_pairs, neighbour_pairs, similar_pairs
+from gs2d.sfm.panoramas import FINER, PANORAMA
 
 Say = Callable[..., None]
 ALIKE = "alike.json"  # beside the database: which photographs look alike
@@ -34,12 +35,14 @@ def find_features(pycolmap: Any, request: dict[str, Any], say: Say) -> None:
         _list(pycolmap, request)
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = request["threads"]
-    options.max_image_size = request["feature_size"]
     mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
     if request.get("masks"):
         reader.mask_path = request["masks"]
-    names = [name for group in request["groups"] for name in group["names"]]
-    pycolmap.extract_features(database, images, names, mode, reader, options, pycolmap.Device.cpu)
+    for finer in (1, FINER):
+        options.max_image_size = finer * request["feature_size"]
+        groups = [group for group in request["groups"] if (group["camera_model"] == PANORAMA) is (finer == FINER)]
+        if names := [name for group in groups for name in group["names"]]:
+            pycolmap.extract_features(database, images, names, mode, reader, options, pycolmap.Device.cpu)
 
 
 def _listed(database: str) -> int:
@@ -65,8 +68,12 @@ def _list(pycolmap: Any, request: dict[str, Any]) -> None:
 def _prior(pycolmap: Any, group: dict[str, Any]) -> str:
     """Camera parameters from the EXIF block of the group's first original; empty without a focal length in it.
 
+    A panorama has no others than its size.
+
     Of the original, because COLMAP takes some of the tags as pixels, which a smaller copy has fewer of.
     """
+    if group["camera_model"] == PANORAMA:
+        return ", ".join(map(str, group["size"]))
     try:
         original = pycolmap.infer_camera_from_image(group["original"])
     except (RuntimeError, ValueError):  # a format that COLMAP does not read; the copy is one that it does

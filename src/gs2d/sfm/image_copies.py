@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 
 from gs2d.core.exif import DAMAGED_EXIF
 from gs2d.core.files import atomic_write, disk_error
-from gs2d.core.images import open_image, read_image
+from gs2d.core.images import is_float, open_image, read_image
 from gs2d.errors import DataError
 from gs2d.sfm.images import JPEG, Photo, turn
 
@@ -90,7 +90,12 @@ def _rewrite(photo: Photo, target: Path, size: tuple[int, int]) -> None:
 
 
 def _kept(source: Path) -> dict[str, bytes]:
-    """Return an image's colour profile (of RGB only: pixels are RGB now) and EXIF block for Pillow's ``save``."""
+    """Return an image's colour profile (of RGB only: pixels are RGB now) and EXIF block for Pillow's ``save``.
+
+    Of floats nothing is kept: they are sRGB values now, and Pillow does not open all of them.
+    """
+    if is_float(source):
+        return {}
     with open_image(source) as file:
         profile = file.info.get("icc_profile") if file.mode in ("RGB", "RGBA") else None
         kept = {"icc_profile": profile} if profile else {}

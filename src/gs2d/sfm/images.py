@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,10 +14,13 @@ from pathlib import Path
 
 from PIL import Image, features
 
+from gs2d.core import exr
 from gs2d.core.exif import Taken, read_taken
-from gs2d.core.images import natural_key, read_image
+from gs2d.core.extras import install
+from gs2d.core.images import is_twice_as_wide, natural_key, read_image
 from gs2d.data.masks import ENDING, FOLDER
 from gs2d.errors import DataError
+from gs2d.sfm.panoramas import PANORAMA, meets_itself
 from gs2d.sfm.video_frames import VIDEOS
 
 
@@ -32,9 +36,10 @@ def _reads_heif() -> bool:
 JPEG, PNG = (".jpg", ".jpeg"), (".png",)
 AVIF = (".avif",) if "avif" in features.modules and features.check("avif") else ()  # Pillow 11.3 and newer
 HEIF = (".heic", ".heif") if _reads_heif() else ()
-CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF, *HEIF)
+EXR = (exr.SUFFIX,) if importlib.util.find_spec("OpenEXR") is not None else ()
+CONVERTED = (".bmp", ".tif", ".tiff", ".webp", *AVIF, *HEIF, *EXR)
 UNREAD = (".heic", ".heif", ".avif")  # without a package for them, by an older Pillow
-RAWS = (*UNREAD, ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+RAWS = (*UNREAD, exr.SUFFIX, ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 _KINDS = {
     suffix: kind
     for kind, suffixes in (("raw", RAWS), ("video", VIDEOS), ("photo", JPEG + PNG + CONVERTED))
@@ -69,6 +74,8 @@ class Photo:
         Width and height as it is seen, px: after its EXIF orientation.
     taken : Taken
         What the file says of how it was taken; its orientation is what is left to be turned.
+    is_sphere : bool
+        Its picture looks like that of a whole sphere (``panoramas.meets_itself``).
     """
 
     source: Path
@@ -76,6 +83,7 @@ class Photo:
     name: str
     size: tuple[int, int]
     taken: Taken
+    is_sphere: bool = False
 
     @property
     def orientation(self) -> int:
@@ -162,6 +170,8 @@ def _raw_remedy(path: Path) -> str:
     kind = path.suffix.lower()
     if kind in (".heic", ".heif"):
         return f"pip install pi-heif (its wheel holds LGPL code) to have {kind[1:].upper()} read, or convert to JPEG"
+    if kind == exr.SUFFIX:
+        return f"{install('exr')} to have OpenEXR read"
     if kind in UNREAD:
         return f"{kind[1:].upper()} is not decoded here; convert to JPEG (magick mogrify -format jpg *{path.suffix})"
     return f"raw files ({kind}) are not developed here; export JPEG or PNG from your photo program"
@@ -181,11 +191,13 @@ def read_photos(paths: Sequence[Path], root: Path, *, threads: int) -> Iterator[
 
 
 def _read(path: Path, root: Path, name: str) -> Photo:
-    height, width = read_image(path).shape[:2]
+    image = read_image(path)
+    height, width = image.shape[:2]
     taken = read_taken(path)
     orientation = 1 if path.suffix.lower() in (".tif", ".tiff") else taken.orientation  # which Pillow has turned
     size = (height, width) if orientation >= 5 else (width, height)
-    return Photo(path, path.relative_to(root).as_posix(), name, size, replace(taken, orientation=orientation))
+    taken = replace(taken, orientation=orientation)
+    return Photo(path, path.relative_to(root).as_posix(), name, size, taken, meets_itself(image))
 
 
 def _names(labels: Sequence[str]) -> list[str]:
@@ -232,6 +244,56 @@ def camera_groups(photos: Sequence[Photo], sizes: Sequence[tuple[int, int]], cam
     for i, (photo, size) in enumerate(zip(photos, sizes, strict=True)):
         groups.setdefault((os.path.dirname(photo.name), size, photo.taken.made_by), []).append(i)
     return list(groups.values())
+
+
+def panorama_groups(
+    photos: Sequence[Photo], groups: Sequence[Sequence[int]], camera_model: str
+) -> tuple[list[bool], list[str]]:
+    """Return which groups of photographs of one camera are panoramas, and lines for people.
+
+    Parameters
+    ----------
+    groups : sequence of sequences of int
+        Numbers of photographs of one camera each, of one size.
+    camera_model : str
+        As the user asks: "auto" looks, ``PANORAMA`` says that all are, another one that none is.
+
+    Raises
+    ------
+    DataError
+        A panorama that is not whole.
+    """
+    if camera_model not in ("auto", PANORAMA):
+        return [False] * len(groups), []
+    found, doubted = [], 0
+    for group in groups:
+        first = photos[group[0]]
+        said = [photos[i].taken.panorama for i in group]
+        looks = 2 * sum(photos[i].is_sphere for i in group) >= len(group)
+        is_one = camera_model == PANORAMA or "whole" in said or looks
+        if "part" in said:
+            raise _not_whole(photos[group[said.index("part")]], "as its XMP says")
+        if is_one and not is_twice_as_wide(*first.size):
+            raise _not_whole(first, "which is not twice as wide as high")
+        found.append(is_one)
+        doubted += 0 if is_one or not is_twice_as_wide(*first.size) else len(group)
+    count = sum(len(group) for group, is_one in zip(groups, found, strict=True) if is_one)
+    about = f"{count} photographs are 360-degree panoramas: each has one place, and is trained in faces"
+    lines = [about] if count else []
+    if doubted:
+        lines.append(
+            f"{doubted} photographs are twice as wide as high, but their edges do not meet: taken as ordinary ones "
+            f"(--camera-model {PANORAMA} if they are panoramas)"
+        )
+    return found, lines
+
+
+def _not_whole(photo: Photo, why: str) -> DataError:
+    width, height = photo.size
+    return DataError(
+        f"{photo.label} must be a whole panorama, 360 by 180 degrees in 2:1, got a part of one, {width}x{height}, "
+        f"{why}; export it whole (what is missing in black, with a mask), or say what lens it is (--camera-model)"
+    )
 
 
 def rig_folders(photos: Sequence[Photo], groups: Sequence[Sequence[int]]) -> tuple[str, ...]:

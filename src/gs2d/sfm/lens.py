@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.sfm.panoramas import PANORAMA
+
 PARAMETERS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 5}  # that are learnt, the fewest first
 MODELS = tuple(PARAMETERS)
 START = "SIMPLE_RADIAL"  # what cameras are placed with before lenses are compared
@@ -58,6 +60,8 @@ def doubts(camera: Any, limits: Believable = Believable()) -> list[str]:
     ----------
     camera : pycolmap.Camera
     """
+    if camera.model.name == PANORAMA:
+        return []
     width, height = camera.width, camera.height
     fx, fy = camera.focal_length_x, camera.focal_length_y
     if not np.isfinite(camera.params).all() or min(fx, fy) <= 0:
@@ -167,22 +171,21 @@ def try_lenses(
     """
     base = _part(pycolmap, piece)
     held = _hold_out(base, seed)
-    before = {number: _plain(camera) for number, camera in base.cameras.items()}
+    before = _lenses(base)
     images = _images(piece)
     trials = []
     for done, model in enumerate(models_to_try(asked), start=1):
         copy = pycolmap.Reconstruction(base)
-        for number, camera in copy.cameras.items():
+        for number in before if model != asked else ():
             rich = images.get(number, 0) >= ENOUGH or PARAMETERS.get(model, 0) <= PARAMETERS[START]
-            if model != asked:
-                _set_model(pycolmap, camera, model if rich else START, before[number])
+            _set_model(pycolmap, copy.camera(number), model if rich else START, before[number])
         adjust(pycolmap, copy, tied=model == "OPENCV" and model != asked, threads=threads)
         found = sorted({doubt for camera in copy.cameras.values() for doubt in doubts(camera)})
         numbers = {number: [float(p) for p in camera.params] for number, camera in copy.cameras.items()}
         kinds = {number: camera.model.name for number, camera in copy.cameras.items()}
         trials.append(Trial(model, _error(copy, held), tuple(found), numbers, kinds))
         if model == "RADIAL":
-            before = {number: _plain(camera) for number, camera in copy.cameras.items()}
+            before = _lenses(copy)
         on_done(done)
     return trials
 
@@ -254,6 +257,11 @@ def _plain(camera: Any) -> tuple[float, float, float, list[float]]:
     """Focal length, principal point, and distortion."""
     extra = [float(camera.params[i]) for i in camera.extra_params_idxs()]
     return camera.mean_focal_length(), camera.principal_point_x, camera.principal_point_y, extra
+
+
+def _lenses(piece: Any) -> dict[int, tuple[float, float, float, list[float]]]:
+    """Return what is known of each camera that has a lens to be compared: all but panoramas."""
+    return {number: _plain(camera) for number, camera in piece.cameras.items() if camera.model.name != PANORAMA}
 
 
 def _set_model(pycolmap: Any, camera: Any, model: str, plain: tuple[float, float, float, list[float]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from gs2d.data.readers.colmap import (
 )
 from gs2d.errors import DataError
 from gs2d.sfm.colmap import Facts
+from gs2d.sfm.panoramas import PANORAMA
 
 _MAX_ANGLES = 2000
 FEW_FEATURES = 50  # of a photograph: fewer verify nothing
@@ -159,6 +161,8 @@ def _first(names: Mapping[str, int]) -> str:
 
 def camera_line(camera: ColmapCamera, images: int) -> str:
     """One line about an estimated camera: model, focal length, field of view."""
+    if camera.model == PANORAMA:
+        return f"{camera.model} of {images} photographs, {camera.width}x{camera.height} (360 degrees wide)"
     focal = focal_length(camera)
     angle = np.degrees(2 * np.arctan(camera.width / (2 * focal)))
     return (
@@ -168,5 +172,7 @@ def camera_line(camera: ColmapCamera, images: int) -> str:
 
 
 def focal_length(camera: ColmapCamera) -> float:
-    """px; the first parameter of every model of COLMAP."""
+    """px; the first parameter of every model of COLMAP, but for panoramas: px a radian."""
+    if camera.model == PANORAMA:
+        return camera.width / (2 * math.pi)
     return float(camera.params[0])

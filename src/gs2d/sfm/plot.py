@@ -11,6 +11,7 @@ from gs2d.sfm.model import SfmModel, focal_length
 
 MAX_POINTS = 20_000
 _VIEWS = (("from above", 0, 1), ("from the side", 0, 2))
+_WIDEST = 1.0  # half the width of what a wedge shows, at the distance 1: panoramas and fisheyes show more
 _WEDGE = 0.06  # length of a camera's wedge, of the picture's width
 _CAMERA = "#d62728"
 
@@ -70,7 +71,7 @@ def _wedge(
 ) -> np.ndarray:
     """Return what a camera sees, from its centre to the two ends of its picture's middle row: [4, 2], closed."""
     camera = piece.cameras[camera_id]
-    half = camera.width / (2 * focal_length(camera))
+    half = min(_WIDEST, camera.width / (2 * focal_length(camera)))
     ends = np.array([[-half, 0.0, 1.0], [half, 0.0, 1.0]]) @ T_cam_world[:3, :3]
     length = _WEDGE * float(box.max())
     path = np.stack([center, center + length * ends[0], center + length * ends[1], center])

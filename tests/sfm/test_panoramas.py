@@ -1,0 +1,205 @@
+"""360-degree panoramas without cameras: which photographs are some, their places, and what training makes of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.wide_captures import (
+    HIGH,
+    LOW,
+    Rays,
+    errors,
+    fisheye_rays,
+    panorama_rays,
+    photograph,
+    walk,
+    walls,
+    write_photographs,
+)
+from PIL import Image
+
+from gs2d.cli import run
+from gs2d.config.robust import DenseStart
+from gs2d.core.camera import Camera
+from gs2d.core.json_files import read_json
+from gs2d.core.similarity import apply, umeyama
+from gs2d.data import load_scene
+from gs2d.data.readers.colmap import read_cameras, read_images
+from gs2d.errors import DataError
+from gs2d.pipeline.events import Event, Notice
+from gs2d.pipeline.options import PosesOptions
+from gs2d.pipeline.sfm import find_poses
+from gs2d.sfm.images import Photo, camera_groups, find_photos, panorama_groups, read_photos
+from gs2d.sfm.panoramas import meets_itself
+from gs2d.training.plane_sweep import start_points, sweep_views
+from room_photos import room_cameras, room_image, textures
+
+WIDTH = 768
+WHOLE = (
+    '<rdf:Description GPano:ProjectionType="equirectangular" GPano:CroppedAreaImageWidthPixels="128" '
+    'GPano:FullPanoWidthPixels="128" GPano:CroppedAreaImageHeightPixels="64" GPano:FullPanoHeightPixels="64"/>'
+)
+PART = WHOLE.replace('FullPanoHeightPixels="64"', 'FullPanoHeightPixels="128"')
+
+
+def one(rays: Rays, size: tuple[int, int]) -> np.ndarray:
+    return photograph(walls(), walk(1, tilt=20, turn=180)[0], rays, size)
+
+
+def ordinary(width: int, height: int) -> np.ndarray:
+    camera = room_cameras(3, width=width, height=height, focal=0.8 * width)[1]
+    return room_image(camera, textures())
+
+
+def two_circles() -> np.ndarray:
+    """What cameras with two fisheyes store before it is stitched."""
+    circle = one(fisheye_rays(256, 256, 190), (256, 256))
+    return np.concatenate([circle, circle[:, ::-1]], axis=1)
+
+
+def test_a_picture_of_a_whole_sphere_meets_itself_and_others_of_its_shape_do_not() -> None:
+    assert meets_itself(one(panorama_rays(512), (512, 256)))
+    assert not meets_itself(one(panorama_rays(512), (512, 256))[:, 40:-40])
+    assert not meets_itself(ordinary(512, 256))
+    assert not meets_itself(two_circles())
+    sky = ordinary(512, 256)
+    sky[:60] = (120, 160, 220)  # a top row of one colour is no sphere yet
+    assert not meets_itself(sky)
+
+
+def photos_of(root: Path, images: dict[str, tuple[np.ndarray, str]]) -> list[Photo]:
+    for name, (image, xmp) in images.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(root / name, quality=92, **({"xmp": xmp.encode()} if xmp else {}))
+    return list(read_photos(find_photos(root)[0], root, threads=1))
+
+
+def groups_of(photos: list[Photo], camera_model: str = "auto") -> tuple[list[bool], list[str]]:
+    groups = camera_groups(photos, [photo.size for photo in photos], "auto")
+    return panorama_groups(photos, groups, camera_model)
+
+
+def test_panoramas_are_known_by_their_pictures_or_by_their_xmp(tmp_path: Path) -> None:
+    flat = np.random.default_rng(0).integers(0, 255, (64, 128, 3)).astype(np.uint8)  # meets itself nowhere
+    sphere = one(panorama_rays(512), (512, 256))
+    photos = photos_of(
+        tmp_path,
+        {"a/1.jpg": (sphere, ""), "b/1.jpg": (flat, WHOLE), "c/1.jpg": (flat, ""), "d/1.jpg": (flat[:50], "")},
+    )
+    found, lines = groups_of(photos)
+    assert found == [True, True, False, False]
+    assert lines[0] == "2 photographs are 360-degree panoramas: each has one place, and is trained in faces"
+    assert lines[1].startswith("1 photographs are twice as wide as high, but their edges do not meet")
+    assert groups_of(photos, "OPENCV") == ([False] * 4, [])
+    assert groups_of(photos[:3], "EQUIRECTANGULAR")[0] == [True, True, True]
+    with pytest.raises(DataError, match=r"^d/1.jpg must be a whole panorama.*128x50, which is not twice as wide"):
+        groups_of(photos, "EQUIRECTANGULAR")
+
+
+def test_a_part_of_a_panorama_is_refused_and_named(tmp_path: Path) -> None:
+    flat = np.full((64, 128, 3), 90, np.uint8)
+    photos = photos_of(tmp_path, {f"{i}.jpg": (flat, PART if i == 1 else WHOLE) for i in range(3)})
+    with pytest.raises(DataError, match=r"^1.jpg must be a whole panorama.* as its XMP says; export it whole"):
+        groups_of(photos)
+
+
+@pytest.fixture(scope="module")
+def panoramas(colmap: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray], list[str]]:
+    """A capture of seven panoramas, their true poses, and what was said."""
+    root = tmp_path_factory.mktemp("panoramas")
+    truth = write_photographs(root / "photos", "panorama", count=7, width=WIDTH)
+    (root / "photos" / "masks").mkdir()
+    mask = np.full((WIDTH // 2, WIDTH), 255, np.uint8)
+    mask[-60:] = 0  # who holds the camera
+    for name in truth:
+        Image.fromarray(mask).save(root / "photos" / "masks" / f"{name}.png")
+    said: list[str] = []
+
+    def note(event: Event) -> None:
+        said.extend([event.text] if isinstance(event, Notice) else [])
+
+    find_poses(PosesOptions(photos=root / "photos", out=root / "capture", threads=2), note)
+    return root, truth, said
+
+
+def test_the_places_of_panoramas_are_found_from_photographs_alone(
+    panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
+) -> None:
+    """Measured: 0.3 mm of a room of 4 m, 0.02 degrees."""
+    root, truth, said = panoramas
+    assert "7 photographs are 360-degree panoramas: each has one place, and is trained in faces" in said
+    found = errors(root / "capture", truth)
+    assert found["placed"] == 7
+    assert found["centres_worst_m"] < 0.003
+    assert found["turned_worst_degrees"] < 0.1
+    (camera,) = read_cameras(root / "capture/sparse/0", "bin").values()
+    assert (camera.model, camera.params) == ("EQUIRECTANGULAR", (WIDTH, WIDTH / 2))
+
+
+def test_features_of_panoramas_keep_out_of_masks_which_go_along_to_the_faces(
+    panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
+) -> None:
+    root = panoramas[0]
+    for image in read_images(root / "capture/sparse/0", "bin", observations=True):
+        assert image.observations is not None
+        assert image.observations[:, 1].max() < WIDTH // 2 - 59
+    scene = load_scene(root / "capture", test_every=0)
+    assert len(scene.views) == 42
+    below = {view.name: view.mask() for view in scene.views if view.name.endswith("_down.jpg")}
+    assert len(below) == 7
+    assert all(mask is not None and not mask[mask.shape[0] // 2, mask.shape[1] // 2] for mask in below.values())
+
+
+@pytest.mark.slow
+def test_panoramas_and_ordinary_photographs_of_one_room_have_one_frame(colmap: None, tmp_path: Path) -> None:
+    truth = write_photographs(tmp_path / "photos" / "around", "panorama", count=6, width=WIDTH)
+    truth = {f"around/{name}": pose for name, pose in truth.items()}
+    patterns = walls()
+    for i, pose in enumerate(walk(6, tilt=3, turn=25, seed=1)):
+        camera = Camera(400, 300, 300.0, 300.0, 200.0, 150.0, pose)
+        name = f"plain/{i:03}.jpg"
+
+        def rays(u: np.ndarray, v: np.ndarray, c: Camera = camera) -> np.ndarray:
+            return np.stack([(u - c.cx) / c.fx, (v - c.cy) / c.fy, np.ones_like(u)], axis=-1)
+
+        (tmp_path / "photos" / "plain").mkdir(exist_ok=True)
+        Image.fromarray(photograph(patterns, pose, rays, (400, 300))).save(tmp_path / "photos" / name, quality=95)
+        truth[name] = pose
+    made = find_poses(PosesOptions(photos=tmp_path / "photos", out=tmp_path / "capture", threads=2))
+    assert made["lens"]["trials"]  # of the ordinary ones
+    assert {camera["model"] == "EQUIRECTANGULAR" for camera in made["cameras"]} == {True, False}
+    found = errors(tmp_path / "capture", truth)
+    assert found["placed"] == 12
+    assert found["centres_worst_m"] < 0.01
+    assert found["turned_worst_degrees"] < 0.3
+
+
+def test_training_starts_on_the_walls_where_faces_of_different_panoramas_agree(
+    panoramas: tuple[Path, dict[str, np.ndarray], list[str]],
+) -> None:
+    root, truth, _ = panoramas
+    scene = load_scene(root / "capture", test_every=0)
+    sweep = sweep_views(scene, DenseStart())
+    whole = [view.name.split("_")[0] for view in scene.train]
+    assert all(whole[j] != whole[i] for i, others in enumerate(sweep.neighbours) for j in others)
+    found = start_points(scene, sweep, DenseStart()).points
+    assert len(found) > 3 * read_json(root / "capture/poses.json")["points"]
+    mine = {view.name: view.camera.center for view in scene.train}
+    names = sorted(truth)
+    centers = np.stack([mine[name.replace(".", "_front.")] for name in names])
+    there = np.stack([-truth[name][:3, :3].T @ truth[name][:3, 3] for name in names])
+    places = apply(umeyama(centers, there), found)
+    off = np.abs(np.concatenate([places - LOW, places - HIGH], axis=1)).min(axis=1)
+    assert (off < 0.03).mean() > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_panoramas_become_a_run(colmap: None, tmp_path: Path) -> None:
+    write_photographs(tmp_path / "photos", "panorama", count=6, width=384)
+    words = ["--threads", "2", "--quality", "draft", "--schedule-scale", "0.002", "--test-every", "3", "--quiet"]
+    assert run(["reconstruct", str(tmp_path / "photos"), "--out", str(tmp_path / "run"), *words]) == 0
+    (stage,) = read_json(tmp_path / "run/metrics.json")["stages"]
+    assert stage["test"]["psnr"] > 15
