@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest import mock
 
 import commands as c
 import mutations as m
@@ -19,10 +20,12 @@ import numpy as np
 import torch
 from mutations import Mutation
 from PIL import Image
+from usd_server import Server
 
 from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
 from foreign_writers import Lens, small_alicevision, small_metashape, small_opensfm
 from gs2d.core.splats import Splats
+from gs2d.io.formats import usd
 
 Files = dict[str, bytes]
 
@@ -194,12 +197,23 @@ def Xform "World"
 """
 
 
+def _usd_seeds() -> list[Files]:
+    _usd_server()  # started here, where nobody looks at what is started
+    return written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD))()
+
+
+@cache
+def _usd_server() -> Server:
+    return Server(usd.usd_process.__file__, _FIELD.encode(), usd._WAIT)
+
+
 def read_usd_once(root: Path) -> None:
-    """As `--init` does: each reading is a process."""
+    """As `--init` does: each reading is a process, here forked from one that has OpenUSD loaded."""
     from gs2d.io.formats.registry import read_surfels
 
     (path,) = (p for p in root.iterdir() if p.is_file())
-    read_surfels(path)
+    with mock.patch.object(usd, "_read_apart", _usd_server().read):
+        read_surfels(path)
 
 
 def _gltf_text(root: Path) -> None:
@@ -456,8 +470,7 @@ _ALL = (
            read_splats_everywhere),
     Family("sog", written(_splats("sog", "a.sog")), {".sog": m.either(m.of_zip(_SOG), m.of_zip(_SOG), m.of_bytes)},
            read_splats_everywhere),
-    Family("usd", written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD)),
-           {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
+    Family("usd", _usd_seeds, {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
     Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),
            {".npy": m.of_npy}, read_map),
     Family("seen-counts", written(_counted), {".npy": m.of_npy}, read_surface),
