@@ -32,8 +32,8 @@ from typing import Any
 from PIL import Image
 
 from gs2d.io.run_dir import load_tensors
-from kill_commands import COMMANDS, DONE, REFUSED, Command, ended, forked, import_all, started
-from kill_states import gone_on_from, watched
+from kill_commands import COMMANDS, DATED, DONE, REFUSED, Command, ended, forked, import_all, started
+from kill_states import States, gone_on_from, lay, tree_of, watched
 
 AT_EACH_CALL = {"kill": -1, "tear": -2, "full": errno.ENOSPC}  # tear: half a write, or right after another call
 
@@ -109,16 +109,21 @@ def gone_on(command: Command, folder: Path, expected: dict[str, Any]) -> list[st
     return differing(command.leaves(folder), expected)
 
 
+def disturbed_at(command: Command, layer: Layer, folder: Path, number: int, action: str) -> int:
+    """Do the command in a new folder, disturbed at one call; its exit code."""
+    command.prepare(folder)
+
+    def disturbed() -> None:
+        layer.arm(folder, number, AT_EACH_CALL[action])
+        command.run(folder)
+
+    return forked(disturbed)
+
+
 def at_call(command: Command, layer: Layer, number: int, action: str, expected: dict[str, Any]) -> list[str]:
     """Disturb the command at one call, do it again, and return what is not as it should be."""
     with scratch(command.work) as folder:
-        command.prepare(folder)
-
-        def disturbed() -> None:
-            layer.arm(folder, number, AT_EACH_CALL[action])
-            command.run(folder)
-
-        code = forked(disturbed)
+        code = disturbed_at(command, layer, folder, number, action)
         allowed = (-signal.SIGKILL,) if action != "full" else (REFUSED, DONE)
         wrong = [] if code in allowed else [f"ended with {code}"]
         wrong += half_written(folder)
@@ -140,6 +145,8 @@ def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> 
         gone_on_from(
             states, folder, lambda at: half_written(at, whole) + gone_on(command, at, expected), given.seconds
         )
+        if given.compare:
+            check_states(command, layer, folder, states, given)
     for action in actions:
         mine = [state for state in states.found.values() if action in state.left_by]
         wrong = states.ended_wrong if action == "full" else []
@@ -153,6 +160,28 @@ def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> 
         tried = sum(len(state.left_by[action]) for state in mine if state.judged)
         named = {"command": command.name, "action": action, "calls": len(states.calls), "kinds": kinds}
         yield {**named, "tried": tried, "states": len(mine), "states of all": len(states.found), "wrong": wrong}
+
+
+def check_states(command: Command, layer: Layer, folder: Path, states: States, given: argparse.Namespace) -> None:
+    """Disturb the command for real: what it leaves must be what was looked at, but for times."""
+    for state in states.found.values():
+        for action, numbers in state.left_by.items():
+            for number in numbers:
+                if number % given.every != given.first:
+                    continue
+                shutil.rmtree(folder, ignore_errors=True)
+                disturbed_at(command, layer, folder, number, action)
+                wrong = differing(*({name: steady(name, data) for name, data in tree.items()}
+                                    for tree in (tree_of(folder), state.tree)))  # fmt: skip
+                if wrong:
+                    raise SystemExit(f"{action} at {number} ({states.calls[number]}) leaves something else: {wrong}")
+
+
+def steady(name: str, data: bytes | None) -> bytes | bool:
+    """What a file holds, or half of it under a temporary name; whether it is one, where times are in it."""
+    whole = Path(name).name.removeprefix(".").removesuffix(".gs2d.tmp")
+    dated = whole in DATED or f".{whole}" in DATED or whole.endswith((".pt", "table.json"))
+    return data is not None if data is None or dated or "/jobs/" in name else data
 
 
 def at_random(
@@ -293,6 +322,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="for each command and action")
     parser.add_argument("--states", action="store_true", help="at each call, from one run: kill_states.py says how")
+    parser.add_argument("--compare", action="store_true", help="such states with those that real kills leave")
     given = parser.parse_args()
     layer, work = Layer(), given.work.resolve()
     work.mkdir(parents=True, exist_ok=True)
