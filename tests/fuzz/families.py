@@ -386,6 +386,10 @@ def read_kept(root: Path) -> None:
 
 
 # -- places in the world -----------------------------------------------------------------------------------------------
+_PLACE = {
+    "format": 1, "method": "positions", "scale": 2.5, "rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "epsg": 32632,
+    "translation": [1, 2, 3], "origin": [600000, 5200000, 400], "geodetic": [47.5, 9.25, 400], "grid_scale": 0.9996,
+}  # fmt: skip
 _TABLES = {
     "control.csv": "# EPSG:32632\nname,x,y,z,photo,u,v,check\nA,600000.5,5200000,400,f_0.png,12.5,7,\n"
     "A,600000.5,5200000,400,f_1.png,3,9,\nB,600010,5200000,401.5,f_0.png,20,11,yes\n",

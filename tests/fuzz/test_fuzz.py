@@ -102,9 +102,12 @@ def test_the_guard_sees_what_is_not_allowed(tmp_path: Path) -> None:
 
     seen = [
         outcome(read, tmp_path / "inside", 10)[0]
-        for read in (fault, warned, outside, lines, process, lambda _: print("x", file=sys.__stderr__))
+        for read in (
+            *(fault, warned, outside, lines, process),
+            *(lambda _: print("x", file=sys.__stderr__), lambda _: print("x", file=sys.__stdout__)),
+        )
     ]
-    words = ("traceback: KeyError", "warning: Runt", "outside: open", "a message of sev", "outside: sub", "printed")
+    words = ("traceback: KeyError", "warning: Runt", "outside: open", "a message of sev", "outside: sub", *("printed",) * 2)
     assert [str(found)[: len(word)] for found, word in zip(seen, words, strict=True)] == list(words)
     assert outcome(refused, tmp_path / "inside", 10)[:2] == (None, "refused")
     assert outcome(inside, tmp_path / "inside", 10)[:2] == (None, "read")

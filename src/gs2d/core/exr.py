@@ -6,12 +6,17 @@ Layout: the OpenEXR file layout (https://openexr.com/en/latest/OpenEXRFileLayout
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import importlib
 import os
+import re
 import struct
-from collections.abc import Mapping
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -24,6 +29,8 @@ MAGIC = b"\x76\x2f\x31\x01"
 PARTS, DEEP = 0x1000, 0x0800  # bits of the version
 MOST_HEADER = 1 << 20  # bytes; a preview is among them
 _SIZES = (4, 2, 4)  # bytes of whole numbers, halves and floats
+_ONE = threading.Lock()
+_SAID = re.compile(rb"\(EXR_ERR_\w+\) (.*)|^Warning: (Exception raised .*)")  # its C library, and its bindings
 _REMEDY = "write it again as one part of scan lines or tiles"
 
 
@@ -122,10 +129,13 @@ def read_channels(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     header, name = read_header(path), os.fspath(path)
     library = _required(name)
     try:
-        decoded: Mapping[str, Any] = library.File(name, separate_channels=True).channels()
+        with _listening() as said:
+            decoded: Mapping[str, Any] = library.File(name, separate_channels=True).channels()
         found = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in decoded.items()}
     except Exception as error:  # whatever its bindings make of a damaged file
         raise DataError(f"image {name} does not decode: {_first_line(error)}; replace or remove the file") from error
+    if said:  # the pixels that it gives then are not those of the file
+        raise DataError(f"image {name} does not decode: {said[0]}; replace or remove the file")
     if {key: pixels.shape for key, pixels in found.items()} != dict.fromkeys(
         header.channels, (header.height, header.width)
     ):
@@ -139,6 +149,49 @@ def _required(name: str) -> Any:
         return importlib.import_module("OpenEXR")
     except ImportError as error:
         raise DataError(f"{name} needs OpenEXR, which is not installed; {install('exr')}") from error
+
+
+@contextlib.contextmanager
+def _listening() -> Iterator[list[str]]:
+    """Take what the library says on the terminal: that is all it does about pixels that it cannot decode.
+
+    Descriptors are those of the whole process: one at a time, and what others say meanwhile is said afterwards.
+    """
+    said: list[str] = []
+    with _ONE, contextlib.ExitStack() as files:
+        _flush()
+        kept = {}
+        for number in (1, 2):
+            with contextlib.suppress(OSError):  # closed
+                kept[number] = os.dup(number), files.enter_context(_scratch())
+                os.dup2(kept[number][1].fileno(), number)
+        try:
+            yield said
+        finally:
+            _flush()
+            for number, (copy, file) in kept.items():
+                os.dup2(copy, number)
+                os.close(copy)
+                file.seek(0)
+                for line in file.read().splitlines(keepends=True):
+                    match = _SAID.search(line)
+                    if match is None:
+                        os.write(number, line)
+                    else:
+                        said.insert(0 if match[1] else len(said), match[match.lastindex or 0].decode("utf-8", "replace"))
+
+
+def _scratch() -> IO[bytes]:
+    """Return a file in memory, where the system has such."""
+    if hasattr(os, "memfd_create"):
+        return open(os.memfd_create("exr"), "w+b")
+    return tempfile.TemporaryFile()
+
+
+def _flush() -> None:
+    """Write what C still holds of its own stdout."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).fflush(None)
 
 
 def _first_line(error: BaseException) -> str:
