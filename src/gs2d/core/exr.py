@@ -7,11 +7,12 @@ Layout: the OpenEXR file layout (https://openexr.com/en/latest/OpenEXRFileLayout
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib
+import io
 import os
 import re
 import struct
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
@@ -30,7 +31,7 @@ PARTS, DEEP = 0x1000, 0x0800  # bits of the version
 MOST_HEADER = 1 << 20  # bytes; a preview is among them
 _SIZES = (4, 2, 4)  # bytes of whole numbers, halves and floats
 _ONE = threading.Lock()
-_SAID = re.compile(rb"\(EXR_ERR_\w+\) (.*)|^Warning: (Exception raised .*)")  # its C library, and its bindings
+_SAID = re.compile(r"\(EXR_ERR_\w+\) (.*)|^Warning: (Exception raised .*)")  # its C library, and its bindings
 _REMEDY = "write it again as one part of scan lines or tiles"
 
 
@@ -155,30 +156,41 @@ def _required(name: str) -> Any:
 def _listening() -> Iterator[list[str]]:
     """Take what the library says on the terminal: that is all it does about pixels that it cannot decode.
 
-    Descriptors are those of the whole process: one at a time, and what others say meanwhile is said afterwards.
+    Its C library writes to stderr, its bindings to Python's stdout. Both are those of the whole process: one picture
+    at a time, and what others say meanwhile is said afterwards.
     """
     said: list[str] = []
-    with _ONE, contextlib.ExitStack() as files:
-        _flush()
-        kept = {}
-        for number in (1, 2):
-            with contextlib.suppress(OSError):  # closed
-                kept[number] = os.dup(number), files.enter_context(_scratch())
-                os.dup2(kept[number][1].fileno(), number)
+    with _ONE, _scratch() as file:
+        words = io.StringIO()
+        kept = None
+        with contextlib.suppress(OSError):  # closed
+            kept = os.dup(2)
+            os.dup2(file.fileno(), 2)
         try:
-            yield said
+            with contextlib.redirect_stdout(words):
+                yield said
         finally:
-            _flush()
-            for number, (copy, file) in kept.items():
-                os.dup2(copy, number)
-                os.close(copy)
-                file.seek(0)
-                for line in file.read().splitlines(keepends=True):
+            if kept is not None:
+                os.dup2(kept, 2)
+                os.close(kept)
+            file.seek(0)
+            errors = file.read().decode("utf-8", "surrogateescape")
+            for text, say in ((errors, _say_error), (words.getvalue(), _say)):
+                for line in text.splitlines(keepends=True):
                     match = _SAID.search(line)
                     if match is None:
-                        os.write(number, line)
+                        say(line)
                     else:
-                        said.insert(0 if match[1] else len(said), match[match.lastindex or 0].decode("utf-8", "replace"))
+                        said.append(match[1] or match[2])
+
+
+def _say(line: str) -> None:
+    if sys.stdout is not None:
+        sys.stdout.write(line)
+
+
+def _say_error(line: str) -> None:
+    os.write(2, line.encode("utf-8", "surrogateescape"))
 
 
 def _scratch() -> IO[bytes]:
@@ -186,12 +198,6 @@ def _scratch() -> IO[bytes]:
     if hasattr(os, "memfd_create"):
         return open(os.memfd_create("exr"), "w+b")
     return tempfile.TemporaryFile()
-
-
-def _flush() -> None:
-    """Write what C still holds of its own stdout."""
-    with contextlib.suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).fflush(None)
 
 
 def _first_line(error: BaseException) -> str:
