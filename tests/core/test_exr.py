@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import struct
 from pathlib import Path
 
@@ -132,6 +133,28 @@ def test_damage_anywhere_gives_a_picture_or_a_plain_error(tmp_path: Path) -> Non
         (tmp_path / "b.exr").write_bytes(damaged)
         with contextlib.suppress(DataError):
             assert read_image(tmp_path / "b.exr").dtype == np.uint8
+
+
+def test_pixels_that_do_not_decode_are_refused_and_nothing_is_printed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The library gives other pixels then, and says on the terminal alone, stdout too, that they are."""
+    path = tmp_path / "a.exr"
+    write(path, {"Z": np.arange(32 * 32, dtype=np.float32).reshape(32, 32)})
+    data = bytearray(path.read_bytes())
+    data[-100:] = b"\xff" * 100  # packed by zlib
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="does not decode: .*; replace or remove the file"):
+        exr.grey_values(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_others_say_while_a_file_is_decoded_is_said_afterwards(capfd: pytest.CaptureFixture[str]) -> None:
+    with exr._listening() as said:
+        print("mine\nWarning: Exception raised reading pixel data\nhalf", end="")
+        os.write(2, b"/tmp/a.exr: (EXR_ERR_CORRUPT_CHUNK) Unable to decompress\nyours\n")
+    assert capfd.readouterr() == ("mine\nhalf", "yours\n")
+    assert said == ["Unable to decompress", "Exception raised reading pixel data"]
 
 
 def test_without_the_library_the_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

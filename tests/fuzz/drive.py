@@ -12,6 +12,7 @@ import itertools
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -83,19 +84,23 @@ def run(name: str, first: int, count: int, seconds: float, keep: Path | None) ->
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             begun = None
-            for line in process.stdout:
-                entry = json.loads(line)
-                if len(entry) == 1:
-                    begun = entry[0]
-                    continue
-                seed, finding, verdict, memory, victim = entry
-                seed, begun, done = seed + 1, None, done + 1
-                read, peak = read + (verdict == "read"), max(peak, memory)
-                if finding:
-                    total += 1
-                    if place(finding) not in found:
-                        found[place(finding)] = f"{name} {entry[0]} ({victim}): {finding}"
-                        _keep(keep, name, entry[0])
+            try:
+                for line in process.stdout:
+                    entry = json.loads(line)
+                    if len(entry) == 1:
+                        begun = entry[0]
+                        continue
+                    seed, finding, verdict, memory, victim = entry
+                    seed, begun, done = seed + 1, None, done + 1
+                    read, peak = read + (verdict == "read"), max(peak, memory)
+                    if finding:
+                        total += 1
+                        if place(finding) not in found:
+                            found[place(finding)] = f"{name} {entry[0]} ({victim}): {finding}"
+                            _keep(keep, name, entry[0])
+            except KeyboardInterrupt:  # the row says how far it came; --first goes on from there
+                process.terminate()
+                break
         if begun is None and process.returncode != 0:
             raise SystemExit(f"{name}: the driver itself failed with status {process.returncode}")
         if begun is not None:
@@ -131,6 +136,7 @@ def main() -> int:
         name, first, count, seconds = options.work
         work(name, int(first), int(count), float(seconds))
         return 0
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: ends the family with the row so far
     findings: list[str] = []
     for index, name in enumerate(options.families or FAMILIES):
         row, found = run(name, options.first, options.count, options.seconds, options.keep)

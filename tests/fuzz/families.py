@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest import mock
 
 import commands as c
 import mutations as m
@@ -19,10 +20,12 @@ import numpy as np
 import torch
 from mutations import Mutation
 from PIL import Image
+from usd_server import Server
 
 from capture_writers import small_blender, small_colmap, small_dtu, small_nerfstudio
 from foreign_writers import Lens, small_alicevision, small_metashape, small_opensfm
 from gs2d.core.splats import Splats
+from gs2d.io.formats import usd
 
 Files = dict[str, bytes]
 
@@ -194,12 +197,23 @@ def Xform "World"
 """
 
 
+def _usd_seeds() -> list[Files]:
+    _usd_server()  # started here, where nobody looks at what is started
+    return written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD))()
+
+
+@cache
+def _usd_server() -> Server:
+    return Server(usd.usd_process.__file__, _FIELD.encode(), usd._WAIT)
+
+
 def read_usd_once(root: Path) -> None:
-    """As `--init` does: each reading is a process."""
+    """As `--init` does: each reading is a process, here forked from one that has OpenUSD loaded."""
     from gs2d.io.formats.registry import read_surfels
 
     (path,) = (p for p in root.iterdir() if p.is_file())
-    read_surfels(path)
+    with mock.patch.object(usd, "_read_apart", _usd_server().read):
+        read_surfels(path)
 
 
 def _gltf_text(root: Path) -> None:
@@ -337,6 +351,90 @@ def _counted(root: Path) -> None:
     np.save(root / "mesh_seen.npy", np.arange(len(_FACES)))
 
 
+def _exr(name: str, channels: str, compression: str, dtype: type = np.float32) -> Callable[[Path], object]:
+    def write(root: Path) -> None:
+        import OpenEXR
+
+        pixels = np.random.default_rng(0).uniform(0, 2, (12, 16)).astype(dtype)
+        header = {"compression": getattr(OpenEXR, compression), "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {channel: pixels for channel in channels}).write(str(root / name))
+
+    return write
+
+
+def _prepared(root: Path) -> None:
+    from gs2d.data.cache import DecodedImage
+    from gs2d.data.prepared import write_prepared
+
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3)).astype(np.uint8)
+    mask = pixels[..., 0] > 100
+    write_prepared(root / "a.prepared", "a" * 64, DecodedImage(pixels, mask, ~mask, mask))
+
+
+def read_kept(root: Path) -> None:
+    """As training does, which makes the picture anew where that is None."""
+    from gs2d.data.prepared import read_prepared
+    from gs2d.errors import DataError
+
+    found = read_prepared(root / "a.prepared", "a" * 64)
+    if found is None:
+        raise DataError("it is made anew")
+    assert found.image.dtype == np.uint8
+    assert found.image.ndim == 3
+    for mask in (found.mask, found.object_mask, found.valid):
+        assert mask is None or (mask.dtype == bool and mask.shape == found.image.shape[:2])
+
+
+# -- places in the world -----------------------------------------------------------------------------------------------
+_PLACE = {
+    "format": 1, "method": "positions", "scale": 2.5, "rotation": [[0, -1, 0], [1, 0, 0], [0, 0, 1]], "epsg": 32632,
+    "translation": [1, 2, 3], "origin": [600000, 5200000, 400], "geodetic": [47.5, 9.25, 400], "grid_scale": 0.9996,
+}  # fmt: skip
+_TABLES = {
+    "control.csv": "# EPSG:32632\nname,x,y,z,photo,u,v,check\nA,600000.5,5200000,400,f_0.png,12.5,7,\n"
+    "A,600000.5,5200000,400,f_1.png,3,9,\nB,600010,5200000,401.5,f_0.png,20,11,yes\n",
+    "control_in_the_run.csv": 'name;lat;lon;height;run_x;run_y;run_z\n"A";47.5;9.25;400;0;1;2\n"B, new";47.6;9.5;;1;1;1\n',
+    "control_odm.txt": "EPSG:32632\n600000 5200000 400 12 8 f_0.png A\n600010 5200000 401 20 11 f_1.png B\n",
+    "positions.csv": "name,lat,lon,height\nf_0.png,47.5,9.25,401\nf_1.png,47.51,9.26,\n",
+    "positions_odm.txt": "+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs\nf_0.png 600000 5200000 400 0 0 0\n",
+}
+
+
+def _georeferenced(root: Path) -> None:
+    from gs2d.io.georeference import Georeference, stamp, write_sidecars
+
+    place = Georeference.from_json(_PLACE)
+    for name, write in (("a.ply", lambda p: ply_mesh(p, "ascii")), ("a.obj", _obj)):
+        write(root / name)
+        stamp(root / name, place)
+    _splats("gltf", "a.glb")(root)
+    stamp(root / "a.glb", place)
+    write_sidecars(root / "b.ply", place, None)
+    ply_mesh(root / "b.ply", "ascii")
+
+
+def read_places(root: Path) -> None:
+    """As `gs2d georeference` reads its tables, and whatever reads a file in local metres what that says of itself."""
+    from gs2d.errors import DataError
+    from gs2d.geo.control import read_control
+    from gs2d.geo.positions import matched, read_positions
+    from gs2d.io.georeference import georeference_of_file
+
+    refused: Exception | None = None
+    for path in sorted(root.iterdir()):
+        try:
+            if path.stem.startswith("control"):
+                read_control(path)
+            elif path.stem.startswith("positions"):
+                matched(read_positions(path), ["f_0.png", "f_1.png"])
+            elif path.suffix in (".ply", ".obj", ".glb"):
+                georeference_of_file(path)
+        except DataError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
 # -- official ground truth ---------------------------------------------------------------------------------------------
 def _official(root: Path) -> None:
     from scipy.io import savemat
@@ -456,8 +554,7 @@ _ALL = (
            read_splats_everywhere),
     Family("sog", written(_splats("sog", "a.sog")), {".sog": m.either(m.of_zip(_SOG), m.of_zip(_SOG), m.of_bytes)},
            read_splats_everywhere),
-    Family("usd", written(_splats("usd", "a.usd"), lambda root: (root / "a.usda").write_text(_FIELD)),
-           {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
+    Family("usd", _usd_seeds, {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
     Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),
            {".npy": m.of_npy}, read_map),
     Family("seen-counts", written(_counted), {".npy": m.of_npy}, read_surface),
@@ -467,6 +564,16 @@ _ALL = (
         _image("a.tif", compression="tiff_lzw"), _image("a.bmp"), _image("a.ppm"),
         _image("a.jp2")),
         {".png": m.of_png, "": m.of_bytes}, read_picture),
+    Family("exr", written(
+        _exr("a.exr", "RGB", "ZIP_COMPRESSION"), _exr("a.exr", "RGBA", "PIZ_COMPRESSION", np.float16),
+        _exr("a.exr", "Z", "RLE_COMPRESSION"), _exr("a.exr", "RGB", "NO_COMPRESSION"),
+        _exr("a.exr", "RGB", "DWAA_COMPRESSION", np.float16), _exr("a.exr", "Y", "B44_COMPRESSION", np.float16)),
+        {".exr": m.of_bytes}, read_picture),
+    Family("prepared", written(_prepared), {".prepared": m.either(m.of_prepared, m.of_prepared, m.of_bytes)}, read_kept),
+    Family("places", written(lambda root: [(root / name).write_text(text) for name, text in _TABLES.items()],
+                             _georeferenced),
+           {".csv": _TEXT, ".txt": _TEXT, ".json": _JSON, ".ply": m.of_ply, ".obj": _TEXT, ".glb": m.of_glb},
+           read_places),
     Family("official", written(_official), {".mat": m.of_bytes, ".json": _JSON, ".txt": _TEXT, ".log": _TEXT},
            read_official),
     Family("zip", written(_packed(zipfile.ZIP_DEFLATED), _packed(zipfile.ZIP_STORED)),

@@ -7,6 +7,7 @@ a word on the terminal, more than 20 s, more than 512 MB and four times the inpu
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import sys
@@ -76,18 +77,29 @@ class Watch:
 
 
 @contextlib.contextmanager
-def _stderr_bytes() -> Iterator[Callable[[], bytes]]:
-    """What is written to descriptor 2 within, by Python or by a library."""
-    sys.stderr.flush()
-    with open(os.memfd_create("stderr"), "w+b") as file:
-        kept = os.dup(2)
-        os.dup2(file.fileno(), 2)
+def _terminal_bytes() -> Iterator[Callable[[], bytes]]:
+    """What is written to descriptors 1 and 2 within, by Python or by a library."""
+    _flush()
+    with open(os.memfd_create("terminal"), "w+b") as file:
+        kept = os.dup(1), os.dup(2)
+        os.dup2(file.fileno(), 1), os.dup2(file.fileno(), 2)
+
+        def written() -> bytes:
+            _flush()
+            return os.pread(file.fileno(), 4000, 0)
+
         try:
-            yield lambda: os.pread(file.fileno(), 4000, 0)
+            yield written
         finally:
-            sys.stderr.flush()
-            os.dup2(kept, 2)
-            os.close(kept)
+            _flush()
+            for number, copy in enumerate(kept, 1):
+                os.dup2(copy, number)
+                os.close(copy)
+
+
+def _flush() -> None:
+    sys.stdout.flush(), sys.stderr.flush()
+    ctypes.CDLL(None).fflush(None)
 
 
 def _reset_peak() -> None:
@@ -121,7 +133,7 @@ def outcome(target: Callable[[Path], object], folder: Path, size: int) -> tuple[
     start = time.monotonic()
     _reset_peak()
     held = max(0, _peak() - LOADED)
-    with warnings.catch_warnings(record=True) as said, _stderr_bytes() as words:
+    with warnings.catch_warnings(record=True) as said, _terminal_bytes() as words:
         warnings.simplefilter("always")
         warnings.filterwarnings("ignore", module=r"PIL\.")  # as the command line does
         signal.setitimer(signal.ITIMER_REAL, SECONDS)

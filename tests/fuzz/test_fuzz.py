@@ -15,14 +15,15 @@ HERE = Path(__file__).resolve().parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
+import families  # noqa: E402
 from drive import try_case  # noqa: E402
 from families import FAMILIES  # noqa: E402
 from guard import outcome  # noqa: E402
 
 from gs2d.errors import DataError  # noqa: E402
+from gs2d.io.formats import usd  # noqa: E402
 
 COUNTS = dict.fromkeys(FAMILIES, 60) | {"run-files": 12, "zip": 40, "dtu": 30, "obj-stl-off": 40, "rasterize": 20}
-COUNTS["usd"] = 8  # a process each
 FINDINGS = sorted(path for path in (HERE / "findings").rglob("*") if path.is_file())
 
 
@@ -47,6 +48,19 @@ def test_what_was_a_finding_stays_mended(tmp_path: Path, path: Path) -> None:
     for seed in seeds:
         finding, _, _ = try_case(family, {**seed, victim: path.read_bytes()}, tmp_path)
         assert finding is None or finding.startswith("memory"), finding
+
+
+def test_a_fork_of_the_server_of_openusd_says_what_the_process_says_that_gs2d_starts(tmp_path: Path) -> None:
+    """Ten thousand inputs are read by forks: they must be as good."""
+    pytest.importorskip("pxr", reason="no OpenUSD: pip install usd-core")
+    said = set()
+    for seed in (0, 1, 12, 13):
+        files, victim = FAMILIES["usd"].case(seed)
+        (tmp_path / victim).write_bytes(files[victim])
+        words = (str(tmp_path / victim), 4 << 30, 10)
+        assert families._usd_server().read(*words) == usd._read_apart(*words)
+        said.add(usd._read_apart(*words)[1])
+    assert len(said) == 4
 
 
 def test_an_input_is_the_same_whenever_it_is_made() -> None:
@@ -88,9 +102,12 @@ def test_the_guard_sees_what_is_not_allowed(tmp_path: Path) -> None:
 
     seen = [
         outcome(read, tmp_path / "inside", 10)[0]
-        for read in (fault, warned, outside, lines, process, lambda _: print("x", file=sys.__stderr__))
+        for read in (
+            *(fault, warned, outside, lines, process),
+            *(lambda _: print("x", file=sys.__stderr__), lambda _: print("x", file=sys.__stdout__)),
+        )
     ]
-    words = ("traceback: KeyError", "warning: Runt", "outside: open", "a message of sev", "outside: sub", "printed")
+    words = ("traceback: KeyError", "warning: Runt", "outside: open", "a message of sev", "outside: sub", *("printed",) * 2)
     assert [str(found)[: len(word)] for found, word in zip(seen, words, strict=True)] == list(words)
     assert outcome(refused, tmp_path / "inside", 10)[:2] == (None, "refused")
     assert outcome(inside, tmp_path / "inside", 10)[:2] == (None, "read")

@@ -1,5 +1,6 @@
 /* A layer under a process (LD_PRELOAD): every call of libc that changes files below one folder is counted, and the
-   n-th ends the process as a power switch would, or fails as on a full disk, and so do all that write after it. */
+   n-th ends the process as a power switch would, or fails as on a full disk, and so do all that write after it. Or the
+   process stands still at each of them in turn, while another looks at what a kill would leave there. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -12,6 +13,7 @@
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/types.h>
+#include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -20,11 +22,19 @@ enum { COUNT = 0, KILL = -1, TEAR = -2 }; /* > 0: an errno */
 static char folder[PATH_MAX];
 static long target = -1, count;
 static int action, record = -1, backwards;
+static int told = -1, answered = -1; /* pipes to whoever looks on, and from there */
 
 /* Called by the test: from now on count, from 0; do ACTION at call NUMBER; write "name path" to RECORD, if >= 0. */
 void failing_arm(const char *below, long number, int what, int descriptor) {
     snprintf(folder, sizeof folder, "%s", below);
     target = number, action = what, record = descriptor, count = 0;
+}
+
+/* Called by the test: tell each call to TO, as "B name path", and wait for a line of FROM. Half of a write is told as
+   "H". On "full" a copy of the process goes on with a full disk, to its end: its status is told as "E", and waited. */
+void failing_watch(const char *below, int to, int from) {
+    failing_arm(below, -1, 0, -1);
+    told = to, answered = from;
 }
 
 /* Called by the test: from now on each look at the clock on the wall finds it an hour earlier. */
@@ -60,10 +70,40 @@ static const char *full(int at, const char *path, char *buffer) {
     return buffer;
 }
 
+/* Say something to whoever looks on; the first letter of the answer. */
+static char ask(const char *line, size_t size) {
+    char answer = 0;
+    if (syscall(SYS_write, told, line, size) < 0 || syscall(SYS_read, answered, &answer, 1) != 1) _exit(99);
+    return answer;
+}
+
+/* A copy of this process finds the disk full from this call on, and ends: meanwhile this one waits. 1 in the copy. */
+static int copied(long here) {
+    pid_t child = fork();
+    if (!child) {
+        told = -1, target = here, action = ENOSPC;
+        return 1;
+    }
+    int status = 0, late = child < 0;
+    for (long waited = 0; child > 0 && waitpid(child, &status, WNOHANG) == 0; waited++) {
+        usleep(1000);
+        if (waited > 120000) kill(child, SIGKILL), late = 1;
+    }
+    char line[64];
+    int code = late ? 97 : WIFEXITED(status) ? WEXITSTATUS(status) : -WTERMSIG(status);
+    ask(line, (size_t)snprintf(line, sizeof line, "E %d\n", code));
+    return 0;
+}
+
 /* What is to happen at this call: 0 nothing, KILL, TEAR, or an errno. MAKES: it needs room on the disk. */
 static int due(const char *name, const char *path, int makes) {
     if (!below(path)) return 0;
     long here = count++;
+    if (told >= 0) {
+        char line[PATH_MAX + 32];
+        size_t size = (size_t)snprintf(line, sizeof line, "B %s %s\n", name, path + strlen(folder));
+        if (ask(line, size) != 'f' || !copied(here)) return 0;
+    }
     if (record >= 0) {
         char line[PATH_MAX + 32];
         int size = snprintf(line, sizeof line, "%s %s\n", name, path + strlen(folder));
@@ -132,7 +172,12 @@ ssize_t write(int descriptor, const void *data, size_t size) {
         die();
     }
     if (what > 0) return errno = what, -1;
-    return real(descriptor, data, size);
+    if (told < 0 || size < 2 || !folder[0] || !below(of(descriptor, buffer))) return real(descriptor, data, size);
+    ssize_t first = real(descriptor, data, size / 2);
+    if (first < 0) return first;
+    ask("H\n", 2);
+    ssize_t second = real(descriptor, (const char *)data + first, size - (size_t)first);
+    return second < 0 ? first : first + second;
 }
 
 int fsync(int descriptor) {

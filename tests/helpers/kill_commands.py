@@ -9,7 +9,10 @@ it would make it again, file by file.
 from __future__ import annotations
 
 import contextlib
+import functools
+import gc
 import importlib
+import importlib.metadata
 import json
 import os
 import pickle
@@ -22,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from ball_runs import comparable, options
+from gs2d.config.registry import Registry
 from gs2d.errors import Gs2dError
 from gs2d.experiments.options import SweepOptions
 from gs2d.experiments.paper import paper
@@ -84,6 +88,7 @@ def draw_little() -> None:
     import matplotlib.figure
     from PIL import Image
 
+    from gs2d.report import plots
     from gs2d.report.sections import pictures
 
     def dot(_figure: Any, file: Any, *, format: str, **_: Any) -> None:
@@ -93,14 +98,23 @@ def draw_little() -> None:
             Image.new("RGB", (1, 1)).save(file, format)
 
     matplotlib.figure.Figure.savefig = dot
+    plots._figure = lambda *_, **__: "<svg></svg>"
     pictures.mesh_images = lambda *_: []
 
 
 def import_all(names: list[str]) -> None:
-    """Import what a child had imported at its end, so that no later child takes time for it."""
+    """Import what a child had imported at its end, so that no later child takes time for it; warm what is cached."""
+    from gs2d.report.html import environment
+
     for name in names:
         with contextlib.suppress(Exception):
             importlib.import_module(name)
+    for template in environment().list_templates():
+        environment().get_template(template)
+    for registry in [thing for thing in gc.get_objects() if type(thing) is Registry]:
+        registry.names()
+    if not hasattr(importlib.metadata.version, "cache_info"):
+        importlib.metadata.version = functools.cache(importlib.metadata.version)
 
 
 def undated(path: Path) -> Any:

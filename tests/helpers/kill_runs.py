@@ -25,13 +25,15 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
 from gs2d.io.run_dir import load_tensors
-from kill_commands import COMMANDS, DONE, REFUSED, Command, ended, forked, import_all, started
+from kill_commands import COMMANDS, DATED, DONE, REFUSED, Command, ended, forked, import_all, started
+from kill_states import States, gone_on_from, lay, tree_of, watched
 
 AT_EACH_CALL = {"kill": -1, "tear": -2, "full": errno.ENOSPC}  # tear: half a write, or right after another call
 
@@ -46,16 +48,23 @@ class Layer:
         """Count from now on in this process; do ``action`` at call ``number``."""
         self._library.failing_arm(os.fsencode(folder), ctypes.c_long(number), action, record)
 
+    def watch(self, folder: Path, told: int, answered: int) -> None:
+        """Tell each call from now on, and wait for an answer (``kill_states``)."""
+        self._library.failing_watch(os.fsencode(folder), told, answered)
+
     def turn_back_the_clock(self) -> None:
         """Let the wall clock of this process run backwards."""
         self._library.failing_clock()
 
 
-def half_written(folder: Path) -> list[str]:
-    """Return the files under their own names that are not whole."""
+def half_written(folder: Path, whole: set[bytes] | None = None) -> list[str]:
+    """Return the files under their own names that are not whole; ``whole``: what was looked at before, and was."""
     broken = []
     for path in folder.rglob("*"):
         if not path.is_file() or path.name.endswith(".tmp"):
+            continue
+        digest = sha256(path.suffix.encode() + path.read_bytes()).digest()
+        if whole is not None and digest in whole:
             continue
         try:
             if path.suffix == ".json":
@@ -68,6 +77,9 @@ def half_written(folder: Path) -> list[str]:
                 raise ValueError("it has no end")
         except Exception as error:
             broken.append(f"{path.relative_to(folder)} is not whole: {error}")
+        else:
+            if whole is not None:
+                whole.add(digest)
     return broken
 
 
@@ -97,16 +109,21 @@ def gone_on(command: Command, folder: Path, expected: dict[str, Any]) -> list[st
     return differing(command.leaves(folder), expected)
 
 
+def disturbed_at(command: Command, layer: Layer, folder: Path, number: int, action: str) -> int:
+    """Do the command in a new folder, disturbed at one call; its exit code."""
+    command.prepare(folder)
+
+    def disturbed() -> None:
+        layer.arm(folder, number, AT_EACH_CALL[action])
+        command.run(folder)
+
+    return forked(disturbed)
+
+
 def at_call(command: Command, layer: Layer, number: int, action: str, expected: dict[str, Any]) -> list[str]:
     """Disturb the command at one call, do it again, and return what is not as it should be."""
     with scratch(command.work) as folder:
-        command.prepare(folder)
-
-        def disturbed() -> None:
-            layer.arm(folder, number, AT_EACH_CALL[action])
-            command.run(folder)
-
-        code = forked(disturbed)
+        code = disturbed_at(command, layer, folder, number, action)
         allowed = (-signal.SIGKILL,) if action != "full" else (REFUSED, DONE)
         wrong = [] if code in allowed else [f"ended with {code}"]
         wrong += half_written(folder)
@@ -115,16 +132,72 @@ def at_call(command: Command, layer: Layer, number: int, action: str, expected: 
         return wrong + gone_on(command, folder, expected)
 
 
-def at_random(command: Command, chance: random.Random, seconds: float, expected: dict[str, Any]) -> list[str]:
-    """Kill the command at a time by chance, and each time that it goes on once more, until it is through."""
+def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Look at all that is left by each action at each call, go on from it; the lines that are printed."""
+    actions = [action for action in given.actions.split(",") if action in AT_EACH_CALL]
+    _, expected, _ = undisturbed(command, layer)
     with scratch(command.work) as folder:
         command.prepare(folder)
+        states = watched(command, layer, folder, actions)
+        if wrong := differing(command.leaves(folder), expected):
+            raise SystemExit(f"looking on changed what {command.name} does: {wrong}")
+        whole: set[bytes] = set()
+        gone_on_from(
+            states, folder, lambda at: half_written(at, whole) + gone_on(command, at, expected), given.seconds
+        )
+        if given.compare:
+            check_states(command, layer, folder, states, given)
+    for action in actions:
+        mine = [state for state in states.found.values() if action in state.left_by]
+        wrong = states.ended_wrong if action == "full" else []
+        wrong = wrong + [
+            f"{number}: {text} ({states.calls[number]})"
+            for state in mine
+            for text in state.wrong
+            for number in state.left_by[action]
+        ]
+        kinds = dict(collections.Counter(line.partition(" ")[0] for line in states.calls))
+        tried = sum(len(state.left_by[action]) for state in mine if state.judged)
+        named = {"command": command.name, "action": action, "calls": len(states.calls), "kinds": kinds}
+        yield {**named, "tried": tried, "states": len(mine), "states of all": len(states.found), "wrong": wrong}
+
+
+def check_states(command: Command, layer: Layer, folder: Path, states: States, given: argparse.Namespace) -> None:
+    """Disturb the command for real: what it leaves must be what was looked at, but for times."""
+    for state in states.found.values():
+        for action, numbers in state.left_by.items():
+            for number in numbers:
+                if number % given.every != given.first:
+                    continue
+                shutil.rmtree(folder, ignore_errors=True)
+                disturbed_at(command, layer, folder, number, action)
+                wrong = differing(*({name: steady(name, data) for name, data in tree.items()}
+                                    for tree in (tree_of(folder), state.tree)))  # fmt: skip
+                if wrong:
+                    raise SystemExit(f"{action} at {number} ({states.calls[number]}) leaves something else: {wrong}")
+
+
+def steady(name: str, data: bytes | None) -> bytes | bool:
+    """What a file holds, or half of it under a temporary name; whether it is one, where times are in it."""
+    whole = Path(name).name.removeprefix(".").removesuffix(".gs2d.tmp")
+    dated = whole in DATED or f".{whole}" in DATED or whole.endswith((".pt", "table.json"))
+    return data is not None if data is None or dated or "/jobs/" in name else data
+
+
+def at_random(
+    command: Command, chance: random.Random, seconds: float, expected: dict[str, Any]
+) -> tuple[list[str], int]:
+    """Kill the command at a time by chance, three times in turn; what is wrong then, and how many kills it felt."""
+    with scratch(command.work) as folder:
+        command.prepare(folder)
+        codes = []
         for _ in range(3):
             child = started(lambda: command.run(folder))
             time.sleep(chance.uniform(0, seconds))
             os.kill(child, signal.SIGKILL)
-            ended(child)
-        return half_written(folder) + gone_on(command, folder, expected)
+            codes.append(ended(child))
+        kills = codes.count(-signal.SIGKILL)  # the others were through before
+        return half_written(folder) + gone_on(command, folder, expected), kills
 
 
 def stopped_and_continued(command: Command, chance: random.Random, expected: dict[str, Any]) -> list[str]:
@@ -212,7 +285,7 @@ def tries(command: Command, layer: Layer, action: str, given: argparse.Namespace
     """Do all of one action to one command; the line that is printed."""
     calls, expected, seconds = undisturbed(command, layer)
     wrong: list[str] = []
-    tried, began, chance = 0, time.monotonic(), random.Random(given.seed)
+    tried, kills, began, chance = 0, 0, time.monotonic(), random.Random(given.seed)
     numbers = range(given.first, len(calls), given.every) if action in AT_EACH_CALL else range(given.times)
     for number in numbers:
         if time.monotonic() - began > given.seconds:
@@ -220,7 +293,8 @@ def tries(command: Command, layer: Layer, action: str, given: argparse.Namespace
         if action in AT_EACH_CALL:
             found = [f"{text} ({calls[number]})" for text in at_call(command, layer, number, action, expected)]
         elif action == "random":
-            found = at_random(command, chance, seconds, expected)
+            found, felt = at_random(command, chance, seconds, expected)
+            kills += felt
         elif action == "stop":
             found = stopped_and_continued(command, chance, expected)
         elif action == "clock":
@@ -233,7 +307,7 @@ def tries(command: Command, layer: Layer, action: str, given: argparse.Namespace
         tried += 1
     kinds = dict(collections.Counter(line.partition(" ")[0] for line in calls))
     named = {"command": command.name, "action": action, "calls": len(calls), "kinds": kinds}
-    return {**named, "tried": tried, "wrong": wrong}
+    return {**named, "tried": tried, **({"kills": kills} if action == "random" else {}), "wrong": wrong}
 
 
 def main() -> None:
@@ -247,10 +321,16 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=1, help="of the actions that are not at a call")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="for each command and action")
+    parser.add_argument("--states", action="store_true", help="at each call, from one run: kill_states.py says how")
+    parser.add_argument("--compare", action="store_true", help="such states with those that real kills leave")
     given = parser.parse_args()
     layer, work = Layer(), given.work.resolve()
     work.mkdir(parents=True, exist_ok=True)
     for name in given.commands.split(","):
+        if given.states:
+            for line in at_every_call(COMMANDS[name](work), layer, given):
+                print(json.dumps(line), flush=True)
+            continue
         for action in given.actions.split(","):
             print(json.dumps(tries(COMMANDS[name](work), layer, action, given)), flush=True)
 

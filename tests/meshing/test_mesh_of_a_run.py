@@ -92,6 +92,19 @@ def test_voxels_that_nobody_asked_for_are_as_large_as_memory_needs(
         mesh_run(run, MeshOptions(voxel=fine["voxel"]), out=tmp_path / "asked.ply", threads=1)
 
 
+def test_a_training_whose_mesh_does_not_fit_has_it_in_larger_voxels_from_the_same_depth_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training and mesh in one command: the depth maps that scoring kept were closed after the voxels that failed."""
+    monkeypatch.setattr("gs2d.pipeline.mesh._volume_bytes", lambda _options: 400 << 10)
+    capture, heard = write_capture(tmp_path / "ball", size=32), list[Event]()
+    overrides = ("init_points=400", "surface.iterations=40", "surface.densify.max_splats=400")
+    run = train(TrainOptions(scene=capture, out=tmp_path / "run", recipe="2dgs", schedule_scale=0.002, threads=1,
+                             overrides=overrides, shown_views=0), heard.append)  # fmt: skip
+    assert any("the mesh has such voxels" in event.text for event in heard if isinstance(event, Notice))
+    assert run.metrics()["mesh"]["faces"] == len(read_mesh(run.file("mesh.ply")).faces) > 10
+
+
 def test_the_run_fuses_its_protocols_depth_and_one_of_before_that_field_still_resumes(
     run: Path, tmp_path: Path
 ) -> None:

@@ -60,6 +60,15 @@ def test_a_page_and_an_export_that_end_at_any_of_their_calls_leave_the_old_file_
         assert result["tried"] == result["calls"] >= 5
 
 
+def test_what_is_looked_at_at_a_call_is_what_a_kill_a_torn_write_and_a_full_disk_leave(
+    layer: Path, tmp_path: Path
+) -> None:
+    """``--states``, for long commands, looks at a process that stands still, instead of ending one at each call."""
+    for result in tried(layer, tmp_path, "export", "kill,tear,full", "--states", "--compare"):
+        assert result["tried"] == result["calls"] >= 5
+        assert 3 <= result["states"] < result["calls"]
+
+
 def test_the_layer_would_notice_a_file_that_is_written_in_place(layer: Path, tmp_path: Path) -> None:
     """A stand-in for an export that writes in place: killed half-way it leaves half a file, which must be found."""
     code = (
@@ -80,12 +89,10 @@ def test_the_layer_would_notice_a_file_that_is_written_in_place(layer: Path, tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("action", ["kill", "tear", "full"])
-def test_a_training_that_ends_at_any_of_its_calls_is_resumed_to_the_same_bytes(
-    layer: Path, tmp_path: Path, action: str
-) -> None:
-    (result,) = tried(layer, tmp_path, "train", action)
-    assert result["tried"] == result["calls"] > 200
+@pytest.mark.timeout(3000)
+def test_a_training_that_ends_at_any_of_its_calls_is_resumed_to_the_same_bytes(layer: Path, tmp_path: Path) -> None:
+    for result in tried(layer, tmp_path, "train", "kill,tear,full", "--states"):
+        assert result["tried"] == result["calls"] > 200
 
 
 @pytest.mark.slow
@@ -96,15 +103,14 @@ def test_a_mesh_and_a_report_that_end_at_any_of_their_calls_are_made_again(layer
 
 @pytest.mark.slow
 @pytest.mark.timeout(6000)
-@pytest.mark.parametrize("action", ["kill", "tear", "full"])
 @pytest.mark.parametrize("command", ["reconstruct", "sweep"])
 def test_a_reconstruction_and_a_sweep_that_end_at_any_of_their_calls_are_gone_on_with(
-    layer: Path, tmp_path: Path, command: str, action: str
+    layer: Path, tmp_path: Path, command: str
 ) -> None:
     if command == "reconstruct":
         pytest.importorskip("pycolmap", reason="no pycolmap: pip install pycolmap")
-    (result,) = tried(layer, tmp_path, command, action)
-    assert result["tried"] == result["calls"] > 200
+    for result in tried(layer, tmp_path, command, "kill,tear,full", "--states"):
+        assert result["tried"] == result["calls"] > 200
 
 
 @pytest.mark.slow

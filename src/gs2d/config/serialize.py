@@ -10,6 +10,7 @@ import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -196,10 +197,15 @@ def _decode_union(value: Any, kinds: tuple[Any, ...], where: str) -> Any:
     return decode(rest, ACTIONS[str(tag)], where)
 
 
+@cache  # looked up in the names of a module each time, by typing: some ms for a recipe
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
 def _decode_dataclass(value: Any, kind: type, where: str) -> Any:
     if not isinstance(value, Mapping):
         raise RecipeError(f"{where} must be an object, got {value!r}")
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     known = {entry.name: entry for entry in fields(kind)}
     for key in value:
         if key not in known:

@@ -6,12 +6,18 @@ Layout: the OpenEXR file layout (https://openexr.com/en/latest/OpenEXRFileLayout
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 import os
+import re
 import struct
-from collections.abc import Mapping
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -25,6 +31,8 @@ MAGIC = b"\x76\x2f\x31\x01"
 PARTS, DEEP = 0x1000, 0x0800  # bits of the version
 MOST_HEADER = 1 << 20  # bytes; a preview is among them
 _SIZES = (4, 2, 4)  # bytes of whole numbers, halves and floats
+_ONE = threading.Lock()
+_SAID = re.compile(r"\(EXR_ERR_\w+\) (.*)|^Warning: (Exception raised .*)")  # its C library, and its bindings
 _REMEDY = "write it again as one part of scan lines or tiles"
 
 
@@ -123,10 +131,13 @@ def read_channels(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     header, name = read_header(path), os.fspath(path)
     library = _required(name)
     try:
-        decoded: Mapping[str, Any] = library.File(name, separate_channels=True).channels()
+        with _listening() as said:
+            decoded: Mapping[str, Any] = library.File(name, separate_channels=True).channels()
         found = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in decoded.items()}
     except Exception as error:  # whatever its bindings make of a damaged file
         raise DataError(f"image {name} does not decode: {_first_line(error)}; replace or remove the file") from error
+    if said:  # the pixels that it gives then are not those of the file
+        raise DataError(f"image {name} does not decode: {said[0]}; replace or remove the file")
     if {key: pixels.shape for key, pixels in found.items()} != dict.fromkeys(
         header.channels, (header.height, header.width)
     ):
@@ -140,6 +151,54 @@ def _required(name: str) -> Any:
         return importlib.import_module("OpenEXR")
     except ImportError as error:
         raise DataError(f"{name} needs OpenEXR, which is not installed; {install('exr')}") from error
+
+
+@contextlib.contextmanager
+def _listening() -> Iterator[list[str]]:
+    """Take what the library says on the terminal: that is all it does about pixels that it cannot decode.
+
+    Its C library writes to stderr, its bindings to Python's stdout. Both are those of the whole process: one picture
+    at a time, and what others say meanwhile is said afterwards.
+    """
+    said: list[str] = []
+    with _ONE, _scratch() as file:
+        words = io.StringIO()
+        kept = None
+        with contextlib.suppress(OSError):  # closed
+            kept = os.dup(2)
+            os.dup2(file.fileno(), 2)
+        try:
+            with contextlib.redirect_stdout(words):
+                yield said
+        finally:
+            if kept is not None:
+                os.dup2(kept, 2)
+                os.close(kept)
+            file.seek(0)
+            errors = file.read().decode("utf-8", "surrogateescape")
+            for text, say in ((errors, _say_error), (words.getvalue(), _say)):
+                for line in text.splitlines(keepends=True):
+                    match = _SAID.search(line)
+                    if match is None:
+                        say(line)
+                    else:
+                        said.append(match[1] or match[2])
+
+
+def _say(line: str) -> None:
+    if sys.stdout is not None:
+        sys.stdout.write(line)
+
+
+def _say_error(line: str) -> None:
+    os.write(2, line.encode("utf-8", "surrogateescape"))
+
+
+def _scratch() -> IO[bytes]:
+    """Return a file in memory, where the system has such."""
+    if hasattr(os, "memfd_create"):
+        return open(os.memfd_create("exr"), "w+b")
+    return tempfile.TemporaryFile()
 
 
 def _first_line(error: BaseException) -> str:

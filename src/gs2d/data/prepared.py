@@ -21,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 from gs2d.core.files import disk_error
+from gs2d.core.growth import check_growth
 from gs2d.core.memory import trim
 from gs2d.data.build import Decoder
 from gs2d.data.cache import DecodedImage, ImageCache
@@ -33,6 +34,7 @@ SUFFIX = ".prepared"
 AHEAD = 8  # pictures that training asks for before it needs them
 _MAGIC = b"gs2d prepared photograph\n"
 _PARTS = ("image", "mask", "object_mask", "valid")
+_OF_PILLOW = (SyntaxError, RecursionError, OverflowError, Image.DecompressionBombError, MemoryError)
 _LEVEL = 1  # of zlib: higher ones take three times as long for a tenth
 
 
@@ -140,11 +142,32 @@ def read_prepared(file: Path, key: str) -> DecodedImage | None:
         start = 0
         for name, size in header["parts"]:
             packed = payload[start : start + size]
-            parts[name] = np.array(Image.open(io.BytesIO(packed), formats=["PNG"])) if size else parts["mask"]
+            parts[name] = _unpacked(file, packed, parts.get("image")) if size else parts["mask"]
             start += size
-        return DecodedImage(**parts)
-    except (KeyError, TypeError, ValueError, OSError):
+        return _whole(DecodedImage(**parts))
+    except (KeyError, TypeError, ValueError, OSError, DataError, *_OF_PILLOW):
         return None
+
+
+def _unpacked(file: Path, packed: memoryview, image: np.ndarray | None) -> np.ndarray:
+    """Return the picture in some bytes, if they can hold one so large; masks, which they can, are as large as that."""
+    with Image.open(io.BytesIO(packed), formats=["PNG"]) as picture:
+        if image is None:
+            check_growth(file, len(packed), 4 * picture.width * picture.height, "a picture")
+        elif (picture.height, picture.width) != image.shape[:2]:
+            raise ValueError("no mask of the image")
+        return np.array(picture)
+
+
+def _whole(found: DecodedImage) -> DecodedImage:
+    """Return a picture as training wants it, or raise ValueError."""
+    masks = [mask for mask in (found.mask, found.object_mask, found.valid) if mask is not None]
+    height, width, channels = found.image.shape
+    if found.image.dtype != np.uint8 or channels not in (3, 4):
+        raise ValueError("no image")
+    if any(mask.dtype != bool or mask.shape != (height, width) for mask in masks):  # an entry that is the mask
+        raise ValueError("no mask of the image")
+    return found
 
 
 def is_prepared(file: Path, key: str) -> bool:

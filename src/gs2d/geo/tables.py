@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -98,19 +97,25 @@ def _read_csv(path: Path, lines: Sequence[tuple[int, str]], epsg: int | None, re
     kept = [(number, text) for number, text in lines if text and not text.startswith("#")]
     number, head = kept[0]
     delimiter = max(",;\t", key=head.count)
-    columns = [name.strip().lower() for name in next(csv.reader([head], delimiter=delimiter))]
+    columns = [name.strip().lower() for name in _split(path, number, head, delimiter)]
     if missing := [name for name in required if name not in columns]:
         raise DataError(
             f"{path}, line {number}: a header with the columns {', '.join(required)} was expected (or OpenDroneMap's "
             f"layout, which begins with EPSG:CODE), {', '.join(missing)} is missing in {head[:60]!r}"
         )
     rows = []
-    for (number, _), words in zip(
-        kept[1:], csv.reader(io.StringIO("\n".join(text for _, text in kept[1:])), delimiter=delimiter), strict=True
-    ):
+    for number, text in kept[1:]:  # by itself: a quote that is not closed ends with its line
+        words = _split(path, number, text, delimiter)
         if len(words) > len(columns):
             raise DataError(f"{path}, line {number}: {len(columns)} values were expected, got {len(words)}")
         rows.append((number, dict(zip(columns, words, strict=False))))
     if not rows:
         raise DataError(f"{path} must hold rows below its header, got none")
     return Table(path, epsg, tuple(rows), tuple(columns))
+
+
+def _split(path: Path, number: int, text: str, delimiter: str) -> list[str]:
+    try:
+        return next(csv.reader([text], delimiter=delimiter))
+    except csv.Error as error:  # a field of more than 128 KiB
+        raise DataError(f"{path}, line {number}: words between {delimiter!r} were expected, got: {error}") from error

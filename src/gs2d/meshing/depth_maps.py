@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -147,17 +148,20 @@ class Spool:
         self._slots.append(_Slot(item.camera, offset, *has))
 
     @classmethod
-    def of(cls, frames: Iterable[RenderedView] | Spool, folder: str | os.PathLike[str] | None = None) -> Spool:
-        """Return the frames in a file of their own, cleaned one by one; a spool as it is."""
+    @contextmanager
+    def of(
+        cls, frames: Iterable[RenderedView] | Spool, folder: str | os.PathLike[str] | None = None
+    ) -> Iterator[Spool]:
+        """Give the frames in a file of their own, cleaned one by one, that is closed at the end; a spool as it is.
+
+        A spool stays open: whoever made it may read it again, in larger voxels.
+        """
         if isinstance(frames, Spool):
-            return frames
-        spool = cls(folder)
-        try:
+            yield frames
+            return
+        with cls(folder) as spool:
             spool.extend(frames)
-        except BaseException:
-            spool.close()
-            raise
-        return spool
+            yield spool
 
     def extend(self, frames: Iterable[RenderedView]) -> None:
         """Clean and write frames one by one."""

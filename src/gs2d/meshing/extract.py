@@ -66,7 +66,7 @@ def extract(
     Parameters
     ----------
     frames : iterable of Frame, or Spool
-        Read once (a generator is fine) and kept in a temporary file; a spool is one, and is closed at the end.
+        Read once (a generator is fine) and kept in a temporary file; a spool is one, and stays open.
     limits : FusionLimits, optional
         Default: ``derive_limits`` from the frames, with ``resolution``, ``bbox``, ``voxel``, ``truncation``,
         ``depth_limit`` and ``points`` as it takes them (they may not be given together with ``limits``); a truncation

@@ -174,6 +174,8 @@ def fused(
         return seen.spool if seen is not None and usable else _frames(job, splats, depth, on_event)
 
     result = _extract_that_fits(job, frames, options, on_event, subject)
+    if seen is not None:
+        seen.spool.close()  # its room on the disk
     if subject is None and result.limits.cut_fraction > MOSTLY_CUT:
         on_event(Notice(_cut_text(result, options)))
     return result

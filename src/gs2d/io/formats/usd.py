@@ -194,30 +194,35 @@ def _ask(path: str | os.PathLike[str]) -> tuple[dict[str, Any], memoryview]:
             pass
     except OSError as error:
         raise DataError(f"cannot read {os.fspath(path)}: {error.strerror or error}") from error
-    seconds = _SECONDS + size // _RATE
-    limits = [str(_ADDRESSES + _RATIO * size), str(seconds)]
-    words = [sys.executable, "-P", usd_process.__file__, os.path.abspath(path), *limits]
-    # One thread: each takes addresses, which are counted.
-    environment = {**os.environ, "PXR_WORK_THREAD_LIMIT": "1", "MALLOC_ARENA_MAX": "1", "OPENBLAS_NUM_THREADS": "1"}
+    most, seconds = _ADDRESSES + _RATIO * size, _SECONDS + size // _RATE
     try:
-        done = subprocess.run(words, capture_output=True, timeout=_WAIT * seconds, env=environment)
+        status, said = _read_apart(os.path.abspath(path), most, seconds)
     except subprocess.TimeoutExpired as error:
         raise DataError(
             f"{os.fspath(path)}: OpenUSD that is read in {error.timeout:.0f} s was expected; do not trust the file"
         ) from error
-    line, _, _ = done.stdout.partition(b"\n")
+    line, _, _ = said.partition(b"\n")
     try:
         facts = json.loads(line)
     except ValueError:
         raise DataError(
-            f"{os.fspath(path)}: OpenUSD was expected, its reader broke on it (status {done.returncode}); copy or "
+            f"{os.fspath(path)}: OpenUSD was expected, its reader broke on it (status {status}); copy or "
             "export the file again"
         ) from None
     if "error" in facts:
         raise DataError(f"{os.fspath(path)}: {facts['error']}")
-    data = memoryview(done.stdout)[len(line) + 1 :]
+    data = memoryview(said)[len(line) + 1 :]
     check_growth(path, size, len(data), "splats", small=_SMALL, ratio=_RATIO)
     return facts, data
+
+
+def _read_apart(path: str, most: int, seconds: int) -> tuple[int, bytes]:
+    """Return exit status and stdout of ``usd_process`` with so many bytes of addresses and seconds of a processor."""
+    words = [sys.executable, "-P", usd_process.__file__, path, str(most), str(seconds)]
+    # One thread: each takes addresses, which are counted.
+    environment = {**os.environ, "PXR_WORK_THREAD_LIMIT": "1", "MALLOC_ARENA_MAX": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(words, capture_output=True, timeout=_WAIT * seconds, env=environment)
+    return done.returncode, done.stdout
 
 
 def _gaussians(path: object, fact: dict[str, Any], arrays: dict[str, np.ndarray]) -> Gaussians:
