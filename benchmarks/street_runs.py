@@ -38,7 +38,7 @@ from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.mesh import fusion_frame
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.scoring import score_views
@@ -224,7 +224,7 @@ def score_run(path: Path) -> dict[str, Any]:
     """
     run, job, splats = open_job(path, None, ignore)
     drawing = (job.settings, job.backend)
-    exposures = with_predicted(read_exposures(run, job.recipe), job.scene)
+    exposures = with_predicted(read_exposures(run, job.recipe), job.scene, metered(splats, *drawing))
 
     def scores(views: Sequence[View], **how: Any) -> dict[str, Any] | None:
         return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, **how))

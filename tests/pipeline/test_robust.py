@@ -140,6 +140,43 @@ def test_where_neighbours_say_nothing_a_view_has_the_mean_exposure() -> None:
     assert predicted(gains) == pytest.approx(1.0, abs=1e-6)
 
 
+def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
+    """The gain that the last view of the ring would have, where the scene is so bright in each view."""
+    scene = ring(gains, test=1)
+    transforms = {view.name: torch.eye(3, 4) * g for view, g in zip(scene.train, gains[:-1], strict=True)}
+    brightness = {view.name: float(value) for view, value in zip(scene.views, seen, strict=True)}
+    found = with_predicted(transforms, scene, lambda view: brightness[view.name])
+    assert all(torch.equal(found[name], transform) for name, transform in transforms.items())
+    return float(found[scene.test[0].name][0, 0])
+
+
+def test_where_exposures_follow_what_the_camera_sees_a_view_has_that_of_its_brightness() -> None:
+    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)  # as if by chance: neighbours say nothing
+    gains = (seen + 0.02) ** -0.8
+    gains /= gains[:-1].mean()
+    assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.02)
+
+
+def test_what_neighbours_have_beside_the_brightness_is_added_to_it() -> None:
+    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
+    gains = (seen + 0.02) ** -0.8 * (1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False)))
+    gains /= gains[:-1].mean()
+    assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.08)
+
+
+def test_a_brightness_that_says_nothing_is_left_out() -> None:
+    gains = 1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False))
+    by_chance = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
+    assert by_meter(gains, by_chance) == predicted(gains)
+    assert by_meter(gains, np.full(24, 0.5)) == predicted(gains)
+
+
+def test_exposures_that_rise_with_brightness_are_no_automatic() -> None:
+    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
+    gains = seen / seen[:-1].mean()
+    assert by_meter(gains, seen) == predicted(gains)
+
+
 def test_a_run_without_exposures_predicts_none() -> None:
     assert with_predicted({}, ring(np.ones(4), test=1)) == {}
 
