@@ -42,7 +42,7 @@ from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.scoring import score_views
-from gs2d.pipeline.subject import sights
+from gs2d.pipeline.subject import sights, surface_reach
 from gs2d.render.api import rasterize
 from gs2d.sfm.images import find_photos
 from gs2d.sfm.workspace import POSES_JSON
@@ -329,7 +329,8 @@ def measure_mesh(path: Path) -> dict[str, Any]:
 def pixels_of(job: Job, splats: Splats, mesh: Mesh) -> float:
     """How many pixels of the training views saw a mesh: each part of it counts in the view that saw it best."""
     views = ((view, render_view(splats, view, job.settings, job.backend)) for view in job.scene.train)
-    maps = (depth_map(fusion_frame(job, view, output, "median")) for view, output in views)
+    reach = surface_reach(job)
+    maps = (depth_map(fusion_frame(job, view, output, "median", reach)) for view, output in views)
     return pixels(mesh, gather(mesh, maps, SAME_SURFACE * job.scene.extent))
 
 

@@ -23,7 +23,11 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.job import as_begun, check_same_run, fit_recipe, reload_job, settled
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
+from gs2d.render.api import rasterize
+from gs2d.render.backends import get_backend
+from gs2d.render.types import RasterSettings
+from train_toys import random_splats
 
 COUNT = 12
 
@@ -148,6 +152,18 @@ def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
     found = with_predicted(transforms, scene, lambda view: brightness[view.name])
     assert all(torch.equal(found[name], transform) for name, transform in transforms.items())
     return float(found[scene.test[0].name][0, 0])
+
+
+def test_the_meter_reads_the_mean_of_a_picture() -> None:
+    """Over the background, in the scene's own exposure, whatever the size of the photograph."""
+    wide = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), width=400, height=300, fx=400.0)
+    view = View.from_arrays("0", wide, np.zeros((300, 400, 3), np.uint8))
+    splats, backend = random_splats(40), get_backend("reference")
+    settings = RasterSettings(background=(0.2, 0.4, 0.6))
+    color = rasterize(splats, wide, settings, backend=backend).color.clamp_min(0)
+    luma = float((color @ torch.tensor([0.299, 0.587, 0.114])).mean())
+    assert metered(splats, settings, backend)(view) == pytest.approx(luma, rel=0.02)
+    assert luma != pytest.approx(0.299 * 0.2 + 0.587 * 0.4 + 0.114 * 0.6, rel=0.05)
 
 
 def test_where_exposures_follow_what_the_camera_sees_a_view_has_that_of_its_brightness() -> None:

@@ -99,9 +99,8 @@ class LearningRates:
     ICLR 2025); 0 = rates as they are.
 
     The other rates are constant, but for ``settle_steps`` iterations after ``settle_start``, over which they fall
-    linearly to ``settle_factor`` times what they were (and stay there): a splat learns from one view at a time, and with
-    constant steps it keeps wandering between what its views ask for. 0 steps = constant to the end, as in the official
-    code.
+    linearly to ``settle_factor`` times what they were, and stay there: a splat learns from one view at a time, and with
+    constant steps it wanders to the end between what its views ask for. 0 steps = constant, as in the official code.
     """
 
     means: float = 1.6e-4

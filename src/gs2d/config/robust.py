@@ -50,14 +50,14 @@ class BackgroundSphere:
         On the whole sphere, evenly; those in directions that no photograph shows are left out. Few and large ones: more
         of them learn each photograph's background by heart (docs/decisions/fog.md).
     radius : float
-        In units of the scene's extent, or of the distance of its sparse points (95th percentile) where that is larger.
+        In units of how far the scene goes: its cameras, and nearly all of its sparse points and swept places.
     size : float
         Standard deviation of a splat, in units of the distance to its neighbours.
     """
 
-    splats: int = 1_500
-    radius: float = 1.5
-    size: float = 0.7
+    splats: int = 500
+    radius: float = 3.0
+    size: float = 0.8
 
 
 @dataclass(frozen=True)

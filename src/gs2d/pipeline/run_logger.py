@@ -83,7 +83,7 @@ class RunLogger:
         self._at_entry = dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self._trainer: Trainer | None = None
-        self._predicted: tuple[tuple[int, int], Transforms] | None = None  # exposures, and the stage and step they are of
+        self._predicted: tuple[tuple[int, int], Transforms] | None = None  # of stage and step
         self.psnr: float | None = None  # of the probe views, the last time that they were scored
         self._before: Snapshot | None = None  # of the last step line, until it is compared with the next progress
         self._signals = HeldSignals()

@@ -8,17 +8,19 @@ far out are enough to begin with; training moves, splits and colours them, and t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from gs2d.config.robust import BackgroundSphere
+from gs2d.data.reach import reach_of
 from gs2d.data.scene import Scene
-from gs2d.training.plane_sweep import Sweep, project
+from gs2d.training.plane_sweep import Sweep, project, unproject
 
 BESIDE_KNOWN = 3  # px: so near to a pixel of known depth, another one is probably of the same thing
 MAX_VIEWS = 200  # that are looked at, evenly chosen
-FARTHEST = 95.0  # percentile of the distances of sparse points: beyond it are mistakes
+STRIDE = 5  # px between those of which places are looked at
 
 
 def sphere_points(
@@ -26,9 +28,8 @@ def sphere_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return places, colours in [0, 1], normals (all [P, 3]) and sizes [P] of splats around everything.
 
-    Their middle is the mean of the training cameras. Places are left out that no photograph shows in a pixel of unknown
-    depth, and all of them where photographs have an alpha channel: it says what is empty. A colour is the median of
-    those pixels.
+    Places are left out that no photograph shows in a pixel of unknown depth, and all of them where photographs have an
+    alpha channel: it says what is empty. A colour is the median of those pixels.
 
     Parameters
     ----------
@@ -37,14 +38,15 @@ def sphere_points(
         Of the scene: its photographs, shrunk, and the depths that are known.
     settings : BackgroundSphere
     """
-    directions = evenly_on_sphere(0 if scene.train[0].alpha() is not None else settings.splats)
-    center = np.stack([view.camera.center for view in scene.train]).mean(axis=0)
-    radius = settings.radius * _reach(scene, center)
-    rows, colors = _looks(sweep, center + radius * directions)
+    looked_at = range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS)))
+    reach = reach_of(scene, _swept_places(sweep, looked_at))
+    if reach is None or scene.train[0].alpha() is not None:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    radius, directions = settings.radius * reach.radius, evenly_on_sphere(settings.splats)
+    rows, colors = _looks(sweep, looked_at, reach.center + radius * directions)
     kept, median = _medians(rows, colors)
-    spacing = math.sqrt(4 * math.pi / max(1, settings.splats))
-    places = center + radius * directions[kept]
-    return places, median, -directions[kept], np.full(len(kept), settings.size * spacing * radius)
+    size = settings.size * math.sqrt(4 * math.pi / settings.splats) * radius
+    return reach.center + radius * directions[kept], median, -directions[kept], np.full(len(kept), size)
 
 
 def evenly_on_sphere(count: int) -> np.ndarray:
@@ -56,19 +58,20 @@ def evenly_on_sphere(count: int) -> np.ndarray:
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
 
 
-def _reach(scene: Scene, center: np.ndarray) -> float:
-    """How far the scene goes from its middle, world units: cameras, and nearly all sparse points."""
-    points = None if scene.points is None else np.asarray(scene.points.points, dtype=np.float64)
-    points = points if points is None else points[np.isfinite(points).all(axis=1)]
-    if points is None or not len(points):
-        return scene.extent
-    return max(scene.extent, float(np.percentile(np.linalg.norm(points - center, axis=1), FARTHEST)))
+def _swept_places(sweep: Sweep, looked_at: Sequence[int]) -> np.ndarray:
+    """Return some of the places [P, 3] of known depth."""
+    found = [np.zeros((0, 3))]
+    for index in looked_at:
+        depth = sweep.depths[index]
+        places, known = unproject(sweep.views[index], depth)[::STRIDE, ::STRIDE], (depth > 0)[::STRIDE, ::STRIDE]
+        found.append(places[known])
+    return np.concatenate(found)
 
 
-def _looks(sweep: Sweep, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _looks(sweep: Sweep, looked_at: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which of the places [N, 3] photographs show in pixels of unknown depth, and in what colour: [L], [L, 3]."""
     rows, colors = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
-    for index in range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS))):
+    for index in looked_at:
         view = sweep.views[index]
         unknown = view.usable & ~binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
         _, column, row, inside = project(view, places)
