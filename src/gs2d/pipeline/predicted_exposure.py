@@ -27,9 +27,9 @@ from gs2d.render.types import RasterSettings
 NEIGHBOURS = 5  # training photographs that a prediction is made of
 CLOSE = 0.02  # added to distances, in extents: poses are never quite the same, and one photograph is no mean
 GREY = 0.5
-WORTH = 0.8  # brightness is believed where what it leaves unsaid (variance) is less than that of what neighbours do
+WORTH = 0.9  # brightness is believed where what it leaves unsaid (variance) is less than that of what neighbours do
 ENOUGH = 8  # training photographs, for a line of two numbers to be more than chance
-METERED = 96  # px of the longer side of a picture whose brightness is looked at
+METERED = 256  # px of the longer side of a picture whose brightness is looked at; smaller ones widen thin splats
 LUMA = (0.299, 0.587, 0.114)
 DARK = 0.02  # added to a brightness: a picture of nothing has a logarithm too
 LEAST_GAIN = 0.05
