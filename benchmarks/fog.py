@@ -36,7 +36,7 @@ from gs2d.evaluation.images import image_metrics, psnr_float
 from gs2d.pipeline.exposure import Transforms, named, photographed
 from gs2d.pipeline.job import fit_recipe, with_backdrop
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.render.api import rasterize
 from gs2d.render.exposure import fit_exposure
 from gs2d.render.types import RasterSettings
@@ -83,8 +83,9 @@ def train_variant(scene: Scene, name: str, recipe: str, scale: float, seed: int)
 @torch.no_grad()
 def measure(scene: Scene, trainer: Trainer) -> dict[str, Any]:
     """The figures of a trained scene."""
-    transforms = with_predicted(named(scene.train, trainer.state.exposures), scene)
     settings, splats = trainer.settings, trainer.splats
+    brightness = metered(splats, settings, trainer.backend)
+    transforms = with_predicted(named(scene.train, trainer.state.exposures), scene, brightness)
     tests = [_score(scene, view, splats, settings, transforms) for view in scene.test]
     chosen = scene.train[:: max(1, len(scene.train) // TRAINING_VIEWS)]
     trains = [_score(scene, view, splats, settings, transforms) for view in chosen]

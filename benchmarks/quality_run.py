@@ -161,11 +161,12 @@ def score(job: Job, state: TrainState) -> dict[str, Any]:
     # Here, while the clocks stand still: a training does not need them.
     from benchmarks.street_runs import summary_of
     from gs2d.pipeline.exposure import named
-    from gs2d.pipeline.predicted_exposure import with_predicted
+    from gs2d.pipeline.predicted_exposure import metered, with_predicted
     from gs2d.pipeline.scoring import score_views
 
-    exposures = with_predicted(named(job.scene.train, state.exposures), job.scene)
     views, splats = job.scene.test or job.scene.train, state.splats
+    brightness = metered(splats, job.settings, job.backend)
+    exposures = with_predicted(named(job.scene.train, state.exposures), job.scene, brightness)
     scores = score_views(
         splats, views, job.settings, job.backend, name="", on_event=ignore, exposures=exposures, split="test"
     )

@@ -38,11 +38,11 @@ from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.mesh import fusion_frame
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.reconstruct import CAPTURE, FEW
 from gs2d.pipeline.render import render_view
 from gs2d.pipeline.scoring import score_views
-from gs2d.pipeline.subject import sights
+from gs2d.pipeline.subject import sights, surface_reach
 from gs2d.render.api import rasterize
 from gs2d.sfm.images import find_photos
 from gs2d.sfm.workspace import POSES_JSON
@@ -224,7 +224,7 @@ def score_run(path: Path) -> dict[str, Any]:
     """
     run, job, splats = open_job(path, None, ignore)
     drawing = (job.settings, job.backend)
-    exposures = with_predicted(read_exposures(run, job.recipe), job.scene)
+    exposures = with_predicted(read_exposures(run, job.recipe), job.scene, metered(splats, *drawing))
 
     def scores(views: Sequence[View], **how: Any) -> dict[str, Any] | None:
         return summary_of(score_views(splats, views, *drawing, name="", on_event=ignore, **how))
@@ -329,7 +329,8 @@ def measure_mesh(path: Path) -> dict[str, Any]:
 def pixels_of(job: Job, splats: Splats, mesh: Mesh) -> float:
     """How many pixels of the training views saw a mesh: each part of it counts in the view that saw it best."""
     views = ((view, render_view(splats, view, job.settings, job.backend)) for view in job.scene.train)
-    maps = (depth_map(fusion_frame(job, view, output, "median")) for view, output in views)
+    reach = surface_reach(job)
+    maps = (depth_map(fusion_frame(job, view, output, "median", reach)) for view, output in views)
     return pixels(mesh, gather(mesh, maps, SAME_SURFACE * job.scene.extent))
 
 

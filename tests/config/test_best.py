@@ -16,7 +16,7 @@ from gs2d.config.presets import (
     with_robustness,
 )
 from gs2d.config.recipe import GradDensify, LearningRates, Recipe, validate
-from gs2d.config.robust import DenseStart, FreeSpace
+from gs2d.config.robust import BackgroundSphere, DenseStart, FreeSpace
 from gs2d.config.schedule import longer_steps, scale_schedule
 from gs2d.config.serialize import apply_overrides, from_json, to_json
 from gs2d.errors import RecipeError
@@ -49,6 +49,15 @@ def test_their_schedule_is_that_of_2dgs_in_fewer_iterations_with_longer_steps(na
     assert short.lr.opacity_logits == pytest.approx(official.lr.opacity_logits * (0.1 * part) ** -0.25)
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_all_rates_are_low_at_the_end(name: str, scale: float) -> None:
+    (stage,) = scale_schedule(get_recipe(name), scale).stages
+    end = stage.iterations
+    assert (stage.lr.settled_at(round(0.69 * end)), stage.lr.settled_at(end)) == (1.0, pytest.approx(0.1))
+    assert stage.lr.means_at(end) == pytest.approx(stage.lr.means_final)
+
+
 def test_best_surface_compares_views_in_its_last_fifth_alone() -> None:
     stage = get_recipe("best-surface").stages[0]
     terms = {term.kind: (term.weight, term.start, term.every) for term in stage.losses if "multiview" in term.kind}
@@ -69,7 +78,9 @@ def test_they_are_written_read_and_described(name: str) -> None:
     assert from_json(to_json(recipe)) == recipe
     said = "\n".join(describe_recipe(recipe))
     assert "the mesh is of the transmittance depth" in said
-    assert "dense start: a sweep over photographs of about 256 px, its splats fitted to them; without where" in said
+    assert "dense start: a sweep over photographs of about 256 px, its splats fitted to them, and 500 on a" in said
+    assert "on a sphere around everything; without where they agree on nothing" in said
+    assert "rates but that of the means fall after iteration" in said
 
 
 def test_recipes_of_before_are_written_as_they_were() -> None:
@@ -91,7 +102,7 @@ def test_parts_can_be_left_out_by_name() -> None:
 
 def test_robust_training_starts_as_it_was_tried_and_spares_sky_and_ground() -> None:
     robust = with_robustness(get_recipe("best"))
-    assert robust.dense_start == DenseStart()
+    assert robust.dense_start == DenseStart(sphere=BackgroundSphere())
     (stage,) = robust.stages
     assert isinstance(stage.densify, GradDensify)
     assert not any(stage.densify.culls_scale(i) for i in range(1, stage.iterations + 1))

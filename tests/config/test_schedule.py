@@ -84,6 +84,15 @@ def test_rates_are_stretched_in_shorter_schedules_where_a_stage_says_so() -> Non
     assert longer.lr == replace(stage.lr, means_decay_steps=60_000)
 
 
+def test_the_end_over_which_rates_settle_goes_with_the_schedule() -> None:
+    recipe = get_recipe("2dgs")
+    stage = replace(recipe.stages[0], lr=LearningRates(settle_start=20_000, settle_steps=10_000, settle_factor=0.2))
+    lr = scale_schedule(replace(recipe, stages=(stage,)), 0.01).stages[0].lr
+    assert (lr.settle_start, lr.settle_steps, lr.settle_factor) == (200, 100, 0.2)
+    assert [lr.settled_at(i) for i in (1, 200, 250, 300, 400)] == pytest.approx([1, 1, 0.6, 0.2, 0.2])
+    assert scale_schedule(recipe, 0.01).stages[0].lr.settled_at(300) == 1
+
+
 def test_sizes_of_photographs_go_with_the_schedule() -> None:
     recipe = get_recipe("2dgs")
     stage = replace(recipe.stages[0], downscale=4, halve_at=(3_000, 9_000))

@@ -23,7 +23,11 @@ from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.job import as_begun, check_same_run, fit_recipe, reload_job, settled
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
+from gs2d.render.api import rasterize
+from gs2d.render.backends import get_backend
+from gs2d.render.types import RasterSettings
+from train_toys import random_splats
 
 COUNT = 12
 
@@ -138,6 +142,55 @@ def test_where_neighbours_have_similar_exposures_a_view_between_them_has_theirs(
 def test_where_neighbours_say_nothing_a_view_has_the_mean_exposure() -> None:
     gains = 1 + 0.3 * (-1.0) ** np.arange(24)  # each is the opposite of its neighbours
     assert predicted(gains) == pytest.approx(1.0, abs=1e-6)
+
+
+def by_meter(gains: np.ndarray, seen: np.ndarray) -> float:
+    """The gain that the last view of the ring would have, where the scene is so bright in each view."""
+    scene = ring(gains, test=1)
+    transforms = {view.name: torch.eye(3, 4) * g for view, g in zip(scene.train, gains[:-1], strict=True)}
+    brightness = {view.name: float(value) for view, value in zip(scene.views, seen, strict=True)}
+    found = with_predicted(transforms, scene, lambda view: brightness[view.name])
+    assert all(torch.equal(found[name], transform) for name, transform in transforms.items())
+    return float(found[scene.test[0].name][0, 0])
+
+
+def test_the_meter_reads_the_mean_of_a_picture() -> None:
+    """Over the background, in the scene's own exposure, whatever the size of the photograph."""
+    wide = look_at(np.array([3.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), width=400, height=300, fx=400.0)
+    view = View.from_arrays("0", wide, np.zeros((300, 400, 3), np.uint8))
+    splats, backend = random_splats(40), get_backend("reference")
+    settings = RasterSettings(background=(0.2, 0.4, 0.6))
+    color = rasterize(splats, wide, settings, backend=backend).color.clamp_min(0)
+    luma = float((color @ torch.tensor([0.299, 0.587, 0.114])).mean())
+    assert metered(splats, settings, backend)(view) == pytest.approx(luma, rel=0.02)
+    assert luma != pytest.approx(0.299 * 0.2 + 0.587 * 0.4 + 0.114 * 0.6, rel=0.05)
+
+
+def test_where_exposures_follow_what_the_camera_sees_a_view_has_that_of_its_brightness() -> None:
+    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)  # as if by chance: neighbours say nothing
+    gains = (seen + 0.02) ** -0.8
+    gains /= gains[:-1].mean()
+    assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.02)
+
+
+def test_what_neighbours_have_beside_the_brightness_is_added_to_it() -> None:
+    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
+    gains = (seen + 0.02) ** -0.8 * (1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False)))
+    gains /= gains[:-1].mean()
+    assert by_meter(gains, seen) == pytest.approx(gains[-1], rel=0.08)
+
+
+def test_a_brightness_that_says_nothing_is_left_out() -> None:
+    gains = 1 + 0.3 * np.cos(np.linspace(0, 2 * np.pi, 24, endpoint=False))
+    by_chance = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
+    assert by_meter(gains, by_chance) == predicted(gains)
+    assert by_meter(gains, np.full(24, 0.5)) == predicted(gains)
+
+
+def test_exposures_that_rise_with_brightness_are_no_automatic() -> None:
+    seen = 0.4 + 0.2 * np.sin(1.7 * np.arange(24) ** 2)
+    gains = seen / seen[:-1].mean()
+    assert by_meter(gains, seen) == predicted(gains)
 
 
 def test_a_run_without_exposures_predicts_none() -> None:

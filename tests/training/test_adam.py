@@ -127,6 +127,15 @@ def test_rates_decay_only_for_the_means_which_scale_with_the_extent() -> None:
     assert first["opacity_logits"] == 0.05
 
 
+def test_where_rates_settle_all_but_that_of_the_means_fall() -> None:
+    plain, settling = LearningRates(), LearningRates(settle_start=100, settle_steps=50, settle_factor=0.1)
+    for iteration, factor in ((100, 1.0), (125, 0.55), (150, 0.1), (900, 0.1)):
+        before, after = lr_at(plain, iteration, 2.0), lr_at(settling, iteration, 2.0)
+        assert after["means"] == before["means"]
+        for name in ("quats", "log_scales", "opacity_logits", "sh0", "shN"):
+            assert after[name] == pytest.approx(factor * before[name])
+
+
 def test_degree_0_has_no_higher_coefficients_to_train() -> None:
     state = TrainState(random_splats(4, degree=0), torch.Generator())
     stage = Stage("s", 1)

@@ -46,7 +46,8 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         start = recipe.dense_start
         fitted = ", its splats fitted to them" if start.fit is not None else ""
         otherwise = "" if start.required else "; without where they agree on nothing"
-        yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{otherwise}"
+        around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around everything"
+        yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{around}{otherwise}"
     if recipe.fused_depth is not None:
         yield f"the mesh is of the {recipe.fused_depth} depth"
     for number, stage in enumerate(recipe.stages, start=1):
@@ -85,6 +86,9 @@ def _describe_stage(stage: Stage) -> Iterator[str]:
         groups.setdefault(rows, []).append(attribute)
     for rows, attributes in groups.items():
         yield f"trains {', '.join(attributes)} of {'all splats' if rows == 'all' else repr(rows)}"
+    if stage.lr.settle_steps:
+        falls = f"to {stage.lr.settle_factor:g} of themselves over {stage.lr.settle_steps:,} iterations"
+        yield f"rates but that of the means fall after iteration {stage.lr.settle_start:,}, {falls}"
     frozen = [attribute for attribute in ALL if attribute not in stage.train]
     if frozen:
         yield f"frozen: {', '.join(frozen)}"

@@ -34,7 +34,7 @@ from gs2d.config.recipe import (
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
 from gs2d.config.registry import Registry
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, StartFit
+from gs2d.config.robust import BackgroundSphere, DenseStart, FreeSpace, OpacityDecay, SeenArea, StartFit
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
 
@@ -47,7 +47,9 @@ DEFAULT_RECIPE = "best"  # of `gs2d train`, `reconstruct` and `demo`
 OFFICIAL_ITERATIONS = 30_000  # of 2DGS, for which its rates were chosen
 BEST_ITERATIONS, FAST_ITERATIONS = 20_000, 6_600
 BACKDROP_RATE = 0.3  # docs/decisions/fog.md
+SETTLING, SETTLED = 0.3, 0.1  # of the iterations, at the end, in which rates fall, and to what: decisions/training.md
 DENSE_START = DenseStart(side=256, neighbours=3, fit=StartFit())  # docs/decisions/training.md
+STREET_START = DenseStart(sphere=BackgroundSphere())  # docs/decisions/fog.md
 
 # AbsGS, the numbers of its released code: clone 2e-4 signed, split 4e-4 absolute, percent_dense 0.001, cull 0.005,
 # reset every 3000, opacity capped at 0.8 every 500. "D" in the paper's table.
@@ -258,12 +260,12 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
     photographs show. A dense start that is not required gives way to the one that was tried with the rest; and where
     no resets delay the prune by size there is none, which would take sky and ground.
     """
-    start = recipe.dense_start or DenseStart()
+    start = recipe.dense_start or STREET_START
     return replace(
         recipe,
         name=name or recipe.name,
         stages=tuple(map(_sparing_large_splats, recipe.stages)),
-        dense_start=start if start.required else DenseStart(),
+        dense_start=start if start.required else STREET_START,
         free_space=recipe.free_space or FreeSpace(),
         opacity_decay=recipe.opacity_decay or OpacityDecay(),
         seen_area=recipe.seen_area or SeenArea(),
@@ -320,14 +322,27 @@ def best(iterations: int = BEST_ITERATIONS, *, name: str = "best") -> Recipe:
         "surface",
         iterations,
         losses=(*PHOTOMETRIC, nc),
-        lr=replace(LearningRates(means_decay_steps=iterations).times(part**-LONGER), stretch=LONGER),
+        lr=_best_rates(iterations),
         densify=GradDensify(
             start=round(500 * part), stop=round(15_000 * part), reset_every=0, scale_cull_start=iterations
         ),
         sh_interval=round(1_000 * part),
     )
-    start = replace(DENSE_START, required=False)
+    start = replace(DENSE_START, required=False, sphere=BackgroundSphere())
     return Recipe(name, (stage,), dense_start=start, fused_depth="transmittance")
+
+
+def _best_rates(iterations: int) -> LearningRates:
+    """Return official rates made longer for fewer iterations, which settle at the end."""
+    times = (iterations / OFFICIAL_ITERATIONS) ** -LONGER
+    start = round((1 - SETTLING) * iterations)
+    return replace(
+        LearningRates(means_decay_steps=iterations).times(times),
+        stretch=LONGER,
+        settle_start=start,
+        settle_steps=iterations - start,
+        settle_factor=SETTLED,
+    )
 
 
 def best_surface(*, name: str = "best-surface") -> Recipe:

@@ -97,6 +97,10 @@ class LearningRates:
     ``view_power`` is of steps that several views share (several processes): a step on the mean of B views has all rates
     times ``B ** view_power``. 1/2 is what Grendel found (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training",
     ICLR 2025); 0 = rates as they are.
+
+    The other rates are constant, but for ``settle_steps`` iterations after ``settle_start``, over which they fall
+    linearly to ``settle_factor`` times what they were, and stay there: a splat learns from one view at a time, and with
+    constant steps it wanders to the end between what its views ask for. 0 steps = constant, as in the official code.
     """
 
     means: float = 1.6e-4
@@ -112,6 +116,16 @@ class LearningRates:
     eps: float = 1e-15
     stretch: float = field(default=0.0, metadata={"omit_empty": True})
     view_power: float = field(default=0.5, metadata={"omit_empty": True})
+    settle_start: int = field(default=0, metadata={"omit_empty": True})
+    settle_steps: int = field(default=0, metadata={"omit_empty": True})
+    settle_factor: float = field(default=0.0, metadata={"omit_empty": True})
+
+    def settled_at(self, iteration: int) -> float:
+        """Factor of all rates but the means' at an iteration (1-based): 1, then linear, then constant."""
+        if self.settle_steps == 0:
+            return 1.0
+        t = min(max((iteration - self.settle_start) / self.settle_steps, 0.0), 1.0)
+        return 1.0 - t * (1.0 - self.settle_factor)
 
     def means_at(self, iteration: int) -> float:
         """Rate of ``means`` at an iteration (1-based), without the extent: log-linear, then constant."""
@@ -120,8 +134,7 @@ class LearningRates:
 
     def times(self, factor: float) -> LearningRates:
         """Return all rates times a factor."""
-        fixed = ("means_decay_steps", "beta1", "beta2", "eps", "stretch", "view_power")
-        names = [entry.name for entry in fields(self) if entry.name not in fixed]
+        names = ("means", "means_final", "quats", "log_scales", "opacity_logits", "sh0", "shN")
         return replace(self, **{name: getattr(self, name) * factor for name in names})
 
     def for_views(self, views: int) -> LearningRates:
@@ -452,6 +465,9 @@ def _check_stage(where: str, stage: Stage, groups: list[str], to_train: bool) ->
     )
     integer(f"{where}: rates.means_horizon", stage.lr.means_decay_steps, low=1)
     require(max(stage.lr.beta1, stage.lr.beta2) < 1, f"{where}: rates.beta1 and rates.beta2 must be below 1")
+    for name in ("settle_start", "settle_steps"):
+        integer(f"{where}: lr.{name}", getattr(stage.lr, name), low=0)
+    require(stage.lr.settle_factor <= 1, f"{where}: lr.settle_factor must be at most 1, got {stage.lr.settle_factor}")
     if isinstance(stage.densify, Densify):
         name = stage.densify.name
         require(not to_train or name in DENSIFIERS, f"{where}: {DENSIFIERS.unknown(name)}")

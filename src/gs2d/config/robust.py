@@ -41,6 +41,26 @@ class StartFit:
 
 
 @dataclass(frozen=True)
+class BackgroundSphere:
+    """Splats around everything where no depth is known, to start from (``training/background_sphere.py``).
+
+    Attributes
+    ----------
+    splats : int
+        On the whole sphere, evenly; those in directions that no photograph shows are left out. Few and large ones: more
+        of them learn each photograph's background by heart (docs/decisions/fog.md).
+    radius : float
+        In units of how far the scene goes: its cameras, and nearly all of its sparse points and swept places.
+    size : float
+        Standard deviation of a splat, in units of the distance to its neighbours.
+    """
+
+    splats: int = 500
+    radius: float = 3.0
+    size: float = 0.8
+
+
+@dataclass(frozen=True)
 class DenseStart:
     """Splats to start from where a plane sweep over neighbouring photographs agrees (``training/plane_sweep.py``).
 
@@ -74,6 +94,8 @@ class DenseStart:
         one photograph.
     required : bool
         Whether training stops where photographs agree on nothing; if not, it says so and starts without.
+    sphere : BackgroundSphere or None
+        Splats around everything, for what no depth is known of.
     """
 
     side: int = 200
@@ -89,6 +111,7 @@ class DenseStart:
     max_views: int = 120
     fit: StartFit | None = field(default=None, metadata={"omit_empty": True})
     required: bool = field(default=True, metadata={"omit_empty": True})
+    sphere: BackgroundSphere | None = field(default=None, metadata={"omit_empty": True})
 
 
 @dataclass(frozen=True)
@@ -196,6 +219,11 @@ def check_robust(
         require(start.min_angle < start.max_angle, f"{at}.min_angle must be below max_angle, got {start.min_angle}")
         if start.fit is not None:
             _check_fit(f"{at}.fit", start.fit)
+        if start.sphere is not None:
+            integer(f"{at}.sphere.splats", start.sphere.splats, low=1)
+            for name in ("radius", "size"):
+                value = number(f"{at}.sphere.{name}", getattr(start.sphere, name), low=0.0)
+                require(value > 0, f"{at}.sphere.{name} must be positive, got {value}")
     if free is not None:
         at = f"{where}: free_space"
         for name in ("every", "views", "window"):

@@ -123,7 +123,12 @@ def _scale_stage(stage: Stage, factor: float) -> Stage:
 
 def _scale_lr(lr: LearningRates, factor: float) -> LearningRates:
     times = factor**-lr.stretch if factor < 1 else 1.0
-    return replace(lr.times(times) if times != 1 else lr, means_decay_steps=_scaled(lr.means_decay_steps, factor))
+    return replace(
+        lr.times(times) if times != 1 else lr,
+        means_decay_steps=_scaled(lr.means_decay_steps, factor),
+        settle_start=round(lr.settle_start * factor),
+        settle_steps=_scaled(lr.settle_steps, factor),
+    )
 
 
 def _scale_densify(densify: GradDensify | Densify, factor: float) -> GradDensify | Densify:

@@ -18,7 +18,7 @@ from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import open_job
 from gs2d.pipeline.options import EvaluateOptions
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.refined_poses import aligned
 from gs2d.pipeline.report import report_again
 from gs2d.pipeline.scoring import score_views, split_metrics
@@ -54,7 +54,7 @@ def evaluate_run(
     if truth is not None and not has_mesh and given is not None:
         raise RunError(f"{path} has no {MESH}; make it with `gs2d mesh {path}`")
     drawing = (job.settings, job.backend)
-    exposures = with_predicted(read_exposures(run, job.recipe), job.scene)
+    exposures = with_predicted(read_exposures(run, job.recipe), job.scene, metered(splats, *drawing))
     if options.match_exposure:
         name = "scoring test views, colours matched"
         scores = score_views(splats, job.scene.test, *drawing, name=name, on_event=on_event, lpips=lpips, match=True)

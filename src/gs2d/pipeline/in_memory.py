@@ -29,7 +29,7 @@ from gs2d.pipeline.job import choose_backend, choose_protocol, settled
 from gs2d.pipeline.masks import with_masks, without_masked_points
 from gs2d.pipeline.mesh import fused
 from gs2d.pipeline.options import MeshOptions, Robust, TrainOptions
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.scoring import score_views
 from gs2d.pipeline.subject import subject_in, wants_subject
 from gs2d.render.backends import Backend
@@ -224,7 +224,11 @@ def evaluate(
         name=f"scoring {split} views",
         on_event=on_event,
         lpips=lpips,
-        exposures=with_predicted(finished.exposures, finished.scene),
+        exposures=with_predicted(
+            finished.exposures,
+            finished.scene,
+            metered(finished.splats, finished.settings, finished.backend),
+        ),
         split=split,
     )
     return mean_metrics(list(scores.values()))

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from gs2d.core.camera import Camera
 from gs2d.core.files import disk_error
 from gs2d.core.georeference import Georeference
 from gs2d.core.memory_limit import memory_budget
 from gs2d.core.splats import Splats
 from gs2d.data import View
+from gs2d.data.reach import Reach
 from gs2d.data.subject import LARGEST, Subject, checked_box
 from gs2d.errors import ProtocolError, RunError
 from gs2d.evaluation.images import ImageMetrics
@@ -31,6 +33,7 @@ from gs2d.io.run_dir import (
     RunFolder,
 )
 from gs2d.meshing.bare import bare_pixels
+from gs2d.meshing.bounds import backproject
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.meshing.slabs import SLAB_BYTES
@@ -45,7 +48,7 @@ from gs2d.pipeline.page import page_run
 from gs2d.pipeline.placed import placed_mesh, placed_output, say_where
 from gs2d.pipeline.report import report_again
 from gs2d.pipeline.scoring import SeenView
-from gs2d.pipeline.subject import OPAQUE, meshed_subject
+from gs2d.pipeline.subject import OPAQUE, meshed_subject, surface_reach
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 
@@ -67,7 +70,7 @@ class MeshFrames:
     """
 
     def __init__(self, job: Job) -> None:
-        self._job = job
+        self._job, self._reach = job, surface_reach(job)
         self.spool = Spool()
 
     def visit(self, seen: SeenView, scores: ImageMetrics) -> None:
@@ -78,7 +81,7 @@ class MeshFrames:
         DiskError
         """
         if seen.split == "train":
-            frame = fusion_frame(self._job, seen.view, seen.output, self._job.protocol.fused_depth)
+            frame = fusion_frame(self._job, seen.view, seen.output, self._job.protocol.fused_depth, self._reach)
             self.spool.append(depth_map(frame))
 
     @property
@@ -303,26 +306,39 @@ def _slab_bytes() -> int:
 
 def _frames(job: RenderedScene, splats: Splats, depth: str, on_event: OnEvent) -> Iterator[RenderedView]:
     views, settings = job.scene.train, replace(job.settings, with_distortion=False).for_depths(depth)
+    reach = surface_reach(job)
     for view in counted(views, "rendering depth", len(views), on_event):
         with torch.no_grad():
             output = rasterize(splats, view.camera, settings, backend=job.backend)
-        yield fusion_frame(job, view, output, depth)
+        yield fusion_frame(job, view, output, depth, reach)
     release(job.scene)  # photographs were looked at for where they are known
     on_event(Phase("fusing", 0))
 
 
-def fusion_frame(job: RenderedScene, view: View, output: RenderOutput, depth: str) -> RenderedView:
-    """Return what fusion takes of a view: depth of a kind and colour where it is covered well enough."""
+def fusion_frame(
+    job: RenderedScene, view: View, output: RenderOutput, depth: str, reach: Reach | None = None
+) -> RenderedView:
+    """Return what fusion takes of a view: depth of a kind and colour, where it is covered well enough and in reach."""
     valid = (output.alpha >= OPAQUE).cpu().numpy()
     mask = view.object_mask() if job.protocol.use_mask_in_fusion else None
     # Beyond the photograph, and where it is ignored, nothing has said how far the surface is.
     for pixels in (mask, view.usable(masks=job.protocol.use_mask_in_fusion)):
         if pixels is not None:
             valid = valid & pixels
+    depths = output.depth(depth).cpu().numpy()
     if job.protocol.fusion.subject:
         valid = valid & one_surface(output)
+    if reach is not None:
+        valid = valid & _within(reach, view.camera, depths)
     color = surface_color(output, job).cpu().numpy()
-    return RenderedView(view.camera, output.depth(depth).cpu().numpy(), color, valid, bare_of(job, view))
+    return RenderedView(view.camera, depths, color, valid, bare_of(job, view))
+
+
+def _within(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray:
+    """Return the pixels [H, W] of depths that show places within reach."""
+    rows, columns = np.indices(depths.shape).reshape(2, -1)
+    places = backproject(camera, depths.reshape(-1).astype(np.float64), rows, columns)
+    return reach.holds(places).reshape(depths.shape)
 
 
 def bare_of(job: RenderedScene, view: View) -> np.ndarray | None:

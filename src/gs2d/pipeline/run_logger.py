@@ -27,7 +27,7 @@ from gs2d.pipeline.job import Job
 from gs2d.pipeline.loss_reports import report_losses
 from gs2d.pipeline.memory import release_buffers
 from gs2d.pipeline.options import TrainOptions
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.render import choose_views, draw_stage
 from gs2d.pipeline.resume import ResumePoint, put_in_cache
 from gs2d.pipeline.scoring import (
@@ -83,6 +83,7 @@ class RunLogger:
         self._at_entry = dict(start.at_entry)
         self._saved_at, self._saved_iteration = time.perf_counter(), 0
         self._trainer: Trainer | None = None
+        self._predicted: tuple[tuple[int, int], Transforms] | None = None  # of stage and step
         self.psnr: float | None = None  # of the probe views, the last time that they were scored
         self._before: Snapshot | None = None  # of the last step line, until it is compared with the next progress
         self._signals = HeldSignals()
@@ -239,7 +240,9 @@ class RunLogger:
     def _probe_psnr(self, splats: Splats) -> float | None:
         """Mean PSNR over a few fixed views (test views where there are any)."""
         self._stop_clock()
-        psnr = mean_psnr(splats, self._now(self._probes), self._settings, self._job.backend, self._exposures)
+        scene = self._job.scene  # by neighbours alone: what the camera would see costs a rendering of every photograph
+        exposures = with_predicted(named(scene.train, self._state.exposures), scene)
+        psnr = mean_psnr(splats, self._now(self._probes), self._settings, self._job.backend, exposures)
         self._start_clock()
         return psnr
 
@@ -358,7 +361,12 @@ class RunLogger:
 
     @property
     def _exposures(self) -> Transforms:
-        return with_predicted(named(self._job.scene.train, self._state.exposures), self._job.scene)
+        at = (self._state.stage, self._state.step)
+        if self._predicted is None or self._predicted[0] != at:
+            scene, brightness = self._job.scene, metered(self._drawn, self._settings, self._job.backend)
+            found = with_predicted(named(scene.train, self._state.exposures), scene, brightness)
+            self._predicted = (at, found)
+        return self._predicted[1]
 
     def _now(self, views: Sequence[View]) -> list[View]:
         """Return views of the capture from where their cameras are now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.data import View
+from gs2d.data.reach import Reach, reach_of
 from gs2d.data.subject import (
     OBJECT,
     Sight,
@@ -34,6 +36,7 @@ from gs2d.report.sections.subject import IMAGE, write_subject_image
 
 MAX_VIEWS = 64  # cameras, evenly chosen, that vote
 SIDE = 56  # px, the shorter side of the depth maps that are looked at
+BEYOND = 1.25  # times the reach of a scene (``data/reach.py``), past which no depth is believed
 OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
 BEHIND = 1.1  # times the rendered depth, beyond which a sparse point is hidden
 POINTS_PART = 0.5  # of a camera's vote is that of the sparse points it sees, where there are enough of them
@@ -157,14 +160,28 @@ def subject_line(subject: Subject, *, meshed: bool) -> str:
     return f"subject: {size} world units, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
+def surface_reach(job: RenderedScene) -> Reach | None:
+    """Return how far surfaces are believed: a little farther than sparse points go, for depths beyond are made up.
+
+    Training draws what is there on a sphere (``training/background_sphere.py``). None: as far as they go, without
+    sparse points and by the protocols of data sets, which have limits of their own.
+    """
+    if not job.protocol.fusion.subject or job.scene.points is None:
+        return None
+    reach = reach_of(job.scene)
+    return None if reach is None else replace(reach, radius=BEYOND * reach.radius)
+
+
 def sights(job: RenderedScene, splats: Splats) -> list[Sight]:
     """Return what some of the training cameras see: rendered depth, and the sparse points that it does not hide."""
     views = job.scene.train
     count = min(len(views), MAX_VIEWS)
     chosen = [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
     points = np.zeros((0, 3)) if job.scene.points is None else np.asarray(job.scene.points.points, np.float64)
+    reach = surface_reach(job)
     return [
-        _sight(camera := _small(view.camera), _depth(job, splats, camera), points, _kept(job, view)) for view in chosen
+        _sight(camera := _small(view.camera), _depth(job, splats, camera), points, _kept(job, view), reach)
+        for view in chosen
     ]
 
 
@@ -186,7 +203,9 @@ def _depth(job: RenderedScene, splats: Splats, camera: Camera) -> np.ndarray:
     return np.asarray(torch.where(output.alpha >= OPAQUE, output.depth_median, 0).cpu().numpy(), np.float64)
 
 
-def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray, kept: np.ndarray | None) -> Sight:
+def _sight(
+    camera: Camera, depth: np.ndarray, points: np.ndarray, kept: np.ndarray | None, reach: Reach | None
+) -> Sight:
     """Return the votes of one camera; ``kept`` [H, W] bool, of any size: pixels that may vote."""
     points = points[shown(camera, points)]
     if kept is not None:
@@ -200,6 +219,8 @@ def _sight(camera: Camera, depth: np.ndarray, points: np.ndarray, kept: np.ndarr
     z = depth[rows, columns]
     rays = np.concatenate([(pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((len(z), 1))], axis=1)
     surface = (rays * z[:, None] - camera.T_cam_world[:3, 3]) @ camera.rotation
+    near = np.ones(len(surface), dtype=bool) if reach is None else reach.holds(surface)
+    surface, pixels = surface[near], pixels[near]
     visible = _visible(camera, depth, points)
     parts = [(surface, middle_weights(camera, pixels)), (visible, middle_weights(camera, camera.project(visible)[0]))]
     fractions = [1.0, 0.0]

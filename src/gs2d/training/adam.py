@@ -28,7 +28,8 @@ def begin_stage(state: TrainState, stage: Stage) -> None:
 
 def lr_at(lr: LearningRates, iteration: int, extent: float) -> dict[str, float]:
     """Learning rates at an iteration (1-based), by attribute; that of the means is in world units: times the extent."""
-    fixed = {name: float(getattr(lr, name)) for name in ATTRIBUTES}
+    settled = lr.settled_at(iteration)
+    fixed = {name: float(getattr(lr, name)) * settled for name in ATTRIBUTES}
     return fixed | {"means": lr.means_at(iteration) * extent}
 
 

@@ -154,10 +154,20 @@ def unproject(view: SmallView, depth: np.ndarray) -> np.ndarray:
     return np.asarray((rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3])
 
 
-def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud:
+def start_points(
+    scene: Scene, sweep: Sweep, settings: DenseStart, around: tuple[np.ndarray, ...] | None = None
+) -> PointCloud:
     """Return points to start from: swept ones, and sparse ones where none of those is near.
 
     For a fitted start, sparse ones keep the size that they have among all sparse points (:attr:`PointCloud.sizes`).
+
+    Parameters
+    ----------
+    scene : Scene
+    sweep : Sweep
+    settings : DenseStart
+    around : tuple of ndarray, optional
+        More of them, of a size of their own: places, colours in [0, 1], normals [P, 3], sizes [P].
 
     Raises
     ------
@@ -182,9 +192,13 @@ def start_points(scene: Scene, sweep: Sweep, settings: DenseStart) -> PointCloud
             f"a plane sweep of {scene.name} found {len(swept.places)} places on which photographs agree, expected at "
             "least 2; do photographs and cameras belong together? Train with --set dense_start=null"
         )
+    if settings.fit is None:  # sparse ones are as large as what was swept around leaves room for
+        parts = [(*part[:3], np.zeros(len(part[3]))) for part in parts]
+    if around is not None:
+        parts.append(around)
     places, colors, normals, sizes = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     colors = np.clip(np.rint(colors * 255), 0, 255).astype(np.uint8)
-    return PointCloud(places, colors, normals, None if settings.fit is None else sizes)
+    return PointCloud(places, colors, normals, sizes if (sizes > 0).any() else None)
 
 
 def _has_points(scene: Scene) -> bool:

@@ -19,6 +19,7 @@ from gs2d.errors import DataError
 from gs2d.render.backends import Backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
+from gs2d.training.background_sphere import sphere_points
 from gs2d.training.free_space import FreeSpaceMaps
 from gs2d.training.initialize import Initial
 from gs2d.training.parallel import ONE_PROCESS, OneProcess
@@ -81,7 +82,8 @@ class Robustness:
         try:
             sweep = sweep_views(scene, start or DenseStart())
             if start is not None:
-                self.scene = replace(scene, points=start_points(scene, sweep, start))
+                around = None if start.sphere is None else sphere_points(scene, sweep, start.sphere)
+                self.scene = replace(scene, points=start_points(scene, sweep, start, around))
         except DataError as error:
             if start is None or start.required or recipe.free_space is not None:
                 raise

@@ -29,7 +29,7 @@ from gs2d.pipeline.mesh import MeshFrames
 from gs2d.pipeline.options import MeshOptions, TrainOptions
 from gs2d.pipeline.part import OWN, read_start
 from gs2d.pipeline.photographs import with_prepared
-from gs2d.pipeline.predicted_exposure import with_predicted
+from gs2d.pipeline.predicted_exposure import metered, with_predicted
 from gs2d.pipeline.render import choose_views, draw_stage
 from gs2d.pipeline.scoring import PeakMemory, score_views, split_metrics
 from gs2d.pipeline.train import finish
@@ -140,7 +140,8 @@ def finish_merged(settled: Settled, options: TrainOptions, on_event: OnEvent) ->
     )
     job = merged_job(settled, options, scene)
     splats = read_splats(run.file(SPLATS)).to(job.backend.device)
-    exposures = with_predicted(read_exposures(run, job.recipe), scene)
+    brightness = metered(splats, job.settings, job.backend)
+    exposures = with_predicted(read_exposures(run, job.recipe), scene, brightness)
     entry = {**_spent(options.out), "splats": len(splats), "bytes": splats.nbytes}
     collected = Collector(scene, job.settings.background)
     hold()
