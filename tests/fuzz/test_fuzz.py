@@ -107,7 +107,14 @@ def test_the_guard_sees_what_is_not_allowed(tmp_path: Path) -> None:
             *(lambda _: print("x", file=sys.__stderr__), lambda _: print("x", file=sys.__stdout__)),
         )
     ]
-    words = ("traceback: KeyError", "warning: Runt", "outside: open", "a message of sev", "outside: sub", *("printed",) * 2)
+    words = (
+        "traceback: KeyError",
+        "warning: Runt",
+        "outside: open",
+        "a message of sev",
+        "outside: sub",
+        *("printed",) * 2,
+    )
     assert [str(found)[: len(word)] for found, word in zip(seen, words, strict=True)] == list(words)
     assert outcome(refused, tmp_path / "inside", 10)[:2] == (None, "refused")
     assert outcome(inside, tmp_path / "inside", 10)[:2] == (None, "read")

@@ -143,7 +143,7 @@ class Command(ABC):
             write_capture(self.capture, train=3, test=1, size=16)
         self.arrange()
 
-    def arrange(self) -> None:
+    def arrange(self) -> None:  # noqa: B027 (most commands begin with nothing)
         """Make once what all runs of it begin with."""
 
     def prepare(self, folder: Path) -> None:

@@ -33,7 +33,7 @@ from PIL import Image
 
 from gs2d.io.run_dir import load_tensors
 from kill_commands import COMMANDS, DATED, DONE, REFUSED, Command, ended, forked, import_all, started
-from kill_states import States, gone_on_from, lay, tree_of, watched
+from kill_states import States, gone_on_from, tree_of, watched
 
 AT_EACH_CALL = {"kill": -1, "tear": -2, "full": errno.ENOSPC}  # tear: half a write, or right after another call
 
@@ -142,9 +142,7 @@ def at_every_call(command: Command, layer: Layer, given: argparse.Namespace) -> 
         if wrong := differing(command.leaves(folder), expected):
             raise SystemExit(f"looking on changed what {command.name} does: {wrong}")
         whole: set[bytes] = set()
-        gone_on_from(
-            states, folder, lambda at: half_written(at, whole) + gone_on(command, at, expected), given.seconds
-        )
+        gone_on_from(states, folder, lambda at: half_written(at, whole) + gone_on(command, at, expected), given.seconds)
         if given.compare:
             check_states(command, layer, folder, states, given)
     for action in actions:

@@ -35,8 +35,8 @@ from gs2d.sfm.upright import up_direction
 Say = Callable[..., None]
 REPEATABLE = 50  # photographs: up to so many, one thread places them, and the same seed gives the same bytes
 SMALLEST_MODEL = 3  # photographs: smaller pieces are nothing that could be trained
-# Ways of placing cameras one by one, each where the one before placed too few, and what they ask of the first two: COLMAP
-# wants 16 degrees between them (4 when relaxed), and not one before the other, as they are on a walk (4, and 1).
+# Ways of placing cameras one by one, each where the one before placed too few, and what they ask of the first two:
+# COLMAP wants 16 degrees between them (4 when relaxed), and not one before the other, as they are on a walk (4, and 1).
 ATTEMPTS: dict[str, dict[str, float]] = {
     "strictly": {},
     "as on a walk": {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0},
