@@ -79,7 +79,7 @@ def test_they_are_written_read_and_described(name: str) -> None:
     said = "\n".join(describe_recipe(recipe))
     assert "the mesh is of the transmittance depth" in said
     assert "dense start: a sweep over photographs of about 256 px, its splats fitted to them, and 500 on a" in said
-    assert "on a sphere around everything; without where they agree on nothing" in said
+    assert "on a sphere around, if needed; without where they agree on nothing" in said
     assert "rates but that of the means fall after iteration" in said
 
 

@@ -46,7 +46,7 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         start = recipe.dense_start
         fitted = ", its splats fitted to them" if start.fit is not None else ""
         otherwise = "" if start.required else "; without where they agree on nothing"
-        around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around everything"
+        around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around, if needed"
         yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{around}{otherwise}"
     if recipe.fused_depth is not None:
         yield f"the mesh is of the {recipe.fused_depth} depth"

@@ -53,11 +53,15 @@ class BackgroundSphere:
         In units of how far the scene goes: its cameras, and nearly all of its sparse points and swept places.
     size : float
         Standard deviation of a splat, in units of the distance to its neighbours.
+    needed : float, dB
+        There is no sphere where photographs whose pixels of unknown depth had one colour would have a PSNR above this:
+        little is missing there, and large splats then stand where no photograph looks.
     """
 
     splats: int = 500
     radius: float = 3.0
     size: float = 0.8
+    needed: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -221,6 +225,7 @@ def check_robust(
             _check_fit(f"{at}.fit", start.fit)
         if start.sphere is not None:
             integer(f"{at}.sphere.splats", start.sphere.splats, low=1)
+            number(f"{at}.sphere.needed", start.sphere.needed, low=0.0)
             for name in ("radius", "size"):
                 value = number(f"{at}.sphere.{name}", getattr(start.sphere, name), low=0.0)
                 require(value > 0, f"{at}.sphere.{name} must be positive, got {value}")

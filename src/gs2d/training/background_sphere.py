@@ -28,8 +28,9 @@ def sphere_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return places, colours in [0, 1], normals (all [P, 3]) and sizes [P] of splats around everything.
 
-    Places are left out that no photograph shows in a pixel of unknown depth, and all of them where photographs have an
-    alpha channel: it says what is empty. A colour is the median of those pixels.
+    Places are left out that no photograph shows in a pixel of unknown depth; a colour is the median of those pixels.
+    There are none where photographs have an alpha channel, which says what is empty, and where one colour would do
+    (``settings.needed``).
 
     Parameters
     ----------
@@ -40,7 +41,7 @@ def sphere_points(
     """
     looked_at = range(0, len(sweep.views), max(1, -(-len(sweep.views) // MAX_VIEWS)))
     reach = reach_of(scene, _swept_places(sweep, looked_at))
-    if reach is None or scene.train[0].alpha() is not None:
+    if reach is None or scene.train[0].alpha() is not None or _one_color(sweep, looked_at) > settings.needed:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     radius, directions = settings.radius * reach.radius, evenly_on_sphere(settings.splats)
     rows, colors = _looks(sweep, looked_at, reach.center + radius * directions)
@@ -68,12 +69,32 @@ def _swept_places(sweep: Sweep, looked_at: Sequence[int]) -> np.ndarray:
     return np.concatenate(found)
 
 
+def _unknown(sweep: Sweep, index: int) -> np.ndarray:
+    """Return the pixels [H, W] of a shrunk photograph that show something of unknown depth."""
+    known = binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
+    return np.asarray(sweep.views[index].usable & ~known)
+
+
+def _one_color(sweep: Sweep, looked_at: Sequence[int]) -> float:
+    """Return the PSNR of photographs, dB, whose pixels of unknown depth had one colour, and all others their own."""
+    colors, pixels = [np.zeros((0, 3))], 0
+    for index in looked_at:
+        view = sweep.views[index]
+        colors.append(view.color.permute(1, 2, 0).numpy()[_unknown(sweep, index)])
+        pixels += int(view.usable.sum())
+    unknown = np.concatenate(colors)
+    if not len(unknown):
+        return math.inf
+    error = float(((unknown - np.median(unknown, axis=0)) ** 2).mean()) * len(unknown) / pixels
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
 def _looks(sweep: Sweep, looked_at: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which of the places [N, 3] photographs show in pixels of unknown depth, and in what colour: [L], [L, 3]."""
     rows, colors = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
     for index in looked_at:
         view = sweep.views[index]
-        unknown = view.usable & ~binary_dilation(sweep.depths[index] > 0, iterations=BESIDE_KNOWN)
+        unknown = _unknown(sweep, index)
         _, column, row, inside = project(view, places)
         shown = np.flatnonzero(inside)
         shown = shown[unknown[row[shown], column[shown]]]
