@@ -26,7 +26,7 @@ from gs2d.training.trainer import Trainer
 from wall_scene import WALL, WIDTH, wall
 
 SMALL = DenseStart(side=48, planes=32, min_angle=1.0, cell=3.0)
-SPHERE = BackgroundSphere(splats=4_000, radius=2.0, size=0.5, needed=np.inf)
+SPHERE = BackgroundSphere(splats=4_000, radius=2.0, size=0.5, needed=1_000.0)
 
 
 def test_directions_share_the_sphere_evenly() -> None:
@@ -77,7 +77,7 @@ def test_there_are_none_where_an_alpha_channel_says_what_is_empty() -> None:
 
 def test_there_are_none_where_one_colour_would_do() -> None:
     """Of the wall its bare third is unknown, which is of one grey; here each photograph has another exposure."""
-    assert not len(sphere_points(wall(), sweep_views(wall(), SMALL), replace(SPHERE, needed=1e9))[0])
+    assert not len(sphere_points(wall(), sweep_views(wall(), SMALL), replace(SPHERE, needed=100.0))[0])
     scene = wall((0.6, 0.8, 1.0, 1.2, 1.4))
     sweep = sweep_views(scene, SMALL)
     unknown, pixels = [], 0

@@ -20,6 +20,7 @@ from gs2d.training.plane_sweep import Sweep, project, unproject
 
 BESIDE_KNOWN = 3  # px: so near to a pixel of known depth, another one is probably of the same thing
 MAX_VIEWS = 200  # that are looked at, evenly chosen
+EXACT = 200.0  # dB, of what is the same
 STRIDE = 5  # px between those of which places are looked at
 
 
@@ -84,9 +85,9 @@ def _one_color(sweep: Sweep, looked_at: Sequence[int]) -> float:
         pixels += int(view.usable.sum())
     unknown = np.concatenate(colors)
     if not len(unknown):
-        return math.inf
+        return EXACT
     error = float(((unknown - np.median(unknown, axis=0)) ** 2).mean()) * len(unknown) / pixels
-    return math.inf if error == 0 else -10 * math.log10(error)
+    return EXACT if error == 0 else -10 * math.log10(error)
 
 
 def _looks(sweep: Sweep, looked_at: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
