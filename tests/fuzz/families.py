@@ -393,8 +393,8 @@ _PLACE = {
 _TABLES = {
     "control.csv": "# EPSG:32632\nname,x,y,z,photo,u,v,check\nA,600000.5,5200000,400,f_0.png,12.5,7,\n"
     "A,600000.5,5200000,400,f_1.png,3,9,\nB,600010,5200000,401.5,f_0.png,20,11,yes\n",
-    "control_in_the_run.csv": "name;lat;lon;height;run_x;run_y;run_z\n"
-    '"A";47.5;9.25;400;0;1;2\n"B, new";47.6;9.5;;1;1;1\n',
+    "control_in_the_run.csv": 'name;lat;lon;height;run_x;run_y;run_z\n"A";47.5;9.25;400;0;1;2\n'
+    '"B, new";47.6;9.5;;1;1;1\n',
     "control_odm.txt": "EPSG:32632\n600000 5200000 400 12 8 f_0.png A\n600010 5200000 401 20 11 f_1.png B\n",
     "positions.csv": "name,lat,lon,height\nf_0.png,47.5,9.25,401\nf_1.png,47.51,9.26,\n",
     "positions_odm.txt": "+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs\nf_0.png 600000 5200000 400 0 0 0\n",
@@ -570,8 +570,8 @@ _ALL = (
         _exr("a.exr", "Z", "RLE_COMPRESSION"), _exr("a.exr", "RGB", "NO_COMPRESSION"),
         _exr("a.exr", "RGB", "DWAA_COMPRESSION", np.float16), _exr("a.exr", "Y", "B44_COMPRESSION", np.float16)),
         {".exr": m.of_bytes}, read_picture),
-    Family("prepared", written(_prepared),
-        {".prepared": m.either(m.of_prepared, m.of_prepared, m.of_bytes)}, read_kept),
+    Family("prepared", written(_prepared), {".prepared": m.either(m.of_prepared, m.of_prepared, m.of_bytes)},
+           read_kept),
     Family("places", written(lambda root: [(root / name).write_text(text) for name, text in _TABLES.items()],
                              _georeferenced),
            {".csv": _TEXT, ".txt": _TEXT, ".json": _JSON, ".ply": m.of_ply, ".obj": _TEXT, ".glb": m.of_glb},

@@ -87,7 +87,7 @@ static int copied(long here) {
     int status = 0, late = child < 0;
     for (long waited = 0; child > 0 && waitpid(child, &status, WNOHANG) == 0; waited++) {
         usleep(1000);
-        if (waited > 120000) kill(child, SIGKILL), late = 1;
+        if (waited > 60000) kill(child, SIGKILL), late = 1;
     }
     char line[64];
     int code = late ? 97 : WIFEXITED(status) ? WEXITSTATUS(status) : -WTERMSIG(status);

@@ -2,9 +2,12 @@
 
 The command runs once. It stands still before each call, and after half of each write, while its folder is looked at:
 that is what SIGKILL leaves there, for what a killed process wrote stays, and its locks go with it. Before each call
-that needs room a copy of the process (fork) goes on alone, with a full disk, until it ends; then the folder is as it
-was and the first goes on. Many states are the same (fsync changes none, and who finds the disk full removes what it
+that needs room a copy of the process (fork) goes on alone, with a full disk, until it ends; then the folder is as
+before and the first goes on. Many states are the same (fsync changes none, and who finds the disk full removes what it
 began): each is gone on from once, and judged for all calls that leave it.
+
+A copy has the thread alone that made the call: of a command that has others (``reconstruct``: those of its libraries)
+it may wait for ever. Such a one is run with a full disk from the start, call by call.
 """
 
 from __future__ import annotations
@@ -72,7 +75,7 @@ class States:
 
 
 class _Kept:
-    """A folder as it was before another process went on in it: the same files (inodes, for some are open)."""
+    """A folder as it was before another process went on in it: the same files (inodes: some are open)."""
 
     def __init__(self, folder: Path, tree: Tree) -> None:
         self.folder, self.tree, self.links = folder, tree, folder.with_name(folder.name + "-kept")
@@ -179,7 +182,7 @@ def watched(command: Command, layer: Any, folder: Path, actions: list[str]) -> S
 
 
 def gone_on_from(states: States, folder: Path, judge: Callable[[Path], list[str]], seconds: float) -> int:
-    """Lay each state into the folder and add what ``judge`` says of it; returns how many there was time for."""
+    """Lay each state into the folder, add what ``judge`` says of it; the number that there was time for."""
     began, done = time.monotonic(), 0
     for state in states.found.values():
         if time.monotonic() - began > seconds:

@@ -1,6 +1,4 @@
-"""Run a command in a control group of little memory, and say what it took.
-
-``python small_memory.py BYTES COMMAND ...``
+"""Run a command in a control group of little memory: ``python small_memory.py BYTES COMMAND ...``; say what it took.
 
 The group lies below that of this process (cgroup v1 or v2, which must be writable: root, mostly) and is removed at the
 end. ``python small_memory.py --capture FOLDER`` writes what is trained in it: 24 photographs of 23 megapixels as PNG.
