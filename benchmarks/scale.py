@@ -50,13 +50,18 @@ class Measured:
 
 
 def resident(process: int) -> int:
-    """Bytes that a process and its children have in memory (Linux)."""
+    """Bytes that a process and its children have in memory (Linux).
+
+    A child that is not yet a program of its own (it has its parent's words) has its parent's pages, not others.
+    """
     try:
         own = int(Path(f"/proc/{process}/statm").read_text().split()[1]) * 4096
+        words = Path(f"/proc/{process}/cmdline").read_bytes()
         children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+        programs = [int(c) for c in children if Path(f"/proc/{c}/cmdline").read_bytes() != words]
     except (OSError, IndexError):
         return 0
-    return own + sum(resident(int(child)) for child in children)
+    return own + sum(map(resident, programs))
 
 
 def measure(photographs: int, name: str, arguments: list[str], log: Path) -> Measured:

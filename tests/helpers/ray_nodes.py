@@ -1,7 +1,7 @@
 """A Ray cluster of several nodes on this machine, as a program: prints its address, and does what it reads.
 
-``lose``: all nodes with CPUs lose their processes without grace, so that no task is spared, and others come. The end of
-its input is its own end.
+``lose``: all nodes with CPUs lose their processes without grace, so that no task is spared, and others come; with
+numbers, those nodes alone. The end of its input is its own end.
 """
 
 from __future__ import annotations
@@ -20,10 +20,13 @@ def main() -> None:
     workers = [cluster.add_node(num_cpus=1, num_gpus=0, **SMALL) for _ in range(int(sys.argv[1]))]
     print(cluster.address, flush=True)
     for line in sys.stdin:
-        if line.strip() == "lose":
-            for node in workers:
-                cluster.remove_node(node, allow_graceful=False)
-            workers = [cluster.add_node(num_cpus=1, num_gpus=0, **SMALL) for _ in workers]
+        word, *which = line.split()
+        if word == "lose":
+            lost = [int(number) for number in which] or range(len(workers))
+            for number in lost:
+                cluster.remove_node(workers[number], allow_graceful=False)
+            for number in lost:
+                workers[number] = cluster.add_node(num_cpus=1, num_gpus=0, **SMALL)
             print("lost", flush=True)
     cluster.shutdown()
 
