@@ -61,7 +61,7 @@ class BackgroundSphere:
     splats: int = 500
     radius: float = 3.0
     size: float = 0.8
-    needed: float = 25.0
+    needed: float = 22.0
 
 
 @dataclass(frozen=True)
