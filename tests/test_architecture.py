@@ -56,7 +56,7 @@ INSIDE = {
         "prepared": 6,
         "readers": 5,
         "build": 4,
-        "bounds": 3,
+        "bounds reach": 3,
         "scene": 2,
         "priors faces": 1,
         "cache masks undistort": 0,
