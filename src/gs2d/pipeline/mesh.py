@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gs2d.core.camera import Camera
 from gs2d.core.files import disk_error
 from gs2d.core.georeference import Georeference
 from gs2d.core.memory_limit import memory_budget
@@ -33,12 +32,12 @@ from gs2d.io.run_dir import (
     RunFolder,
 )
 from gs2d.meshing.bare import bare_pixels
-from gs2d.meshing.bounds import backproject
 from gs2d.meshing.depth_maps import RenderedView, Spool, depth_map
 from gs2d.meshing.extract import Extraction, extract, extract_unbounded
 from gs2d.meshing.slabs import SLAB_BYTES
 from gs2d.meshing.tsdf import VolumeTooLargeError
 from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.believed import surface_reach, within_reach
 from gs2d.pipeline.events import Notice, OnEvent, Phase, counted, ignore
 from gs2d.pipeline.finished import checked_output, open_job
 from gs2d.pipeline.job import Job, RenderedScene
@@ -48,7 +47,7 @@ from gs2d.pipeline.page import page_run
 from gs2d.pipeline.placed import placed_mesh, placed_output, say_where
 from gs2d.pipeline.report import report_again
 from gs2d.pipeline.scoring import SeenView
-from gs2d.pipeline.subject import OPAQUE, meshed_subject, surface_reach
+from gs2d.pipeline.subject import OPAQUE, meshed_subject
 from gs2d.render.api import rasterize
 from gs2d.render.types import RenderOutput
 
@@ -329,16 +328,9 @@ def fusion_frame(
     if job.protocol.fusion.subject:
         valid = valid & one_surface(output)
     if reach is not None:
-        valid = valid & _within(reach, view.camera, depths)
+        valid = valid & within_reach(reach, view.camera, depths)
     color = surface_color(output, job).cpu().numpy()
     return RenderedView(view.camera, depths, color, valid, bare_of(job, view))
-
-
-def _within(reach: Reach, camera: Camera, depths: np.ndarray) -> np.ndarray:
-    """Return the pixels [H, W] of depths that show places within reach."""
-    rows, columns = np.indices(depths.shape).reshape(2, -1)
-    places = backproject(camera, depths.reshape(-1).astype(np.float64), rows, columns)
-    return reach.holds(places).reshape(depths.shape)
 
 
 def bare_of(job: RenderedScene, view: View) -> np.ndarray | None:

@@ -34,6 +34,7 @@ from gs2d.io.run_dir import (
     remove_made,
 )
 from gs2d.pipeline.attempts import again, attempted
+from gs2d.pipeline.believed import believed_reach, within_reach
 from gs2d.pipeline.events import Notice, OnEvent, Phase, Step, counted, ignore
 from gs2d.pipeline.exposure import NONE, Transforms, exposed, exposure_named, photographed, read_exposures
 from gs2d.pipeline.finished import open_job
@@ -124,7 +125,8 @@ def draw_stage(
         output = outputs.get(view.name) or render_view(splats, view, job.settings, job.backend)
         depth = output.depth(job.protocol.depth).cpu().numpy()
         alpha = output.alpha.cpu().numpy()
-        near_far = limits.get(view.name) or list(depth_limits(depth, alpha))  # of the first stage: stages compare
+        # Limits are of the first stage, so that stages compare.
+        near_far = limits.get(view.name) or shown_limits(job.scene, view, depth, alpha)
         photo = view.target(job.settings.background)
         color = photographed(view, output.color, exposures, job.settings.background).cpu().numpy()
         images = {
@@ -143,6 +145,13 @@ def draw_stage(
         views.append({**shown_as, "camera": camera_json(view.camera)})
     stages = [*(name for name in index["stages"] if name != stage), stage]
     write_json(index_file, {"views": views, "stages": stages, "images": list(IMAGES)})
+
+
+def shown_limits(scene: Scene, view: View, depth: np.ndarray, alpha: np.ndarray) -> list[float]:
+    """Return the nearest and farthest depth worth a colour, world units: of what is within reach, where anything is."""
+    reach = believed_reach(scene)
+    near = alpha if reach is None else alpha * within_reach(reach, view.camera, depth)
+    return list(depth_limits(depth, near if (near >= 0.5).any() else alpha))
 
 
 def camera_json(camera: Camera) -> dict[str, Any]:

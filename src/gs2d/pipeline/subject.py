@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from gs2d.core.camera import Camera
 from gs2d.core.json_files import write_json
 from gs2d.core.splats import Splats
 from gs2d.data import View
-from gs2d.data.reach import Reach, reach_of
+from gs2d.data.reach import Reach
 from gs2d.data.subject import (
     OBJECT,
     Sight,
@@ -28,6 +27,8 @@ from gs2d.data.subject import (
 )
 from gs2d.errors import DataError, DiskError, ProtocolError, RunError
 from gs2d.io.run_dir import RENDERS, SUBJECT, RunFolder, make_folder
+from gs2d.meshing.bounds import backproject
+from gs2d.pipeline.believed import surface_reach
 from gs2d.pipeline.events import Notice, OnEvent
 from gs2d.pipeline.job import Job, RenderedScene
 from gs2d.pipeline.options import MeshOptions
@@ -36,7 +37,6 @@ from gs2d.report.sections.subject import IMAGE, write_subject_image
 
 MAX_VIEWS = 64  # cameras, evenly chosen, that vote
 SIDE = 56  # px, the shorter side of the depth maps that are looked at
-BEYOND = 1.25  # times the reach of a scene (``data/reach.py``), past which no depth is believed
 OPAQUE = 0.5  # a pixel is surface where at least this much of it is covered
 BEHIND = 1.1  # times the rendered depth, beyond which a sparse point is hidden
 POINTS_PART = 0.5  # of a camera's vote is that of the sparse points it sees, where there are enough of them
@@ -160,18 +160,6 @@ def subject_line(subject: Subject, *, meshed: bool) -> str:
     return f"subject: {size} world units, box {_numbers(subject.box.ravel())} ({subject.why}); {end}"
 
 
-def surface_reach(job: RenderedScene) -> Reach | None:
-    """Return how far surfaces are believed: a little farther than sparse points go, for depths beyond are made up.
-
-    Training draws what is there on a sphere (``training/background_sphere.py``). None: as far as they go, without
-    sparse points and by the protocols of data sets, which have limits of their own.
-    """
-    if not job.protocol.fusion.subject or job.scene.points is None:
-        return None
-    reach = reach_of(job.scene)
-    return None if reach is None else replace(reach, radius=BEYOND * reach.radius)
-
-
 def sights(job: RenderedScene, splats: Splats) -> list[Sight]:
     """Return what some of the training cameras see: rendered depth, and the sparse points that it does not hide."""
     views = job.scene.train
@@ -217,8 +205,7 @@ def _sight(
     rows, columns = np.nonzero(depth > 0)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     z = depth[rows, columns]
-    rays = np.concatenate([(pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((len(z), 1))], axis=1)
-    surface = (rays * z[:, None] - camera.T_cam_world[:3, 3]) @ camera.rotation
+    surface = backproject(camera, z, rows, columns)
     near = np.ones(len(surface), dtype=bool) if reach is None else reach.holds(surface)
     surface, pixels = surface[near], pixels[near]
     visible = _visible(camera, depth, points)
