@@ -89,8 +89,8 @@ def test_there_are_none_where_one_colour_would_do() -> None:
     error = ((colors - np.median(colors, axis=0)) ** 2).mean() * len(colors) / pixels
     psnr = -10 * np.log10(error)
     assert 10 < psnr < 40
-    assert len(sphere_points(scene, sweep, replace(SPHERE, needed=psnr + 0.1))[0])
-    assert not len(sphere_points(scene, sweep, replace(SPHERE, needed=psnr - 0.1))[0])
+    assert len(sphere_points(scene, sweep, replace(SPHERE, needed=psnr + 0.01))[0])
+    assert not len(sphere_points(scene, sweep, replace(SPHERE, needed=psnr - 0.01))[0])
 
 
 def test_what_a_mask_leaves_out_gives_no_colour() -> None:

@@ -79,11 +79,10 @@ def _unknown(sweep: Sweep, index: int) -> np.ndarray:
 def _one_color(sweep: Sweep, looked_at: Sequence[int]) -> float:
     """Return the PSNR of photographs, dB, whose pixels of unknown depth had one colour, and all others their own."""
     colors, pixels = [np.zeros((0, 3), dtype=np.float32)], 0
-    some = np.s_[::2, ::2]  # pixels: of hundreds of photographs all of them would be 100 MB
     for index in looked_at:
         view = sweep.views[index]
-        colors.append(view.color.permute(1, 2, 0).numpy()[some][_unknown(sweep, index)[some]])
-        pixels += int(view.usable[some].sum())
+        colors.append(view.color.permute(1, 2, 0).numpy()[_unknown(sweep, index)])
+        pixels += int(view.usable.sum())
     unknown = np.concatenate(colors)
     if not len(unknown):
         return EXACT
