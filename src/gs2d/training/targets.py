@@ -13,9 +13,10 @@ from gs2d.core.memory_limit import cache_bytes
 from gs2d.data.scene import View
 from gs2d.losses.api import TargetMaps
 
-# Of 292 photographs of 780x520 a fifth would stay in twice as much, for less than 1 % of an iteration's time: to make a
-# target anew from its bytes takes a few ms. Small captures stay whole.
-TARGET_BYTES = 1 << 28
+TARGET_BYTES = 1 << 28  # small captures stay whole
+# Part of the views that must fit, or none stays: of 292 photographs of 780x520 a tenth would, for less than 1 % of an
+# iteration's time, because to make a target anew from its bytes takes a few ms.
+WORTH_KEEPING = 0.5
 PINNED_BYTES = 1 << 33
 
 
@@ -77,6 +78,8 @@ class TargetSource(Protocol):
 class Targets:
     """Targets of the training views. The first ones that fit in ``limit_bytes`` stay; the others are made anew.
 
+    Where most of them would be, none stays.
+
     ``maps`` makes what the losses need of an image alone, which stays with it.
 
     Nothing is evicted: views come in shuffled epochs, where the least recently used is the next to be wanted.
@@ -99,8 +102,14 @@ class Targets:
         self._use_masks = use_masks
         self._maps, self._with_silhouettes = maps, with_silhouettes
         self._dtype, self._device = dtype, device
-        self._room = cache_bytes(limit_bytes)
+        room, all_bytes = cache_bytes(limit_bytes), self._bytes_of_all()
+        self._room = room if room >= WORTH_KEEPING * all_bytes else 0
         self._kept: dict[int, Target] = {}
+
+    def _bytes_of_all(self) -> int:
+        """Return what the images of all views take, and what is made of them alone."""
+        pixels = sum(view.camera.width * view.camera.height for view in self._views)
+        return pixels * 3 * self._dtype.itemsize * (1 if self._maps is None else 2)
 
     def photograph(self, index: int) -> Photograph | None:
         """Return None: targets are kept as floats."""
