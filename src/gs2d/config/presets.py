@@ -34,7 +34,7 @@ from gs2d.config.recipe import (
 )
 from gs2d.config.recipe_files import is_recipe_file, made_recipe, read_recipe_file
 from gs2d.config.registry import Registry
-from gs2d.config.robust import BackgroundSphere, DenseStart, FreeSpace, OpacityDecay, SeenArea, StartFit
+from gs2d.config.robust import BackgroundSphere, DenseStart, FreeSpace, OpacityDecay, SeenArea, SplatDropout, StartFit
 from gs2d.config.schedule import LONGER
 from gs2d.errors import RecipeError
 
@@ -255,10 +255,11 @@ def with_normal_prior(recipe: Recipe, weight: float = NORMAL_WEIGHT, *, name: st
 def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
     """Return the recipe with what photographs of the street need; what it has of that already stays.
 
-    Not in the paper: a dense start, free space that is kept free, opacity that decays, no large
-    splat that is hardly photographed (docs/decisions/fog.md). The capture must say which sparse points its
-    photographs show. A dense start that is not required gives way to the one that was tried with the rest; and where
-    no resets delay the prune by size there is none, which would take sky and ground.
+    Not in the paper: a dense start, free space that is kept free, opacity that decays, no large splat that is
+    hardly photographed, and splats left out at random where photographs are few (docs/decisions/fog.md). The
+    capture must say which sparse points its photographs show. A dense start that is not required gives way to the
+    one that was tried with the rest; and where no resets delay the prune by size there is none, which would take
+    sky and ground.
     """
     start = recipe.dense_start or STREET_START
     return replace(
@@ -269,6 +270,7 @@ def with_robustness(recipe: Recipe, *, name: str | None = None) -> Recipe:
         free_space=recipe.free_space or FreeSpace(),
         opacity_decay=recipe.opacity_decay or OpacityDecay(),
         seen_area=recipe.seen_area or SeenArea(),
+        dropout=recipe.dropout or SplatDropout(),
     )
 
 

@@ -18,7 +18,7 @@ from gs2d.config.densify import DENSIFIERS, Densify
 from gs2d.config.losses import LOSSES
 from gs2d.config.multiview import MULTIVIEW_KINDS, MultiView, check_multiview
 from gs2d.config.priors import DepthPrior, NormalPrior, check_priors
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, check_robust
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, SplatDropout, check_robust
 from gs2d.config.validate import group, integer, number, one_of, require
 from gs2d.config.views import Exposure as Exposure  # a field's type: whoever reads a recipe finds it here
 from gs2d.config.views import IntrinsicsRefinement as IntrinsicsRefinement
@@ -354,7 +354,8 @@ class Recipe:
     their focal lengths are the capture's; ``photometry`` None: they have neither vignetting nor a response.
     ``multiview``, ``depth_prior``, ``normal_prior``: how views are compared, and what is known of them, for the losses
     that do.
-    ``dense_start``, ``free_space``, ``opacity_decay``, ``seen_area``: what keeps fog out where photographs are few.
+    ``dense_start``, ``free_space``, ``opacity_decay``, ``seen_area``, ``dropout``: what keeps fog out where photographs
+    are few.
     ``fused_depth``: the depth that becomes the mesh ("mean", "median" or "transmittance"); None: the protocol says.
     """
 
@@ -375,6 +376,7 @@ class Recipe:
     fused_depth: str | None = field(default=None, metadata={"omit_empty": True})
     intrinsics: IntrinsicsRefinement | None = field(default=None, metadata={"omit_empty": True})
     photometry: Photometry | None = field(default=None, metadata={"omit_empty": True})
+    dropout: SplatDropout | None = field(default=None, metadata={"omit_empty": True})
 
     @property
     def iterations(self) -> int:
@@ -416,7 +418,8 @@ def validate(recipe: Recipe, *, to_train: bool = True) -> Recipe:
     check_priors(where, recipe.depth_prior, recipe.normal_prior, kinds)
     if recipe.fused_depth is not None:
         one_of(f"{where}: fused_depth", recipe.fused_depth, DEPTH_KINDS)
-    check_robust(where, recipe.dense_start, recipe.free_space, recipe.opacity_decay, recipe.seen_area)
+    robust = (recipe.dense_start, recipe.free_space, recipe.opacity_decay, recipe.seen_area, recipe.dropout)
+    check_robust(where, *robust)
     names = [stage.name for stage in recipe.stages]
     for name in names:
         require(names.count(name) == 1, f"{where}: two stages are called {name!r}; give each its own name")

@@ -204,14 +204,37 @@ class SeenArea:
     side: int = 200
 
 
+@dataclass(frozen=True)
+class SplatDropout:
+    """Splats that an iteration leaves out at random where photographs are few (``training/dropout.py``).
+
+    Attributes
+    ----------
+    rate : float
+        Part of the splats that is left out, anew in each iteration of stages that train all of geometry and opacity.
+    max_views : int
+        With more training views than that none is: what is hidden from few views is learned by heart, what many see is
+        only blurred (docs/decisions/fog.md).
+    """
+
+    rate: float = 0.1
+    max_views: int = 24
+
+
 def check_robust(
     where: str,
     start: DenseStart | None,
     free: FreeSpace | None,
     decay: OpacityDecay | None,
     seen: SeenArea | None = None,
+    dropout: SplatDropout | None = None,
 ) -> None:
     """Raise RecipeError for a value that cannot be trained with."""
+    if dropout is not None:
+        at = f"{where}: dropout"
+        rate = number(f"{at}.rate", dropout.rate, low=0.0)
+        require(rate < 1, f"{at}.rate must be below 1, got {rate}: nothing would be drawn")
+        integer(f"{at}.max_views", dropout.max_views, low=1)
     if start is not None:
         at = f"{where}: dense_start"
         least = {"side": 16, "planes": 4, "neighbours": 1, "radius": 1, "votes": 1, "max_views": 2}

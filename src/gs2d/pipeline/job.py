@@ -622,6 +622,8 @@ def as_begun(run: RunFolder, job: Job) -> Job:
         return job
     if "seen_area" not in before:
         recipe = replace(recipe, seen_area=None)
+    if "dropout" not in before:
+        recipe = replace(recipe, dropout=None)
     decay = before.get("opacity_decay")
     if isinstance(decay, dict) and "backdrop_rate" not in decay:
         recipe = without_fading_backdrop(recipe)

@@ -25,6 +25,7 @@ from gs2d.render.backends import Backend
 from gs2d.render.exposure import identity
 from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings, RenderOutput
+from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.exposure import apply_exposure
 from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours, is_compared
 from gs2d.training.poses import pose_rate
@@ -158,6 +159,17 @@ class FullRender:
         """Return the splats, and in rows behind them those that are frozen: what photographs show."""
         return splats if self.frozen is None else splats.followed_by(self.frozen)
 
+    def drops(self, stage: Stage) -> float:
+        """Return the part of the splats that iterations of a stage leave out."""
+        return dropout_rate(self.recipe, stage, len(self.scene.train))
+
+    def _left(self, splats: Splats, state: TrainState, stage: Stage, iteration: int) -> Splats:
+        """Return what an iteration draws: all but those of the splats that it leaves out."""
+        rate = self.drops(stage)
+        if rate > 0:
+            splats = dropped_out(splats, kept_splats(self.recipe, state.stage, iteration, len(splats), rate))
+        return self.drawn(splats)
+
     def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
         """Return the camera of training view ``index`` where it is now; with ``learns`` it gets a gradient."""
         camera = self.scene.train[index].camera
@@ -175,7 +187,8 @@ class FullRender:
         camera = self.camera(state, index, learns=learns)
         settings = self.settings(stage, iteration)
         rows = learning_rows(state, stage) if probe is None else None  # the signal is of every splat
-        drawn, of_all, rows = self.drawn(leaves), probe, self._with_frozen(rows, len(splats), camera)
+        drawn, of_all = self._left(leaves, state, stage, iteration), probe
+        rows = self._with_frozen(rows, len(splats), camera)
         if self.frozen is not None and probe is not None:
             of_all = torch.cat([probe, probe.new_zeros(len(self.frozen), probe.shape[1])])
         output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)

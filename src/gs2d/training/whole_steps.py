@@ -38,7 +38,7 @@ class WholeSteps:
     def __init__(self, whole: FullRender, objective: Objective | None, stage: Stage) -> None:
         self._whole, self._stage = whole, stage
         self._terms = whole.protocol.resolve(stage.losses)
-        self._possible = objective is whole and whole.frozen is None
+        self._possible = objective is whole and whole.frozen is None and whole.drops(stage) == 0
         self._settings: dict[int, RasterSettings] = {}  # by SH degree
         self._rows: tuple[tuple[Tensor, ...], Tensor | None] | None = None  # groups, and what they are together
 

@@ -268,7 +268,7 @@ def seam_recipe(recipe: Recipe, partition: Partition) -> Recipe:
     )
     exposure = None if recipe.exposure is None else replace(recipe.exposure, initial="given")
     found = replace(recipe, stages=(stage,), exposure=exposure, dense_start=None, free_space=None)
-    return validate(replace(found, opacity_decay=None, seen_area=None))
+    return validate(replace(found, opacity_decay=None, seen_area=None, dropout=None))
 
 
 def seam_folder(out: Path) -> Path:

@@ -1,0 +1,42 @@
+"""Splats left out of an iteration at random, so that few photographs are not learned by heart."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gs2d.config.recipe import Recipe, Stage
+from gs2d.core.splats import Splats
+
+NOT_DRAWN = -30.0  # logit of an opacity far below ``alpha_min``
+DRAW = 0xD  # sets these draws apart from others of the same seed and iteration
+
+
+def dropout_rate(recipe: Recipe, stage: Stage, views: int) -> float:
+    """Return the part of the splats that an iteration of a stage leaves out, with so many training views.
+
+    0 but in stages that train all of geometry and opacity: others work on splats that are settled.
+    """
+    settings = recipe.dropout
+    trained = stage.moves_all and stage.train.get("opacity_logits") == "all"
+    return settings.rate if settings is not None and trained and views <= settings.max_views else 0.0
+
+
+def kept_splats(recipe: Recipe, stage: int, iteration: int, count: int, rate: float) -> Tensor:
+    """Return which of ``count`` splats an iteration (from 1) of a stage draws, [N] bool in the host's memory.
+
+    The same whenever the iteration is done, by whichever process.
+    """
+    generator = np.random.default_rng([recipe.seed, stage, iteration, DRAW])
+    return torch.from_numpy(generator.random(count, dtype=np.float32) >= rate)
+
+
+def dropped_out(splats: Splats, kept: Tensor) -> Splats:
+    """Return the splats [N], of which only ``kept`` [N] bool are drawn and have gradients.
+
+    Those stay as opaque as they are: to make up for what is left out was worse (docs/decisions/fog.md).
+    """
+    logits = splats.opacity_logits
+    logits = torch.where(kept.to(logits.device), logits, logits.new_full((), NOT_DRAWN))
+    return Splats(**{**dict(splats.items()), "opacity_logits": logits})

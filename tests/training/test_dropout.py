@@ -1,0 +1,86 @@
+"""Splats that an iteration leaves out at random where photographs are few."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gs2d.config.presets import best, two_dgs, two_dgs_r, with_robustness
+from gs2d.config.protocols import GENERIC
+from gs2d.config.recipe import Recipe, validate
+from gs2d.config.robust import SplatDropout
+from gs2d.core.splats import Splats
+from gs2d.errors import RecipeError
+from gs2d.render.api import rasterize
+from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
+from gs2d.training.trainer import Trainer
+from train_toys import make_scene, same, short
+
+
+def dropping(rate: float, max_views: int = 24) -> Recipe:
+    return replace(short(), dropout=SplatDropout(rate, max_views))
+
+
+def test_robust_recipes_have_it_and_the_paper_s_have_not() -> None:
+    assert two_dgs_r().dropout is None
+    assert best().dropout is None
+    assert with_robustness(two_dgs()).dropout == SplatDropout()
+    own = replace(two_dgs(), dropout=SplatDropout(rate=0.3))
+    assert with_robustness(own).dropout == SplatDropout(rate=0.3)
+
+
+def test_only_stages_that_train_all_of_geometry_and_opacity_drop_splats_and_only_of_few_views() -> None:
+    recipe = replace(two_dgs_r(), dropout=SplatDropout(rate=0.2, max_views=24))
+    assert [dropout_rate(recipe, stage, 24) for stage in recipe.stages] == [0.2, 0.0, 0.0]
+    assert dropout_rate(recipe, recipe.stages[0], 25) == 0
+    assert dropout_rate(two_dgs_r(), recipe.stages[0], 3) == 0
+
+
+def test_an_iteration_leaves_out_the_same_splats_whenever_it_is_done() -> None:
+    recipe = dropping(0.25)
+    first = kept_splats(recipe, 0, 7, 40_000, 0.25)
+    assert torch.equal(first, kept_splats(recipe, 0, 7, 40_000, 0.25))
+    assert abs(float(first.float().mean()) - 0.75) < 0.01
+    for other in ((0, 8), (1, 7)):
+        both = (first & kept_splats(recipe, *other, 40_000, 0.25)).float().mean()
+        assert abs(float(both) - 0.75**2) < 0.01  # independent
+    assert not torch.equal(first, kept_splats(replace(recipe, seed=1), 0, 7, 40_000, 0.25))
+
+
+def test_those_that_are_left_out_are_not_drawn_and_learn_nothing() -> None:
+    trainer = Trainer(make_scene(), short(), GENERIC, backend="cpu")
+    splats = trainer.splats
+    kept = torch.arange(len(splats)) % 2 == 0
+    splats.opacity_logits.requires_grad_()
+    drawn = dropped_out(splats, kept)
+    assert torch.equal(drawn.opacity_logits[kept], splats.opacity_logits[kept])
+    camera = trainer.scene.train[0].camera
+    output = rasterize(drawn, camera, trainer.settings, backend="cpu")
+    assert not output.radii[~kept].any()
+    alone = rasterize(drawn.rows(kept), camera, trainer.settings, backend="cpu")
+    assert torch.equal(output.color, alone.color)
+    output.color.sum().backward()  # type: ignore[no-untyped-call]
+    gradient = splats.opacity_logits.grad
+    assert gradient is not None
+    assert not gradient[~kept].any()
+    assert gradient[kept].any()
+
+
+def test_training_with_it_differs_and_without_few_views_it_is_as_if_there_were_none() -> None:
+    scene = make_scene()
+
+    def trained(recipe: Recipe) -> Splats:
+        return Trainer(scene, recipe, GENERIC, backend="cpu").run()
+
+    plain = trained(short())
+    assert same(trained(dropping(0.2, max_views=len(scene.train) - 1)), plain)
+    assert same(trained(dropping(0.0)), plain)
+    assert not same(trained(dropping(0.2)), plain)
+
+
+@pytest.mark.parametrize(("settings", "what"), [(SplatDropout(1.0), "rate"), (SplatDropout(0.1, 0), "max_views")])
+def test_a_bad_value_is_named(settings: SplatDropout, what: str) -> None:
+    with pytest.raises(RecipeError, match=f"dropout.{what} must be"):
+        validate(replace(short(), dropout=settings))
