@@ -21,6 +21,7 @@ from gs2d.training.plane_sweep import Sweep, project, unproject
 BESIDE_KNOWN = 3  # px: so near to a pixel of known depth, another one is probably of the same thing
 MAX_VIEWS = 200  # that are looked at, evenly chosen
 EXACT = 200.0  # dB, of what is the same
+MEDIAN_OF = 1_000_000  # pixels, of all views
 STRIDE = 5  # px between those of which places are looked at
 
 
@@ -78,16 +79,21 @@ def _unknown(sweep: Sweep, index: int) -> np.ndarray:
 
 def _one_color(sweep: Sweep, looked_at: Sequence[int]) -> float:
     """Return the PSNR of photographs, dB, whose pixels of unknown depth had one colour, and all others their own."""
-    colors, pixels = [np.zeros((0, 3), dtype=np.float32)], 0
-    for index in looked_at:
-        view = sweep.views[index]
-        colors.append(view.color.permute(1, 2, 0).numpy()[_unknown(sweep, index)])
-        pixels += int(view.usable.sum())
-    unknown = np.concatenate(colors)
-    if not len(unknown):
+    unknown = {index: _unknown(sweep, index) for index in looked_at}
+    step = max(1, -(-sum(int(mask.sum()) for mask in unknown.values()) // MEDIAN_OF))
+    some = np.concatenate([_colors(sweep, index, mask)[::step] for index, mask in unknown.items()])
+    if not len(some):
         return EXACT
-    error = float(((unknown - np.median(unknown, axis=0)) ** 2).mean()) * len(unknown) / pixels
-    return EXACT if error == 0 else -10 * math.log10(error)
+    color, error, pixels = np.median(some, axis=0), 0.0, 0
+    for index, mask in unknown.items():  # view by view: those of hundreds of photographs are hundreds of MB
+        error += float(((_colors(sweep, index, mask) - color) ** 2).sum(dtype=np.float64))
+        pixels += int(sweep.views[index].usable.sum())
+    return EXACT if error == 0 else -10 * math.log10(error / (3 * pixels))
+
+
+def _colors(sweep: Sweep, index: int, mask: np.ndarray) -> np.ndarray:
+    """Return the colours [P, 3] of some pixels of a shrunk photograph."""
+    return np.asarray(sweep.views[index].color.permute(1, 2, 0).numpy()[mask])
 
 
 def _looks(sweep: Sweep, looked_at: Sequence[int], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
