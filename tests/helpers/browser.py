@@ -63,9 +63,9 @@ class Page:
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def until(self, expression: str) -> None:
-        """Wait until an expression is true."""
-        end = time.monotonic() + PATIENCE
+    def until(self, expression: str, patience: float = PATIENCE) -> None:
+        """Wait until an expression is true, so many seconds."""
+        end = time.monotonic() + patience
         while not self.ask(f"Boolean({expression})"):
             assert time.monotonic() < end, f"never true: {expression}; {self.errors}"
             time.sleep(0.05)

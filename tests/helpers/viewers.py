@@ -5,11 +5,11 @@
     PYTHONPATH=src python tests/helpers/viewers.py RUN --out FOLDER [--up 0 0 1] [--viewers spark babylon]
 
 Writes the splats of a run, or of a file of splats, in every layout that a viewer says it reads, turned so that what is
-up is -y, as viewers take it; opens each file in each of them and prints a row of Markdown for it: splats, PSNR against
-gs2d's own rendering from the same camera (both over white), and what is up there. A stream is shown by PlayCanvas's
-engine at each of its levels, beside our rendering of that level, and by SuperSplat's viewer near and far, coloured by
-level. FOLDER/viewers.jpg and FOLDER/viewers-levels.jpg have all pictures, FOLDER/shots each one. Needs npm and
-Chromium, and says so where it cannot have them.
+up is -y, as viewers take it; opens each file in each of them and prints a row of Markdown for it: PSNR against gs2d's
+own rendering from the same camera (both over white), and which axis of the splats is up there. A stream is shown by
+PlayCanvas's engine at each of its levels, beside our rendering of that level, and by SuperSplat's viewer near and far,
+coloured by level. FOLDER/viewers.jpg and FOLDER/viewers-levels.jpg have all pictures, FOLDER/shots each one. Needs npm
+and Chromium, and says so where it cannot have them.
 """
 
 from __future__ import annotations
@@ -43,11 +43,12 @@ from gs2d.render.types import RasterSettings
 from npm import VERSIONS, forget, package
 
 WIDTH, HEIGHT = 480, 360
-FRAMES = 40  # drawn before the picture is taken: sorting is done beside drawing
+FRAMES = 20  # drawn before the picture is taken: sorting is done beside drawing
+PATIENCE = 240.0  # s: the frames are drawn without a GPU
 
 # How a viewer's frame lies to that of the splats: factors of x, y, z. The last one is left-handed, as its viewer is.
 AS_IT_IS, ABOUT_X, ABOUT_Z, LEFT = (1, 1, 1), (1, -1, -1), (-1, -1, 1), (1, -1, 1)
-WORDS = {AS_IT_IS: "-y", ABOUT_X: "+y", ABOUT_Z: "+y", LEFT: "+y"}  # what is up there of splats whose -y is up
+WORDS = {AS_IT_IS: "+y", ABOUT_X: "-y", ABOUT_Z: "-y", LEFT: "-y"}  # which axis of the splats is up there
 
 
 @dataclass(frozen=True)
@@ -316,7 +317,7 @@ def drawn_by(viewer: Viewer, layout: str, camera: Camera, folder: Path, address:
         tab.size(WIDTH, HEIGHT)
         try:
             tab.open(f"{address}/index.html")
-            tab.until(f"window.failure || window.drawn >= {FRAMES}")
+            tab.until(f"window.failure || window.drawn >= {FRAMES}", PATIENCE)
         except AssertionError as error:
             raise ViewerError(str(error)) from None
         if failure := tab.ask("window.failure"):
@@ -377,7 +378,7 @@ def _all_shots(names: Sequence[str], splats: Splats, folder: Path, address: str)
     """Open every file in every viewer; rows of Markdown are printed."""
     camera = camera_for(splats)
     shots = {"gs2d": camera.drawn(splats)}
-    print("| viewer | file | PSNR to gs2d, dB | up of splats whose -y is up |\n|---|---|---|---|")
+    print("| viewer | file | PSNR to gs2d, dB | axis of the splats that is up there |\n|---|---|---|---|")
     for name in names:
         viewer = VIEWERS[name]
         for layout, frame in viewer.frames.items():

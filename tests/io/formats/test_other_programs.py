@@ -1,28 +1,18 @@
-"""Our files in other people's programs, from npm: a validator, a converter both ways, a viewer in a browser."""
+"""Our files in other people's programs, from npm: a validator, and a converter both ways (viewers: test_viewers.py)."""
 
 from __future__ import annotations
 
-import functools
-import http.server
 import json
-import math
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from browser import browser, require_browser
-from gs2d.core.camera import look_at
 from gs2d.core.splats import Splats
 from gs2d.io.formats.gltf import EXTENSION
 from gs2d.io.formats.registry import read_splat_file, write_layout
 from gs2d.io.gaussians import Gaussians, unit_quats
-from gs2d.render.api import rasterize
-from gs2d.render.types import RasterSettings
 from npm import forget, node, package, splat_transform
 from splat_scenes import a_scene, turned_by
 
@@ -169,79 +159,3 @@ def test_the_field_s_converter_reads_our_streams_and_writes_the_same_kind_of_ind
     assert set(leaf) == set(other) == {"bound", "lods"}
     assert set(leaf["bound"]) == set(other["bound"])
     assert set(leaf["lods"]["0"]) == set(other["lods"]["0"])
-
-
-_PAGE = """<!doctype html><html><body style="margin:0;overflow:hidden">
-<canvas id="c" width="WIDTH" height="HEIGHT" style="width:WIDTHpx;height:HEIGHTpx"></canvas>
-<script src="node_modules/babylonjs/babylon.js"></script>
-<script src="node_modules/babylonjs-loaders/babylonjs.loaders.js"></script><script>
-const engine = new BABYLON.Engine(document.getElementById("c"), false), scene = new BABYLON.Scene(engine);
-scene.useRightHandedSystem = true;
-scene.clearColor = new BABYLON.Color4(1, 1, 1, 1);
-const camera = new BABYLON.FreeCamera("a", new BABYLON.Vector3(...EYE), scene);
-camera.setTarget(new BABYLON.Vector3(0, 0, 0)); camera.fov = FOV; camera.minZ = 0.05;
-window.drawn = 0;
-BABYLON.SceneLoader.ImportMeshAsync("", "", "a.glb", scene).then(r => {
-  window.kinds = r.meshes.map(m => m.getClassName());
-  engine.runRenderLoop(() => { scene.render(); window.drawn += 1; });
-});
-</script></body></html>"""
-
-
-@contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """Serve a folder to this machine."""
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
-
-
-@pytest.mark.usefixtures("native")
-def test_babylon_js_draws_our_glb_as_we_draw_the_splats(tmp_path: Path) -> None:
-    require_browser()
-    home = package("babylonjs").parent.parent
-    package("babylonjs-loaders")
-    splats = a_ball()
-    write_layout(tmp_path / "a.glb", splats, "gltf")
-    width, height, fx = 320, 240, 300.0
-    eye = np.array([0.6, 0.4, -3.0])  # ours; theirs after the half turn about z
-    fov = 2 * math.atan(height / 2 / fx)
-    page = _PAGE.replace("WIDTH", str(width)).replace("HEIGHT", str(height)).replace("FOV", str(fov))
-    (tmp_path / "index.html").write_text(page.replace("EYE", str((eye * (-1, -1, 1)).tolist())))
-    (tmp_path / "node_modules").symlink_to(home / "node_modules")
-    with served(tmp_path) as address, browser() as tab:
-        tab.size(width, height)
-        tab.open(f"{address}/index.html")
-        tab.until("window.drawn > 20")
-        assert tab.ask("window.kinds.includes('GaussianSplattingMesh')"), tab.ask("window.kinds")
-        theirs = tab.image()
-    camera = look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]), width=width, height=height, fx=fx)
-    ours = rasterize(splats, camera, RasterSettings(near=0.05, background=(1.0, 1.0, 1.0), sh_degree=splats.sh_degree))
-    difference = theirs - ours.color.clamp(0, 1).numpy()
-    assert -10 * np.log10(np.square(difference).mean()) > 30.0
-
-
-def a_ball() -> Splats:
-    """Disks on a ball, in colours by place and by where they are seen from; the background is white."""
-    splats = a_scene(3000, 1, seed=4)
-    generator = torch.Generator().manual_seed(2)
-    normal = torch.nn.functional.normalize(torch.randn((3000, 3), generator=generator), dim=1)
-    splats.means[:] = normal * 0.8
-    quats = torch.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(3000)], dim=1)  # turns z to it
-    splats.quats[:] = quats
-    splats.log_scales[:] = torch.randn((3000, 2), generator=generator) * 0.2 - 3.0
-    splats.opacity_logits[:] = 3.0
-    splats.sh0[:, 0] = normal * 1.2
-    splats.shN[:] = torch.randn((3000, 3, 3), generator=generator) * 0.1
-    return splats
