@@ -17,6 +17,7 @@ from unittest import mock
 import commands as c
 import mutations as m
 import numpy as np
+import run_parts as parts
 import torch
 from mutations import Mutation
 from PIL import Image
@@ -555,6 +556,8 @@ _ALL = (
            read_splats_everywhere),
     Family("sog", written(_splats("sog", "a.sog")), {".sog": m.either(m.of_zip(_SOG), m.of_zip(_SOG), m.of_bytes)},
            read_splats_everywhere),
+    Family("sog-streamed", written(partial(parts.write_stream, make=some_splats)),
+           {".json": _JSON, ".webp": m.of_bytes}, parts.read_stream),
     Family("usd", _usd_seeds, {".usd": m.of_bytes, ".usda": m.either(_TEXT, _TEXT, m.of_bytes)}, read_usd_once),
     Family("npy", written(_array("depth.npy", np.ones((8, 9))), _array("normal.npy", np.ones((8, 9, 3)) / 3**0.5)),
            {".npy": m.of_npy}, read_map),
@@ -583,6 +586,10 @@ _ALL = (
     Family("checkpoint", written(_checkpoint), {".pt": m.either(m.of_zip(m.of_bytes), m.of_bytes)}, read_checkpoint),
     Family("recipe", written(_recipe), {".json": _JSON}, read_recipe),
     Family("run-files", c.run_seeds, c.RUN_FILES, c.read_run),
+    Family("run-found", parts.found_seeds, {".json": _JSON}, parts.read_found),
+    Family("tables", parts.table_seeds, parts.TABLE_FILES, parts.read_table),
+    Family("blocks", parts.block_seeds, {".json": _JSON, ".npz": m.either(_NPZ, m.of_bytes)}, parts.read_blocks),
+    Family("searches", parts.search_seeds, {".json": _JSON, ".db": m.of_bytes}, parts.read_search),
     Family("command-line", c.line_seeds, {".json": c.JSON_LINE}, c.read_line),
     Family("rasterize", c.scene_seeds, {".splats": c.of_floats}, c.draw),
 )  # fmt: skip

@@ -26,7 +26,7 @@ from typing import Any
 
 from ball_runs import comparable, options
 from gs2d.config.registry import Registry
-from gs2d.errors import Gs2dError
+from gs2d.errors import DataError, Gs2dError
 from gs2d.experiments.options import SweepOptions
 from gs2d.experiments.paper import paper
 from gs2d.io.run_dir import RunFolder
@@ -314,8 +314,11 @@ class Reconstruct(Command):
         from gs2d.pipeline import sfm
 
         def again(request: Any, *_: Any) -> Any:
-            shutil.copyfile(self.searched / "database.db", request.database)
-            shutil.copytree(self.searched / "models", request.output, dirs_exist_ok=True)
+            try:
+                shutil.copyfile(self.searched / "database.db", request.database)
+                shutil.copytree(self.searched / "models", request.output, dirs_exist_ok=True)
+            except OSError as error:  # the process that stands in for COLMAP's ends: that is what is said of it
+                raise DataError("COLMAP ended") from error
             return pickle.loads((self.searched / "solved").read_bytes())
 
         sfm.solve = again

@@ -110,7 +110,10 @@ def test_the_colours_of_an_obj_file_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.colors, mesh.colors)
 
 
-@pytest.mark.parametrize("text", ["v 0 0\n", "v 0 0 0\nf 1 2 x\n", "v 0 0 0\nf 1 2 3\n", "v 0 0 0\n"])
+@pytest.mark.parametrize(
+    "text",
+    ["v 0 0\n", "v 0 0 0\nf 1 2 x\n", "v 0 0 0\nf 1 2 3\n", "v 0 0 0\n", f"v 0 0 0\nf 1 1 {'9' * 30}\n"],  # no int64
+)
 def test_a_broken_obj_is_a_data_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.obj").write_text(text)
     with pytest.raises(DataError):

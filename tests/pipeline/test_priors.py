@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from PIL import Image
 from ball_runs import SMALL, Stop, comparable, options
 from gs2d.errors import DataError, RecipeError
 from gs2d.io.run_dir import REPORT, RunFolder
-from gs2d.pipeline.events import Event, Notice, Step, ignore
+from gs2d.pipeline.events import Event, MissingFile, Notice, Step, ignore
 from gs2d.pipeline.job import build_recipe, prepare_job
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.train import train
@@ -144,6 +146,23 @@ def test_a_broken_map_is_named_before_anything_is_trained_and_leaves_nothing(val
         train(knowing(broken, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     train(options(broken, tmp_path / "plain"))  # nobody asks for them
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere names of files are text")
+def test_names_that_are_no_utf_8_and_hold_escape_sequences_have_known_depths_too(valid: Path, tmp_path: Path) -> None:
+    named, name = tmp_path / "named", os.fsdecode(b"\xe9\x1b]0;owned\x07")
+    shutil.copytree(valid, named)
+    for folder in ("train", "depths/train", "normals/train"):
+        (named / folder / "r_0.png").rename(named / folder / f"{name}.png")
+    file = named / "transforms_train.json"
+    meta = json.loads(file.read_text())
+    meta["frames"][0]["file_path"] = f"./train/{name}"
+    file.write_text(json.dumps(meta))
+    heard: list[Event] = []
+    stages = train(knowing(named, tmp_path / "run"), heard.append).metrics()["stages"]
+    assert len(stages[-1]["losses"]["depth_prior"]["by_view"]) == 6
+    assert (tmp_path / "run" / REPORT).exists()
+    assert not any(isinstance(event, MissingFile) for event in heard)
 
 
 def test_a_capture_without_depths_is_refused_and_leaves_nothing(capture: Path, tmp_path: Path) -> None:

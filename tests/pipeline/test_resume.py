@@ -13,7 +13,7 @@ import pytest
 
 from ball_runs import SMALL, Stop, comparable, options, spawn
 from gs2d.errors import DiskError, RunError
-from gs2d.io.run_dir import RunFolder, open_run
+from gs2d.io.run_dir import RunFolder, load_tensors, open_run
 from gs2d.pipeline.events import Event, Notice, StageDone, Step, ignore
 from gs2d.pipeline.job import prepare_job
 from gs2d.pipeline.train import train
@@ -122,6 +122,21 @@ def test_a_cache_gives_the_same_bytes_without_training_the_shared_stages(
     assert shared.file("renders/surface").is_dir()
     assert not any(isinstance(event, Step) and event.detail.startswith("surface") for event in heard)
     assert len(list(cache.glob("*.pt"))) == 3
+
+
+def test_a_stage_that_a_killed_process_had_no_time_to_keep_is_kept_by_the_one_that_goes_on(
+    capture: Path, tmp_path: Path
+) -> None:
+    cache, given = tmp_path / "cache", {"recipe": "2dgs", "cache": tmp_path / "cache"}
+    train(options(capture, tmp_path / "run", **given))
+    (kept,) = cache.iterdir()
+    before = load_tensors(kept)
+    kept.rename(cache / f".{kept.name}.gs2d.tmp")  # the process is killed before the rename
+    train(options(capture, tmp_path / "run", resume=True, **given))
+    assert list(cache.iterdir()) == [kept]
+    after = load_tensors(kept)
+    assert after.keys() == before.keys()
+    assert [after[name] for name in ("key", "log", "metrics")] == [before[name] for name in ("key", "log", "metrics")]
 
 
 def test_a_cache_that_cannot_be_is_said_before_anything_trains(capture: Path, tmp_path: Path) -> None:

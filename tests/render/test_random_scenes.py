@@ -3,6 +3,8 @@ them. A few in every run of the tests, two thousand in `make test-all`.
 
 What is compared how is that of ``test_parity``: the reference judges in float64 on the same float32 numbers; decisions
 at thresholds may flip for one pair in some 1e5, and gradients are compared where no decision is near its threshold.
+The cosine between a disc and the ray to it is one of those decisions: where it is small, float32 has fewer digits of
+it, and gradients may be off by as much more.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from gs2d.render.types import RasterSettings
 from render_scenes import IMAGES, contraction, random_camera, random_cotangents, random_splats, requiring_grad
 
 SETTINGS = RasterSettings(background=(0.2, 0.5, 0.9))
+GRADIENT_ERROR, TIMES_MARGIN = 5e-3, 1.5e-5  # relative; the latter over the margin, where that is more
 
 
 def random_scene(seed: int) -> tuple[Splats, Camera]:
@@ -52,6 +55,7 @@ def gradients(native: Backend | None, splats: Splats, camera: Camera, seed: int)
 def compare(native: Backend, seeds: range) -> None:
     different, pixels, wrong_radii, count, compared = 0, 0, 0, 0, 0
     errors: list[float] = []
+    beyond: list[tuple[int, str, float, float]] = []
     for seed in seeds:
         splats, camera = random_scene(seed)
         double = splats.to(dtype=torch.float64)
@@ -68,7 +72,9 @@ def compare(native: Backend, seeds: range) -> None:
         assert all(bool(grad.isfinite().all()) for grad in got.values()), seed
         small = camera.resized(min(camera.width, 8), min(camera.height, 8))
         few = splats.rows(torch.arange(min(len(splats), 12)))
-        if seed % 2 == 0 and render_oracle.render(few, small, SETTINGS).margin >= 1e-4:
+        with np.errstate(all="ignore"):
+            margin = render_oracle.render(few, small, SETTINGS).margin
+        if margin >= 1e-4:
             compared += 1
             ours, theirs = (
                 gradients(backend, scene, small, seed)
@@ -77,11 +83,14 @@ def compare(native: Backend, seeds: range) -> None:
             for name, expected in theirs.items():
                 if float(expected.norm()) > 1e-3:
                     errors.append(float((ours[name].double() - expected).norm() / expected.norm()))
+                    if errors[-1] > max(GRADIENT_ERROR, TIMES_MARGIN / margin):
+                        beyond.append((seed, name, errors[-1], margin))
     assert different / pixels < 4e-4, (different, pixels)
     assert wrong_radii <= max(1, 3e-3 * count), (wrong_radii, count)
-    assert compared >= len(seeds) // 20, compared
+    print(f"gradients of {compared} of {len(seeds)} scenes: median {np.median(errors):.1e}, most {max(errors):.1e}")
+    assert compared >= len(seeds) // 4, compared
     assert np.median(errors) < 1e-5
-    assert max(errors) < 5e-3
+    assert not beyond
 
 
 def test_random_scenes_agree_with_the_reference(native: Backend) -> None:

@@ -7,6 +7,7 @@ announces are compared with the file's bytes. Layout: TIFF 6.0, and BigTIFF, who
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import struct
 from dataclasses import dataclass
@@ -111,6 +112,7 @@ def _decoded(name: str) -> tuple[np.ndarray, bool]:
         library: Any = importlib.import_module("tifffile")
     except ImportError as error:
         raise DataError(f"{name} is a TIFF of floats and needs tifffile; {install('exr')}") from error
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)  # it tells of each tag that it does not know
     try:
         with library.TiffFile(name) as file:
             page = file.pages[0]

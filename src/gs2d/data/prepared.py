@@ -145,7 +145,7 @@ def read_prepared(file: Path, key: str) -> DecodedImage | None:
             parts[name] = _unpacked(file, packed, parts.get("image")) if size else parts["mask"]
             start += size
         return _whole(DecodedImage(**parts))
-    except (KeyError, TypeError, ValueError, OSError, DataError, *_OF_PILLOW):
+    except (LookupError, TypeError, ValueError, OSError, DataError, *_OF_PILLOW):
         return None
 
 

@@ -112,9 +112,9 @@ class Subject:
         try:
             low, high, center, up = (np.asarray(data[name], np.float64) for name in ("min", "max", "center", "up"))
             kind, why = data["kind"], str(data["why"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DataError(f"a subject must hold kind, min, max, center, up and why, got {error!r}") from error
-        whole = all(value.shape == (3,) and np.isfinite(value).all() for value in (low, high, center, up))
+        whole = all(value.shape == (3,) and (np.abs(value) <= LARGEST).all() for value in (low, high, center, up))
         if kind not in (OBJECT, SCENE) or not whole or not (low < high).all():
             raise DataError(f"a subject must be an object or a scene with a box of finite corners, got {dict(data)}")
         return cls(kind, low, high, center, up, why)

@@ -19,7 +19,7 @@ from gs2d.experiments.execute import execute
 from gs2d.experiments.options import BlocksOptions
 from gs2d.experiments.tasks import Task, failures
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
-from gs2d.pipeline.blocks.merged import MERGED, SEAM_VIEWS, finish_merged, write_merged, write_result
+from gs2d.pipeline.blocks.merged import MERGED, finish_merged, read_seam_views, write_merged, write_result
 from gs2d.pipeline.blocks.settle import (
     Settled,
     block_folder,
@@ -88,13 +88,13 @@ class BlocksTask(Task):
         """Return the options of a training with the settled protocol."""
         use_threads(self.options.threads)
         use_memory(self.memory)
-        data = read_json(self.options.out / BLOCKS_JSON)
+        data = settled_of(self.options.out)
         settled: dict[str, Any] = {"protocol": protocol_from_json(data["protocol"]), "memory": self.memory}
         return replace(self.options, **{**settled, **SETTLED, "part": Part(), **changes})
 
     def partition(self) -> Partition:
         """Return the partition of the job."""
-        return from_json(read_json(self.options.out / BLOCKS_JSON)["partition"])
+        return from_json(settled_of(self.options.out)["partition"])
 
     def settled(self, on_event: OnEvent) -> Settled:
         """Return what is settled, with the scene.
@@ -103,7 +103,7 @@ class BlocksTask(Task):
         ------
         Gs2dError
         """
-        data = read_json(self.options.out / BLOCKS_JSON)
+        data = settled_of(self.options.out)
         recipe, protocol = recipe_from_json(data["recipe"]), protocol_from_json(data["protocol"])
         found = open_settled(self.training(), recipe, protocol, on_event)
         check_capture(self.options.out, data, found.capture)
@@ -166,7 +166,7 @@ class BlockTask(BlocksTask):
         block = blocks[self.block]
         if block.skipped:
             return {"skipped": block.skipped}
-        whole = recipe_from_json(read_json(out / BLOCKS_JSON)["recipe"])
+        whole = recipe_from_json(settled_of(out)["recipe"])
         part = Part(
             views=block.views,
             splats=coarse_folder(out) / SPLATS,
@@ -196,7 +196,7 @@ class SeamsTask(BlocksTask):
     def work(self, on_event: OnEvent) -> dict[str, Any]:
         """Train, or go on; write."""
         out, settled, partition = self.options.out, self.settled(on_event), self.partition()
-        views = tuple(read_json(out / SEAM_VIEWS)["views"])
+        views = read_seam_views(out)
         if views:
             start = start_file(partition_folder(out), SEAMS)
             part = Part(views=views, splats=out / MERGED, start=start, prepared=out)
@@ -274,7 +274,7 @@ def blocks(options: BlocksOptions, on_event: OnEvent = ignore) -> RunFolder:
         return _one_training(options, training, on_event)
     settled = settle(training, on_event)
     if not partition.grid and begun:
-        found = read_json(options.out / BLOCKS_JSON)["partition"]
+        found = settled_of(options.out)["partition"]
         partition = replace(from_json(found), **_asked(partition))
     elif not partition.grid:
         fitting = fitting_partition(settled, training, partition, on_event)
@@ -347,6 +347,20 @@ def check_job_folder(out: Path) -> None:
     check_claim(out, resume=True, overwrite=False, allowed=(LOCK, "jobs"))
 
 
+def settled_of(out: Path) -> dict[str, Any]:
+    """Return what ``blocks.json`` of a job folder holds.
+
+    Raises
+    ------
+    DataError, RunError
+        Missing, or changed by hand.
+    """
+    found = read_json(out / BLOCKS_JSON)
+    if isinstance(found, dict) and found.keys() >= {"recipe", "protocol", "partition"}:
+        return found
+    raise RunError(f"{out / BLOCKS_JSON} must hold recipe, protocol and partition, got something else; restore it")
+
+
 def check_same_job(out: Path, definition: dict[str, Any]) -> None:
     """Refuse to go on with another definition.
 
@@ -355,9 +369,7 @@ def check_same_job(out: Path, definition: dict[str, Any]) -> None:
     RunError
         Names the first thing that differs.
     """
-    before = read_json(out / BLOCKS_JSON)
-    if not isinstance(before, dict):
-        raise RunError(f"{out / BLOCKS_JSON} must hold an object, got {type(before).__name__}; restore it")
+    before = settled_of(out)
     for name, value in definition.items():
         old = before.get(name)
         if name == "capture":

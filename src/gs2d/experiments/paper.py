@@ -93,7 +93,7 @@ def with_other_rows(plan: Plan) -> Plan:
     options, path = plan.options, plan.options.out / ABOUT
     if not isinstance(options, SweepOptions) or not path.exists():
         return plan
-    found = read_json(path).get("recipes")
+    found = _about(path).get("recipes")
     if not isinstance(found, list):
         raise RunError(f"{path} must list the recipes of its sweep, got {found!r}; choose another --out")
     names = tuple(dict.fromkeys([*map(str, found), *options.recipes]))
@@ -112,7 +112,7 @@ def check_folder(plan: Plan) -> None:
         raise RunError(f"--out must be a folder, {plan.options.out} is a file")
     if not path.exists():
         return
-    before, after = read_json(path).get("options"), json.loads(json.dumps(_defining(plan.options)))
+    before, after = _about(path).get("options"), json.loads(json.dumps(_defining(plan.options)))
     if not isinstance(before, dict):
         raise RunError(f"{path} must be one that gs2d paper or sweep wrote, got another file; choose another --out")
     for name, value in after.items():
@@ -121,6 +121,14 @@ def check_folder(plan: Plan) -> None:
                 f"{plan.options.out} holds a table made with {name} = {before.get(name)}, now {value}; "
                 "choose another --out (--cache may stay: stages that are the same are taken from there)"
             )
+
+
+def _about(path: Path) -> dict[str, Any]:
+    """Return what ``about.json`` of a folder holds."""
+    found = read_json(path)
+    if isinstance(found, dict):
+        return found
+    raise RunError(f"{path} must be one that gs2d paper or sweep wrote, got another file; choose another --out")
 
 
 def _defining(options: TableOptions) -> dict[str, Any]:

@@ -20,13 +20,13 @@ from markupsafe import Markup
 from gs2d.config.presets import about_recipe, get_recipe
 from gs2d.core.files import atomic_write
 from gs2d.core.images import read_image
-from gs2d.core.json_files import read_json
 from gs2d.errors import Gs2dError
 from gs2d.experiments.aggregate import FIGURES, Cell, ClaimResult, Results, Row
 from gs2d.experiments.tables import LOWER_IS_BETTER, METRICS, PaperTable, printed
 from gs2d.io.run_dir import RENDERS
 from gs2d.pipeline.events import OnEvent, ignore
 from gs2d.report.html import drawing, image_tag, page
+from gs2d.report.sections.pictures import read_index
 
 DIGITS = {"fscore": 3, "chamfer": 3, "psnr": 2, "ssim": 4, "lpips": 4, "bytes": 2, "seconds": 0}
 TITLES = {**METRICS, "bytes": "MB", "seconds": "s"}
@@ -336,16 +336,16 @@ def side_by_side(results: Results) -> list[dict[str, Any]]:
     """Return one view of each scene, by every trained row: its name, and a list of pictures of each kind."""
     found: list[dict[str, Any]] = []
     for scene, runs in _runs_by_scene(results).items():
-        index = read_json(next(iter(runs.values())) / RENDERS / "index.json") if runs else {"views": [None]}
-        for view in index["views"][:1]:
+        index = read_index(next(iter(runs.values())) / RENDERS) if runs else {"views": [None]}
+        for view in (index or {"views": []})["views"][:1]:
             found.append({"name": scene, "view": view, "runs": list(runs)})
             if view is None:
                 continue
-            photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view['file']}.png"
+            photo = next(iter(runs.values())) / RENDERS / "photos" / f"{view.get('file', '')}.png"
             found[-1]["images"] = images = {}
             for what, title in IMAGES.items():
                 first = _image(photo, f"{scene}: photograph") if what == "color" else Markup("<div></div>")
-                others = [(name, _last_image(run, view["file"], what)) for name, run in runs.items()]
+                others = [(name, _last_image(run, view.get("file", ""), what)) for name, run in runs.items()]
                 images[title] = [first, *(_image(p, f"{scene}, {name}: {title.lower()}") for name, p in others)]
     return found
 
@@ -363,7 +363,7 @@ def _runs_by_scene(results: Results) -> dict[str, dict[str, Path]]:
 
 def _last_image(run: Path, file: str, what: str) -> Path:
     """Return a picture after the last stage that was drawn."""
-    stages = read_json(run / RENDERS / "index.json")["stages"]
+    stages = (read_index(run / RENDERS) or {"stages": []})["stages"]
     return run / RENDERS / (stages[-1] if stages else "none") / f"{file}.{what}.png"
 
 

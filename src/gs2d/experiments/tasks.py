@@ -17,7 +17,13 @@ from typing import Any, Self, TypeVar
 from gs2d.core.json_files import read_json, write_json
 from gs2d.errors import Gs2dError
 from gs2d.io.run_dir import now
+from gs2d.io.run_schema import check_shape
 from gs2d.pipeline.events import Notice, OnEvent, ignore
+
+_OUTCOME = {
+    **{"state": str, "reason?": str, "notes?": ({"*": str}, None), "wanted?": [str], "trained?": bool},
+    **{"command?": ([str], str, None), "*": object},
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +62,18 @@ class Task(ABC):
     gpu: bool = True
 
     def outcome(self) -> dict[str, Any]:
-        """Return what became of it: ``state`` (new, running, done, failed), ``reason``, and what it says of itself."""
-        return dict(read_json(self.record)) if self.record.exists() else {"state": "new"}
+        """Return what became of it: ``state`` (new, running, done, failed), ``reason``, and what it says of itself.
+
+        Raises
+        ------
+        DataError, RunError
+            The record was changed by hand.
+        """
+        if not self.record.exists():
+            return {"state": "new"}
+        found: dict[str, Any] = read_json(self.record)
+        check_shape(self.record, found, _OUTCOME, f"delete it, and {self.name} is done again")
+        return found
 
     def is_done(self) -> bool:
         """Return whether nothing is left to do."""
@@ -100,7 +116,11 @@ AnyTask = TypeVar("AnyTask", bound=Task)
 def failures(tasks: Sequence[Task]) -> dict[str, str]:
     """Return the reason by task, of those that failed."""
     outcomes = {task.name: task.outcome() for task in tasks}
-    return {name: outcome["reason"] for name, outcome in outcomes.items() if outcome["state"] == "failed"}
+    return {
+        name: outcome.get("reason", "no reason was written down")
+        for name, outcome in outcomes.items()
+        if outcome["state"] == "failed"
+    }
 
 
 def do(task: Task, on_event: OnEvent = ignore) -> None:

@@ -106,7 +106,10 @@ class RunFolder:
         RunError
             Written by a later gs2d, or damaged.
         """
-        data = current_names(_object(self.file(RUN_JSON)))
+        try:
+            data = current_names(_object(self.file(RUN_JSON)))
+        except RecursionError as error:
+            raise RunError(f"{self.file(RUN_JSON)} is nested too deeply to read; it was damaged: restore it") from error
         if data.get("format") != FORMAT:
             raise RunError(
                 f"{self.file(RUN_JSON)} has format {data.get('format')!r}, expected {FORMAT}; use the gs2d that made it"

@@ -18,7 +18,8 @@ Shape = Any
 list of them; a mapping: an object of such values. Those whose name ends in ``?`` may be missing, ``"*"`` is all others.
 """
 
-_SCORES = {"*": (float, str, bool, None, {"*": object}, [object])}
+_FIGURES = ("psnr", "ssim", "psnr_float", "ssim_float", "lpips", "lpips_signed")
+_SCORES = {**{f"{name}?": (float, None) for name in _FIGURES}, "*": (float, str, bool, None, {"*": object}, [object])}
 _SURFACE = {
     "chamfer?": (float, None),
     "unit?": str,
@@ -66,6 +67,16 @@ METRICS_SHAPE: Shape = {
     "surface?": (_SURFACE, None),
     "surface_reason?": (str, None),
     "mesh?": ({"*": object}, None),
+    "*": object,
+}
+VERDICT_SHAPE: Shape = {
+    "verdict": {
+        **{"grade": (str, None), "headline": str},
+        "findings": [
+            {"name": str, "grade": (str, None), "figure": str, "text": str, "advice": (str, None), "*": object}
+        ],
+        "*": object,
+    },
     "*": object,
 }
 _KINDS = {str: "text", bool: "true or false", int: "a whole number >= 0", float: "a finite number", None: "null"}

@@ -73,7 +73,7 @@ def read_exposures(run: RunFolder, recipe: Recipe) -> Transforms:
     try:
         found = read_json(run.file(EXPOSURE))["photographs"]
         transforms = {entry["name"]: torch.tensor(entry["transform"], dtype=torch.float32) for entry in found}
-    except (DataError, KeyError, TypeError, ValueError) as error:
+    except (DataError, KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise RunError(
             f"{run.file(EXPOSURE)} must hold the exposures that this run found, got: {error}; {remedy}"
         ) from error

@@ -36,7 +36,7 @@ from gs2d.data.benchmarks import missing_lines, protocol_of
 from gs2d.data.load import reader_of
 from gs2d.data.masks import EMPTY, Masks
 from gs2d.data.subject import check_subject_box
-from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
+from gs2d.errors import DataError, ProtocolError, RecipeError, RunError, ShapeError
 from gs2d.io.formats.registry import read_surfels
 from gs2d.io.run_dir import RUN_JSON, RunFolder, is_run, versions
 from gs2d.pipeline.events import Event, Notice, OnEvent, Phase, Step
@@ -48,6 +48,7 @@ from gs2d.pipeline.photographs import HOW, already_prepared, with_prepared
 from gs2d.pipeline.photometry import with_found_photometries
 from gs2d.pipeline.priors import with_priors
 from gs2d.pipeline.refined_poses import with_found_poses
+from gs2d.render.api import check_settings
 from gs2d.render.backends import Backend, backend_report, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training.backdrop import find_backdrop
@@ -585,12 +586,13 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
     try:
         recipe, protocol = from_json(data["recipe"], to_train=False), protocol_from_json(data["protocol"])
         settings: RasterSettings = decode(data["raster"], RasterSettings, "raster")
+        check_settings(settings)
         settings = settings.for_depths(protocol.depth, protocol.fused_depth)
         named, downscale, digest = data["backend"]["name"], data["downscale"], data["scene"]["digest"]
         cache_bytes = int(data.get("stage2_cache_bytes", 0))  # runs of before there were cached views had none
         said = data["scene"].get("masks", {})
         masks = Masks(None if said.get("folder") is None else Path(said["folder"]), said.get("masked"))
-    except (LookupError, TypeError, ValueError, AttributeError, RecipeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecipeError, ShapeError) as error:
         raise RunError(
             f"{run.file(RUN_JSON)} must hold recipe, protocol, raster, backend, downscale and scene as gs2d writes "
             f"them, got another entry ({error}); restore it, or train again with --overwrite"
@@ -609,8 +611,15 @@ def reload_job(run: RunFolder, on_event: OnEvent, *, backend: str = "auto") -> J
 
 
 def protocol_from_json(data: dict[str, Any]) -> Protocol:
-    """Return the protocol that ``asdict`` and JSON made of one."""
-    old = {"subject": data["name"] == GENERIC.name}  # for runs of before there was such a field
+    """Return the protocol that ``asdict`` and JSON made of one.
+
+    Raises
+    ------
+    RecipeError
+    """
+    if not isinstance(data, dict) or not isinstance(data.get("fusion"), dict):
+        raise RecipeError("protocol must be an object with its fusion, got something else")
+    old = {"subject": data.get("name") == GENERIC.name}  # for runs of before there was such a field
     protocol: Protocol = decode({**data, "fusion": {**old, **data["fusion"]}}, Protocol, "protocol")
     return protocol
 

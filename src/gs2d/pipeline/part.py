@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gs2d.config.recipe import Recipe
+from gs2d.core.arrays import read_npz
 from gs2d.core.files import atomic_write
 from gs2d.core.splats import Splats
 from gs2d.data import Scene
@@ -25,7 +24,6 @@ from gs2d.io.splat_ply import read_splats
 from gs2d.pipeline.options import Part
 from gs2d.training.initialize import splats_as_start
 
-_UNREADABLE = (OSError, ValueError, LookupError, EOFError, TypeError, NotImplementedError)
 ABSENT, FROZEN, OWN = 0, 1, 2  # of a row of the splats that were trained before
 
 
@@ -97,11 +95,11 @@ def read_start(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         Missing or damaged.
     """
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as found:
-            rows, exposures = np.asarray(found["rows"]), np.asarray(found["exposures"])
+        found = read_npz(path, "start of a block", lambda name: name in ("rows", "exposures"))
+        rows, exposures = found["rows"], found["exposures"]
         if rows.dtype != np.uint8 or rows.ndim != 1 or rows.max(initial=0) > OWN:
             raise ValueError(f"it has {rows.dtype} {rows.shape}")
-    except (*_UNREADABLE, zipfile.BadZipFile, zlib.error) as error:
+    except (DataError, KeyError, ValueError) as error:
         raise RunError(
             f"{path} must say which splats a block trains, got {' '.join(str(error).split())[:120]}; delete the folder "
             f"{path.parent} and run the command again"

@@ -277,8 +277,8 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
                 raise RunError(
                     f"{name} {what} {options.photos} since the cameras were found; begin anew with --overwrite"
                 )
-        placed_line(poses)
-    except (KeyError, TypeError) as error:
+        _lines(poses, capture)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise RunError(
             f"{capture / POSES_JSON} must be as `gs2d reconstruct` writes it, got another entry ({error}); begin anew "
             "with --overwrite"
@@ -288,12 +288,19 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
 
 def _tell(poses: dict[str, Any], capture: Path, on_event: OnEvent) -> None:
     """How the search for the cameras ended."""
-    on_event(Notice(f"{placed_line(poses)}; {capture / POSES_PNG} shows them"))
+    for line in _lines(poses, capture):
+        on_event(Notice(line))
+
+
+def _lines(poses: dict[str, Any], capture: Path) -> list[str]:
+    """Say how the search for the cameras ended."""
     lost = [row for row in poses["photographs"] if not row["placed"]]
-    for row in lost[:SHOWN_LOST]:
-        on_event(Notice(f"no place: {row['source']}: {row['reason']}"))
-    if len(lost) > SHOWN_LOST:
-        on_event(Notice(f"... and {len(lost) - SHOWN_LOST} more without a place, in {capture / POSES_JSON}"))
+    more = len(lost) - SHOWN_LOST
+    return [
+        f"{placed_line(poses)}; {capture / POSES_PNG} shows them",
+        *(f"no place: {row['source']}: {row['reason']}" for row in lost[:SHOWN_LOST]),
+        *([f"... and {more} more without a place, in {capture / POSES_JSON}"] if more > 0 else []),
+    ]
 
 
 def _by_the_images(training: TrainOptions, options: ReconstructOptions, on_event: OnEvent) -> TrainOptions:

@@ -158,7 +158,7 @@ def read_poses(run: RunFolder, recipe: Recipe) -> FoundPoses:
         frames = [entry for entry in every if entry["split"] == "train"]
         poses = {entry["name"]: np.array(entry["T_cam_world"], dtype=np.float64) for entry in frames}
         zooms = {entry["name"]: Zoom(*map(float, entry["zoom"])) for entry in every if "zoom" in entry}
-    except (DataError, KeyError, TypeError, ValueError) as error:
+    except (DataError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{run.file(POSES)} must hold the poses that this run found, got: {error}; {remedy}") from error
     for name, pose in poses.items():
         if pose.shape != (4, 4) or not np.isfinite(pose).all():

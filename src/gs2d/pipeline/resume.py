@@ -71,7 +71,10 @@ def choose_start(run: RunFolder, job: Job, options: TrainOptions, on_event: OnEv
         ``start_from`` has no stage in common with this run, or no checkpoint is readable.
     """
     if run.checkpoints():
-        return _resume(run, job, on_event)
+        start = _resume(run, job, on_event)
+        if options.cache is not None:
+            _keep_scored(run, options.cache)
+        return start
     run.events.cut(0)
     found = [
         stage
@@ -284,7 +287,23 @@ def stage_end(run: RunFolder, job: Job, index: int) -> TrainState | None:
     return None
 
 
-def put_in_cache(folder: Path, run: RunFolder, payload: dict[str, Any]) -> None:
+def _keep_scored(run: RunFolder, folder: Path) -> None:
+    """Keep the last stage that a killed process had scored, and had no time to keep; remove what it left half-written.
+
+    Raises
+    ------
+    DiskError
+    """
+    sweep(folder)
+    stages = run.metrics()["stages"]
+    ends = [c for c in run.checkpoints() if c.iteration is None and c.stage_index < len(stages)]
+    for end in ends[-1:]:
+        if "reused_from" not in stages[end.stage_index]:  # that is whose it is
+            with contextlib.suppress(RunError):  # damaged: training goes on from the one before
+                put_in_cache(folder, run, end.stage_index, _read(end.path))
+
+
+def put_in_cache(folder: Path, run: RunFolder, index: int, payload: dict[str, Any]) -> None:
     """Keep a finished and scored stage for other runs.
 
     Raises
@@ -295,5 +314,5 @@ def put_in_cache(folder: Path, run: RunFolder, payload: dict[str, Any]) -> None:
     path = _cache_file(folder, payload["key"])
     if not path.exists():
         log = run.events.read_bytes(payload["events_bytes"]).decode()
-        stages = [{k: v for k, v in m.items() if k != "reused_from"} for m in run.metrics()["stages"]]
+        stages = [{k: v for k, v in m.items() if k != "reused_from"} for m in run.metrics()["stages"][: index + 1]]
         save_tensors(path, {**payload, "metrics": json.dumps(stages), "log": log})

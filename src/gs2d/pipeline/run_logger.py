@@ -326,7 +326,7 @@ class RunLogger:
         self._run.write_metrics({"stages": stages, "surface": None})
         if self._options.cache is not None:
             saved = next(c for c in self._run.checkpoints() if c.stage_index == index and c.iteration is None)
-            put_in_cache(self._options.cache, self._run, load_tensors(saved.path))
+            put_in_cache(self._options.cache, self._run, index, load_tensors(saved.path))
         self._on_event(StageDone(entry))
 
     def _scored(self, *, last: bool) -> list[tuple[str, Sequence[View]]]:

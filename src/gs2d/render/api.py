@@ -280,7 +280,7 @@ def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> Rast
             raise ShapeError(f"{name} must be float32 or float64 like means ({splats.dtype}), got {tensor.dtype}")
         if tensor.device != splats.device:
             raise ShapeError(f"{name} must be on {splats.device} like means, got {tensor.device}")
-    _check_settings(settings)
+    check_settings(settings)
     if settings.lowpass_depth not in backend.lowpass_depths:
         raise BackendError(
             f"lowpass_depth={settings.lowpass_depth!r} is a setting of the reference backend, got backend "
@@ -289,7 +289,14 @@ def _checked(splats: Splats, settings: RasterSettings, backend: Backend) -> Rast
     return replace(settings, sh_degree=min(settings.sh_degree, held))
 
 
-def _check_settings(s: RasterSettings) -> None:
+def check_settings(s: RasterSettings) -> None:
+    """Raise for a number or a word that no rasterizer takes.
+
+    Raises
+    ------
+    ShapeError
+    """
+
     def require(holds: bool, field: str, rule: str) -> None:
         if not holds:
             raise ShapeError(f"RasterSettings.{field} must be {rule}, got {getattr(s, field)!r}")

@@ -253,11 +253,22 @@ def read_facts(database: Path) -> Facts:
     """Read the database of a finished worker.
 
     A pair's number is 2147483647 * (smaller image id) + (larger one) (COLMAP's documentation, Database Format).
+
+    Raises
+    ------
+    DataError
+        It cannot be read: SQLite needs room on the disk to read what another process wrote.
     """
-    with contextlib.closing(_open(database)) as connection:
-        names = dict(connection.execute("SELECT image_id, name FROM images"))
-        features = dict.fromkeys(names.values(), 0)
-        features |= {names[i]: rows for i, rows in connection.execute("SELECT image_id, rows FROM keypoints")}
-        found = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
-        matches = {(names[pair // 2147483647], names[pair % 2147483647]): rows for pair, rows in found}
+    try:
+        with contextlib.closing(_open(database)) as connection:
+            names = dict(connection.execute("SELECT image_id, name FROM images"))
+            features = dict.fromkeys(names.values(), 0)
+            features |= {names[i]: rows for i, rows in connection.execute("SELECT image_id, rows FROM keypoints")}
+            found = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
+            matches = {(names[pair // 2147483647], names[pair % 2147483647]): rows for pair, rows in found}
+    except (sqlite3.Error, KeyError) as error:
+        raise DataError(
+            f"{database} must be the database that COLMAP wrote, it cannot be read: {error}; free some space, or remove "
+            f"{database.parent} and begin anew"
+        ) from error
     return Facts(features, matches)

@@ -99,8 +99,11 @@ class Cells:
             )
             names = tuple(str(cell["name"]) for cell in cells)
             numbers = float(data["margin"]), float(data["side"])
-            return cls(np.array(data["axes"], np.float64), low, high, *numbers, names)
-        except (LookupError, TypeError, ValueError) as error:
+            axes = np.array(data["axes"], np.float64)
+            if axes.ndim != 2 or axes.shape[1] != 3 or not low.shape == high.shape == (len(names), len(axes)):
+                raise ValueError(f"axes {list(axes.shape)} of {len(names)} cells from {list(low.shape)}")
+            return cls(axes, low, high, *numbers, names)
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise RunError(f"the cells of a partition are damaged ({type(error).__name__}: {error})") from error
 
 

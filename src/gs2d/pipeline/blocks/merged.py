@@ -86,6 +86,21 @@ def write_merged(settled: Settled, options: TrainOptions, partition: Partition, 
     return {"splats": len(splats), "views": len(views)}
 
 
+def read_seam_views(out: Path) -> tuple[str, ...]:
+    """Return the views that see the seams of a job's merged scene.
+
+    Raises
+    ------
+    DataError, RunError
+        Missing, or changed by hand.
+    """
+    found = read_json(out / SEAM_VIEWS)
+    views = found.get("views") if isinstance(found, dict) else None
+    if not isinstance(views, list) or not all(isinstance(view, str) for view in views):
+        raise RunError(f"{out / SEAM_VIEWS} must list views by name, got something else; delete it, and {MERGED} too")
+    return tuple(views)
+
+
 def write_result(settled: Settled, options: TrainOptions, partition: Partition, on_event: OnEvent) -> int:
     """Write the merged scene as a run, its seams as they have learned; returns its splats.
 
@@ -94,7 +109,7 @@ def write_result(settled: Settled, options: TrainOptions, partition: Partition, 
     RunError, DiskError
     """
     run, splats = RunFolder(options.out), read_splats(options.out / MERGED)
-    if read_json(options.out / SEAM_VIEWS)["views"]:
+    if read_seam_views(options.out):
         rows, _ = read_start(start_file(partition_folder(options.out), SEAMS))
         rest = splats.rows(torch.from_numpy(rows != OWN))
         splats = rest.followed_by(finished_splats(open_run(seam_folder(options.out))))

@@ -88,7 +88,7 @@ class Split:
                 raise ValueError(f"format {data['format']!r}, expected {FORMAT}")
             blocks = tuple(Block(**{**entry, "views": tuple(entry["views"])}) for entry in data["blocks"])
             return cls(Cells.from_json(data["cells"]), blocks)
-        except (LookupError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise RunError(f"{CELLS} of a partition is damaged ({type(error).__name__}: {error})") from error
 
 

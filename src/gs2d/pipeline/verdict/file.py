@@ -10,6 +10,7 @@ from gs2d.core.json_files import read_json, write_json
 from gs2d.data.subject import OBJECT, read_subject
 from gs2d.errors import DataError, RunError
 from gs2d.io.run_dir import VERDICT, RunFolder
+from gs2d.io.run_schema import VERDICT_SHAPE, check_shape
 from gs2d.pipeline.job import Job
 from gs2d.pipeline.verdict.judge import FORMAT, judge
 from gs2d.pipeline.verdict.measures import Collector, Measures, measure, measures_from_json
@@ -44,16 +45,23 @@ def write_verdict(run: RunFolder, job: Job, collected: Collector) -> dict[str, A
 def read_verdict(run: RunFolder) -> dict[str, Any] | None:
     """Return the verdict of a run as it was written, or None where there is none."""
     try:
-        verdict = read_json(run.file(VERDICT))["verdict"] if run.file(VERDICT).exists() else None
-        return verdict if isinstance(verdict, dict) and {"grade", "headline", "findings"} <= verdict.keys() else None
-    except (DataError, KeyError, TypeError):
+        return dict(_read(run)["verdict"]) if run.file(VERDICT).exists() else None
+    except (DataError, RunError):
         return None
+
+
+def _read(run: RunFolder) -> dict[str, Any]:
+    """Return what ``verdict.json`` holds, checked (DataError, RunError)."""
+    path = run.file(VERDICT)
+    data: dict[str, Any] = read_json(path)
+    check_shape(path, data, VERDICT_SHAPE, "delete it: the verdict is made again with the run's next scores")
+    return data
 
 
 def _measured_before(run: RunFolder) -> Measures:
     if not run.file(VERDICT).exists():
         raise RunError("the views were scored before the run was broken off, and are not measured")
-    return measures_from_json(read_json(run.file(VERDICT)).get("measured") or {})
+    return measures_from_json(_read(run).get("measured") or {})
 
 
 def _subject(run: RunFolder) -> np.ndarray | None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gs2d.config.serialize import decode
 from gs2d.core.camera import Camera
 from gs2d.core.json_files import read_json
 from gs2d.core.transforms import focus_point, up_direction
 from gs2d.data import Scene, View
 from gs2d.data.priors import ObservedPoints
-from gs2d.errors import DataError, RunError
+from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.evaluation.hidden_points import hidden_points
 from gs2d.evaluation.images import ImageMetrics, psnr_float
 from gs2d.pipeline.exposure import GREY, matched_by_halves, over
@@ -98,7 +99,7 @@ class Measures:
         return asdict(self)
 
 
-def measures_from_json(data: Mapping[str, Any]) -> Measures:
+def measures_from_json(data: Any) -> Measures:
     """Read what ``Measures.to_json`` wrote.
 
     Raises
@@ -107,11 +108,9 @@ def measures_from_json(data: Mapping[str, Any]) -> Measures:
         Something else.
     """
     try:
-        rest = {f.name: data[f.name] for f in fields(Measures) if f.name not in ("views", "neighbours", "lost")}
-        views = tuple(ViewMeasures(**row) for row in data["views"])
-        neighbours = tuple(Neighbour(**row) for row in data["neighbours"])
-        return Measures(views=views, neighbours=neighbours, lost=tuple(data["lost"]), **rest)
-    except (KeyError, TypeError) as error:
+        found: Measures = decode(data, Measures, "measured")
+        return found
+    except RecipeError as error:
         raise RunError(f"expected measures as gs2d writes them, got another entry ({error})") from error
 
 
@@ -279,7 +278,7 @@ def placed_images(capture: Path | None) -> tuple[int | None, int | None, tuple[s
     try:
         lost = tuple(str(row["source"]) for row in data["photographs"] if not row["placed"])
         return int(data["placed"]), int(data["count"]), lost
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None, None, ()  # another program's file of this name
 
 

@@ -46,7 +46,7 @@ def capture_section(run: Path, definition: Mapping[str, Any]) -> Markup:
         lost = [(row["source"], f"{int(row['features']):,}", row["reason"]) for row in rows]
         lens = str((found.get("lens") or {}).get("about", ""))
         return render("capture.html", found=found, lens=lens, lost=lost, pixels=pixels, unreadable=unreadable)
-    except (KeyError, TypeError, ValueError, AttributeError, UndefinedError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, UndefinedError) as error:
         raise DataError(
             f"{folder / POSES_JSON} must be as `gs2d poses` writes it, got another entry ({error})"
         ) from error

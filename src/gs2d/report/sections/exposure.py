@@ -50,7 +50,7 @@ def _gains(path: Path) -> tuple[list[str], np.ndarray]:
         images = read_json(path)["photographs"]
         names = [str(entry["name"]) for entry in images]
         gains = np.array([entry["grey"] for entry in images], dtype=np.float64).reshape(len(names), 3) / GREY
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path} must hold name and grey of each photograph, got another entry ({error})") from error
     if not names or not np.isfinite(gains).all():
         raise DataError(f"{path} must hold finite numbers of one photograph or more, got others")

@@ -25,6 +25,6 @@ def photometry_section(path: Path) -> Markup:
             }
             for entry in read_json(path)["cameras"]
         ]
-    except (LookupError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path} must hold falloff and shift of each camera, got another entry ({error})") from error
     return render("photometry.html", cameras=cameras)

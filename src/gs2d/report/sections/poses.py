@@ -63,7 +63,7 @@ def _moved(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
         far = np.array([[entry["moved"][name] for name in MEASURES] for entry in frames], dtype=np.float64)
         refined = bool(frames) and "zoom" in frames[0]
         zooms = np.array([float(entry["zoom"][0]) for entry in frames]) if refined else None
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path} must hold name and motion of each photograph, got another entry ({error})") from error
     if not names or not np.isfinite(far).all():
         raise DataError(f"{path} must hold finite numbers of one photograph or more, got others")

@@ -32,7 +32,7 @@ def verdict_section(path: Path) -> Markup:
     try:
         data = read_json(path)["verdict"]
         return Markup() if data is None else render("verdict.html", verdict=data)
-    except (KeyError, TypeError, UndefinedError) as error:
+    except (KeyError, TypeError, ValueError, UndefinedError) as error:
         raise DataError(f"{path} must hold a verdict as gs2d writes it, got another entry ({error})") from error
 
 

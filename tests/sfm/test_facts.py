@@ -1,0 +1,19 @@
+"""What is read of COLMAP's database when its process has ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gs2d.errors import DataError
+from gs2d.sfm.colmap import read_facts
+
+
+@pytest.mark.parametrize("data", [None, b"no database", b""])
+def test_a_database_that_cannot_be_read_is_one_line(tmp_path: Path, data: bytes | None) -> None:
+    """On a full disk SQLite cannot open what is in its journal: that was a traceback."""
+    if data is not None:
+        (tmp_path / "database.db").write_bytes(data)
+    with pytest.raises(DataError, match=r"database\.db must be the database that COLMAP wrote, .*; free some space"):
+        read_facts(tmp_path / "database.db")
