@@ -19,7 +19,7 @@ from gs2d.experiments.execute import execute
 from gs2d.experiments.options import BlocksOptions
 from gs2d.experiments.tasks import Task, failures
 from gs2d.io.run_dir import LOCK, REPORT, SPLATS, RunFolder, check_claim, is_run, make_folder, open_run
-from gs2d.pipeline.blocks.merged import MERGED, finish_merged, read_seam_views, write_merged, write_result
+from gs2d.pipeline.blocks.merged import MERGED, SEAM_VIEWS, finish_merged, read_seam_views, write_merged, write_result
 from gs2d.pipeline.blocks.settle import (
     Settled,
     block_folder,

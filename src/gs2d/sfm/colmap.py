@@ -268,7 +268,7 @@ def read_facts(database: Path) -> Facts:
             matches = {(names[pair // 2147483647], names[pair % 2147483647]): rows for pair, rows in found}
     except (sqlite3.Error, KeyError) as error:
         raise DataError(
-            f"{database} must be the database that COLMAP wrote, it cannot be read: {error}; free some space, or remove "
-            f"{database.parent} and begin anew"
+            f"{database} must be the database that COLMAP wrote, it cannot be read: {error}; free some space, or "
+            f"remove {database.parent} and begin anew"
         ) from error
     return Facts(features, matches)
