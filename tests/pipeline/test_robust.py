@@ -203,15 +203,20 @@ def test_another_robustness_is_refused_by_the_name_of_its_option(undisturbed: Ru
         check_same_run(undisturbed, replace(job, recipe=with_robustness(job.recipe)))
 
 
-def test_a_run_of_before_seen_area_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
+def test_a_run_of_before_seen_area_and_dropout_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
     run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
     job = reload_job(run, lambda _: None)
     robust = replace(job, recipe=with_robustness(job.recipe))
-    assert as_begun(run, robust).recipe.seen_area is not None
     data = json.loads(run.file("run.json").read_text())
+    data["recipe"] = to_json(robust.recipe)
+    run.file("run.json").write_text(json.dumps(data))
+    assert as_begun(run, robust).recipe == robust.recipe
+    del data["recipe"]["dropout"]
+    run.file("run.json").write_text(json.dumps(data))
+    assert as_begun(run, robust).recipe == replace(robust.recipe, dropout=None)
     del data["recipe"]["seen_area"]
     run.file("run.json").write_text(json.dumps(data))
-    assert as_begun(run, robust).recipe == replace(robust.recipe, seen_area=None)
+    assert as_begun(run, robust).recipe == replace(robust.recipe, seen_area=None, dropout=None)
 
 
 def test_a_run_of_before_backdrops_faded_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
