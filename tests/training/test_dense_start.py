@@ -22,7 +22,7 @@ from gs2d.errors import DataError, RecipeError
 from gs2d.evaluation.images import psnr_float
 from gs2d.pipeline.estimate import start_text
 from gs2d.render.api import rasterize
-from gs2d.training import start_fit
+from gs2d.training import plane_sweep, start_fit
 from gs2d.training.events import Initialised
 from gs2d.training.plane_sweep import Sweep, _unique_rows, start_points, sweep_views
 from gs2d.training.start_fit import fit_start
@@ -290,3 +290,19 @@ def test_where_they_agree_it_is_as_if_it_were_required() -> None:
     wished = Trainer(ball(), recipe(replace(BALL, required=False)), GENERIC, backend="reference").splats
     needed = Trainer(ball(), recipe(BALL), GENERIC, backend="reference").splats
     assert all(torch.equal(a, b) for (_, a), (_, b) in zip(wished.items(), needed.items(), strict=True))
+
+
+def test_places_are_thinned_view_by_view_as_if_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view is held twice and cells are large, so that most places share one, and some are equally good."""
+    sweep = swept_ball()
+    whole = start_points(ball(), sweep, BALL)
+    twice = [plane_sweep._swept(sweep, index, BALL) for index in (*range(len(sweep.views)), 0)]
+    for cell in (3.0, 8.0):
+        expected = plane_sweep._thin(plane_sweep._joined(twice), cell)
+        monkeypatch.setattr(plane_sweep, "WAITING", 10)
+        found = plane_sweep._thinned(iter(twice), cell)
+        assert len(expected.score) < 0.9 * len(plane_sweep._joined(twice).score)
+        for name in ("places", "colors", "normals", "pixel", "score"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    again = start_points(ball(), sweep, BALL)
+    np.testing.assert_array_equal(again.points, whole.points)

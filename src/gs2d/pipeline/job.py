@@ -629,10 +629,8 @@ def as_begun(run: RunFolder, job: Job) -> Job:
     before, recipe = run.definition().get("recipe"), job.recipe
     if not isinstance(before, dict):
         return job
-    if "seen_area" not in before:
-        recipe = replace(recipe, seen_area=None)
-    if "dropout" not in before:
-        recipe = replace(recipe, dropout=None)
+    lacking: dict[str, Any] = {name: None for name in ("seen_area", "dropout") if name not in before}
+    recipe = replace(recipe, **lacking)
     decay = before.get("opacity_decay")
     if isinstance(decay, dict) and "backdrop_rate" not in decay:
         recipe = without_fading_backdrop(recipe)

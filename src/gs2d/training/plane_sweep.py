@@ -38,6 +38,7 @@ BEST_ANGLE, NARROW, WIDE = 10.0, 4.0, 12.0  # degrees: neighbours' baselines, an
 TRIM_EVERY = 8  # views; what is freed between results that stay was 2 GB of a capture of 292 photographs
 PLANES_AT_ONCE = 16  # 5 MB of each of what a comparison is made of, at 200 px; fewer would make threads wait more
 SWEEP_BYTES = 1 << 30  # of shrunk views, of depths, of free space: each; what is beyond goes to the disk
+WAITING = 500_000  # places that wait to be thinned; those of 292 photographs were a GB
 REPEATED = 3.0  # cells: sparse points within that of a swept one start no splat of their own
 
 T = TypeVar("T")
@@ -180,8 +181,7 @@ def start_points(
             f"{settings.max_angle:g} degrees apart, got none; set dense_start.min_angle or max_angle, or train with "
             "--set dense_start=null"
         )
-    found = [_swept(sweep, index, settings) for index in range(len(sweep.views))]
-    swept = _thin(_joined(found), settings.cell)
+    swept = _thinned((_swept(sweep, index, settings) for index in range(len(sweep.views))), settings.cell)
     parts: list[tuple[np.ndarray, ...]] = [
         (swept.places, swept.colors, swept.normals, np.zeros(len(swept.places))),
     ]
@@ -216,6 +216,16 @@ class _Found:
 
 def _joined(found: Sequence[_Found]) -> _Found:
     return _Found(*(np.concatenate([getattr(f, name) for f in found]) for name in _Found.__dataclass_fields__))
+
+
+def _thinned(found: Iterable[_Found], cell: float) -> _Found:
+    """Return what :func:`_thin` leaves of all views together, without having all of them in memory."""
+    waiting: list[_Found] = []
+    for some in found:
+        waiting.append(some)
+        if sum(len(one.score) for one in waiting) > max(WAITING, 2 * len(waiting[0].score)):
+            waiting = [_thin(_joined(waiting), cell)]
+    return _thin(_joined(waiting), cell)
 
 
 def _thin(found: _Found, cell: float) -> _Found:
