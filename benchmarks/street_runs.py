@@ -277,6 +277,11 @@ def placed(run: Path) -> dict[str, Any] | None:
     }
 
 
+def typed(process: Process, folder: Path) -> str:
+    """The command as a person types it, with OUT for where all captures' folders are: results name no machine's."""
+    return " ".join(["gs2d", *process.command[3:]]).replace(str(folder.parent.parent), "OUT")
+
+
 def measure_run(source: Path, folder: Path, quality: str, extra: Sequence[str] = ()) -> dict[str, Any]:
     """Run a capture, if that is not done, and tabulate what it took, told and left."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -285,7 +290,7 @@ def measure_run(source: Path, folder: Path, quality: str, extra: Sequence[str] =
         "photographs": count,
         "poses": placed(run),
         **{name: value for name, value in asdict(process).items() if name != "command"},
-        "command": " ".join(["gs2d", *process.command[3:]]),
+        "command": typed(process, folder),
         "files": {name: (run / name).exists() for name in (SPLATS, MESH, REPORT, PAGE)},
     }
     if process.exit_code:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks import street, street_gallery, street_runs
-from benchmarks.street_runs import Process, estimate_error, reconstruct_command, told_estimate, watch_process
+from benchmarks.street_runs import Process, estimate_error, reconstruct_command, told_estimate, typed, watch_process
 from PIL import Image
 
 from gs2d.core.camera import Camera
@@ -244,3 +244,10 @@ def test_only_what_its_licence_allows_may_be_shown() -> None:
     allowed = [capture.name for capture in street.CAPTURES if capture.may_be_shown]
     assert allowed == ["bottle"]
     assert set(street.STREET) == {"fox", "castle", "fountain", "mouse", "temple", "monstree", "bust"}
+
+
+def test_a_command_in_the_results_names_no_folder_of_this_machine(tmp_path: Path) -> None:
+    folder = tmp_path / "draft" / "fox"
+    words = reconstruct_command(folder / "photographs" / "fox", 50, folder / "run", "draft")
+    told = typed(process([sys.executable, "-m", "gs2d", *words]), folder)
+    assert told == "gs2d reconstruct OUT/draft/fox/photographs/fox --out OUT/draft/fox/run --quality draft"

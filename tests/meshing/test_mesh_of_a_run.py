@@ -20,9 +20,10 @@ from gs2d.kernels.library import available_variants
 from gs2d.meshing.tsdf import Add, Volume, integrator
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import check_same_run, reload_job, with_fused_depth
+from gs2d.pipeline.job import reload_job, with_fused_depth
 from gs2d.pipeline.mesh import extract_mesh, mesh_run
 from gs2d.pipeline.options import MeshOptions, TrainOptions
+from gs2d.pipeline.same_run import check_same_run
 from gs2d.pipeline.train import train
 from gs2d.render.backends import Backend, get_backend
 from tiny import RADIUS, write_capture

@@ -14,6 +14,7 @@ import torch
 from gs2d.config.presets import with_fading_backdrop, with_robustness
 from gs2d.config.protocols import DTU, GENERIC
 from gs2d.config.recipe import LearningRates
+from gs2d.config.robust import SplatDropout
 from gs2d.config.serialize import to_json
 from gs2d.core.camera import look_at
 from gs2d.data.priors import ObservedPoints
@@ -21,9 +22,10 @@ from gs2d.data.scene import Scene, View
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.io.run_dir import RunFolder
 from gs2d.pipeline.events import Event, Notice
-from gs2d.pipeline.job import as_begun, check_same_run, fit_recipe, reload_job, settled
+from gs2d.pipeline.job import fit_recipe, reload_job, settled
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.predicted_exposure import metered, with_predicted
+from gs2d.pipeline.same_run import as_begun, check_same_run
 from gs2d.render.api import rasterize
 from gs2d.render.backends import get_backend
 from gs2d.render.types import RasterSettings
@@ -217,6 +219,38 @@ def test_a_run_of_before_seen_area_and_dropout_goes_on_as_it_began(undisturbed: 
     del data["recipe"]["seen_area"]
     run.file("run.json").write_text(json.dumps(data))
     assert as_begun(run, robust).recipe == replace(robust.recipe, seen_area=None, dropout=None)
+
+
+def test_a_run_of_before_the_sphere_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    job = reload_job(run, lambda _: None)
+    robust = with_robustness(job.recipe)
+    assert robust.dense_start is not None
+    assert robust.dense_start.sphere is not None
+    before = replace(robust, dense_start=replace(robust.dense_start, sphere=None))
+    data = json.loads(run.file("run.json").read_text())
+    data["recipe"] = to_json(before)
+    run.file("run.json").write_text(json.dumps(data))
+    assert as_begun(run, replace(job, recipe=robust)).recipe == before
+    data["recipe"] = to_json(robust)
+    run.file("run.json").write_text(json.dumps(data))
+    assert as_begun(run, replace(job, recipe=robust)).recipe == robust
+
+
+def test_dropout_makes_another_stage_and_another_run(undisturbed: RunFolder, tmp_path: Path) -> None:
+    run = RunFolder(Path(shutil.copytree(undisturbed.path, tmp_path / "run")))
+    job = reload_job(run, lambda _: None)
+    robust = replace(job, recipe=with_robustness(job.recipe))
+    none = replace(robust, recipe=replace(robust.recipe, dropout=None))
+    more = replace(robust, recipe=replace(robust.recipe, dropout=SplatDropout(rate=0.3)))
+    assert len({one.stage_key(0) for one in (robust, none, more)}) == 3
+    data = json.loads(run.file("run.json").read_text())
+    data["recipe"] = to_json(none.recipe)  # begun with dropout=null: that is said, not lacking
+    run.file("run.json").write_text(json.dumps(data))
+    for other in (robust, more):
+        with pytest.raises(RunError, match=r"made with another recipe \(dropout: None, now"):
+            check_same_run(run, as_begun(run, other))
+    check_same_run(run, as_begun(run, none))
 
 
 def test_a_run_of_before_backdrops_faded_goes_on_as_it_began(undisturbed: RunFolder, tmp_path: Path) -> None:

@@ -48,6 +48,9 @@ def describe_recipe(recipe: Recipe) -> Iterator[str]:
         otherwise = "" if start.required else "; without where they agree on nothing"
         around = "" if start.sphere is None else f", and {start.sphere.splats:,} on a sphere around, if needed"
         yield f"dense start: a sweep over photographs of about {start.side} px{fitted}{around}{otherwise}"
+    if recipe.dropout is not None:
+        d = recipe.dropout
+        yield f"dropout: {d.rate:g} of the splats each iteration, with at most {d.max_views:,} training views"
     if recipe.fused_depth is not None:
         yield f"the mesh is of the {recipe.fused_depth} depth"
     for number, stage in enumerate(recipe.stages, start=1):

@@ -373,10 +373,10 @@ class Recipe:
     free_space: FreeSpace | None = None
     opacity_decay: OpacityDecay | None = None
     seen_area: SeenArea | None = None
+    dropout: SplatDropout | None = None
     fused_depth: str | None = field(default=None, metadata={"omit_empty": True})
     intrinsics: IntrinsicsRefinement | None = field(default=None, metadata={"omit_empty": True})
     photometry: Photometry | None = field(default=None, metadata={"omit_empty": True})
-    dropout: SplatDropout | None = field(default=None, metadata={"omit_empty": True})
 
     @property
     def iterations(self) -> int:

@@ -213,8 +213,8 @@ class SplatDropout:
     rate : float
         Part of the splats that is left out, anew in each iteration of stages that train all of geometry and opacity.
     max_views : int
-        With more training views than that none is: what is hidden from few views is learned by heart, what many see is
-        only blurred (docs/decisions/fog.md).
+        With more training views than that none is: there it gains on some captures and loses on others
+        (docs/decisions/fog.md).
     """
 
     rate: float = 0.1

@@ -38,9 +38,10 @@ from gs2d.pipeline.blocks.split import CELLS, SEAMS, read_split, split_model, st
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.exposure import read_exposures
 from gs2d.pipeline.finished import finished_splats
-from gs2d.pipeline.job import check_train_options, difference, protocol_from_json
+from gs2d.pipeline.job import check_train_options, protocol_from_json
 from gs2d.pipeline.memory import use_memory
 from gs2d.pipeline.options import Part, Training, TrainOptions, values
+from gs2d.pipeline.same_run import difference
 from gs2d.pipeline.threads import use_threads
 from gs2d.pipeline.train import train
 from gs2d.training.trainer import raster_settings

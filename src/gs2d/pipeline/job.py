@@ -23,7 +23,6 @@ from gs2d.config.presets import (
     with_photometry,
     with_poses,
     with_robustness,
-    without_fading_backdrop,
 )
 from gs2d.config.protocols import BLACK, GENERIC, Protocol, get_protocol, protocol_for
 from gs2d.config.recipe import Recipe, validate
@@ -64,7 +63,7 @@ ROBUST = ("auto", "on", "off")
 DIFFERS = 0.03  # standard deviation of the logarithm of gains from which photographs are said to differ in exposure
 LATER_FIELDS = (  # of recipes, that run folders of before there were such lack
     *("exposure", "poses", "multiview", "depth_prior", "normal_prior"),
-    *("dense_start", "free_space", "opacity_decay", "seen_area"),
+    *("dense_start", "free_space", "opacity_decay", "seen_area", "dropout"),
 )
 
 
@@ -138,7 +137,7 @@ class Job:
             processes = [(0, 0, self.processes)] if self.processes > 1 else []
         facts = {
             "scene": self.images_digest,
-            "protocol": _training_facts(asdict(self.protocol)),
+            "protocol": training_facts(asdict(self.protocol)),
             "raster": self.settings.facts(),
             "seed": self.recipe.seed,
             "backend": self.backend.facts(),
@@ -161,6 +160,12 @@ class Job:
         """Whether stage ``index`` or one before it can train from cached views."""
         views, stages = len(self.scene.train), self.recipe.stages[: index + 1]
         return any(is_cacheable(self.recipe, stage, backend=self.backend, views=views) for stage in stages)
+
+
+def training_facts(protocol: dict[str, Any]) -> dict[str, Any]:
+    """Return a protocol without what decides no byte of training: what is fused, and what the recipe says."""
+    fusion = {name: value for name, value in protocol.get("fusion", {}).items() if name not in ("depth", "subject")}
+    return {**{name: value for name, value in protocol.items() if name != "robust"}, "fusion": fusion}
 
 
 class RenderedScene(typing.Protocol):
@@ -624,77 +629,4 @@ def protocol_from_json(data: dict[str, Any]) -> Protocol:
     return protocol
 
 
-def as_begun(run: RunFolder, job: Job) -> Job:
-    """Return a job without what runs of before did not have: it goes on as it began."""
-    before, recipe = run.definition().get("recipe"), job.recipe
-    if not isinstance(before, dict):
-        return job
-    lacking: dict[str, Any] = {name: None for name in ("seen_area", "dropout") if name not in before}
-    recipe = replace(recipe, **lacking)
-    decay = before.get("opacity_decay")
-    if isinstance(decay, dict) and "backdrop_rate" not in decay:
-        recipe = without_fading_backdrop(recipe)
-    return replace(job, recipe=recipe)
-
-
-def check_same_run(run: RunFolder, job: Job) -> None:
-    """Refuse to resume a run with another definition.
-
-    Raises
-    ------
-    RunError
-        Names the first thing that differs.
-    """
-    before, after = run.definition(), {"init": None, "part": None, **json.loads(json.dumps(job.definition()))}
-    after = {"backend": after.pop("backend"), **after}  # first: another processor reads cameras with other last digits
-    for name, value in after.items():
-        old = before.get(name)
-        if name == "protocol" and isinstance(old, dict):
-            old, value = _training_facts(old), _training_facts(value)
-        if name == "recipe" and isinstance(old, dict):
-            old = {**dict.fromkeys(LATER_FIELDS), **old}  # runs of before there were such
-            if old["exposure"] is not None:
-                old["exposure"] = {"initial": "identity", **old["exposure"]}
-            was, now = ("off" if facts["free_space"] is None else "on" for facts in (old, value))
-            if was != now:
-                raise RunError(
-                    f"{run.path} was made with --robust {was}, and would go on with {now}; resume with --robust {was}, "
-                    "or choose another --out"
-                )
-        where = ""
-        if name == "scene":
-            old, value = old and old.get("digest"), value["digest"]
-            name = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
-        elif name == "init":
-            name = "--init: another file, or none"
-        elif name == "part":
-            name = "start: the model that this part is cut of changed"
-        else:
-            where = difference(old, value)
-        if old != value:
-            raise RunError(
-                f"{run.path} was made with another {name}{where}; resume with the same options, or choose another --out"
-            )
-
-
-def _training_facts(protocol: dict[str, Any]) -> dict[str, Any]:
-    """Return a protocol without what decides no byte of training: what is fused, and what the recipe says."""
-    fusion = {name: value for name, value in protocol.get("fusion", {}).items() if name not in ("depth", "subject")}
-    return {**{name: value for name, value in protocol.items() if name != "robust"}, "fusion": fusion}
-
-
-def difference(old: Any, new: Any, where: str = "") -> str:
-    """Where two JSON values first differ, in words."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in new:
-            if old.get(key) != new[key]:
-                return difference(old.get(key), new[key], f"{where}.{key}" if where else key)
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        for i, (a, b) in enumerate(zip(old, new, strict=True)):
-            if a != b:
-                name = b.get("name", i) if isinstance(b, dict) else i
-                return difference(a, b, f"{where}.{name}" if where else str(name))
-    return f" ({where + ': ' if where else ''}{str(old)[:60]}, now {str(new)[:60]})"
-
-
-__all__ = ["FORMATS", "Job", "build_recipe", "check_same_run", "prepare_job", "reload_job"]
+__all__ = ["FORMATS", "Job", "build_recipe", "prepare_job", "reload_job"]

@@ -22,9 +22,10 @@ from gs2d.errors import BackendError, Gs2dError, RunError
 from gs2d.io.run_dir import RunFolder, is_run
 from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.interruption import HeldSignals
-from gs2d.pipeline.job import Job, as_begun, prepare_job
+from gs2d.pipeline.job import Job, prepare_job
 from gs2d.pipeline.options import TrainOptions
 from gs2d.pipeline.run_logger import progress_every
+from gs2d.pipeline.same_run import as_begun
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
 from gs2d.training.trainer import Trainer
 

@@ -30,7 +30,7 @@ from gs2d.io.splat_ply import write_splats
 from gs2d.pipeline.attempts import again, attempted
 from gs2d.pipeline.events import Event, Expected, Notice, OnEvent, Phase, Plan, ignore
 from gs2d.pipeline.exposure import Transforms, named, write_exposures
-from gs2d.pipeline.job import Job, as_begun, check_same_run, check_train_options, prepare_job
+from gs2d.pipeline.job import Job, check_train_options, prepare_job
 from gs2d.pipeline.live import open_live
 from gs2d.pipeline.memory import release, use_memory
 from gs2d.pipeline.mesh import MeshFrames, extract_mesh, keep_facts
@@ -46,6 +46,7 @@ from gs2d.pipeline.refined_poses import NONE, found_poses, write_poses
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
 from gs2d.pipeline.run_logger import RunLogger
+from gs2d.pipeline.same_run import as_begun, check_same_run
 from gs2d.pipeline.scoring import Visitor
 from gs2d.pipeline.subject import meshed_subject
 from gs2d.pipeline.threads import use_threads

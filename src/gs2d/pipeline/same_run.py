@@ -1,0 +1,82 @@
+"""Whether a run that is gone on with is the same: by its definition, and without what runs of before did not have."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+from gs2d.config.presets import without_fading_backdrop
+from gs2d.errors import RunError
+from gs2d.io.run_dir import RunFolder
+from gs2d.pipeline.job import LATER_FIELDS, Job, training_facts
+
+
+def as_begun(run: RunFolder, job: Job) -> Job:
+    """Return a job without what runs of before did not have: it goes on as it began."""
+    before, recipe = run.definition().get("recipe"), job.recipe
+    if not isinstance(before, dict):
+        return job
+    lacking: dict[str, Any] = {name: None for name in ("seen_area", "dropout") if name not in before}
+    recipe = replace(recipe, **lacking)
+    start = before.get("dense_start")
+    if recipe.dense_start is not None and isinstance(start, dict) and "sphere" not in start:
+        recipe = replace(recipe, dense_start=replace(recipe.dense_start, sphere=None))
+    decay = before.get("opacity_decay")
+    if isinstance(decay, dict) and "backdrop_rate" not in decay:
+        recipe = without_fading_backdrop(recipe)
+    return replace(job, recipe=recipe)
+
+
+def check_same_run(run: RunFolder, job: Job) -> None:
+    """Refuse to resume a run with another definition.
+
+    Raises
+    ------
+    RunError
+        Names the first thing that differs.
+    """
+    before, after = run.definition(), {"init": None, "part": None, **json.loads(json.dumps(job.definition()))}
+    after = {"backend": after.pop("backend"), **after}  # first: another processor reads cameras with other last digits
+    for name, value in after.items():
+        old = before.get(name)
+        if name == "protocol" and isinstance(old, dict):
+            old, value = training_facts(old), training_facts(value)
+        if name == "recipe" and isinstance(old, dict):
+            old = {**dict.fromkeys(LATER_FIELDS), **old}  # runs of before there were such
+            if old["exposure"] is not None:
+                old["exposure"] = {"initial": "identity", **old["exposure"]}
+            was, now = ("off" if facts["free_space"] is None else "on" for facts in (old, value))
+            if was != now:
+                raise RunError(
+                    f"{run.path} was made with --robust {was}, and would go on with {now}; resume with --robust {was}, "
+                    "or choose another --out"
+                )
+        where = ""
+        if name == "scene":
+            old, value = old and old.get("digest"), value["digest"]
+            name = "scene: its photographs, cameras, points or maps changed, or this is another kind of processor"
+        elif name == "init":
+            name = "--init: another file, or none"
+        elif name == "part":
+            name = "start: the model that this part is cut of changed"
+        else:
+            where = difference(old, value)
+        if old != value:
+            raise RunError(
+                f"{run.path} was made with another {name}{where}; resume with the same options, or choose another --out"
+            )
+
+
+def difference(old: Any, new: Any, where: str = "") -> str:
+    """Where two JSON values first differ, in words."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in new:
+            if old.get(key) != new[key]:
+                return difference(old.get(key), new[key], f"{where}.{key}" if where else key)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for i, (a, b) in enumerate(zip(old, new, strict=True)):
+            if a != b:
+                name = b.get("name", i) if isinstance(b, dict) else i
+                return difference(a, b, f"{where}.{name}" if where else str(name))
+    return f" ({where + ': ' if where else ''}{str(old)[:60]}, now {str(new)[:60]})"
