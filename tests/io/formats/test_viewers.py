@@ -34,7 +34,7 @@ def test_a_viewer_shows_our_file_as_we_render_it(name: str, layout: str, tmp_pat
     written(splats, [layout], tmp_path)
     with served(tmp_path) as address:
         shot = drawn_by(VIEWERS[name], layout, CAMERA, tmp_path, address)
-    assert psnr(shot, CAMERA.drawn(splats)) > 28.0
+    assert psnr(shot, CAMERA.drawn(splats)) > (30.0 if (name, layout) == ("babylon", "gltf") else 28.0)
 
 
 @pytest.mark.parametrize(("name", "layout"), sorted(REFUSED))
