@@ -218,17 +218,17 @@ def test_an_iteration_that_comes_again_is_a_graph_with_the_same_bits(
 
 
 @pytest.mark.parametrize(
-    "driver",
+    "lacks",
     [
-        FakeDriver(version=11080),
-        FakeDriver(failing={"cuGraphInstantiate": Result.CUDA_ERROR_NOT_SUPPORTED}),
-        FakeDriver(failing={"cuGraphExecKernelNodeSetParams": Result.CUDA_ERROR_NOT_SUPPORTED}),
+        {"version": 11080},
+        {"failing": {"cuGraphInstantiate": Result.CUDA_ERROR_NOT_SUPPORTED}},
+        {"failing": {"cuGraphExecKernelNodeSetParams": Result.CUDA_ERROR_NOT_SUPPORTED}},
     ],
     ids=["too old", "makes none", "changes none"],
 )
-def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: Scene, driver: FakeDriver) -> None:
+def test_a_driver_without_graphs_launches_one_by_one(emulator: Emulator, scene: Scene, lacks: dict[str, Any]) -> None:
     plain, some = trained(emulator, scene, brief(), "launches")
-    driver.emulator = emulator
+    driver = FakeDriver(emulator=emulator, **lacks)
     found, as_many = trained(on_gpu(driver), scene, brief(), "graph")
     assert same(plain, found)
     assert some == as_many
