@@ -44,7 +44,7 @@ TOP = {"__init__.py", "__main__.py", "errors.py"}  # nothing else lies loose
 # Floors inside a room: a module imports from lower ones of its room only. A folder of a room is one entry.
 INSIDE = {
     "core": {
-        "checks growth light locks extras memory memory_limit processes spill text": 0,
+        "checks growth light locks extras memory memory_limit missing processes spill text": 0,
         "exr files float_tiff georeference similarity": 1,
         "arrays json_files camera images mesh sh splats": 2,
         "exif photometry transforms": 3,

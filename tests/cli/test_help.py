@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import tyro
@@ -30,6 +31,13 @@ from gs2d.cli.usage import NAMES
         ("--quiet train here --out there", "options come after the command: gs2d train --quiet here --out there"),
         ("--versoin", "no option --versoin; did you mean --version?"),
         ("train here --out there --recip 2dgs", "gs2d train has no option --recip; did you mean --recipe?"),
+        ("train -s here -m there", "no option -s; what is read stands alone, without an option"),
+        ("train here -o there", "no option -o; what is made goes to --out"),
+        ("train here --out there --iterations 900", "--schedule-scale 0.1 trains a tenth of the recipe's iterations"),
+        ("reconstruct here --out there --max_steps 9", "--schedule-scale 0.1 trains a tenth"),
+        ("train here --out there --resolution 2", "no option --resolution; --downscale 2 halves the photographs"),
+        ("evaluate here --iterations 900", "gs2d evaluate has no option --iterations; see"),
+        ("train here --out there --quality best", "--quality must be draft, normal or full, got 'best'"),
         ("train here --out there --zzz", "gs2d train has no option --zzz; see `gs2d train --help`"),
         ("train here --out there --ground-truth a", "gs2d evaluate has one"),
         ("train here --out there --backend gpu", "backend must be one of auto, cpu, cuda, reference, got 'gpu"),
@@ -38,6 +46,14 @@ from gs2d.cli.usage import NAMES
         ("recipes shwo 2dgs", "ACTION must be list or show, got 'shwo'; did you mean show?"),
         ("train", "gs2d train needs SCENE and --out RUN"),
         ("train a b --out there", "what is 'b'? The command takes SCENE and options"),
+        (
+            "train my scan --out there",
+            "takes SCENE and options; a path with spaces needs quotes",
+        ),
+        (
+            "train here --out my run",
+            "what is 'run'? The command takes SCENE and options; a path with",
+        ),
         ("doctor now", "what is 'now'? The command takes options only"),
         ("train here --out there --downscale two", "--downscale must be a whole number, got 'two'"),
         ("mesh here --voxel wide", "--voxel must be a number, got 'wide'"),
@@ -56,6 +72,16 @@ def test_a_command_line_with_a_mistake_is_one_line_that_says_what_was_meant(
     out, err = capsys.readouterr()
     assert out == ""
     assert named in one_line(err)
+
+
+def test_a_path_with_spaces_that_is_there_is_quoted_in_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my own scan").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert run("train --out there my own scan --seed 3".split()) == 2
+    line = one_line(capsys.readouterr().err)
+    assert line.endswith("options; a path with spaces needs quotes: 'my own scan'; see `gs2d train --help`")
 
 
 def test_a_folder_in_the_place_of_a_command_is_photographs(

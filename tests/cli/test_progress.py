@@ -91,6 +91,22 @@ def test_a_log_file_gets_a_line_a_phase_and_now_and_then_how_far_it_is(
     assert len(err) == 11
 
 
+def test_a_log_file_hears_of_a_long_training_within_a_minute_and_every_five(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr("gs2d.cli.console.time.monotonic", clock)
+    console = Console(quiet=False, as_json=False)
+    console.on_event(Phase("training best", 20_000))
+    for done in range(1, 1001):  # a fiftieth an hour
+        clock.now += 3.0
+        console.on_event(Step(done))
+    at = [
+        int(line.split(": ")[1].split(" of")[0].replace(",", "")) for line in capsys.readouterr().err.splitlines()[1:]
+    ]
+    assert at == list(range(20, 1001, 100))
+
+
 def test_quiet_and_json_draw_nothing_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
     quiet, as_json = Console(quiet=True, as_json=True), Console(quiet=False, as_json=True)
     for console in (quiet, as_json):

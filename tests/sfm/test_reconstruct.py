@@ -21,10 +21,12 @@ from gs2d.cli.app import parse
 from gs2d.config.presets import DEFAULT_RECIPE, get_recipe
 from gs2d.io.run_dir import open_run
 from gs2d.pipeline import options as options_module
+from gs2d.pipeline import quality as quality_module
 from gs2d.pipeline import reconstruct as module
 from gs2d.pipeline.events import Event, Notice
 from gs2d.pipeline.options import ReconstructOptions, Training, values
-from gs2d.pipeline.reconstruct import FEW, QUALITIES, poses_options, reconstruct, train_options
+from gs2d.pipeline.quality import QUALITIES
+from gs2d.pipeline.reconstruct import FEW, poses_options, reconstruct, train_options
 from room_photos import Room, write_room
 from tiny import write_capture
 
@@ -275,7 +277,7 @@ def test_every_option_of_train_is_one_of_reconstruct() -> None:
 
 def test_the_help_states_the_qualities_that_are_there() -> None:
     text = (Path(options_module.__file__)).read_text(encoding="utf-8")
-    stated = re.search(r'quality: Literal\["draft", "normal", "full"\].*?"""(.*?)"""', text, re.DOTALL)
+    stated = re.search(r'quality: Quality = "normal"\n.*?"""(.*?)"""', text, re.DOTALL)
     assert stated is not None
     assert list(QUALITIES) == ["draft", "normal", "full"]
     cpu, gpu = stated[1].split("on a GPU")
@@ -294,7 +296,8 @@ def test_the_size_of_the_pictures_is_by_the_quality(
     room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quality: str, downscale: int
 ) -> None:
     sides = {"draft": 50, "normal": 95, "full": 10_000}  # of 200x200: 4, 2.1 and less than 1 times smaller
-    monkeypatch.setattr(module, "QUALITIES", {name: {"cpu": module.Quality(9, side)} for name, side in sides.items()})
+    qualities = {name: {"cpu": quality_module.Quality(9, side)} for name, side in sides.items()}
+    monkeypatch.setattr(quality_module, "QUALITIES", qualities)
     asked: list[Any] = []
     monkeypatch.setattr(module, "train", lambda options, _: asked.append(options) or open_run(tmp_path))
     out = started(room, tmp_path)

@@ -22,6 +22,7 @@ from gs2d.core.text import printable
 from gs2d.pipeline.events import Event, Expected, MissingFile, Notice, Phase, Plan, StageDone, Step
 
 LOG_SECONDS, LOG_FRACTION = 60.0, 0.1  # in a log file: a line after so long, if at least so much of the phase was done
+LOG_SILENCE = 300.0  # s, after which there is a line whatever was done; the first one comes after LOG_SECONDS
 _ANY_WIDTH = 10_000  # columns
 _NO_SCREENS = ("dumb", "unknown")  # values of TERM: no cursor that goes back
 
@@ -71,6 +72,7 @@ class Console:
         self._named: set[str] = set()  # phases that a log file has heard of
         self.missing: list[MissingFile] = []  # what could not be made, for the end of the command
         self._logged = (0.0, 0)  # s, steps done: at the last line of a log file
+        self._logs = 0  # lines of a log file about how far the phase is
 
     def on_event(self, event: Event) -> None:
         """Draw an event of the pipeline."""
@@ -118,7 +120,7 @@ class Console:
                 name = printable(phase.name)
                 self._err.print(f"{name} ({phase.total})" if phase.total else name, markup=False)
             self._named.add(phase.name)
-            self._logged = (time.monotonic(), phase.done)
+            self._logged, self._logs = (time.monotonic(), phase.done), 0
         elif self._live is None:
             self._live = Live(self._bar, console=self._err, transient=True, refresh_per_second=4)
             self._live.start()
@@ -130,9 +132,10 @@ class Console:
             return
         self._bar.step(step.done, step.detail)
         total, (at, done) = self._bar.phase.total, self._logged
-        late = time.monotonic() - at >= LOG_SECONDS
-        if not self._interactive and total and late and LOG_FRACTION * total <= step.done - done:
-            self._logged = (time.monotonic(), step.done)
+        silence = time.monotonic() - at
+        due = LOG_FRACTION * total <= step.done - done or not self._logs or silence >= LOG_SILENCE
+        if not self._interactive and total and silence >= LOG_SECONDS and due:
+            self._logged, self._logs = (time.monotonic(), step.done), self._logs + 1
             words = [
                 f"{printable(self._bar.phase.name)}: {step.done:,} of {total:,}, {self._bar.left()}",
                 self._whole.line(),

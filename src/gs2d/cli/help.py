@@ -37,7 +37,7 @@ _FIRST: dict[str, tuple[str, ...]] = {  # options that `--help` explains; of oth
     "poses": ("photos", "out", "frames", "camera_model", "max_size", "overwrite"),
     "plan": ("scene", "recipe", "schedule_scale", "downscale", "memory", "disk"),
     "train": (
-        "scene", "out", "recipe", "schedule_scale", "downscale", "exposure", "viewer", "resume", "overwrite"
+        "scene", "out", "quality", "recipe", "schedule_scale", "downscale", "exposure", "viewer", "resume", "overwrite"
     ),
     "blocks": ("scene", "out", "blocks", "recipe", "schedule_scale", "downscale", "memory", "slots"),
     "mesh": ("run", "out", "texture", "voxel", "bbox", "unbounded"),

@@ -16,6 +16,17 @@ HELP_WORDS = ("-h", "--help", "--help-all")
 _NUMBER = re.compile(r"-\.?\d")  # a value, not an option
 _ALIKE = 0.6  # of difflib's ratio, from which a word is proposed
 _MOST = 3  # words that are proposed
+_CAPTURE = ("", "what is read stands alone, without an option")
+_RUN = ("--out", "what is made goes to --out")
+_SHORTER = ("--schedule-scale", "--schedule-scale 0.1 trains a tenth of the recipe's iterations")
+_SMALLER = ("--downscale", "--downscale 2 halves the photographs")
+_ELSEWHERE: dict[str, tuple[str, str]] = {  # what other programs of the field call it -> our option, what is said
+    **dict.fromkeys(("-s", "--source-path", "--data", "--data-dir", "--input", "-i"), _CAPTURE),
+    **dict.fromkeys(("-m", "--model-path", "-o", "--output", "--output-dir", "--output-path", "--result-dir"), _RUN),
+    **dict.fromkeys(("--iterations", "--iters", "--max-steps", "--num-iters", "--steps", "--total-steps"), _SHORTER),
+    **dict.fromkeys(("-r", "--resolution", "--data-factor", "--images", "--downscale-factor"), _SMALLER),
+    "--eval": ("--test-every", "--test-every 8 holds every eighth photograph out"),
+}
 
 
 class UsageError(Exception):
@@ -60,12 +71,12 @@ def _check_words(name: str, words: Sequence[str]) -> None:
     options = options_of(NAMES[name])
     flags = {flag: option for option in options for flag in option.flags}
     seen: set[str] = set()
-    loose: list[str] = []
+    loose: list[int] = []  # of words
     i = 0
     while i < len(words):
         word, i = words[i], i + 1
         if not _is_flag(word):
-            loose.append(word)
+            loose.append(i - 1)
             continue
         flag, equals, value = word.partition("=")
         option = flags.get(flag.replace("_", "-"))
@@ -76,7 +87,7 @@ def _check_words(name: str, words: Sequence[str]) -> None:
             values, i = [*values, words[i]], i + 1
         _check_values(option, values, given=bool(equals))
         seen.add(option.field)
-    _check_positional([option for option in options if not option.flags], loose, seen)
+    _check_positional([option for option in options if not option.flags], words, loose, seen)
     if lacking := [option.usage for option in options if option.required and option.field not in seen]:
         raise UsageError(f"gs2d {name} needs {' and '.join(lacking)}")
 
@@ -89,6 +100,9 @@ def _no_option(name: str, flag: str, flags: Iterable[str]) -> str:
     """Return what is said of an option that the command does not have: one much like it, or a command that does."""
     known = list(flags)
     wanted = flag.replace("_", "-")
+    here, said = _ELSEWHERE.get(wanted, ("", ""))
+    if here in known or (said and not here):
+        return f"gs2d {name} has no option {flag}; {said}"
     others = [
         other
         for other, command in NAMES.items()
@@ -133,17 +147,33 @@ def _converts(kind: type, value: str) -> bool:
     return True
 
 
-def _check_positional(options: Sequence[Option], words: Sequence[str], seen: set[str]) -> None:
-    """Give the words without an option to the arguments in their order."""
-    left = list(words)
+def _check_positional(options: Sequence[Option], words: Sequence[str], loose: Sequence[int], seen: set[str]) -> None:
+    """Give the words without an option, of these indices, to the arguments in their order."""
+    left = list(loose)
     for option in options:
         taken, left = (left, []) if option.count is None else (left[:1], left[1:])
         if taken:
-            _check_values(option, taken, given=False)
+            _check_values(option, [words[i] for i in taken], given=False)
             seen.add(option.field)
     if left:
         takes = f"takes {' '.join(option.usage for option in options)} and options" if options else "takes options only"
-        raise UsageError(f"what is {left[0]!r}? The command {takes}")
+        raise UsageError(f"what is {words[left[0]]!r}? The command {takes}{_quotes(words, left[0])}")
+
+
+def _quotes(words: Sequence[str], index: int) -> str:
+    """Return what is to be said of a word too many that may be a part of a path with spaces."""
+    first = last = index
+    while first > 0 and not _is_flag(words[first - 1]):
+        first -= 1
+    while last + 1 < len(words) and not _is_flag(words[last + 1]):
+        last += 1
+    if first == last:
+        return ""
+    for start in range(first, index + 1):
+        for end in range(last, max(index, start + 1) - 1, -1):
+            if Path(whole := " ".join(words[start : end + 1])).exists():
+                return f"; a path with spaces needs quotes: {shlex.quote(whole)}"
+    return "; a path with spaces needs quotes"
 
 
 def _meant(word: str, known: Iterable[str], before: str = "") -> str:

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from gs2d.core.memory_limit import cache_bytes as room_for_cache
+from gs2d.core.missing import where_it_ends
 from gs2d.data.benchmarks import missing_lines
 from gs2d.data.build import Capture, build_scene
 from gs2d.data.masks import Masks
@@ -100,7 +101,8 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     if images is not None and not lacking:
         raise DataError(
             f"{root} must hold cameras, got {_images(images)} photographs without any; find them first: "
-            f"gs2d poses {shlex.quote(str(images))} --out CAPTURE, then train CAPTURE"
+            f"gs2d poses {shlex.quote(str(images))} --out CAPTURE, then train CAPTURE; or both in one: "
+            f"gs2d reconstruct {shlex.quote(str(images))} --out RUN"
         )
     raise DataError(
         f"{root} must hold transforms_train.json (Blender), transforms.json (nerfstudio), {' or '.join(CAMERA_FILES)} "
@@ -120,7 +122,7 @@ def _folder(path: str | os.PathLike[str]) -> Path:
     try:
         os.listdir(root)
     except (FileNotFoundError, NotADirectoryError) as error:
-        got = "a file; give its folder" if root.exists() else "no such folder"
+        got = "a file; give its folder" if root.exists() else f"no such folder{where_it_ends(root)}"
         raise DataError(f"{root} must be the folder of a capture, got {got}") from error
     except OSError as error:
         raise DataError(f"cannot read the folder {root}: {error.strerror or error}") from error

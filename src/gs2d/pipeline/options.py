@@ -18,6 +18,7 @@ from gs2d.config.recipe import Recipe
 from gs2d.errors import RecipeError
 
 Robust = Literal["auto", "on", "off"]
+Quality = Literal["draft", "normal", "full"]
 LensModel = Literal[
     "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 ]
@@ -212,6 +213,9 @@ class TrainOptions(Training, Resources, HowItRuns):
     Metashape, Meshroom."""
     out: Annotated[Path, arg(metavar="RUN")]
     """Run folder to make."""
+    quality: Quality | None = None
+    """How long is trained on how large pictures, as in `gs2d reconstruct`: minutes for a draft (default: all of the
+    recipe on pictures of full size, hours on a CPU)."""
     format: str = "auto"
     """Format of the capture: blender, nerfstudio, dtu, colmap, opensfm, metashape, alicevision, or a package's."""
     downscale: int | None = None
@@ -288,7 +292,7 @@ class ReconstructOptions(Resources, HowItRuns):
     """Folder of photographs, with or without sub-folders, or a video; it is only read."""
     out: Annotated[Path, arg(metavar="RUN")]
     """Run folder to make; the photographs with their cameras go to its sub-folder `capture`."""
-    quality: Literal["draft", "normal", "full"] = "normal"
+    quality: Quality = "normal"
     """How long is trained on how large pictures. On a CPU: 1800 iterations at 400 px, 6000 at 800, all of the recipe's
     at 1600; on a GPU 6000 at 800 px, 30000 at 1600, all at 1600. The time it will take is told before it begins."""
     schedule_scale: float | None = None

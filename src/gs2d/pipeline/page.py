@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gs2d.core.missing import where_it_ends
 from gs2d.core.transforms import up_direction
 from gs2d.data import View
 from gs2d.data.subject import Subject, read_subject
@@ -73,7 +74,7 @@ def page_run(
             on_event(Notice(f"without the cameras of the photographs: {error}"))
     else:
         if not path.exists():
-            raise DataError(f"expected a run folder or a file of splats at {path}, found nothing; check the path")
+            raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
         splats, title = read_disks(path), path.stem
     views = [] if job is None else _some(job.scene.train)
     cameras = [view.camera for view in views]

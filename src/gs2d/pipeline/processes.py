@@ -24,6 +24,7 @@ from gs2d.pipeline.events import Notice, OnEvent, ignore
 from gs2d.pipeline.interruption import HeldSignals
 from gs2d.pipeline.job import Job, prepare_job
 from gs2d.pipeline.options import TrainOptions
+from gs2d.pipeline.quality import by_quality
 from gs2d.pipeline.run_logger import progress_every
 from gs2d.pipeline.same_run import as_begun
 from gs2d.training.parallel import ONE_PROCESS, LostContactError, ManyProcesses, OneProcess
@@ -124,7 +125,7 @@ def follow(options: TrainOptions, together: ManyProcesses) -> RunFolder:
         Process 0 has ended.
     """
     told: dict[str, Any] = together.tell({})
-    prepared = replace(options, scene=Path(told["scene"]), prepare=told["prepare"])
+    prepared = by_quality(replace(options, scene=Path(told["scene"]), prepare=told["prepare"]), ignore)
     job = prepare_job(prepared, ignore)
     run = RunFolder(options.out)
     job = as_begun(run, job) if is_run(run.path) else job

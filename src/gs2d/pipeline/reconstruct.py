@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
-from gs2d.config.recipe import Recipe
 from gs2d.core.json_files import read_json
 from gs2d.data import detect_format, load_scene
 from gs2d.data.masks import OFF
-from gs2d.errors import DataError, ProtocolError, RecipeError, RunError
+from gs2d.errors import DataError, ProtocolError, RunError
 from gs2d.io.run_dir import LOCK, MESH, TEXTURED, RunFolder, check_claim, is_run, make_folder, open_run, remove_made
 from gs2d.meshing.texture import required
 from gs2d.pipeline.attempts import again, attempted
@@ -32,12 +29,12 @@ from gs2d.pipeline.options import (
     values,
 )
 from gs2d.pipeline.plan import PLACED, TEXTURED_TOO, TRAINED
+from gs2d.pipeline.quality import at_quality, quality_of
 from gs2d.pipeline.report import report_again
 from gs2d.pipeline.sfm import asked_for, check_poses_options, find_poses, placed_line
 from gs2d.pipeline.texture import PACKAGES as TEXTURE_PACKAGES
 from gs2d.pipeline.texture import texture_run
 from gs2d.pipeline.train import check_viewer, train
-from gs2d.render.backends import get_backend
 from gs2d.sfm.colmap import check_installed
 from gs2d.sfm.images import find_photos
 from gs2d.sfm.video_frames import is_video, look_into
@@ -48,28 +45,6 @@ CLUSTER = "cluster"  # in the run folder: what became of its tasks on the machin
 FEW = 24  # photographs, below which each is needed for the surface and none is held out
 NO_NAMES = ("images", "photos", "photographs", "pictures")  # of folders; the one above has a better one
 SHOWN_LOST = 3  # photographs without a place that are named; poses.json has all
-
-
-@dataclass(frozen=True)
-class Quality:
-    """How much is trained on what: iterations (None: as many as the recipe has), and the longer side in px, about."""
-
-    iterations: int | None
-    side: int
-
-    def schedule_scale(self, recipe: Recipe) -> float:
-        """Return the part of the recipe that is trained: never more than all of it."""
-        return 1.0 if self.iterations is None else min(1.0, self.iterations / max(1, recipe.iterations))
-
-
-_FULL = Quality(None, 1600)  # the side at which the official code trains, too
-QUALITIES: Mapping[str, Mapping[str, Quality]] = MappingProxyType(  # name -> device -> what it means there
-    {
-        "draft": {"cpu": Quality(1_800, 400), "cuda": Quality(6_000, 800)},
-        "normal": {"cpu": Quality(6_000, 800), "cuda": Quality(30_000, 1600)},
-        "full": {"cpu": _FULL, "cuda": _FULL},
-    }
-)
 
 
 def poses_options(options: ReconstructOptions) -> PosesOptions:
@@ -164,13 +139,6 @@ def _title(photos: Path) -> str:
     return photos.parent.name if photos.name.lower() in NO_NAMES and photos.parent.name else photos.name
 
 
-def _quality(options: ReconstructOptions) -> Quality:
-    """Return the schedule and the picture size that are meant, on the device that this machine trains with."""
-    if options.quality not in QUALITIES:
-        raise RecipeError(f"--quality must be one of {', '.join(QUALITIES)}, got {options.quality}")
-    return QUALITIES[options.quality][get_backend(options.backend).device]
-
-
 def check_reconstruct(options: ReconstructOptions) -> None:
     """Refuse what can be refused before anything is made.
 
@@ -179,9 +147,12 @@ def check_reconstruct(options: ReconstructOptions) -> None:
     Gs2dError
     """
     training, out = train_options(options), options.out
-    quality = _quality(options)
+    quality = quality_of(options.quality, options.backend)
+    scale = options.schedule_scale
+    if scale is None:
+        scale = quality.schedule_scale(recipe_of(options.training.recipe))
     downscale = 1 if options.downscale is None else options.downscale
-    check_train_options(replace(training, schedule_scale=_scale(options, quality), downscale=downscale))
+    check_train_options(replace(training, schedule_scale=scale, downscale=downscale))
     check_claim(out, resume=options.resume, overwrite=options.overwrite, allowed=training.allowed)
     if options.texture:
         for package in TEXTURE_PACKAGES:
@@ -206,15 +177,6 @@ def check_reconstruct(options: ReconstructOptions) -> None:
         raise RunError(
             f"{out} holds the cameras of photographs, and no run: go on with --resume, or begin anew with --overwrite"
         )
-
-
-def _scale(options: ReconstructOptions, quality: Quality) -> float:
-    """Return the part of the recipe's schedule that is trained: as asked for, or by quality."""
-    return (
-        options.schedule_scale
-        if options.schedule_scale is not None
-        else quality.schedule_scale(recipe_of(options.training.recipe))
-    )
 
 
 def _check_photos(options: ReconstructOptions) -> None:
@@ -305,21 +267,10 @@ def _lines(poses: dict[str, Any], capture: Path) -> list[str]:
 
 def _by_the_images(training: TrainOptions, options: ReconstructOptions, on_event: OnEvent) -> TrainOptions:
     """Set what depends on the photographs that were placed: image size, and whether some are held out."""
-    quality = _quality(options)
     views = load_scene(training.scene, format="colmap", test_every=0).views
     cameras, photographs = [view.camera for view in views], len({view.path for view in views})
-    largest = max(cameras, key=lambda camera: max(camera.width, camera.height))
-    side = max(largest.width, largest.height)
-    downscale = options.downscale or max(1, math.floor(side / quality.side + 0.5))
-    scale = _scale(options, quality)
-    chosen = replace(training, schedule_scale=scale, downscale=downscale)
-    iterations, shown = check_train_options(chosen).iterations, largest.downscaled(downscale)
-    on_event(
-        Notice(
-            f"quality {options.quality}: {iterations:,} iterations (--schedule-scale {scale:g}) "
-            f"on pictures of {shown.width}x{shown.height} (--downscale {downscale})"
-        )
-    )
+    sized = replace(training, downscale=options.downscale)
+    chosen = at_quality(sized, options.quality, cameras, on_event, options.schedule_scale)
     if training.test_every is None and training.protocol == "auto" and photographs < FEW:
         on_event(Notice(f"all photographs train, because they are fewer than {FEW} (--test-every 8 holds some out)"))
         chosen = replace(chosen, test_every=0)

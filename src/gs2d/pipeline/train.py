@@ -42,6 +42,7 @@ from gs2d.pipeline.photometry import write_photometries
 from gs2d.pipeline.plan import TRAINED
 from gs2d.pipeline.planned import plan_notices
 from gs2d.pipeline.processes import connected, follow, lead, memory_of
+from gs2d.pipeline.quality import by_quality
 from gs2d.pipeline.refined_poses import NONE, found_poses, write_poses
 from gs2d.pipeline.report import report_run
 from gs2d.pipeline.resume import ResumePoint, check_sources, choose_start
@@ -99,6 +100,7 @@ def _train(options: TrainOptions, on_event: OnEvent, together: OneProcess) -> Ru
     use_threads(options.threads, together.place.local_size)
     use_memory(memory_of(together.place, options.memory))
     on_event(Plan(TRAINED))
+    options = by_quality(options, on_event)
     job = prepare_job(options, on_event)
     if options.overwrite:
         check_sources(job, options)

@@ -16,6 +16,7 @@ import torch
 from gs2d.core.camera import Camera, look_at
 from gs2d.core.georeference import Georeference
 from gs2d.core.images import to_uint8
+from gs2d.core.missing import where_it_ends
 from gs2d.core.splats import Splats
 from gs2d.core.transforms import up_direction
 from gs2d.data import View
@@ -176,7 +177,7 @@ def _splats_of(checkpoint: Path) -> Splats:
 
 def _of_file(path: Path) -> _Content:
     if not path.exists():
-        raise DataError(f"expected a run folder or a file of splats at {path}, found nothing; check the path")
+        raise DataError(f"expected a run folder or a file of splats at {path}, found nothing{where_it_ends(path)}")
     splats = read_disks(path)
     settings, backend = settings_without_run(splats), get_backend("auto")
     return _Content(path.name, {FINAL: lambda: splats}, (), settings, backend, "median", lambda _: None)

@@ -18,6 +18,7 @@ from gs2d.core import exr
 from gs2d.core.exif import Taken, read_taken
 from gs2d.core.extras import install
 from gs2d.core.images import is_twice_as_wide, natural_key, read_image
+from gs2d.core.missing import where_it_ends
 from gs2d.data.masks import ENDING, FOLDER
 from gs2d.errors import DataError
 from gs2d.sfm.panoramas import PANORAMA, meets_itself
@@ -115,7 +116,7 @@ def find_photos(root: Path) -> tuple[list[Path], tuple[str, ...]]:
     if root.is_file():
         raise DataError(f"{root} must be a folder of photographs or a video, got another file; give its folder")
     if not root.is_dir():
-        raise DataError(f"{root} must be a folder of photographs, got no such folder")
+        raise DataError(f"{root} must be a folder of photographs, got no such folder{where_it_ends(root)}")
     sorted_out: dict[str, list[Path]] = {"photo": [], "video": [], "raw": [], "mask": [], "other": []}
     for path in _files(root):
         kind = _KINDS.get(path.suffix.lower(), "other")

@@ -513,7 +513,10 @@ def _image_folder(root: Path, model: Path, images: list[ColmapImage]) -> tuple[P
     for home in homes:
         if any((home / image.name).is_file() for image in images):
             return home, home
-    raise DataError(f"{root} must have its photographs in the folder images, got no such folder")
+    raise DataError(
+        f"{root} must have its photographs in the folder images, got no such folder; put the folder that COLMAP was "
+        f"given there, under that name"
+    )
 
 
 def _other_models(folder: Path) -> list[str]:
