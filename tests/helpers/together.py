@@ -193,8 +193,15 @@ def together_in(size: int, cases: Sequence[str], folder: Path) -> dict[str, list
     return {case: [torch.load(path, weights_only=False) for path in paths] for case, paths in found.items()}
 
 
+SHARDED = "sharded-"  # before a case: each process has a part of the splats
+
+
 def do(case: str, many: Any) -> Any:
     """Do one case in this process of several."""
+    if case.startswith(SHARDED):
+        from gs2d.training.shards import Shards
+
+        return do(case.removeprefix(SHARDED), Shards(many.place, many.hears))
     if case in RECIPES:
         state, heard = trained(RECIPES[case](), many)
         return {"state": state.state_dict(), "losses": heard["losses"]}

@@ -134,7 +134,7 @@ def test_both_losses_are_there_once_they_have_started_and_move_depths(scene: Sce
     assert trainer.recipe.multiview is not None
     coarse = replace(trainer.recipe, multiview=replace(trainer.recipe.multiview, depth_downscale=2))
     small = Trainer(scene, coarse, GENERIC, backend=backend, state=trainer.state)._whole
-    neighbour = small._neighbour_of(trainer.state, stage, 7, 0)
+    neighbour = small.neighbour_of(trainer.state, stage, 7, 0, trainer.state.splats)
     assert neighbour is not None
     assert neighbour.depth.shape == tuple(-(-n // 2) for n in neighbour.source.grey.shape)
     found = small.evaluate(trainer.state, stage, 7, 0).losses["multiview_photometric"]

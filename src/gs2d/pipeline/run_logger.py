@@ -110,10 +110,10 @@ class RunLogger:
 
     def stop_if_asked(self) -> None:
         """Save a checkpoint and stop, where a signal asks for it and this iteration can be gone on from."""
-        state = self._state
         assert self._trainer is not None
-        if not (self._signals.asked or self._trainer.processes.stop_asked) or not state.entered:
+        if not (self._signals.asked or self._trainer.processes.stop_asked) or not self._state.entered:
             return
+        state = self._state
         if self._before is not None and self._before.iteration != state.step:
             return  # the line of changes that is due would be lost: at most until the next progress
         if state.step == self._stage(state.stage).iterations:
@@ -189,7 +189,6 @@ class RunLogger:
         self._run.events.append({"kind": kind, **facts, **extra})
 
     def _on_progress(self, event: train_events.Progress) -> None:
-        state = self._state
         last = event.iteration == event.iterations
         self._log_changes(event)
         if last or self._step_line_due(event.iteration, event.iterations):
@@ -203,7 +202,7 @@ class RunLogger:
             self._log("step", event, **extra)
             if not last:
                 self._stop_clock()
-                self._before = take_snapshot(state.splats, event.iteration)
+                self._before = take_snapshot(self._state.splats, event.iteration)
                 self._start_clock()
         detail = (
             f"{event.stage} {event.iteration:,}/{event.iterations:,}  {event.splats:,} splats  loss {event.loss:.4f}"

@@ -21,7 +21,7 @@ from gs2d.kernels.library import library_for
 from gs2d.render import pose_gradient_native as native
 from gs2d.render.types import RenderOutput
 
-__all__ = ["attach_pose_grad", "normals_without_pose_grad", "with_world_normals"]
+__all__ = ["attach_pose_grad", "normals_without_pose_grad", "pose_gradient", "with_world_normals"]
 
 
 def attach_pose_grad(splats: Splats, pose: Tensor, sh_degree: int) -> Splats:
@@ -74,7 +74,7 @@ class _Carry(torch.autograd.Function):
                 # What is not finite has zero gradients (rule 16), but NaN times zero is no zero.
                 means, quats, shN = (torch.where(tensor.isfinite(), tensor, 0.0) for tensor in (means, quats, shN))
                 force, torque = _wrench(pose, means, quats, shN, ctx.degree, gradients)
-            to_pose = _of_pose(pose, force, torque)
+            to_pose = pose_gradient(pose, force, torque)
         wanted = ctx.needs_input_grad[3:]
         return to_pose, None, None, *(g if want else None for g, want in zip(gradients, wanted, strict=True))
 
@@ -95,7 +95,8 @@ class _TurnNormals(torch.autograd.Function):
         to_pose = None
         if ctx.needs_input_grad[0]:
             torque = ctx.sign * _turned(normal.reshape(-1, 3), gradient.reshape(-1, 3))
-            to_pose = _of_pose(pose, torch.zeros_like(torque), torque)  # without a force: the same about every point
+            # without a force: the same about every point
+            to_pose = pose_gradient(pose, torch.zeros_like(torque), torque)
         return to_pose, gradient if ctx.needs_input_grad[1] else None, None
 
 
@@ -146,8 +147,10 @@ def turns_of_harmonics(degree: int) -> Tensor:
     return turns.sign() * ((4 * turns * turns).round() / 4).sqrt()
 
 
-def _of_pose(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:
+def pose_gradient(pose: Tensor, force: Tensor, torque: Tensor) -> Tensor:
     """Return the gradient [4, 4] of T_cam_world whose product with each rigid motion of the scene is the wrench's.
+
+    ``force`` [3] and ``torque`` [3] about the camera's centre are derivatives by a shift and by a turn of the scene.
 
     A scene that moves by x + w x (x - center) + v is T_cam_world (1 + [w]x, v - w x center): the smallest matrix with
     the right products is R [torque about the origin]x / 2 beside R force.

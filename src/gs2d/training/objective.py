@@ -20,14 +20,14 @@ from gs2d.errors import DivergedError
 from gs2d.kernels.reference import finite
 from gs2d.losses.api import LossFunction, LossReport, LossView, compute_losses, loss_of, prepared
 from gs2d.losses.multiview import Neighbour
-from gs2d.render.api import rasterize
+from gs2d.render.api import rasterize, splat_errors
 from gs2d.render.backends import Backend
 from gs2d.render.exposure import identity
 from gs2d.render.photometry import Shading, photograph
 from gs2d.render.types import RasterSettings, RenderOutput
 from gs2d.training.dropout import dropout_rate, dropped_out, kept_splats
 from gs2d.training.exposure import apply_exposure
-from gs2d.training.multiview import PATCH_BYTES, ImageFiles, draw_turn, find_neighbours, is_compared
+from gs2d.training.multiview import PATCH_BYTES, ImageFiles, Turn, draw_turn, find_neighbours, is_compared
 from gs2d.training.poses import pose_rate
 from gs2d.training.state import TrainState
 from gs2d.training.targets import Target, TargetSource
@@ -170,6 +170,10 @@ class FullRender:
             splats = dropped_out(splats, kept_splats(self.recipe, state.stage, iteration, len(splats), rate))
         return self.drawn(splats)
 
+    def learns(self, state: TrainState, iteration: int) -> bool:
+        """Whether cameras learn in an iteration."""
+        return any(rate(self.recipe, state.stage, iteration) > 0 for rate in (pose_rate, zoom_rate))
+
     def camera(self, state: TrainState, index: int, *, learns: bool = False) -> Camera:
         """Return the camera of training view ``index`` where it is now; with ``learns`` it gets a gradient."""
         camera = self.scene.train[index].camera
@@ -183,8 +187,7 @@ class FullRender:
         """Render one view; loss and gradients, checked to be finite (DivergedError; not on a GPU)."""
         splats = state.splats
         leaves = Splats(**{k: t.detach().requires_grad_(k in stage.train) for k, t in splats.items()})
-        learns = any(rate(self.recipe, state.stage, iteration) > 0 for rate in (pose_rate, zoom_rate))
-        camera = self.camera(state, index, learns=learns)
+        camera = self.camera(state, index, learns=self.learns(state, iteration))
         settings = self.settings(stage, iteration)
         rows = learning_rows(state, stage) if probe is None else None  # the signal is of every splat
         drawn, of_all = self._left(leaves, state, stage, iteration), probe
@@ -192,7 +195,7 @@ class FullRender:
         if self.frozen is not None and probe is not None:
             of_all = torch.cat([probe, probe.new_zeros(len(self.frozen), probe.shape[1])])
         output = rasterize(drawn, camera, settings, backend=self.backend, screen_probe=of_all, gradient_rows=rows)
-        neighbour = self._neighbour_of(state, stage, iteration, index)
+        neighbour = self.neighbour_of(state, stage, iteration, index, splats)
         given = (index, camera, output, dict(leaves.items()), neighbour)
         losses, gradients = self.differentiate(state, stage, iteration, *given)
         return StepResult(losses, gradients, None if probe is None else _gradient(probe), output.radii[: len(splats)])
@@ -218,6 +221,16 @@ class FullRender:
         error = error if target.mask is None else error * target.mask
         return ViewResidual(error, camera, settings, self.frozen)
 
+    @torch.no_grad()
+    def errors(
+        self, state: TrainState, index: int, splats: Splats, settings: RasterSettings, *, occlusion: bool
+    ) -> Tensor:
+        """Return the inner sum of E_i of splats [N] in training view ``index``, in the colours that it shows."""
+        camera, target = self.camera(state, index), self.targets[index]
+        splats, settings = self.photographed(state, index, splats, camera, settings)
+        given = {"backend": self.backend, "mask": target.mask, "occlusion": occlusion}
+        return splat_errors(splats, camera, target.image, settings, **given)  # type: ignore[arg-type]
+
     def _transform(self, state: TrainState, index: int, like: Tensor) -> Tensor:
         """Return the exposure of a view [3, 4]; the mean one where none are learned."""
         return identity(like) if state.exposures is None else state.exposures.transform(index)
@@ -239,21 +252,27 @@ class FullRender:
         photometry = None if state.photometries is None else state.photometries.photometry(index)
         return apply_exposure(splats, camera, transform, settings, photometry)
 
-    @torch.no_grad()
-    def _neighbour_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Neighbour | None:
-        """Return the view that view ``index`` is compared with in an iteration, rendered; None: with none."""
+    def turn_of(self, state: TrainState, stage: Stage, iteration: int, index: int) -> Turn | None:
+        """Return with what view ``index`` is compared in an iteration; None: with none."""
         settings = self.recipe.multiview
         if settings is None or not is_compared(stage, iteration):
             return None
-        turn = draw_turn(self.recipe, state.stage, iteration, self._neighbours[index], settings)
-        if turn is None:
+        return draw_turn(self.recipe, state.stage, iteration, self._neighbours[index], settings)
+
+    @torch.no_grad()
+    def neighbour_of(
+        self, state: TrainState, stage: Stage, iteration: int, index: int, splats: Splats
+    ) -> Neighbour | None:
+        """Return the view that view ``index`` is compared with in an iteration, rendered; None: with none."""
+        settings, turn = self.recipe.multiview, self.turn_of(state, stage, iteration, index)
+        if settings is None or turn is None:
             return None
         camera, other = self.camera(state, turn.neighbour), turn.neighbour
         kind = next((term.depth for term in stage.losses if term.kind in MULTIVIEW_KINDS and term.depth), None)
         kind = kind or self.protocol.depth
         bare = replace(self.settings(stage, iteration), sh_degree=0, with_distortion=False).for_depths(kind)
         small = camera.resized(*(-(-n // settings.depth_downscale) for n in (camera.width, camera.height)))
-        depth = rasterize(self.drawn(state.splats), small, bare, backend=self.backend).depth(kind)
+        depth = rasterize(self.drawn(splats), small, bare, backend=self.backend).depth(kind)
         here, there = (self._images.of(i, self.targets[i]) for i in (index, other))
         return Neighbour(here, there, camera, depth, turn.draws.to(depth.device, non_blocking=True), settings)
 

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from gs2d.core.processes import Place
+from gs2d.core.splats import Splats
 from gs2d.errors import RunError
 from gs2d.training.objective import StepResult
 from gs2d.training.state import TrainState
@@ -58,10 +59,13 @@ class OneProcess:
     place : Place
     stop_asked : bool
         Whether any process was asked to stop, as of the last meeting.
+    splits : bool
+        Whether each process has a part of the splats (:class:`gs2d.training.shards.Shards`); else all have all.
     """
 
     place = Place()
     stop_asked = False
+    splits = False
 
     @property
     def size(self) -> int:
@@ -133,13 +137,31 @@ class OneProcess:
         """Return the sum of a tensor over the processes, in its place."""
         return tensor
 
+    def sum_views(self, tensor: Tensor) -> Tensor:
+        """Return numbers of splats that are sums over some views, of which each process did others: over all."""
+        return self.sum(tensor)
+
     def any(self, mask: Tensor) -> Tensor:
         """Return where a mask is True in any process."""
         return mask
 
-    def decide(self, mask: Callable[[], Tensor], like: Tensor) -> Tensor:
-        """Return a mask [N] that process 0 makes, N the rows of ``like``."""
-        return mask()
+    def decide(self, mask: Callable[[Splats], Tensor], splats: Splats) -> Tensor:
+        """Return a mask [N] that process 0 makes of the splats' places, sizes and opacities."""
+        return mask(splats)
+
+    def whole_state(self, state: TrainState) -> TrainState:
+        """Return the state with all splats, to process 0 while the others attend."""
+        return state
+
+    def end(self, state: TrainState) -> TrainState:
+        """Return the state with all splats to process 0, when all have come to the end."""
+        return state
+
+    def attend(self, state: TrainState) -> None:
+        """Be there for process 0 while it tells somebody of an event, and may want the whole state."""
+
+    def dismiss(self) -> None:
+        """Let the others go on, who attend."""
 
 
 ONE_PROCESS = OneProcess()
@@ -165,7 +187,7 @@ class ManyProcesses(OneProcess):
     def tell(self, facts: T) -> T:
         """Return what process 0 says, whatever the others do."""
         box: list[Any] = [facts]
-        with self._contact():
+        with self.contact():
             self._group.broadcast_object_list(box, src=0)
         told: T = box[0]
         return told
@@ -179,7 +201,7 @@ class ManyProcesses(OneProcess):
             return False
 
     @contextmanager
-    def _contact(self) -> Iterator[None]:
+    def contact(self) -> Iterator[None]:
         """Say in one line that another process is gone."""
         try:
             yield
@@ -216,11 +238,11 @@ class ManyProcesses(OneProcess):
         if state is not None:
             torch.save(state.state_dict(), file)
         size = torch.tensor([file.tell()])
-        with self._contact():
+        with self.contact():
             self._group.broadcast(size, src=0)
         data = torch.frombuffer(file.getbuffer(), dtype=torch.uint8) if state is not None else torch.empty(0)
         data = data if state is not None else torch.empty(int(size), dtype=torch.uint8)
-        with self._contact():
+        with self.contact():
             self._group.broadcast(data, src=0)
         if state is not None:
             return state
@@ -251,7 +273,7 @@ class ManyProcesses(OneProcess):
     def _all(self, own: Tensor) -> Tensor:
         """Return a small tensor of the host's memory [n] of all processes [W, n]."""
         met = [torch.empty_like(own) for _ in range(self.size)]
-        with self._contact():
+        with self.contact():
             self._group.all_gather(met, own)
         return torch.stack(met)
 
@@ -272,16 +294,16 @@ class ManyProcesses(OneProcess):
         if rows is not None and result.rows is None:
             splats = {name: tensor[rows] for name, tensor in splats.items()}
         splats = {name: tensor.contiguous() for name, tensor in splats.items()}
-        with self._contact():
+        with self.contact():
             sums = [self._group.all_reduce(splats[name], async_op=True) for name in sorted(splats)]
             for work in sums:
                 work.wait()
         for tensor in splats.values():
             tensor.div_(len(turns))
-        each = self._of_views(result.gradients)[: len(turns)] if of_views else [{}] * len(turns)
+        each = self.of_views(result.gradients)[: len(turns)] if of_views else [{}] * len(turns)
         return replace(result, gradients=splats, rows=rows), each
 
-    def _of_views(self, gradients: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
+    def of_views(self, gradients: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
         """Return the gradients of what is learned of one view, of all processes; the same bits."""
         own = torch.zeros(sum(1 + math.prod(shape) for shape in OF_A_VIEW.values()), dtype=torch.float64)
         places, start = {}, 0
@@ -309,7 +331,7 @@ class ManyProcesses(OneProcess):
     def mean_losses(self, losses: Mapping[str, float | Tensor], views: int) -> Mapping[str, float | Tensor]:
         """Return the mean of the losses of the views."""
         found: list[Any] = [None] * self.size
-        with self._contact():
+        with self.contact():
             self._group.all_gather_object(found, {kind: float(value) for kind, value in losses.items()})
         kinds = dict.fromkeys(kind for one in found for kind in one)
         return {kind: sum(one.get(kind, 0.0) for one in found) / views for kind in kinds}
@@ -321,7 +343,7 @@ class ManyProcesses(OneProcess):
 
     def sum(self, tensor: Tensor) -> Tensor:
         """Return the sum of a tensor over the processes, in its place."""
-        with self._contact():
+        with self.contact():
             self._group.all_reduce(tensor)
         return tensor
 
@@ -329,11 +351,11 @@ class ManyProcesses(OneProcess):
         """Return where a mask is True in any process."""
         return self.sum(mask.to(torch.int32)) > 0
 
-    def decide(self, mask: Callable[[], Tensor], like: Tensor) -> Tensor:
+    def decide(self, mask: Callable[[Splats], Tensor], splats: Splats) -> Tensor:
         """Return a mask [N] that process 0 makes."""
-        shape = like.shape[:1]
-        found = mask().to(torch.uint8) if self.leads else torch.empty(shape, dtype=torch.uint8, device=like.device)
-        with self._contact():
+        nothing = torch.empty(len(splats), dtype=torch.uint8, device=splats.device)
+        found = mask(splats).to(torch.uint8) if self.leads else nothing
+        with self.contact():
             self._group.broadcast(found, src=0)
         return found.bool()
 

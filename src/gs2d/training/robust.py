@@ -118,29 +118,29 @@ class Robustness:
         """Prune the splats in free space, and those of which little is photographed, where that is due."""
         happened: list[events.Event] = []
         if self._looks_at_free_space(stage, iteration):
-            pruned = self._drop(state, partial(self._in_free_space, state))
+            pruned = self._drop(state, self._in_free_space)
             if pruned:
-                happened.append(events.FreeSpacePruned(stage.name, iteration, pruned, len(state.splats)))
+                happened.append(events.FreeSpacePruned(stage.name, iteration, pruned, state.count))
         settings = self._recipe.seen_area
         if settings is not None and self._looks_at_seen_area(stage, iteration):
             pruned = self._drop(state, partial(self._unseen, state, settings))
             if pruned:
-                happened.append(events.UnseenPruned(stage.name, iteration, pruned, len(state.splats)))
+                happened.append(events.UnseenPruned(stage.name, iteration, pruned, state.count))
         return happened
 
-    def _in_free_space(self, state: TrainState) -> Tensor:
+    def _in_free_space(self, splats: Splats) -> Tensor:
         assert self._free is not None
-        return self._free.inside(state.splats)
+        return self._free.inside(splats)
 
-    def _unseen(self, state: TrainState, settings: SeenArea) -> Tensor:
+    def _unseen(self, state: TrainState, settings: SeenArea, splats: Splats) -> Tensor:
         cameras = [view.camera for view in per_image.scene_now(state, self._given).train]
-        return mostly_unseen(state.splats, cameras, settings, self._raster, self._backend)
+        return mostly_unseen(splats, cameras, settings, self._raster, self._backend)
 
-    def _drop(self, state: TrainState, mask: Callable[[], Tensor]) -> int:
+    def _drop(self, state: TrainState, mask: Callable[[Splats], Tensor]) -> int:
         """Drop the splats of a mask [N] and return how many: none where nothing would be left."""
-        found = self._processes.decide(mask, state.splats.means)
-        dropped = int(found.sum())
-        if dropped == 0 or dropped == len(found):  # all: the photographs contradict each other
+        found = self._processes.decide(mask, state.splats)
+        dropped = state.parts.count(int(found.sum()))
+        if dropped == 0 or dropped == state.count:  # all: the photographs contradict each other
             return 0
         keep_rows(state, ~found)
         return dropped

@@ -7,6 +7,7 @@ loss, backward, statistics, densify and prune, opacity reset, Adam. So on an ite
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
@@ -22,7 +23,6 @@ from gs2d.data.cache import ReadAhead
 from gs2d.data.scene import Scene
 from gs2d.errors import DataError, RecipeError, RunError
 from gs2d.losses.api import LossFunction, LossReport, target_maps
-from gs2d.render.api import splat_errors
 from gs2d.render.backends import Backend, get_backend
 from gs2d.render.types import RasterSettings
 from gs2d.training import events, per_image
@@ -49,6 +49,8 @@ from gs2d.training.rank_clone import clone_in_place, rank_by_error
 from gs2d.training.resumable import check_resumable
 from gs2d.training.robust import Robustness
 from gs2d.training.rows import keep_rows
+from gs2d.training.shards import Shards
+from gs2d.training.split_views import SplitViews
 from gs2d.training.state import TrainState
 from gs2d.training.targets import PINNED_BYTES, TARGET_BYTES, DeviceTargets, Targets, TargetSource
 from gs2d.training.whole_steps import WholeSteps
@@ -144,12 +146,16 @@ class Trainer:
         self._robust = Robustness(scene, begins, self.settings, self.backend, processes)
         if state is not None:
             check_resumable(state, self.recipe, len(scene.train))
-        self.state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
-        self.state.trained_by(processes.size)
+        self._telling = False  # somebody in process 0 of an event
+        self._told: TrainState | None = None  # with all splats, if that was asked for
+        self._state = processes.share(lambda: self._new_state(dtype, init, exposures) if state is None else state)
+        self.state.trained_by(processes.size, splits=processes.splits)
         self._frozen = None if frozen is None or len(frozen) == 0 else frozen.detach().to(self.backend.device)
         if self._frozen is not None and self._frozen.sh_degree != self.recipe.sh_degree:
             degrees = f"{self._frozen.sh_degree}, the recipe trains {self.recipe.sh_degree}"
             raise RecipeError(f"frozen splats must have the recipe's SH degree, got {degrees}; set sh_degree")
+        if self._frozen is not None and processes.splits:
+            raise RecipeError(f"frozen splats need all splats in a process, got {len(self._frozen)}; do not shard")
         self.state.move_to(self.backend.device)
         self._robust.move_to(self.backend.device)
         self._learner = self.backend.for_training()
@@ -163,6 +169,19 @@ class Trainer:
         self._check_sizes()
         stage = self.recipe.stages[min(self.state.stage, len(self.recipe.stages) - 1)]
         self._look_at(stage.downscale_at(self.state.step + 1))
+        self._telling = processes.splits and processes.leads  # until it runs
+
+    @property
+    def state(self) -> TrainState:
+        """The state as it is now.
+
+        Where processes have parts of the splats it is of this one's; to who hears an event, in process 0, of all.
+        """
+        if not self._telling:
+            return self._state
+        if self._told is None:
+            self._told = self.processes.whole_state(self._state)
+        return self._told
 
     @property
     def splats(self) -> Splats:
@@ -195,6 +214,7 @@ class Trainer:
 
     def run(self) -> Splats:
         """Train from where the state is to the end of the last stage."""
+        self._stop_telling()
         while not self.done:
             if not self.state.entered:
                 self.enter(self.state.stage)
@@ -202,8 +222,10 @@ class Trainer:
             while self.state.step < stage.iterations:
                 self.step()
                 if not is_async(self.state.splats.device):
-                    self._between()
+                    with self._event():
+                        self._between()
             self._finish(stage)
+        self._state = self.processes.end(self._state)
         return self.state.splats
 
     def enter(self, index: int) -> None:
@@ -212,9 +234,9 @@ class Trainer:
         state.stage, state.step, state.entered = index, 0, False
         self._objective = self._whole_steps = None
         self._look_at(stage.downscale_at(1))
-        while self._pending:
+        while self._pending:  # of who made the start
             self._on_event(self._pending.pop(0))
-        self._on_event(events.StageEntering(stage.name, index, len(state.splats)))
+        self._tell(events.StageEntering(stage.name, index, state.count))
         happened = [self._act(stage, action) for action in stage.on_enter]
         begin_stage(state, stage)
         state.statistics, densifier = None, self._densifiers[index]
@@ -225,8 +247,8 @@ class Trainer:
         state.entered = True
         self.processes.check(state)
         for event in happened:
-            self._on_event(event)
-        self._on_event(events.StageStarted(stage.name, index, stage.iterations, len(state.splats)))
+            self._tell(event)
+        self._tell(events.StageStarted(stage.name, index, stage.iterations, state.count))
 
     def step(self) -> None:
         """One iteration of the stage that was entered; several processes do as many of the schedule in one.
@@ -250,7 +272,7 @@ class Trainer:
         if self._ahead is not None:
             self._ahead.expect(together.part(state.queue[-self.scene.ahead * together.size :][::-1]))
         if self._objective is None:
-            limit = self._stage2_cache_bytes // together.place.local_size
+            limit = 0 if together.splits else self._stage2_cache_bytes // together.place.local_size
             self._objective = choose_objective(self._whole, state, stage, limit, together.size)
         reports = any(i % self._progress_every == 0 for i in iterations) or iteration == stage.iterations
         changes_rows = any(self._changes(i) or self._robust.prunes(stage, i) for i in iterations)
@@ -266,13 +288,31 @@ class Trainer:
         if changes_rows:
             together.check(state)
         for event in happened:
-            self._on_event(event)
+            self._tell(event)
         if reports:
             assert result is not None  # of an iteration that was looked at
             losses = check_losses(stage, iteration, together.mean_losses(result.losses, self.views))
             self._check_parameters(stage, tuple(stage.train))  # on a CPU gradients are checked each time
             lr = lr_at(stage.lr.for_views(self.views), iteration, self.scene.extent)
-            self._on_event(self._progress(stage, iteration, losses, lr))
+            self._tell(self._progress(stage, iteration, losses, lr))
+
+    def _tell(self, event: events.Event) -> None:
+        with self._event():
+            self._on_event(event)
+
+    @contextmanager
+    def _event(self) -> Iterator[None]:
+        """While somebody hears of an event, who may want the state of all splats: the others are there for that."""
+        self._telling = self.processes.splits and self.processes.leads
+        yield
+        self._stop_telling()
+
+    def _stop_telling(self) -> None:
+        if self.processes.splits and not self.processes.leads:
+            self.processes.attend(self._state)
+        elif self._telling:
+            self._telling, self._told = False, None
+            self.processes.dismiss()
 
     def _changes(self, iteration: int) -> bool:
         """Whether the densifier of the stage under way may change splats in an iteration."""
@@ -304,13 +344,7 @@ class Trainer:
         # What densification is told: of the iterations that are done in one, that in which something is due.
         due = next((turn.iteration for turn in turns[:-1] if self._changes(turn.iteration)), iteration)
         probe = None if densifier is None else densifier.before_backward(state, due)
-        result, of_views = self.processes.evaluate(
-            turns,
-            lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
-            lambda: no_view(state, stage, probe),
-            rows=objective.rows,
-            of_views=bool(state.of_views()),
-        )
+        result, of_views = self._evaluate(objective, stage, turns, probe)
         happened = [] if densifier is None else list(densifier.after_backward(state, result, due))
         if not any(isinstance(event, events.Densified) for event in happened):
             limited = any(isinstance(event, events.OpacityLimited) for event in happened)
@@ -322,6 +356,21 @@ class Trainer:
             self._robust.decay(state, stage, turn.iteration, self._learner)
             per_image.update(state, self.recipe, turn.iteration, turn.index, gradients, self._learner)
         return result, happened
+
+    def _evaluate(
+        self, objective: Objective, stage: Stage, turns: Sequence[Turn], probe: Tensor | None
+    ) -> tuple[StepResult, Sequence[Mapping[str, Tensor]]]:
+        """Gradients of the mean loss of some views, and those of each view."""
+        state = self.state
+        if isinstance(self.processes, Shards):
+            return SplitViews(self._whole, self.processes).evaluate(state, stage, turns, probe)
+        return self.processes.evaluate(
+            turns,
+            lambda turn: objective.evaluate(state, stage, turn.iteration, turn.index, probe),
+            lambda: no_view(state, stage, probe),
+            rows=objective.rows,
+            of_views=bool(state.of_views()),
+        )
 
     def _learn_at_once(self, stage: Stage, turns: Sequence[Turn], densifier: Densifier | None) -> bool:
         """Let the backend do an iteration of one process in one piece, if it is of a kind that it does."""
@@ -350,6 +399,11 @@ class Trainer:
                 raise RecipeError(
                     f"stage {stage.name!r}: its densifier must know several views in an iteration to train in {many} "
                     f"processes, got {kind}, which knows one (Densifier.shares_views); train in one process"
+                )
+            if self.processes.splits and not densifier.splits_rows:
+                raise RecipeError(
+                    f"stage {stage.name!r}: its densifier must do with a part of the splats to train with --sharded, "
+                    f"got {kind}, which looks at all (Densifier.splits_rows); train without, or by another one"
                 )
             if type(densifier).changes is Densifier.changes:
                 raise RecipeError(
@@ -447,27 +501,21 @@ class Trainer:
         """Run an entry action."""
         if isinstance(action, CloneInPlace):
             count = clone_in_place(self.state, action)
-            return events.Cloned(stage.name, action.writes, count, action.opacity, len(self.state.splats))
-        errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion), self.processes.sum)
-        group = self.state.groups[action.writes]
+            return events.Cloned(stage.name, action.writes, count, action.opacity, self.state.count)
+        errors = rank_by_error(self.state, action, self._errors_by_view(action.occlusion), self.processes.sum_views)
+        group = self.state.parts.whole(self.state.groups[action.writes])
         fraction = float(errors[group].sum() / errors.sum().clamp(min=1e-300))
         return events.Ranked(stage.name, action.writes, int(group.sum()), float(errors[group].min()), fraction)
 
     def _errors_by_view(self, occlusion: bool) -> Iterator[Tensor]:
         """Yield the inner sum of E_i [N] for each training view that this process looks at."""
+        if isinstance(self.processes, Shards):
+            views = SplitViews(self._whole, self.processes)
+            yield from views.errors(self.state, self.settings, occlusion=occlusion)
+            return
         for index in self.processes.part(range(len(self.scene.train))):
-            target, splats, settings = self._targets[index], self.drawn, self.settings
-            camera = self._whole.camera(self.state, index)
-            splats, settings = self._whole.photographed(self.state, index, splats, camera, settings)
-            yield splat_errors(
-                splats,
-                camera,
-                target.image,
-                settings,
-                backend=self.backend,
-                mask=target.mask,
-                occlusion=occlusion,
-            )[: len(self.state.splats)]
+            found = self._whole.errors(self.state, index, self.drawn, self.settings, occlusion=occlusion)
+            yield found[: len(self.state.splats)]
 
     def _finish(self, stage: Stage) -> None:
         """Point the state at the next stage and say that this one is done."""
@@ -475,7 +523,7 @@ class Trainer:
         unseen = self._drop_unseen(stage)
         state.stage, state.step, state.entered, state.statistics = index + 1, 0, False, None
         self._objective = self._whole_steps = None
-        self._on_event(events.StageFinished(stage.name, index, stage.iterations, len(state.splats), unseen))
+        self._tell(events.StageFinished(stage.name, index, stage.iterations, state.count, unseen))
 
     def _drop_unseen(self, stage: Stage) -> int:
         """Drop the splats that no training view sees; how many.
@@ -488,8 +536,8 @@ class Trainer:
             return 0
         views = self.processes.part(per_image.scene_now(self.state, self.scene).train)
         seen = self.processes.any(visible_mask(self.state.splats, views, self.settings, self.backend))
-        unseen = int((~seen).sum())
-        if unseen == len(seen):
+        unseen = self.state.parts.count(int((~seen).sum()))
+        if unseen == self.state.count:
             return 0  # nothing is left to say what the scene is; evaluation will show it
         if unseen:
             keep_rows(self.state, seen)
@@ -506,9 +554,9 @@ class Trainer:
             iterations=stage.iterations,
             losses=losses,
             loss=sum(losses.values()),
-            splats=len(splats),
-            mean_opacity=float(splats.opacities.mean()),
-            mean_k_a=float(splats.scales.prod(dim=1).mean()),
+            splats=self.state.count,
+            mean_opacity=self.state.parts.mean(splats.opacities),
+            mean_k_a=self.state.parts.mean(splats.scales.prod(dim=1)),
             lr={name: lr[name] for name in stage.train},
             sh_degree=stage.active_sh_degree(iteration, self.recipe.sh_degree),
         )

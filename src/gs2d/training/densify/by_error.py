@@ -41,6 +41,7 @@ class MultiViewErrorDensifier(GradientDensifier):
     """
 
     absolute = None  # as the options say
+    splits_rows = False  # it renders views by itself
 
     def __init__(self, surroundings: Surroundings, densify: GradDensify | None = None, **options: Any) -> None:
         super().__init__(surroundings, densify, **options)

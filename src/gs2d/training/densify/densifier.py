@@ -74,9 +74,13 @@ class Densifier:
     shares_views : bool
         Whether it may train in several processes, where an iteration has a view in each: it takes what ``output`` says
         of the view (``losses``, ``signal``, ``radii``) through ``surroundings.processes`` alone, or not at all.
+    splits_rows : bool
+        Whether it may train where each process has a part of the splats: it renders nothing, and what it asks of all
+        splats goes through ``state.parts`` (``training.parts``).
     """
 
     shares_views = False
+    splits_rows = False
 
     def __init__(self, surroundings: Surroundings) -> None:
         self.surroundings = surroundings
