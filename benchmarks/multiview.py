@@ -61,7 +61,7 @@ def make_pair(trainer: Trainer) -> ViewPair:
     """Return the first view of a trainer beside the neighbour of the first iteration."""
     objective = trainer._whole
     state, stage = trainer.state, trainer.recipe.stages[0]
-    neighbour = objective._neighbour_of(state, stage, 1, 0)
+    neighbour = objective.neighbour_of(state, stage, 1, 0, state.splats)
     assert neighbour is not None
     with torch.no_grad():
         output = rasterize(state.splats, trainer.scene.train[0].camera, objective.settings(stage, 1), backend="cpu")
@@ -88,8 +88,10 @@ def run(count: int, size: int, threads: int, repeats: int) -> dict[str, object]:
         "iteration without": plain.step,
         "iteration with": compared.step,
         "iteration with, depth_downscale 2": coarse.step,
-        "render of the neighbour": lambda: objective._neighbour_of(state, stage, 1, 0),
-        "render of the neighbour, depth_downscale 2": lambda: coarse._whole._neighbour_of(state, stage, 1, 0),
+        "render of the neighbour": lambda: objective.neighbour_of(state, stage, 1, 0, state.splats),
+        "render of the neighbour, depth_downscale 2": lambda: coarse._whole.neighbour_of(
+            state, stage, 1, 0, state.splats
+        ),
         "losses in torch": lambda: losses(pair, native=False),
         "losses, native": lambda: losses(pair, native=True),
     }

@@ -22,7 +22,7 @@ from gs2d.config.densify import Densify
 from gs2d.config.presets import two_dgs, with_robustness
 from gs2d.config.protocols import GENERIC
 from gs2d.config.recipe import Exposure, PoseRefinement, Recipe
-from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea
+from gs2d.config.robust import DenseStart, FreeSpace, OpacityDecay, SeenArea, SplatDropout
 from gs2d.config.schedule import scale_schedule
 from gs2d.core.processes import Place
 from gs2d.errors import Gs2dError
@@ -108,6 +108,11 @@ def cached() -> Recipe:
     return Recipe("cached", (replace(first, iterations=3), replace(second, iterations=25)))
 
 
+def dropping() -> Recipe:
+    """Splats are left out of iterations, and views compared with their neighbours."""
+    return replace(compared(), dropout=SplatDropout(rate=0.3))
+
+
 def robust() -> Recipe:
     """15 iterations on a wall: a dense start, free space looked at in the tenth, seen area and decay in each fifth."""
     made = scale_schedule(with_robustness(two_dgs()), 0.0005)
@@ -124,6 +129,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
     "short": short,
     "absgs": lambda: short(absgs=True),
     "compared": compared,
+    "dropping": dropping,
     "learning": learning,
     "relocating": relocating,
     "by_error": by_error,
@@ -196,12 +202,26 @@ def together_in(size: int, cases: Sequence[str], folder: Path) -> dict[str, list
 SHARDED = "sharded-"  # before a case: each process has a part of the splats
 
 
+def counting(many: Any) -> Any:
+    """The processes of a group, each with a part of the splats, that note how many this one has: ``rows``."""
+    from gs2d.training.shards import Shards
+
+    class Counting(Shards):
+        rows: list[tuple[int, int]] = []  # noqa: RUF012 (of this process, of all)
+
+        def settle(self, state: TrainState, pieces: Sequence[int]) -> None:
+            super().settle(state, pieces)
+            self.rows = [*self.rows, (len(state.splats), state.count)]
+
+    return Counting(many.place, many.hears)
+
+
 def do(case: str, many: Any) -> Any:
     """Do one case in this process of several."""
     if case.startswith(SHARDED):
-        from gs2d.training.shards import Shards
-
-        return do(case.removeprefix(SHARDED), Shards(many.place, many.hears))
+        shards = counting(many)
+        done = do(case.removeprefix(SHARDED), shards)
+        return {**done, "rows": shards.rows} if isinstance(done, dict) else done
     if case in RECIPES:
         state, heard = trained(RECIPES[case](), many)
         return {"state": state.state_dict(), "losses": heard["losses"]}

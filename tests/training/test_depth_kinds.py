@@ -68,10 +68,10 @@ def test_both_views_that_are_compared_have_that_depth(scene: Scene, backend: str
     recipe = by_depth(compared(), "transmittance", "multiview_photometric", "multiview_geometric")
     trainer = Trainer(scene, recipe, GENERIC, backend=backend)
     trainer.enter(0)
-    neighbour = trainer._whole._neighbour_of(trainer.state, recipe.stages[0], 7, 0)
+    neighbour = trainer._whole.neighbour_of(trainer.state, recipe.stages[0], 7, 0, trainer.splats)
     plain = Trainer(scene, compared(), GENERIC, backend=backend)
     plain.enter(0)
-    other = plain._whole._neighbour_of(plain.state, compared().stages[0], 7, 0)
+    other = plain._whole.neighbour_of(plain.state, compared().stages[0], 7, 0, plain.splats)
     assert neighbour is not None
     assert other is not None
     assert not torch.equal(neighbour.depth, other.depth)

@@ -176,7 +176,7 @@ def test_a_view_without_neighbours_trains_without_these_losses(scene: Scene) -> 
 def test_the_neighbour_s_depth_is_rendered_as_the_splats_are_now(scene: Scene) -> None:
     trainer = Trainer(scene, compared(), GENERIC, backend="reference")
     trainer.enter(0)
-    neighbour = trainer._whole._neighbour_of(trainer.state, trainer.recipe.stages[0], 9, 0)
+    neighbour = trainer._whole.neighbour_of(trainer.state, trainer.recipe.stages[0], 9, 0, trainer.splats)
     assert neighbour is not None
     with torch.no_grad():
         expected = rasterize(trainer.splats, neighbour.camera, trainer.settings, backend="reference").depth_mean

@@ -240,7 +240,7 @@ def _same_poses(capture: Path, options: ReconstructOptions) -> dict[str, Any]:
                     f"{name} {what} {options.photos} since the cameras were found; begin anew with --overwrite"
                 )
         _lines(poses, capture)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise RunError(
             f"{capture / POSES_JSON} must be as `gs2d reconstruct` writes it, got another entry ({error}); begin anew "
             "with --overwrite"

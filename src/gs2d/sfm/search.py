@@ -21,6 +21,7 @@ SEARCH = "search.json"
 LAYERS = ("photographs", "features", "pairs", "mapping")
 DATABASE, MAPPING = "database.db", "mapping"
 _PAIRS = ("pairs.txt", "pairs_again.txt", "alike.json")
+DAMAGED = (sqlite3.Error, UnicodeDecodeError)  # of a database, whose words need not be text
 _AGAIN = "pairs again.json"  # of the mapping: from here on pairs are compared by looser rules
 
 
@@ -97,7 +98,7 @@ def _clear(database: Path) -> None:
         with contextlib.closing(sqlite3.connect(database, timeout=60.0)) as connection, connection:
             for table in ("matches", "two_view_geometries"):
                 connection.execute(f"DELETE FROM {table}")
-    except sqlite3.Error:
+    except DAMAGED:
         for path in database.parent.glob(f"{database.name}*"):
             path.unlink()
 
@@ -105,7 +106,7 @@ def _clear(database: Path) -> None:
 def _kept(work: Path, layers: int) -> str:
     """Return what of the first ``layers`` layers is there, for people."""
     said = []
-    with contextlib.suppress(sqlite3.Error), contextlib.closing(_open(work / DATABASE)) as connection:
+    with contextlib.suppress(*DAMAGED), contextlib.closing(_open(work / DATABASE)) as connection:
         if layers > LAYERS.index("features"):
             said.append(f"features of {_count(connection, 'keypoints'):,} photographs")
         if layers > LAYERS.index("pairs"):
